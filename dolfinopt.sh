@@ -1,0 +1,204 @@
+#!/bin/bash
+# Sets dolfinopt up on first use (Debian 12 or 13) and runs it; `usage` says how.
+set -u
+
+usage() {
+  cat <<'TEXT'
+usage: ./dolfinopt.sh [-n RANKS] COMMAND ...               run a command, with -n under mpirun
+       ./dolfinopt.sh [-n RANKS] test [PYTEST ARGUMENTS]   ruff, mypy, pytest alone and on RANKS (2)
+       ./dolfinopt.sh --help                               list the commands
+
+The first call sets up what is missing: on Debian 12 or 13 DOLFINx and its libraries with apt
+(as root or with sudo), and Python packages in .venv. Where DOLFINx exists already (conda, Docker),
+`pip install -e .` and the command `dolfinopt` do the same.
+TEXT
+}
+
+here=$(cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")" && pwd) || exit 1
+venv=$here/.venv
+python=$venv/bin/python
+log=$venv/setup.log
+
+say() { echo "dolfinopt: $*" >&2; }
+
+# --- environment: what the user has set already stays ---------------------------------------------
+
+# One thread a rank: the ranks are the parallelism, and small matrices lose by threads.
+export OMP_NUM_THREADS="${OMP_NUM_THREADS-1}"
+# Packages in ~/.local must not take the place of the system's NumPy that DOLFINx was built for.
+export PYTHONNOUSERSITE="${PYTHONNOUSERSITE-1}"
+# Pictures without a display.
+export VTK_DEFAULT_OPENGL_WINDOW="${VTK_DEFAULT_OPENGL_WINDOW-vtkEGLRenderWindow}"
+export PYVISTA_OFF_SCREEN="${PYVISTA_OFF_SCREEN-true}"
+# Containers run as root.
+export OMPI_ALLOW_RUN_AS_ROOT="${OMPI_ALLOW_RUN_AS_ROOT-1}"
+export OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="${OMPI_ALLOW_RUN_AS_ROOT_CONFIRM-1}"
+# More ranks than cores, ranks of two runs not on the same cores, shared memory only, and no comment
+# of mpirun's on a status other than 0: each for Open MPI 4, then 5.
+export OMPI_MCA_rmaps_base_oversubscribe="${OMPI_MCA_rmaps_base_oversubscribe-1}"
+export PRTE_MCA_rmaps_default_mapping_policy="${PRTE_MCA_rmaps_default_mapping_policy-:oversubscribe}"
+export OMPI_MCA_hwloc_base_binding_policy="${OMPI_MCA_hwloc_base_binding_policy-none}"
+export PRTE_MCA_hwloc_default_binding_policy="${PRTE_MCA_hwloc_default_binding_policy-none}"
+export OMPI_MCA_btl="${OMPI_MCA_btl-^tcp}"
+export OMPI_MCA_orte_execute_quiet="${OMPI_MCA_orte_execute_quiet-1}"
+
+# --- set-up ---------------------------------------------------------------------------------------
+
+# What a finished set-up belongs to: these files, at this place, on this release of the system.
+fingerprint() { cksum "$here/dolfinopt.sh" "$here/pyproject.toml" /etc/debian_version 2>/dev/null; }
+
+# is_ready STAMP: the stamp is written last, an interrupted set-up has none.
+is_ready() { [ -f "$venv/$1" ] && [ "$(<"$venv/$1")" = "$(fingerprint)" ]; }
+
+# step WHAT COMMAND ...: one line for the user, the rest into the log.
+step() {
+  say "$1"
+  shift
+  echo "+ $*" >>"$log"
+  "$@" >>"$log" 2>&1 </dev/null 9<&- && return
+  say "failed; the end of $log:"
+  tail -n 15 "$log" >&2
+  exit 1
+}
+
+missing_packages() {
+  # libopenblas0-pthread: else the reference BLAS is linked and factorisations take three times longer.
+  local wanted="python3-dolfinx python3-petsc4py python3-slepc4py python3-mpi4py python3-scipy
+    python3-gmsh python3-venv libegl1 libgl1-mesa-dri libxrender1 libopenblas0-pthread"
+  local installed package
+  installed=$(dpkg-query -W -f '${db:Status-Abbrev}${Package}\n' 2>/dev/null)
+  for package in $wanted; do
+    grep -qx "[hi]i $package" <<<"$installed" || echo "$package"
+  done
+}
+
+install_packages() {
+  local packages sudo=()
+  mapfile -t packages < <(missing_packages)
+  [ ${#packages[@]} -gt 0 ] || return
+  [ "$(id -u)" = 0 ] || sudo=(sudo)
+  if ! command -v apt-get >/dev/null; then
+    say "no apt here: install FEniCSx with conda (fenics-dolfinx slepc4py python-gmsh) or use the" \
+      "Docker image dolfinx/dolfinx, then 'pip install -e .' and the command 'dolfinopt'"
+    exit 1
+  elif [ ${#sudo[@]} -gt 0 ] && ! command -v sudo >/dev/null; then
+    say "run this once as root: apt-get install --no-install-recommends ${packages[*]}"
+    exit 1
+  fi
+  local apt=("${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -q -y
+    -o Acquire::Retries=3 -o DPkg::Lock::Timeout=600)
+  step "fetching the package lists (apt)" "${apt[@]}" update
+  step "finishing interrupted installations (dpkg)" "${sudo[@]}" dpkg --configure -a
+  step "installing DOLFINx and its libraries (apt, about two minutes)" \
+    "${apt[@]}" install --no-install-recommends "${packages[@]}"
+}
+
+# set_up STAMP PROJECT: PROJECT is what pip installs, with or without the extras for tests.
+set_up() {
+  local stamp=$1 project=$2 version
+  is_ready "$stamp" && return # another call did it while this one waited for the lock
+  mkdir -p "$venv" || exit 1
+  install_packages
+
+  # A finished environment is brought up to date in place, since others may be running in it; one
+  # that was never finished or belongs to another Python is made anew.
+  version=$(/usr/bin/python3 -c 'import sys; print("%d.%d" % sys.version_info[:2])') || exit 1
+  if [ -f "$venv/ready" ] && [ -d "$venv/lib/python$version" ]; then
+    rm "$venv/ready"
+    [ ! -f "$venv/ready-dev" ] || project="${here}[dev]"
+  else
+    find "$venv" -mindepth 1 -maxdepth 1 ! -name setup.log -exec rm -rf {} +
+    step "making .venv" /usr/bin/python3 -m venv --system-site-packages "$venv"
+  fi
+
+  # The system's DOLFINx works with the system's NumPy only. Beside DOLFINx 0.5, VTK 9.4 crashes,
+  # 9.6 aborts at scalar bars, and 9.3 needs an X server.
+  /usr/bin/python3 - >"$venv/constraints.txt" <<'PYTHON' || exit 1
+from importlib.metadata import version
+print("numpy==" + version("numpy"))
+if version("fenics-dolfinx").startswith("0.5."):
+    print("vtk==9.5.2")
+PYTHON
+  step "installing Python packages (pip)" "$python" -m pip install --disable-pip-version-check \
+    --no-warn-script-location -c "$venv/constraints.txt" -e "$project"
+  step "checking the set-up" "$python" -c "import dolfinx.fem, gmsh, slepc4py, pyvista"
+
+  fingerprint >"$venv/ready"
+  [ "$project" = "$here" ] || cp "$venv/ready" "$venv/ready-dev"
+}
+
+# ensure STAMP PROJECT: sets up unless that was done; one call at a time.
+ensure() {
+  is_ready "$1" && return
+  (
+    flock -n 9 || { say "waiting for another set-up"; flock 9; }
+    set_up "$@"
+  ) 9<"$here" || exit
+}
+
+# --- tests ----------------------------------------------------------------------------------------
+
+# check NAME COMMAND ...: keeps the last line of the output and the verdict for the summary.
+check() {
+  local name=$1 begin=$SECONDS verdict=ok
+  shift
+  echo "== $name"
+  "$@" 2>&1 | tee "$output"
+  if [ "${PIPESTATUS[0]}" != 0 ]; then
+    verdict=FAILED
+    failed+=("$name")
+  fi
+  summary+=$(printf '%-6s  %-20s %4d s  %s' "$verdict" "$name" $((SECONDS - begin)) \
+    "$(grep -v '^ *$' "$output" | tail -n 1)")$'\n'
+}
+
+run_tests() {
+  local output summary="" failed=()
+  output=$(mktemp) || exit 1
+  trap 'rm -f "$output"' EXIT
+  cd "$here" || exit 1
+  export NO_COLOR=1 # mpirun gives the ranks a terminal even when there is none
+  check "ruff check" "$python" -m ruff check .
+  check "ruff format" "$python" -m ruff format --check .
+  check "mypy" "$python" -m mypy
+  check "pytest" "$python" -m pytest "$@"
+  check "pytest, $ranks ranks" /usr/bin/mpirun -n "$ranks" "$python" -m pytest "$@"
+  printf '== summary\n%s' "$summary"
+  if [ ${#failed[@]} -gt 0 ]; then
+    printf 'FAILED:%s\n' "$(printf ' %s;' "${failed[@]}")"
+    exit 1
+  fi
+  echo "all checks passed"
+}
+
+# --- command line ---------------------------------------------------------------------------------
+
+ranks=""
+if [ "${1-}" = -n ]; then
+  ranks=${2-}
+  if ! [[ $ranks =~ ^[1-9][0-9]*$ ]]; then
+    say "-n needs a number of ranks, 1 or more, not '$ranks'"
+    exit 2
+  fi
+  shift 2
+fi
+
+case ${1-} in
+  "" | -h)
+    usage
+    ;;
+  test)
+    shift
+    ranks=${ranks:-2}
+    ensure ready-dev "${here}[dev]"
+    run_tests "$@"
+    ;;
+  *)
+    ensure ready "$here"
+    # -P: a file in the current folder must not take the place of a module.
+    if [ -n "$ranks" ]; then
+      exec /usr/bin/mpirun -n "$ranks" "$python" -P -m dolfinopt "$@"
+    fi
+    exec "$python" -P -m dolfinopt "$@"
+    ;;
+esac
