@@ -1,0 +1,145 @@
+"""The only file that knows DOLFINx 0.5 from 0.9 from 0.11."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+# DOLFINx 0.5 logs each JIT compilation through the root logger; a handler set beforehand keeps
+# `logging.basicConfig` from being triggered by the first message.
+logging.getLogger().addHandler(logging.NullHandler())
+for _name in ("UFL", "FFCx"):
+    logging.getLogger(_name).setLevel(logging.ERROR)
+
+import dolfinx  # noqa: E402
+import ufl  # noqa: E402
+from dolfinx import fem, la  # noqa: E402
+from dolfinx.mesh import GhostMode  # noqa: E402
+from mpi4py import MPI  # noqa: E402
+
+VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
+
+
+def dolfinx_version() -> str:
+    """Return DOLFINx's version, e.g. "0.5.2"."""
+    return dolfinx.__version__
+
+
+def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]:
+    """Distribute the Gmsh model of rank 0 over `comm`; return (mesh, cell tags, facet tags).
+
+    Cells are ghosted across shared facets, so that every rank sees the neighbours of its cells.
+    """
+    if VERSION >= (0, 10):
+        from dolfinx.io import gmsh as gmshio
+    else:
+        from dolfinx.io import gmshio
+    if VERSION < (0, 6):
+        return gmshio.model_to_mesh(model, comm, 0, gdim)
+    partitioner = dolfinx.mesh.create_cell_partitioner(GhostMode.shared_facet)
+    data = gmshio.model_to_mesh(model, comm, 0, gdim, partitioner=partitioner)
+    if isinstance(data, tuple) and not hasattr(data, "cell_tags"):
+        return data[0], data[1], data[2]
+    return data.mesh, data.cell_tags, data.facet_tags
+
+
+def lagrange_space(mesh: Any, degree: int, components: int = 1) -> Any:
+    """Return the continuous Lagrange space of `degree` with 1 or more components a node."""
+    if VERSION < (0, 7):
+        if components == 1:
+            return fem.FunctionSpace(mesh, ("Lagrange", degree))
+        return fem.VectorFunctionSpace(mesh, ("Lagrange", degree), dim=components)
+    if components == 1:
+        return fem.functionspace(mesh, ("Lagrange", degree))
+    return fem.functionspace(mesh, ("Lagrange", degree, (components,)))
+
+
+def _rows(adjacency: Any, columns: int) -> np.ndarray:
+    """Return a fixed-width connectivity as an array (n, columns) whatever its container."""
+    return np.asarray(getattr(adjacency, "array", adjacency)).reshape(-1, columns)
+
+
+def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
+    """Return the (block) dof numbers (num_cells, nodes a cell) of the first cells, local."""
+    nodes = space.dofmap.cell_dofs(0).size
+    return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
+
+
+def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:
+    """Return the coordinates (num_cells, points a cell, 3) of the first cells, m."""
+    dofmap = mesh.geometry.dofmap
+    points = (
+        dofmap.links(0).size if hasattr(dofmap, "links") else np.asarray(dofmap).shape[1]
+    )
+    return mesh.geometry.x[_rows(dofmap, points)[:num_cells]]
+
+
+def local_cell_counts(mesh: Any) -> tuple[int, int]:
+    """Return the number of cells this rank owns and the number of its ghost cells."""
+    cells = mesh.topology.index_map(mesh.topology.dim)
+    return cells.size_local, cells.num_ghosts
+
+
+def scatter_forward(function: Any) -> None:
+    """Copy owned values to the ghosts on other ranks."""
+    function.x.scatter_forward()
+
+
+def scatter_reverse_add(function: Any) -> None:
+    """Add the ghosts' values to their owners."""
+    if hasattr(la, "InsertMode"):
+        function.x.scatter_reverse(la.InsertMode.add)
+    else:
+        function.x.scatter_reverse(la.ScatterMode.add)
+
+
+def compile_form(form: ufl.Form) -> Any:
+    """Compile a UFL form; the JIT cache of DOLFINx keeps it between runs."""
+    return fem.form(form)
+
+
+def tabulate_cells(form: Any, constants: list[float], coordinates: np.ndarray) -> np.ndarray:
+    """Evaluate FFCx's cell kernel of a bilinear form on every cell.
+
+    Args:
+        form: compiled bilinear form with one cell integral and no coefficients.
+        constants: values of its `fem.Constant`s in UFL's order.
+        coordinates: (n_cells, points a cell, 3), m.
+
+    Returns:
+        Element matrices (n_cells, dofs a cell, dofs a cell) in the kernel's dof order.
+    """
+    ffi = form.module.ffi if hasattr(form, "module") else _cffi()
+    compiled = form.ufcx_form
+    if hasattr(compiled, "form_integrals"):
+        integral = compiled.form_integrals[compiled.form_integral_offsets[0]]
+    else:
+        integral = compiled.integrals(0)[0]
+    kernel = integral.tabulate_tensor_float64
+    sizes = [_element_size(space) for space in form.function_spaces]
+    matrices = np.zeros((len(coordinates), sizes[0], sizes[1]))
+    coordinates = np.ascontiguousarray(coordinates, dtype=np.float64)
+    values = np.asarray(constants, dtype=np.float64)
+    none = ffi.NULL
+    tail = [none] if VERSION >= (0, 10) else []  # FFCx 0.10 hands custom data through
+
+    def address(array: np.ndarray) -> Any:
+        return ffi.cast("double *", array.ctypes.data)
+
+    c = address(values)
+    for k in range(len(coordinates)):
+        kernel(address(matrices[k]), none, c, address(coordinates[k]), none, none, *tail)
+    return matrices
+
+
+def _cffi() -> Any:
+    import cffi
+
+    return cffi.FFI()
+
+
+def _element_size(space: Any) -> int:
+    """Return the number of dofs of a cell, components included."""
+    return space.dofmap.dof_layout.num_dofs * space.dofmap.index_map_bs

@@ -1,0 +1,45 @@
+"""Where the seconds went and how often the costly things were done."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+
+
+@dataclass
+class Counts:
+    """How often the costly steps ran, over all arms."""
+
+    assemblies: int = 0
+    factorisations: int = 0
+    solves: int = 0
+    eigenproblems: int = 0
+    simulations: int = 0
+    newton_iterations: int = 0
+
+    def __add__(self, other: Counts) -> Counts:
+        return Counts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+
+@dataclass
+class Ledger:
+    """Seconds by phase and counts of one run on one rank.
+
+    Attributes:
+        seconds: wall-clock time by phase, s.
+        counts: see `Counts`.
+    """
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    counts: Counts = field(default_factory=Counts)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Add the time spent in the block to phase `name`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

@@ -1,0 +1,119 @@
+"""Gmsh geometry -> the distributed mesh of one arm, with its interfaces and solid cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt import compat
+from dolfinopt.data import mesh_folder
+
+# Physical groups of the .geo files.
+INBOARD, OUTBOARD, DESIGN, PASSIVE = 1, 2, 3, 4
+
+
+@dataclass(frozen=True)
+class ArmMesh:
+    """One arm's mesh on its communicator; every array holds this rank's part.
+
+    Attributes:
+        name: the arm's name in the scene.
+        comm: ranks that share this arm.
+        mesh: DOLFINx mesh; the body frame is the mesh's frame, origin on the inboard joint axis.
+        centroid: (n_cells, 2) of the owned cells, m.
+        area: (n_cells,) of the owned cells, m2.
+        passive: (n_cells,) True where the cell stays solid.
+        inboard_facets, outboard_facets: facets of the interfaces, local numbers.
+        outboard_point: (2,) reference point of the outboard interface, m.
+    """
+
+    name: str
+    comm: MPI.Comm
+    mesh: Any
+    centroid: np.ndarray
+    area: np.ndarray
+    passive: np.ndarray
+    inboard_facets: np.ndarray
+    outboard_facets: np.ndarray
+    outboard_point: np.ndarray
+
+    @property
+    def num_cells(self) -> int:
+        """Number of cells this rank owns."""
+        return len(self.area)
+
+
+def structured_arm(
+    comm: MPI.Comm,
+    name: str,
+    length: float,
+    height: float,
+    cells: tuple[int, int],
+    passive: float = 0.0,
+) -> ArmMesh:
+    """Mesh a rectangular arm with `cells` (along, across) quadrilaterals from meshes/arm.geo.
+
+    Args:
+        comm: ranks that share the arm.
+        name: the arm's name.
+        length: joint axis to joint axis, m.
+        height: in the plane of motion, m.
+        cells: number along and across.
+        passive: length kept solid at both ends, m.
+    """
+    parameters = {
+        "1 length (m)": length,
+        "2 height (m)": height,
+        "3 cells along": cells[0],
+        "4 cells across": cells[1],
+        "5 solid length at both ends (m)": passive,
+    }
+    mesh, cell_tags, facet_tags = _read_geo(comm, mesh_folder() / "arm.geo", parameters)
+    owned, _ = compat.local_cell_counts(mesh)
+    corners = compat.cell_coordinates(mesh, owned)[:, :, :2]
+    solid = np.zeros(owned, dtype=bool)
+    tagged = cell_tags.indices[cell_tags.values == PASSIVE]
+    solid[tagged[tagged < owned]] = True
+    return ArmMesh(
+        name=name,
+        comm=comm,
+        mesh=mesh,
+        centroid=corners.mean(axis=1),
+        area=_cell_area(corners),
+        passive=solid,
+        inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
+        outboard_facets=facet_tags.indices[facet_tags.values == OUTBOARD],
+        outboard_point=np.array([length, 0.0]),
+    )
+
+
+def _read_geo(comm: MPI.Comm, path: Path, parameters: dict[str, float]) -> tuple[Any, Any, Any]:
+    """Mesh a parametric .geo file on rank 0 and distribute it; return mesh, cell, facet tags."""
+    import gmsh
+
+    if comm.rank == 0:
+        gmsh.initialize()
+        gmsh.option.setNumber("General.Terminal", 0)
+        # ONELAB parameters override the defaults of DefineConstant when the file is read.
+        for key, value in parameters.items():
+            gmsh.onelab.setNumber(f"Parameters/{key}", [float(value)])
+        gmsh.open(str(path))
+        gmsh.model.mesh.generate(2)
+    try:
+        return compat.model_to_mesh(gmsh.model, comm, gdim=2)
+    finally:
+        if comm.rank == 0:
+            gmsh.finalize()
+
+
+def _cell_area(corners: np.ndarray) -> np.ndarray:
+    """Return the area (n,) of straight triangles or quadrilaterals in DOLFINx's corner order."""
+    if corners.shape[1] == 3:
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    else:  # tensor-product order: 0-3 and 1-2 are the diagonals
+        first, second = corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]
+    return 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
