@@ -15,7 +15,7 @@ def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = 
     """Reduce to 3 constraint modes and `coordinates` - 3 fixed-interface normal modes.
 
     Psi = [-K_II^-1 K_Ib; I],  K_II Phi = M_II Phi diag(lambda). The stiffness is block diagonal:
-    the Schur complement K_bb + K_bI Psi_I and diag(lambda).
+    Psi' K Psi and diag(lambda).
 
     Args:
         arm: with its design set.
@@ -23,19 +23,19 @@ def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = 
         start: `Basis.start` of a nearby design, or None.
     """
     normal = coordinates - 3
-    coupling, corner = arm.restrict(arm.stiffness_times(arm.rigid))
+    coupling, _ = arm.restrict(arm.stiffness_times(arm.rigid))
     interior = arm.solve(-coupling)
-    schur = corner + arm.comm.allreduce(coupling.T @ interior)
-    stiffness = np.zeros((coordinates, coordinates))
-    stiffness[:3, :3] = 0.5 * (schur + schur.T)
     modes = np.empty((arm.num_interior, 0))
     if normal > 0:
         K, M = arm.interior_stiffness(), arm.interior_mass()
-        values, modes = lowest_eigenpairs(arm, K, M, arm.solve_vector, normal, start)
-        stiffness[3:, 3:] = np.diag(values)
+        _, modes = lowest_eigenpairs(arm, K, M, arm.solve_vector, normal, start)
     outboard = np.hstack([np.eye(3), np.zeros((3, normal))])
     V = arm.expand(np.hstack([interior, modes]), outboard)
     MV = arm.mass_times(V)
     sign = np.ones(coordinates)
     sign[3:] = orient(arm, V[:, :, 3:], MV[:, :, 3:])
+    # Constraint and normal modes are K-orthogonal, normal modes among themselves, too.
+    energy = arm.energy_matrix(V)
+    stiffness = np.diag(np.diag(energy))
+    stiffness[:3, :3] = energy[:3, :3]
     return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[3:])

@@ -21,14 +21,15 @@ def modal(arm: ElasticArm, coordinates: int, start: np.ndarray | None = None) ->
         start: `Basis.start` of a nearby design, or None.
     """
     operator = _FreeArm(arm)
-    values, vectors = lowest_eigenpairs(
+    _, vectors = lowest_eigenpairs(
         arm, operator.stiffness, operator.mass, operator.solve, coordinates, start
     )
     interior, outboard = operator.split(vectors)
     V = arm.expand(interior, outboard)
     MV = arm.mass_times(V)
     sign = orient(arm, V, MV)
-    return Basis(V * sign, MV * sign, np.diag(values), outboard * sign, vectors * sign)
+    stiffness = np.diag(np.diag(arm.energy_matrix(V)))
+    return Basis(V * sign, MV * sign, stiffness, outboard * sign, vectors * sign)
 
 
 class _FreeArm:
@@ -44,8 +45,7 @@ class _FreeArm:
         k_coupling, k_corner = arm.restrict(arm.stiffness_times(arm.rigid))
         m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
         self.psi = arm.solve(-k_coupling)
-        schur = k_corner + arm.comm.allreduce(k_coupling.T @ self.psi)
-        self.schur_inverse = np.linalg.inv(0.5 * (schur + schur.T))
+        self.schur_inverse = np.linalg.inv(arm.energy_matrix(arm.expand(self.psi, np.eye(3))))
         size = ((rows, None), (rows, None))
         self.stiffness = PETSc.Mat().createPython(
             size, _Bordered(self, arm.interior_stiffness(), k_coupling, k_corner), comm=arm.comm
