@@ -67,13 +67,16 @@ def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
     return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
 
 
+def cell_geometry_nodes(mesh: Any, num_cells: int) -> np.ndarray:
+    """Return the geometry's node numbers (num_cells, points a cell) of the first cells, local."""
+    dofmap = mesh.geometry.dofmap
+    points = dofmap.links(0).size if hasattr(dofmap, "links") else np.asarray(dofmap).shape[1]
+    return _rows(dofmap, points)[:num_cells]
+
+
 def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:
     """Return the coordinates (num_cells, points a cell, 3) of the first cells, m."""
-    dofmap = mesh.geometry.dofmap
-    points = (
-        dofmap.links(0).size if hasattr(dofmap, "links") else np.asarray(dofmap).shape[1]
-    )
-    return mesh.geometry.x[_rows(dofmap, points)[:num_cells]]
+    return mesh.geometry.x[cell_geometry_nodes(mesh, num_cells)]
 
 
 def local_cell_counts(mesh: Any) -> tuple[int, int]:

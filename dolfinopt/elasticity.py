@@ -21,6 +21,7 @@ from dolfinopt import compat
 from dolfinopt.errors import InputError
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import ArmMesh
+from dolfinopt.parallel import direct_solver
 
 
 @dataclass(frozen=True)
@@ -374,7 +375,7 @@ class ElasticArm:
         if self._K_II is None:
             self._K_II = InteriorMatrix(self.comm, local, 1, self._numbers, self.num_interior)
         if self._ksp is None:
-            self._ksp = direct_solver(self._K_II.mat)
+            self._ksp = direct_solver(self._K_II.mat, "natural")  # numbered for it
         with self.ledger.phase("factorisation"):
             self._K_II.update(local.data)
             self._ksp.setOperators(self._K_II.mat)
@@ -437,18 +438,3 @@ class ElasticArm:
 def _cell_products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return sum_k left' A_e right (n_cells,) for (n_cells, n, n) and (n_cells, n, k)."""
     return np.einsum("eik,eik->e", left, elements @ right)
-
-
-def direct_solver(mat: PETSc.Mat) -> PETSc.KSP:
-    """Return a Cholesky solver for `mat`: PETSc's own on one rank, MUMPS across ranks."""
-    ksp = PETSc.KSP().create(mat.comm)
-    ksp.setOperators(mat)
-    ksp.setType(PETSc.KSP.Type.PREONLY)
-    pc = ksp.getPC()
-    pc.setType(PETSc.PC.Type.CHOLESKY)
-    if mat.comm.size == 1:
-        pc.setFactorSolverType("petsc")
-        pc.setFactorOrdering("natural")  # the numbering is already the ordering
-    else:
-        pc.setFactorSolverType("mumps")
-    return ksp

@@ -117,3 +117,26 @@ def _cell_area(corners: np.ndarray) -> np.ndarray:
     else:  # tensor-product order: 0-3 and 1-2 are the diagonals
         first, second = corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]
     return 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+
+def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the facets between two cells this rank knows, ghost cells included.
+
+    Returns:
+        Local numbers of the two cells, the facet's length and the distance of the cells'
+        centroids, each (n_facets,); m.
+    """
+    owned, ghosts = compat.local_cell_counts(mesh)
+    nodes = compat.cell_geometry_nodes(mesh, owned + ghosts)
+    corners = mesh.geometry.x[nodes][:, :, :2]
+    # DOLFINx's corner order: a tensor product for quadrilaterals.
+    sides = ((0, 1), (0, 2), (1, 2)) if nodes.shape[1] == 3 else ((0, 1), (0, 2), (1, 3), (2, 3))
+    ends = np.concatenate([np.sort(nodes[:, side], axis=1) for side in sides])
+    cell = np.tile(np.arange(len(nodes)), len(sides))
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    twice = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
+    first, second = cell[order[twice]], cell[order[twice + 1]]
+    a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
+    centroid = corners.mean(axis=1)
+    length = np.linalg.norm(a - b, axis=1)
+    return first, second, length, np.linalg.norm(centroid[first] - centroid[second], axis=1)

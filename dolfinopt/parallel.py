@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from dolfinopt.errors import ConvergenceError, InputError
 
@@ -139,3 +140,23 @@ def _all_arrive(world: MPI.Comm) -> bool:
             return True
         time.sleep(0.01)
     return False
+
+
+def direct_solver(mat: PETSc.Mat, ordering: str) -> PETSc.KSP:
+    """Return a Cholesky solver for `mat`: PETSc's own on one rank, MUMPS across ranks.
+
+    Args:
+        mat: symmetric positive definite, marked so.
+        ordering: PETSc's name of the elimination order on one rank; MUMPS chooses its own.
+    """
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOperators(mat)
+    ksp.setType(PETSc.KSP.Type.PREONLY)
+    pc = ksp.getPC()
+    pc.setType(PETSc.PC.Type.CHOLESKY)
+    if mat.comm.size == 1:
+        pc.setFactorSolverType("petsc")
+        pc.setFactorOrdering(ordering)
+    else:
+        pc.setFactorSolverType("mumps")
+    return ksp

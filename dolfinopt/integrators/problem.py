@@ -1,0 +1,130 @@
+"""What every integrator is given, and what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.mechanism import Mechanism, RigidMotion, inverse_dynamics, tangent
+
+
+@dataclass(frozen=True)
+class ElasticProblem:
+    """Elastic rows of a mechanism = 0 over a horizon, rigid coordinates prescribed.
+
+    Attributes:
+        mechanism: N elastic coordinates.
+        motion: rigid coordinates at given instants (n,) s.
+        breakpoints: ascending instants, first 0 and last the horizon, between which the
+            prescribed motion is smooth; steps end there. s.
+    """
+
+    mechanism: Mechanism
+    motion: Callable[[np.ndarray], RigidMotion]
+    breakpoints: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Piecewise polynomial elastic motion.
+
+    On step n, tau = (t - edges[n]) / h:  qdd = sum_j l_j(tau) a[n, j] with the Lagrange
+    polynomials of `nodes`, integrated twice from q[n], qd[n].
+
+    Attributes:
+        edges: (n + 1,) ends of the steps, s.
+        nodes: (s,) of each step, in [0, 1].
+        q, qd: (n, N) at the steps' beginnings.
+        a: (n, s, N) accelerations at the nodes.
+        error: estimated relative error of the elastic coordinates.
+        iterations: Newton iterations spent.
+    """
+
+    edges: np.ndarray
+    nodes: np.ndarray
+    q: np.ndarray
+    qd: np.ndarray
+    a: np.ndarray
+    error: float
+    iterations: int
+
+    def sample(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return q, qd, qdd (n, N) at instants t (n,) within the horizon."""
+        step = np.clip(np.searchsorted(self.edges, t, side="left") - 1, 0, len(self.a) - 1)
+        h = np.diff(self.edges)[step]
+        tau = (t - self.edges[step]) / h
+        w0, w1, w2 = lagrange_integrals(self.nodes, tau)
+        a = self.a[step]
+        q = self.q[step] + (h * tau)[:, None] * self.qd[step]
+        q += (h * h)[:, None] * np.einsum("ns,nsk->nk", w2, a)
+        qd = self.qd[step] + h[:, None] * np.einsum("ns,nsk->nk", w1, a)
+        return q, qd, np.einsum("ns,nsk->nk", w0, a)
+
+
+def lagrange_integrals(
+    nodes: np.ndarray, tau: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Lagrange polynomials of `nodes` at tau, their integral from 0 and its integral.
+
+    Returns:
+        Three arrays (len(tau), s).
+    """
+    s = len(nodes)
+    powers = np.arange(s)
+    coefficients = np.linalg.inv(nodes[:, None] ** powers)  # (power, node)
+    value = tau[:, None] ** powers
+    first = tau[:, None] ** (powers + 1) / (powers + 1)
+    second = tau[:, None] ** (powers + 2) / ((powers + 1) * (powers + 2))
+    return value @ coefficients, first @ coefficients, second @ coefficients
+
+
+def static_start(problem: ElasticProblem) -> np.ndarray:
+    """Return the elastic coordinates (N,) at rest at t = 0: zero unless loads act there.
+
+    Raises:
+        ConvergenceError: no equilibrium near the undeformed state.
+    """
+    mechanism = problem.mechanism
+    motion = problem.motion(np.zeros(1))
+    size = mechanism.coordinates
+    q, rest = np.zeros((1, size)), np.zeros((1, size))
+    scale = 1.0 / np.sqrt(np.diag(mechanism.stiffness()))
+    first = None
+    for _ in range(50):
+        rows, _ = inverse_dynamics(mechanism, motion, q, rest, rest)
+        norm = np.abs(rows * scale).max()
+        first = norm if first is None else first
+        if norm <= 1e-12 * first or norm == 0.0:
+            return q[0]
+        step = np.linalg.solve(tangent(mechanism, motion, q, rest, rest)[0, :, :size], -rows[0])
+        q = q + step
+        if np.abs(step / scale).max() <= 1e-13 * np.abs(q / scale).max():
+            return q[0]
+    raise ConvergenceError(
+        "the mechanism finds no static equilibrium at t = 0: the arms are too soft for gravity; "
+        "raise material.young_modulus or interpolation.floor, or lower motion.gravity"
+    )
+
+
+def energy_norm(mechanism: Mechanism, q: np.ndarray) -> np.ndarray:
+    """Return the largest sqrt(q' K q) over the instants, for each arm (arms,); q is (n, N)."""
+    norms = []
+    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
+        e = q[:, part]
+        norms.append(np.sqrt(np.maximum(np.einsum("nk,nk->n", e @ body.K, e), 0.0).max()))
+    return np.array(norms)
+
+
+def relative_error(mechanism: Mechanism, error: np.ndarray, q: np.ndarray) -> float:
+    """Return the largest error in time over the largest value, energy norm, worst arm.
+
+    An arm that nearly rests beside the others is measured against a thousandth of theirs.
+    """
+    size = energy_norm(mechanism, q)
+    size = np.maximum(size, 1e-3 * size.max())
+    if size.max() == 0.0:
+        return float(np.abs(error).max())
+    return float((energy_norm(mechanism, error) / size).max())

@@ -1,0 +1,386 @@
+"""Radau IIA collocation on the whole horizon at once.
+
+Source: Hairer & Wanner, Solving Ordinary Differential Equations II (1996), IV.5, IV.8,
+doi:10.1007/978-3-642-05221-7. Of order 2 s - 1 at the steps' ends.
+
+The unknowns are the accelerations a (n, s, N) at all stages of all steps. With h the step,
+    qd_i = qd_n + h sum_j A_ij a_j,   q_i = q_n + c_i h qd_n + h^2 sum_j (A A)_ij a_j
+and the last stage ends the step. Newton's matrix is block lower bidiagonal: the blocks of all
+steps are solved in one batch for an affine map of the state at their beginning, then a short
+recursion runs over the steps. Measured on the paper's example, see `benchmarks`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.integrators.problem import (
+    ElasticProblem,
+    Solution,
+    lagrange_integrals,
+    relative_error,
+    static_start,
+)
+from dolfinopt.ledger import Ledger
+from dolfinopt.mechanism import Mechanism, RigidMotion, inverse_dynamics, tangent
+
+MAX_NEWTON = 30
+MAX_GRIDS = 12
+SHORTEST = 1.0 / 64.0  # of a damped Newton step; then windows are tried
+BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
+# Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent
+# between neighbouring designs, and a grid that is refined twice costs more than one too fine.
+AIM = 0.4
+
+
+@dataclass(frozen=True)
+class Collocation:
+    """Nodes c (s,) and matrices of an s-stage method: A (s, s) and A A."""
+
+    c: np.ndarray
+    A: np.ndarray
+    A2: np.ndarray
+
+
+def radau_iia(stages: int) -> Collocation:
+    """Return the s-stage Radau IIA method: c are the zeros of P_s - P_{s-1} on [0, 1]."""
+    legendre = np.polynomial.legendre.Legendre
+    c = (legendre.basis(stages) - legendre.basis(stages - 1)).roots()
+    c = np.sort(0.5 * (1.0 + c.real))
+    c[-1] = 1.0
+    _, A, _ = lagrange_integrals(c, c)
+    return Collocation(c, A, A @ A)
+
+
+@dataclass(frozen=True)
+class _Stages:
+    """The problem at all stages of a run of steps.
+
+    Attributes:
+        mechanism: of the problem.
+        method: collocation.
+        h: (n,) steps, s.
+        motion: rigid coordinates at the n s stages.
+    """
+
+    mechanism: Mechanism
+    method: Collocation
+    h: np.ndarray
+    motion: RigidMotion
+
+    def window(self, first: int, last: int) -> _Stages:
+        """Return the steps first..last - 1."""
+        s = len(self.method.c)
+        part = slice(first * s, last * s)
+        motion = RigidMotion(self.motion.q[part], self.motion.qd[part], self.motion.qdd[part])
+        return replace(self, h=self.h[first:last], motion=motion)
+
+
+def integrate(
+    problem: ElasticProblem,
+    tolerance: float,
+    stages: int,
+    ledger: Ledger,
+    start: Solution | None = None,
+) -> Solution:
+    """Solve to `tolerance`, refining the steps until the estimated error is below it.
+
+    Args:
+        problem: what to solve.
+        tolerance: relative error of the elastic coordinates, energy norm, largest in time.
+        stages: 1 <= s.
+        ledger: counts Newton iterations.
+        start: solution of a nearby problem: gives steps and first guess.
+
+    Raises:
+        ConvergenceError: neither Newton over the whole horizon nor marching window by window
+            converges, or the tolerance is beyond rounding.
+    """
+    method = radau_iia(stages)
+    p = 2 * stages - 1
+    finer = radau_iia(stages + 1)
+    edges = _next_edges(problem, start, tolerance, p)
+    initial = static_start(problem)
+    iterations = 0
+    for _ in range(MAX_GRIDS):
+        stage_problem = _stages(problem, method, edges)
+        guess = _first_guess(method, edges, start, len(initial))
+        a, spent = _march(stage_problem, (initial, np.zeros_like(initial)), guess, tolerance)
+        solution = _with_error(problem, stage_problem, finer, edges, initial, a)
+        iterations += spent
+        start = replace(solution, iterations=iterations)
+        if solution.error <= tolerance:
+            ledger.counts.newton_iterations += iterations
+            return start
+        edges = _next_edges(problem, start, tolerance, p)
+    raise ConvergenceError(
+        f"the simulation reaches an error of {start.error:.2g} with {len(start.a)} steps, not the "
+        f"simulation.tolerance of {tolerance:g}; raise it, or simulation.stages"
+    )
+
+
+# -- grids -----------------------------------------------------------------------------------
+
+
+def _edges(problem: ElasticProblem, count: int) -> np.ndarray:
+    """Return about `count` even steps that end at the breakpoints."""
+    ends = np.asarray(problem.breakpoints)
+    lengths = np.diff(ends)
+    steps = np.maximum(np.ceil(count * lengths / lengths.sum() - 1e-9), 1).astype(int)
+    pieces = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(ends[:-1], ends[1:], steps, strict=True)
+    ]
+    return np.append(np.concatenate(pieces), ends[-1])
+
+
+def _first_count(problem: ElasticProblem) -> int:
+    """Return a number of steps from cold: eight a period of the slowest vibration at t = 0."""
+    mechanism = problem.mechanism
+    size = mechanism.coordinates
+    rest = np.zeros((1, size))
+    blocks = tangent(mechanism, problem.motion(np.zeros(1)), rest, rest, rest)[0]
+    stiffness, mass = mechanism.stiffness(), blocks[:, 2 * size :]
+    slowest = np.sqrt(1.0 / np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass))).max())
+    horizon = problem.breakpoints[-1]
+    smooth = 20 * (len(problem.breakpoints) - 1)
+    return int(np.clip(8.0 * horizon * slowest / (2.0 * np.pi), smooth, 20_000))
+
+
+def _next_edges(
+    problem: ElasticProblem, start: Solution | None, tolerance: float, order: int
+) -> np.ndarray:
+    """Return steps that should meet the tolerance, from the estimated error of `start`.
+
+    Steps that are good enough stay, unless a fifth of them can be saved.
+    """
+    if start is None:
+        return _edges(problem, _first_count(problem))
+    count = len(start.a)
+    growth = (start.error / (AIM * tolerance)) ** (1.0 / order)
+    if start.error > tolerance:
+        return _edges(problem, int(np.ceil(count * min(max(growth, 1.1), 8.0))))
+    if growth > 0.8 and np.isin(problem.breakpoints, start.edges).all():
+        return start.edges
+    return _edges(problem, int(np.ceil(count * min(max(growth, 0.5), 1.0))))
+
+
+def _stages(problem: ElasticProblem, method: Collocation, edges: np.ndarray) -> _Stages:
+    h = np.diff(edges)
+    times = edges[:-1, None] + h[:, None] * method.c
+    return _Stages(problem.mechanism, method, h, problem.motion(times.ravel()))
+
+
+def _first_guess(
+    method: Collocation, edges: np.ndarray, start: Solution | None, size: int
+) -> np.ndarray:
+    """Return accelerations (n, s, N) to start Newton from: those of `start`, or zero."""
+    shape = (len(edges) - 1, len(method.c), size)
+    if start is None or start.a.shape[2] != size:
+        return np.zeros(shape)
+    if np.array_equal(start.edges, edges) and np.array_equal(start.nodes, method.c):
+        return start.a
+    times = edges[:-1, None] + np.diff(edges)[:, None] * method.c
+    return start.sample(times.ravel())[2].reshape(shape)
+
+
+# -- Newton ----------------------------------------------------------------------------------
+
+
+def _march(
+    stages: _Stages,
+    state: tuple[np.ndarray, np.ndarray],
+    guess: np.ndarray,
+    tolerance: float,
+) -> tuple[np.ndarray, int]:
+    """Return the accelerations (n, s, N) and the Newton iterations spent.
+
+    Newton over all steps; where it does not converge, over halves in turn, down to one step.
+
+    Raises:
+        ConvergenceError: Newton fails in a single step.
+    """
+    a, spent, converged = _newton(stages, state, guess, tolerance)
+    count = len(stages.h)
+    if converged:
+        return a, spent
+    if count == 1:
+        raise ConvergenceError(
+            f"Newton's method fails in a single time step of {stages.h[0]:.3g} s: the arms deform "
+            "beyond small-deflection theory; stiffen them (material.young_modulus, "
+            "interpolation.floor, design.minimum) or slow the motion (motion.duration)"
+        )
+    half = count // 2
+    front, back = stages.window(0, half), stages.window(half, count)
+    first, spent_1 = _march(front, state, guess[:half], tolerance)
+    q, qd = _ends(front, state, first)
+    second, spent_2 = _march(back, (q[-1], qd[-1]), guess[half:], tolerance)
+    return np.concatenate([first, second]), spent + spent_1 + spent_2
+
+
+def _newton(
+    stages: _Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, int, bool]:
+    """Return (a, iterations, converged) of Newton's method, damped on the scaled residual.
+
+    A full step that moves the coordinates by less than a thousandth of the tolerance ends it:
+    convergence is quadratic there, so that the iterate is right to about the square of that.
+    """
+    scale = 1.0 / np.sqrt(np.diag(stages.mechanism.stiffness()))  # rows as energy^(1/2)
+    q, qd = _at_stages(stages, state, a)
+    rows = _rows(stages, q, qd, a)
+    norm = np.abs(rows * scale).max()
+    for iteration in range(1, MAX_NEWTON + 1):
+        step, shift = _newton_step(stages, q, qd, a, rows)
+        if not np.isfinite(step).all():
+            return a, iteration, False
+        size = stages.mechanism.coordinates
+        moved = relative_error(stages.mechanism, shift.reshape(-1, size), (q + shift).reshape(-1, size))
+        if moved <= 1e-3 * tolerance:
+            return a + step, iteration, True
+        length = 1.0
+        while True:
+            trial = a + length * step
+            q, qd = _at_stages(stages, state, trial)
+            rows = _rows(stages, q, qd, trial)
+            new = np.abs(rows * scale).max()
+            if new <= (1.0 - 0.1 * length) * norm:
+                break
+            length *= 0.5
+            if length < SHORTEST:
+                return a, iteration, False
+        a, norm = trial, new
+    return a, MAX_NEWTON, False
+
+
+def _starts(
+    stages: _Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n + 1, N) at the beginning of every step and at the end of the last."""
+    method, h = stages.method, stages.h[:, None]
+    gain_v = h * np.einsum("j,njk->nk", method.A[-1], a)
+    qd = np.cumsum(np.concatenate([state[1][None], gain_v]), axis=0)
+    gain_q = h * qd[:-1] + h * h * np.einsum("j,njk->nk", method.A2[-1], a)
+    q = np.cumsum(np.concatenate([state[0][None], gain_q]), axis=0)
+    return q, qd
+
+
+def _ends(
+    stages: _Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n, N) at the end of every step."""
+    q, qd = _starts(stages, state, a)
+    return q[1:], qd[1:]
+
+
+def _at_stages(
+    stages: _Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n, s, N) at all stages."""
+    q, qd = _starts(stages, state, a)
+    return _from_starts(stages, q[:-1], qd[:-1], a)
+
+
+def _from_starts(
+    stages: _Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n, s, N) at all stages from those (n, N) at the steps' beginnings."""
+    method, h = stages.method, stages.h[:, None, None]
+    q_s = q[:, None] + method.c[:, None] * h * qd[:, None] + h * h * (method.A2 @ a)
+    return q_s, qd[:, None] + h * (method.A @ a)
+
+
+def _rows(stages: _Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the elastic rows (n, s, N) at all stages."""
+    size = q.shape[2]
+    flat = (x.reshape(-1, size) for x in (q, qd, a))
+    return inverse_dynamics(stages.mechanism, stages.motion, *flat)[0].reshape(q.shape)
+
+
+def _newton_step(
+    stages: _Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return Newton's change of a and the change of q it makes, both (n, s, N)."""
+    count, s, size = a.shape
+    method = stages.method
+    answers = np.empty((count, s, size, 1 + 2 * size))
+    chunk = max(1, int(BATCH_BYTES / (8 * (s * size) ** 2)))
+    for first in range(0, count, chunk):
+        part = slice(first, min(first + chunk, count))
+        answers[part] = _solve_blocks(
+            stages.window(part.start, part.stop), q[part], qd[part], a[part], rows[part]
+        )
+    # Change of the state over a step: y+ = transfer y + forced, y = (q, qd) at its beginning.
+    h = stages.h[:, None, None]
+    gain_q = h * h * np.einsum("j,njkm->nkm", method.A2[-1], answers)
+    gain_v = h * np.einsum("j,njkm->nkm", method.A[-1], answers)
+    gain = np.concatenate([gain_q, gain_v], axis=1)
+    forced, transfer = gain[:, :, 0], gain[:, :, 1:] + np.eye(2 * size)
+    diagonal = np.arange(size)
+    transfer[:, diagonal, size + diagonal] += stages.h[:, None]
+    y = np.zeros((count, 2 * size))
+    for n in range(count - 1):
+        y[n + 1] = transfer[n] @ y[n] + forced[n]
+    step = answers[..., 0] + np.einsum("njkm,nm->njk", answers[..., 1:], y)
+    shift, _ = _from_starts(stages, y[:, :size], y[:, size:], step)
+    return step, shift
+
+
+def _solve_blocks(
+    stages: _Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """Solve every step's block for -rows and for a unit change of the state at its beginning.
+
+    Returns:
+        (n, s, N, 1 + 2 N): the change of a.
+    """
+    count, s, size = a.shape
+    method = stages.method
+    flat = (x.reshape(-1, size) for x in (q, qd, a))
+    slopes = tangent(stages.mechanism, stages.motion, *flat).reshape(count, s, size, 3 * size)
+    by_q, by_v, by_a = np.split(slopes, 3, axis=3)
+    h = stages.h[:, None, None]
+    block = np.empty((count, s, size, s, size))
+    right = np.empty((count, s, size, 1 + 2 * size))
+    right[..., 0] = -rows
+    right[..., 1 : 1 + size] = -by_q
+    for i in range(s):
+        right[:, i, :, 1 + size :] = -by_v[:, i] - method.c[i] * h * by_q[:, i]
+        for j in range(s):
+            block[:, i, :, j] = h * (
+                method.A[i, j] * by_v[:, i] + method.A2[i, j] * h * by_q[:, i]
+            )
+        block[:, i, :, i] += by_a[:, i]
+    shape = (count, s * size, -1)
+    return np.linalg.solve(block.reshape(shape), right.reshape(shape)).reshape(right.shape)
+
+
+# -- error -----------------------------------------------------------------------------------
+
+
+def _with_error(
+    problem: ElasticProblem,
+    stages: _Stages,
+    finer: Collocation,
+    edges: np.ndarray,
+    initial: np.ndarray,
+    a: np.ndarray,
+) -> Solution:
+    """Return the solution with its error estimated by one Newton step of one stage more.
+
+    The polynomial is put into the richer collocation of the same steps, of order 2 s + 1; the
+    step from there is the global error to its leading order, propagation included.
+    """
+    q, qd = _starts(stages, (initial, np.zeros_like(initial)), a)
+    richer = _stages(problem, finer, edges)
+    values, _, _ = lagrange_integrals(stages.method.c, finer.c)
+    a_finer = values @ a
+    q_finer, qd_finer = _from_starts(richer, q[:-1], qd[:-1], a_finer)
+    rows = _rows(richer, q_finer, qd_finer, a_finer)
+    _, shift = _newton_step(richer, q_finer, qd_finer, a_finer, rows)
+    size = len(initial)
+    error = relative_error(problem.mechanism, shift.reshape(-1, size), q_finer.reshape(-1, size))
+    return Solution(edges, stages.method.c, q[:-1], qd[:-1], a, error, 0)

@@ -1,0 +1,402 @@
+"""Cart + chain of floating bodies: inverse dynamics and its tangent, batched over instants.
+
+Plane vectors are complex numbers: v = v_x + i v_y, so S v = i v, a rotation by phi multiplies by
+exp(i phi), u . v = Re(conj(u) v) and the moment of a force F about the origin of its lever u is
+Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.body import FloatingBody
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
+
+    Attributes:
+        q, qd, qdd: (n, 1 + arms); m and rad, per s, per s2. The first angle is measured from +x,
+            each further one from the deformed outboard tangent of the arm before.
+    """
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A cart on a horizontal rail that carries a chain of arms and a payload.
+
+    Attributes:
+        bodies: from the cart outwards.
+        payload_mass: point mass at the last outboard interface, kg.
+        payload_inertia: its rotary inertia, kg m2.
+        gravity: (g_x, g_y), m/s2.
+        joint_height: y of the first joint, m.
+    """
+
+    bodies: tuple[FloatingBody, ...]
+    payload_mass: float
+    payload_inertia: float
+    gravity: tuple[float, float]
+    joint_height: float
+
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        """Each body's place in the vector of all elastic coordinates."""
+        ends = np.cumsum([0] + [body.coordinates for body in self.bodies])
+        return tuple(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+
+    @property
+    def coordinates(self) -> int:
+        """Number N of elastic coordinates of all bodies."""
+        return sum(body.coordinates for body in self.bodies)
+
+    def stiffness(self) -> np.ndarray:
+        """Return the block-diagonal stiffness (N, N)."""
+        K = np.zeros((self.coordinates, self.coordinates))
+        for part, body in zip(self.slices, self.bodies, strict=True):
+            K[part, part] = body.K
+        return K
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """One body's constants in complex form; real ones are read from `body`."""
+
+    body: FloatingBody
+    c: complex
+    C: np.ndarray  # (q,) complex
+    B: np.ndarray  # (q,) complex outboard deflection
+    turn: np.ndarray  # (q,) outboard rotation
+    reach: complex  # outboard reference point
+
+
+def _shapes(body: FloatingBody) -> _Shapes:
+    return _Shapes(
+        body=body,
+        c=complex(*body.moment),
+        C=body.C[0] + 1j * body.C[1],
+        B=body.outboard[0] + 1j * body.outboard[1],
+        turn=body.outboard[2],
+        reach=complex(*body.outboard_point),
+    )
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Motion of one tangent frame and what one body makes of it; arrays over n instants.
+
+    Attributes:
+        a: acceleration of the origin less gravity, body components, complex.
+        w, wd: angular velocity and acceleration.
+        d, dd, ddd: outboard point from the origin and its relative velocity and acceleration.
+        s, sd, sdd: first mass moment c + C q and its relative rates.
+        jM, rG: (n, q) j + M q and r + G q.
+        swing: (n,) complex exp(i (theta + joint angle)) from the next frame to this one.
+    """
+
+    a: np.ndarray
+    w: np.ndarray
+    wd: np.ndarray
+    d: np.ndarray
+    dd: np.ndarray
+    ddd: np.ndarray
+    s: np.ndarray
+    sd: np.ndarray
+    sdd: np.ndarray
+    jM: np.ndarray
+    rG: np.ndarray
+    swing: np.ndarray
+
+
+def _outward(
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> tuple[list[_Shapes], list[_Frame], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Pass out along the chain; return shapes, frames and (a, w, wd) of the payload's frame."""
+    gravity = complex(*mechanism.gravity)
+    joints, joints_d, joints_dd = motion.q[:, 1:], motion.qd[:, 1:], motion.qdd[:, 1:]
+    a = np.exp(-1j * joints[:, 0]) * (motion.qdd[:, 0] - gravity)
+    w, wd = joints_d[:, 0], joints_dd[:, 0]
+    shapes, frames = [], []
+    last = len(mechanism.bodies) - 1
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        shape = _shapes(body)
+        e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
+        # Behind the last arm the payload's frame has no joint of its own.
+        beta, beta_d, beta_dd = (
+            (joints[:, k + 1], joints_d[:, k + 1], joints_dd[:, k + 1]) if k < last else (0, 0, 0)
+        )
+        frame = _Frame(
+            a=a,
+            w=w,
+            wd=wd,
+            d=shape.reach + e @ shape.B,
+            dd=ed @ shape.B,
+            ddd=edd @ shape.B,
+            s=shape.c + e @ shape.C,
+            sd=ed @ shape.C,
+            sdd=edd @ shape.C,
+            jM=body.j + e @ body.M,
+            rG=body.r - e @ body.G,  # G is skew: (G q)' = -q' G
+            swing=np.exp(1j * (e @ shape.turn + beta)),
+        )
+        shapes.append(shape)
+        frames.append(frame)
+        a = np.conj(frame.swing) * (
+            a + (1j * wd - w * w) * frame.d + 2j * w * frame.dd + frame.ddd
+        )
+        w = w + ed @ shape.turn + beta_d
+        wd = wd + edd @ shape.turn + beta_dd
+    return shapes, frames, (a, w, wd)
+
+
+def inverse_dynamics(
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the generalised force of every coordinate by recursive Newton-Euler passes.
+
+    Out along the chain for the frames' motion, back for the forces. With frame acceleration a
+    (less gravity), angular velocity w and acceleration wd of a body,
+        F = m a + wd S(c + C q) - w^2 (c + C q) + 2 w S C qd + C qdd
+        T = (S(c + C q)) . a + (J + 2 j.q + q'M q) wd + 2 w (j + M q).qd + (r + G q).qdd
+        f = C'a + (r + G q) wd - w^2 (j + M q) + 2 w G qd + M qdd + K q + D qd
+    plus what is attached outboard. Source: Featherstone, Rigid Body Dynamics Algorithms (2008);
+    Schwertassek & Wallrapp (1999).
+
+    Args:
+        mechanism: N elastic coordinates.
+        motion: rigid coordinates at n instants.
+        q, qd, qdd: (n, N) elastic coordinates and derivatives.
+
+    Returns:
+        Elastic rows (n, N), zero when the equations of motion hold, and the forces of cart and
+        joints (n, 1 + arms), N and N m, that drive the rigid coordinates.
+    """
+    shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
+    force, moment = mechanism.payload_mass * tip[0], mechanism.payload_inertia * tip[2]
+    rows = np.empty_like(q)
+    drives = np.empty_like(motion.q)
+    bodies = list(zip(mechanism.slices, shapes, frames, strict=True))
+    for k in reversed(range(len(bodies))):
+        part, shape, frame = bodies[k]
+        body, w = shape.body, frame.w[:, None]
+        e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
+        force = frame.swing * force  # of everything outboard, in this frame
+        rows[:, part] = (
+            np.outer(frame.a.real, shape.C.real)
+            + np.outer(frame.a.imag, shape.C.imag)
+            + frame.rG * frame.wd[:, None]
+            - w * w * frame.jM
+            - 2.0 * w * (ed @ body.G)
+            + edd @ body.M
+            + e @ body.K
+            + ed @ body.D
+            + np.outer(force.real, shape.B.real)
+            + np.outer(force.imag, shape.B.imag)
+            + np.outer(moment, shape.turn)
+        )
+        moment = (
+            moment
+            + (np.conj(frame.d) * force + np.conj(frame.s) * frame.a).imag
+            + _inertia(body, frame, e) * frame.wd
+            + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, ed)
+            + np.einsum("nk,nk->n", frame.rG, edd)
+        )
+        force = force + _body_force(body, frame)
+        drives[:, k + 1] = moment
+    drives[:, 0] = (np.exp(1j * motion.q[:, 1]) * force).real
+    return rows, drives
+
+
+def _inertia(body: FloatingBody, frame: _Frame, e: np.ndarray) -> np.ndarray:
+    """Return the deformed body's inertia about its frame's origin (n,), kg m2."""
+    return body.inertia + np.einsum("nk,nk->n", body.j + frame.jM, e)
+
+
+def _body_force(body: FloatingBody, frame: _Frame) -> np.ndarray:
+    """Return the inertia force F (n,) complex, body components, N."""
+    w = frame.w
+    return (
+        body.mass * frame.a
+        + (1j * frame.wd - w * w) * frame.s
+        + 2j * w * frame.sd
+        + frame.sdd
+    )
+
+
+def tangent(
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> np.ndarray:
+    """Return the derivative of the elastic rows with respect to [q, qd, qdd].
+
+    Exact, by differentiating both passes of `inverse_dynamics`. An arm feels those inboard of
+    it through the four numbers (a_x, a_y, w, wd) of its frame, and those outboard of it through
+    force and moment, so that the passes carry few rows however many coordinates there are.
+
+    Returns:
+        (n, N, 3 N), columns ordered q, qd, qdd.
+    """
+    shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
+    count, size = q.shape
+    jacobian = np.zeros((count, size, 3 * size))
+    a_v = np.zeros((count, 3 * size), dtype=complex)  # derivatives of the frame's motion
+    w_v = np.zeros((count, 3 * size))
+    wd_v = np.zeros((count, 3 * size))
+    bodies = list(zip(mechanism.slices, shapes, frames, strict=True))
+    motions = []
+    for part, shape, frame in bodies:
+        motions.append((a_v, w_v, wd_v))
+        a_v, w_v, wd_v = _next_motion(shape, frame, part, size, (a_v, w_v, wd_v))
+    force = mechanism.payload_mass * tip[0]
+    force_v = mechanism.payload_mass * a_v
+    moment_v = mechanism.payload_inertia * wd_v
+    for k in reversed(range(len(bodies))):
+        part, shape, frame = bodies[k]
+        e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
+        columns = _columns(part, size)
+        force = frame.swing * force
+        force_v = frame.swing[:, None] * force_v
+        force_v[:, columns[0]] += 1j * force[:, None] * shape.turn
+        rows = jacobian[:, part]
+        _body_rows(rows, shape, frame, motions[k], columns, ed)
+        rows += (
+            shape.B.real[:, None] * force_v.real[:, None, :]
+            + shape.B.imag[:, None] * force_v.imag[:, None, :]
+            + shape.turn[:, None] * moment_v[:, None, :]
+        )
+        if k == 0:
+            break
+        moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
+        moment_v[:, columns[0]] += (np.conj(shape.B) * force[:, None]).imag
+        force_b, moment_b = _body_load(shape, frame, motions[k], columns, e, ed, edd)
+        force_v, moment_v = force_v + force_b, moment_v + moment_b
+        force = force + _body_force(shape.body, frame)
+    return jacobian
+
+
+def _columns(part: slice, size: int) -> tuple[slice, slice, slice]:
+    """Return a body's columns in [q, qd, qdd]."""
+    a, b = part.start, part.stop
+    return slice(a, b), slice(size + a, size + b), slice(2 * size + a, 2 * size + b)
+
+
+def _next_motion(
+    shape: _Shapes,
+    frame: _Frame,
+    part: slice,
+    size: int,
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the derivatives (n, 3 N) of the next frame's (a, w, wd)."""
+    a_v, w_v, wd_v = motion
+    cq, cv, ca = _columns(part, size)
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    d, dd = frame.d[:, None], frame.dd[:, None]
+    inner = a_v + 1j * d * wd_v + (2j * dd - 2.0 * w * d) * w_v
+    inner[:, cq] += (1j * wd - w * w) * shape.B
+    inner[:, cv] += 2j * w * shape.B
+    inner[:, ca] += shape.B
+    next_a = frame.a + (1j * frame.wd - frame.w**2) * frame.d + 2j * frame.w * frame.dd + frame.ddd
+    inner[:, cq] -= 1j * next_a[:, None] * shape.turn
+    out = np.conj(frame.swing)[:, None] * inner
+    w_v, wd_v = w_v.copy(), wd_v.copy()
+    w_v[:, cv] += shape.turn
+    wd_v[:, ca] += shape.turn
+    return out, w_v, wd_v
+
+
+def _body_rows(
+    rows: np.ndarray,
+    shape: _Shapes,
+    frame: _Frame,
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
+    columns: tuple[slice, slice, slice],
+    ed: np.ndarray,
+) -> None:
+    """Add one body's own elastic rows (n, q, 3 N), nothing outboard."""
+    body = shape.body
+    a_v, w_v, wd_v = motion
+    w, wd = frame.w[:, None, None], frame.wd[:, None, None]
+    rows[:, :, columns[0]] += body.K - w * w * body.M + wd * body.G
+    rows[:, :, columns[1]] += body.D + 2.0 * w * body.G
+    rows[:, :, columns[2]] += body.M
+    by_w = -2.0 * frame.w[:, None] * frame.jM - 2.0 * (ed @ body.G)
+    rows += (
+        shape.C.real[:, None] * a_v.real[:, None, :]
+        + shape.C.imag[:, None] * a_v.imag[:, None, :]
+        + by_w[:, :, None] * w_v[:, None, :]
+        + frame.rG[:, :, None] * wd_v[:, None, :]
+    )
+
+
+def _body_load(
+    shape: _Shapes,
+    frame: _Frame,
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
+    columns: tuple[slice, slice, slice],
+    e: np.ndarray,
+    ed: np.ndarray,
+    edd: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (n, 3 N) of one body's own force F and moment T."""
+    body = shape.body
+    a_v, w_v, wd_v = motion
+    cq, cv, ca = columns
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    s, sd = frame.s[:, None], frame.sd[:, None]
+    force = body.mass * a_v + 1j * s * wd_v + (2j * sd - 2.0 * w * s) * w_v
+    force[:, cq] += (1j * wd - w * w) * shape.C
+    force[:, cv] += 2j * w * shape.C
+    force[:, ca] += shape.C
+    spin = 2.0 * np.einsum("nk,nk->n", frame.jM, ed)[:, None]
+    moment = (
+        (np.conj(s) * a_v).imag + _inertia(body, frame, e)[:, None] * wd_v + spin * w_v
+    )
+    moment[:, cq] += (
+        (np.conj(shape.C) * frame.a[:, None]).imag
+        + 2.0 * wd * frame.jM
+        + 2.0 * w * (ed @ body.M)
+        + edd @ body.G  # (G q) . qdd = qdd' G q
+    )
+    moment[:, cv] += 2.0 * w * frame.jM
+    moment[:, ca] += frame.rG
+    return force, moment
+
+
+def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
+    place = motion.q[:, 0] + 1j * mechanism.joint_height
+    swing = np.ones(len(q), dtype=complex)
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        shape = _shapes(body)
+        swing = swing * np.exp(1j * motion.q[:, k + 1])
+        place = place + swing * (shape.reach + q[:, part] @ shape.B)
+        swing = swing * np.exp(1j * (q[:, part] @ shape.turn))
+    return np.stack([place.real, place.imag], axis=1)
+
+
+def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the flexible minus the equivalent rigid end-effector (n, 2), m.
+
+    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
+    """
+    rigid = end_effector(mechanism, motion, np.zeros_like(q))
+    return end_effector(mechanism, motion, q) - rigid
+
+
+def compliance(bodies: Sequence[FloatingBody], parts: Sequence[slice], q: np.ndarray) -> np.ndarray:
+    """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper."""
+    return np.stack(
+        [
+            np.einsum("nk,nk->n", q[:, part] @ body.K, q[:, part])
+            for part, body in zip(parts, bodies, strict=True)
+        ],
+        axis=1,
+    )
