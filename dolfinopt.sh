@@ -33,14 +33,15 @@ export PYVISTA_OFF_SCREEN="${PYVISTA_OFF_SCREEN-true}"
 # Containers run as root.
 export OMPI_ALLOW_RUN_AS_ROOT="${OMPI_ALLOW_RUN_AS_ROOT-1}"
 export OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="${OMPI_ALLOW_RUN_AS_ROOT_CONFIRM-1}"
-# More ranks than cores, ranks of two runs not on the same cores, shared memory only, and no comment
-# of mpirun's on a status other than 0: each for Open MPI 4, then 5.
+# More ranks than cores, and ranks of two runs not on the same cores: for Open MPI 4, then 5.
 export OMPI_MCA_rmaps_base_oversubscribe="${OMPI_MCA_rmaps_base_oversubscribe-1}"
 export PRTE_MCA_rmaps_default_mapping_policy="${PRTE_MCA_rmaps_default_mapping_policy-:oversubscribe}"
 export OMPI_MCA_hwloc_base_binding_policy="${OMPI_MCA_hwloc_base_binding_policy-none}"
 export PRTE_MCA_hwloc_default_binding_policy="${PRTE_MCA_hwloc_default_binding_policy-none}"
-export OMPI_MCA_btl="${OMPI_MCA_btl-^tcp}"
-export OMPI_MCA_orte_execute_quiet="${OMPI_MCA_orte_execute_quiet-1}"
+# Shared memory by name ("vader" to both versions): looking for networks, or merely excluding TCP,
+# costs every start up to a second. For several hosts set OMPI_MCA_btl and OMPI_MCA_pml.
+export OMPI_MCA_btl="${OMPI_MCA_btl-self,vader}"
+export OMPI_MCA_pml="${OMPI_MCA_pml-ob1}"
 
 # --- set-up ---------------------------------------------------------------------------------------
 
@@ -136,6 +137,27 @@ ensure() {
   ) 9<"$here" || exit
 }
 
+# --- running --------------------------------------------------------------------------------------
+
+# Containers without an /etc/hosts wait 5 s in MPI_Init for a name server to know them.
+answer_soon() { export RES_OPTIONS="${RES_OPTIONS-timeout:1 attempts:1}"; }
+
+# Drop what mpirun adds to a status other than 0, since the ranks have said what is wrong; what it
+# says of killed ranks or its own troubles stays.
+drop_chatter() {
+  trap '' INT TERM # it ends after mpirun, whose last words it passes on
+  sed -u -e 's/\x00//g' -e '/PMIX ERROR: PMIX_ERR_UNREACH in file .*pmix_server.c/d' \
+    -e '/ORTE_ERROR_LOG: .* in file .*show_help.c/d' |
+    sed -u '/^-\{70,\}$/{
+      N
+      /\n\(prterun has exited due\|.*run detected that one or more\|MPI_ABORT was\|Primary job\)/!b
+      :rest
+      N
+      /\n-\{70,\}$/!b rest
+      d
+    }'
+}
+
 # --- tests ----------------------------------------------------------------------------------------
 
 # check NAME COMMAND ...: keeps the last line of the output and the verdict for the summary.
@@ -143,7 +165,7 @@ check() {
   local name=$1 begin=$SECONDS verdict=ok
   shift
   echo "== $name"
-  "$@" 2>&1 | tee "$output"
+  "$@" 2>&1 | drop_chatter | tee "$output"
   if [ "${PIPESTATUS[0]}" != 0 ]; then
     verdict=FAILED
     failed+=("$name")
@@ -157,6 +179,7 @@ run_tests() {
   output=$(mktemp) || exit 1
   trap 'rm -f "$output"' EXIT
   cd "$here" || exit 1
+  answer_soon
   export NO_COLOR=1 # mpirun gives the ranks a terminal even when there is none
   check "ruff check" "$python" -m ruff check .
   check "ruff format" "$python" -m ruff format --check .
@@ -195,10 +218,10 @@ case ${1-} in
     ;;
   *)
     ensure ready "$here"
+    answer_soon
     # -P: a file in the current folder must not take the place of a module.
-    if [ -n "$ranks" ]; then
-      exec /usr/bin/mpirun -n "$ranks" "$python" -P -m dolfinopt "$@"
-    fi
-    exec "$python" -P -m dolfinopt "$@"
+    [ -n "$ranks" ] || exec "$python" -P -m dolfinopt "$@"
+    exec 2> >(drop_chatter >&2)
+    exec /usr/bin/mpirun -n "$ranks" "$python" -P -m dolfinopt "$@"
     ;;
 esac
