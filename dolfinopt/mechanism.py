@@ -13,20 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.body import FloatingBody
-
-
-@dataclass(frozen=True)
-class RigidMotion:
-    """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
-
-    Attributes:
-        q, qd, qdd: (n, 1 + arms); m and rad, per s, per s2. The first angle is measured from +x,
-            each further one from the deformed outboard tangent of the arm before.
-    """
-
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
+from dolfinopt.motion import RigidMotion
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mechanism import RigidMotion
 from dolfinopt.scene import Motion, Scene
 
 # Nearer to a singular position than this share of the larger arm, joint speeds lose their
 # digits: accelerations grow with the inverse cube of sin(elbow angle).
 SINGULAR = 1e-6
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
+
+    Attributes:
+        q, qd, qdd: (n, 1 + arms); m and rad, per s, per s2. The first angle is measured from +x,
+            each further one from the deformed outboard tangent of the arm before.
+    """
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.mechanism import Mechanism, RigidMotion, inverse_dynamics, tangent
+from dolfinopt.mechanism import Mechanism, inverse_dynamics, tangent
+from dolfinopt.motion import RigidMotion
 
 
 @dataclass(frozen=True)
@@ -51,17 +52,18 @@ class Solution:
     error: float
     iterations: int
 
-    def sample(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, qd, qdd (n, N) at instants t (n,) within the horizon."""
+    def sample(self, t: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Return q, qd or qdd (n, N), by order of `derivative`, at instants t (n,) s."""
         step = np.clip(np.searchsorted(self.edges, t, side="left") - 1, 0, len(self.a) - 1)
         h = np.diff(self.edges)[step]
         tau = (t - self.edges[step]) / h
-        w0, w1, w2 = lagrange_integrals(self.nodes, tau)
-        a = self.a[step]
-        q = self.q[step] + (h * tau)[:, None] * self.qd[step]
-        q += (h * h)[:, None] * np.einsum("ns,nsk->nk", w2, a)
-        qd = self.qd[step] + h[:, None] * np.einsum("ns,nsk->nk", w1, a)
-        return q, qd, np.einsum("ns,nsk->nk", w0, a)
+        weights = lagrange_integrals(self.nodes, tau)[2 - derivative] * (h ** (2 - derivative))[:, None]
+        value = (weights[:, None] @ self.a[step])[:, 0]
+        if derivative == 0:
+            value += self.q[step] + (h * tau)[:, None] * self.qd[step]
+        elif derivative == 1:
+            value += self.qd[step]
+        return value
 
 
 def lagrange_integrals(

@@ -25,7 +25,8 @@ from dolfinopt.integrators.problem import (
     static_start,
 )
 from dolfinopt.ledger import Ledger
-from dolfinopt.mechanism import Mechanism, RigidMotion, inverse_dynamics, tangent
+from dolfinopt.mechanism import Mechanism, inverse_dynamics, tangent
+from dolfinopt.motion import RigidMotion
 
 MAX_NEWTON = 30
 MAX_GRIDS = 12
@@ -184,7 +185,7 @@ def _first_guess(
     if np.array_equal(start.edges, edges) and np.array_equal(start.nodes, method.c):
         return start.a
     times = edges[:-1, None] + np.diff(edges)[:, None] * method.c
-    return start.sample(times.ravel())[2].reshape(shape)
+    return start.sample(times.ravel(), 2).reshape(shape)
 
 
 # -- Newton ----------------------------------------------------------------------------------

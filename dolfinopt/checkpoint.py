@@ -1,0 +1,185 @@
+"""The optimiser's whole memory in one file, so that a resumed run ends in the same bits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dolfinopt.arm import Arm
+from dolfinopt.errors import InputError
+from dolfinopt.files import HistoryRow, write_arrays
+from dolfinopt.integrators.problem import Solution
+from dolfinopt.parallel import ArmShare, gather_cells, on_root
+from dolfinopt.scene import Scene
+
+NAME = "checkpoint.npz"
+# Keys a resumed run may change: they say when to stop, not what is computed.
+MAY_CHANGE = ("max_iterations", "tolerance")
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Everything the next iteration depends on; cell and node arrays are this rank's.
+
+    Attributes:
+        iteration: design updates made.
+        cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
+        modes: per arm (n_interior_nodes, 2 * k): eigenvectors to start from, owned nodes.
+        multipliers: MMA's, on all ranks.
+        solution: the last simulation; on the root only.
+        history: rows so far; on the root only.
+        initial_deviation: (n, 2) m of the initial design; on the root only.
+        finished: reason, or "" while running.
+    """
+
+    iteration: int
+    cells: Mapping[int, np.ndarray]
+    modes: Mapping[int, np.ndarray]
+    multipliers: np.ndarray
+    solution: Solution | None
+    history: list[HistoryRow]
+    initial_deviation: np.ndarray
+    finished: str
+
+
+def _scene_text(scene: Scene) -> str:
+    return json.dumps(scene.to_dict(), sort_keys=True)
+
+
+def begin(folder: Path, scene: Scene) -> None:
+    """Write the checkpoint of a run that has done nothing yet (root only)."""
+    write_arrays(folder / NAME, {"scene": np.array(_scene_text(scene)), "iteration": -1})
+
+
+def save(
+    folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm], memory: Memory
+) -> None:
+    """Replace the checkpoint atomically (collective)."""
+    centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
+    cells = gather_cells(share, memory.cells)
+    nodes = gather_cells(share, {k: _interior_points(arm) for k, arm in arms.items()})
+    modes = gather_cells(share, memory.modes)
+    if share.world.rank != 0:
+        return
+    assert memory.solution is not None
+    arrays: dict[str, Any] = {
+        "scene": np.array(_scene_text(scene)),
+        "iteration": memory.iteration,
+        "multipliers": memory.multipliers,
+        "history": np.array([astuple(row) for row in memory.history]),
+        "initial_deviation": memory.initial_deviation,
+        "finished": np.array(memory.finished),
+    }
+    for field in ("edges", "nodes", "q", "qd", "a", "error"):
+        arrays[f"solution/{field}"] = getattr(memory.solution, field)
+    for k, values in enumerate(zip(centroids, cells, nodes, modes, strict=True)):
+        for key, value in zip(("centroid", "cells", "points", "modes"), values, strict=True):
+            arrays[f"arm{k}/{key}"] = value
+    write_arrays(folder / NAME, arrays)
+
+
+def check(folder: Path, scene: Scene) -> None:
+    """Raise `InputError` unless the folder holds a checkpoint of this scene (root only)."""
+    _read(folder, scene)
+
+
+def load(
+    folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
+) -> Memory | None:
+    """Return the memory of an interrupted run, or None when it had only begun (collective).
+
+    Rows go to the cells and nodes at the same place, on any number of ranks.
+
+    Raises:
+        InputError: no checkpoint, a damaged one, or one of another scene.
+    """
+    arrays = on_root(share.world, _read, folder, scene)
+    if int(arrays["iteration"]) < 0:
+        return None
+    cells, modes = {}, {}
+    for k, arm in arms.items():
+        rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
+        cells[k] = arrays[f"arm{k}/cells"][rows]
+        rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
+        modes[k] = arrays[f"arm{k}/modes"][rows]
+    solution = Solution(
+        **{f: arrays[f"solution/{f}"] for f in ("edges", "nodes", "q", "qd", "a")},
+        error=float(arrays["solution/error"]),
+        iterations=0,
+    )
+    history = [HistoryRow(int(row[0]), *map(float, row[1:])) for row in arrays["history"]]
+    return Memory(
+        iteration=int(arrays["iteration"]),
+        cells=cells,
+        modes=modes,
+        multipliers=arrays["multipliers"],
+        solution=solution,
+        history=history,
+        initial_deviation=arrays["initial_deviation"],
+        finished=str(arrays["finished"]),
+    )
+
+
+def _interior_points(arm: Arm) -> np.ndarray:
+    return arm.elastic.points[arm.elastic.interior_nodes]
+
+
+def _match(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return for each wanted point the row of the same point among the known ones."""
+    from scipy.spatial import cKDTree
+
+    if len(wanted) == 0:
+        return np.zeros(0, dtype=int)
+    return cKDTree(known).query(wanted)[1]
+
+
+def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
+    """Read and verify the checkpoint."""
+    path = folder / NAME
+    if not path.is_file():
+        raise InputError(
+            f"{path}: --resume finds no checkpoint here; start without --resume, or name the "
+            "folder of the interrupted run with --out"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        theirs = json.loads(str(arrays["scene"]))
+        int(arrays["iteration"])
+    except Exception as error:  # whatever a foreign or damaged file may raise
+        raise InputError(
+            f"{path}: --resume cannot read this checkpoint ({type(error).__name__}); start "
+            "without --resume"
+        ) from None
+    difference = _difference(theirs, json.loads(_scene_text(scene)))
+    if difference:
+        raise InputError(
+            f"{path}: --resume: the checkpoint is of another scene: {difference}; start without "
+            "--resume, or give the scene it was made for"
+        )
+    return arrays
+
+
+def _difference(theirs: Any, ours: Any, key: str = "") -> str:
+    """Describe the first difference between two scenes; empty when they compute the same."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for name in [*ours, *(k for k in theirs if k not in ours)]:
+            if key == "optimizer" and name in MAY_CHANGE:
+                continue
+            path = f"{key}.{name}" if key else name
+            found = _difference(theirs.get(name), ours.get(name), path)
+            if found:
+                return found
+        return ""
+    if isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
+        for k, (a, b) in enumerate(zip(theirs, ours, strict=True)):
+            found = _difference(a, b, f"{key}.{k}")
+            if found:
+                return found
+        return ""
+    return "" if theirs == ours else f"{key} = {theirs!r} there, {ours!r} here"

@@ -1,0 +1,94 @@
+"""One pass down the street: physical densities -> bodies -> simulation -> objective."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.arm import Arm
+from dolfinopt.body import first_frequency
+from dolfinopt.integrators.problem import Solution
+from dolfinopt.ledger import Ledger
+from dolfinopt.objective import load_cases, objective, second_moments, worst_instants
+from dolfinopt.parallel import ArmShare, gather_bodies, on_root
+from dolfinopt.scene import Scene
+from dolfinopt.sensitivity import esl_gradient
+from dolfinopt.simulation import Trajectory, simulate
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What one design does; the same on all ranks.
+
+    Attributes:
+        objective: N m, or N m s for an integral over the horizon.
+        compliance: sum of the load cases' compliance, whatever the objective, N m.
+        max_deviation, max_deviation_time: m, s.
+        first_frequencies: of every arm, clamped-free, Hz.
+        moments: Q (q, q) of every arm, see `objective.second_moments`.
+        error: estimated relative error of the elastic coordinates.
+    """
+
+    objective: float
+    compliance: float
+    max_deviation: float
+    max_deviation_time: float
+    first_frequencies: tuple[float, ...]
+    moments: tuple[np.ndarray, ...]
+    error: float
+
+
+def evaluate(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    ledger: Ledger,
+    start: Solution | None = None,
+) -> tuple[Evaluation, Trajectory | None]:
+    """Reduce every arm, simulate on the root, evaluate the objective (collective).
+
+    Args:
+        scene: what is simulated and minimised.
+        share: which ranks do which arm.
+        arms: this rank's.
+        x_phys: their physical densities (n_cells,).
+        ledger: of this rank.
+        start: solution of a nearby design; read on the root only.
+
+    Returns:
+        The evaluation, and on the root the trajectory.
+
+    Raises:
+        ConvergenceError: on all ranks alike.
+    """
+    mine = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
+    bodies = gather_bodies(share, mine)
+    kept: list[Trajectory] = []
+
+    def run() -> Evaluation:
+        trajectory = simulate(scene, bodies, ledger, start)
+        kept.append(trajectory)
+        with ledger.phase("objective"):
+            cases = load_cases(trajectory, scene)
+            worst = worst_instants(trajectory, scene.objective.load_cases)
+            distance, when = trajectory.max_deviation
+            return Evaluation(
+                objective=objective(trajectory, cases),
+                compliance=float(trajectory.compliance[worst].sum()),
+                max_deviation=distance,
+                max_deviation_time=when,
+                first_frequencies=tuple(first_frequency(body) for body in bodies),
+                moments=tuple(second_moments(trajectory, cases)),
+                error=trajectory.solution.error,
+            )
+
+    evaluation = on_root(share.world, run)
+    return evaluation, kept[0] if kept else None
+
+
+def gradient(arms: Mapping[int, Arm], evaluation: Evaluation) -> dict[int, np.ndarray]:
+    """Return the ESL gradient with respect to the physical densities of this rank's arms."""
+    return {index: esl_gradient(arm, evaluation.moments[index]) for index, arm in arms.items()}

@@ -1,0 +1,391 @@
+"""The files of a run: written whole or not at all, read with one clear line when they do not fit.
+
+Everything here runs on the root unless it says "collective".
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, astuple, dataclass, fields
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt import __version__, compat
+from dolfinopt.arm import Arm
+from dolfinopt.errors import InputError
+from dolfinopt.parallel import ArmShare, gather_cells, on_root
+from dolfinopt.simulation import Trajectory
+
+
+@dataclass(frozen=True)
+class HistoryRow:
+    """One line of history.csv: the design after `iteration` updates; 0 is the initial design.
+
+    Attributes:
+        iteration: number of design updates made.
+        objective: N m (N m s for the whole horizon).
+        max_deviation: m.
+        grayness: over all arms.
+        volume_fraction: over all arms.
+        change: largest change of a design variable in the update that led here.
+        seconds: wall-clock time since the run's beginning, earlier parts included.
+    """
+
+    iteration: int
+    objective: float
+    max_deviation: float
+    grayness: float
+    volume_fraction: float
+    change: float
+    seconds: float
+
+
+# -- writing ---------------------------------------------------------------------------------
+
+
+def prepare_folder(folder: Path) -> None:
+    """Create the output folder and make sure that it can be written.
+
+    Raises:
+        InputError: it cannot.
+    """
+    probe = folder / f".write-test-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
+        ) from None
+
+
+def write_atomically(path: Path, write: Any) -> None:
+    """Call `write(stream)` on a temporary neighbour and rename it over `path` when complete."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with open(temporary, "wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an .npz atomically."""
+    write_atomically(path, lambda stream: np.savez(stream, **arrays))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    write_atomically(path, lambda stream: stream.write(text.encode()))
+
+
+def _csv_lines(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    lines = [",".join(header)]
+    lines += [",".join(str(v) if isinstance(v, int) else f"{v:.10g}" for v in row) for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+class HistoryWriter:
+    """history.csv, a line an iteration as it happens."""
+
+    def __init__(self, path: Path, rows: Sequence[HistoryRow]):
+        """Begin the file anew with the rows known so far."""
+        self.path = path
+        header = [f.name for f in fields(HistoryRow)]
+        write_text(path, _csv_lines(header, [astuple(row) for row in rows]))
+
+    def append(self, row: HistoryRow) -> None:
+        """Add one line."""
+        line = _csv_lines([], [astuple(row)]).lstrip("\n")
+        with open(self.path, "a", encoding="utf-8") as stream:
+            stream.write(line)
+
+
+def read_history(path: Path) -> list[HistoryRow]:
+    """Read history.csv back."""
+    with _open(path) as stream:
+        kinds = [int] + [float] * (len(fields(HistoryRow)) - 1)
+        rows = list(csv.reader(stream.read().decode().splitlines()))[1:]
+        return [HistoryRow(*(kind(v) for kind, v in zip(kinds, r, strict=True))) for r in rows]
+
+
+def write_trajectory(
+    folder: Path, trajectory: Trajectory, initial: np.ndarray | None = None
+) -> None:
+    """Write trajectory.npz and trajectory.csv.
+
+    Args:
+        folder: where.
+        trajectory: what.
+        initial: (n, 2) deviation of the initial design, m, kept for the picture.
+    """
+    arrays = {
+        "t": trajectory.t,
+        "q_r": trajectory.q_r,
+        "q_e": trajectory.q_e,
+        "deviation": trajectory.deviation,
+        "compliance": trajectory.compliance,
+        "joint_forces": trajectory.joint_forces,
+    }
+    if initial is not None:
+        arrays["initial_deviation"] = initial
+    write_arrays(folder / "trajectory.npz", arrays)
+    distance = np.hypot(*trajectory.deviation.T)
+    table = np.column_stack(
+        [trajectory.t, trajectory.deviation, distance, trajectory.compliance.sum(axis=1)]
+    )
+    header = ["t", "deviation_x", "deviation_y", "deviation", "compliance"]
+    write_text(folder / "trajectory.csv", _csv_lines(header, table))
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write summary.json."""
+    write_text(folder / "summary.json", json.dumps(summary, indent=2, sort_keys=False) + "\n")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of everything a result depends on."""
+    import scipy
+    from petsc4py import PETSc
+    from slepc4py import SLEPc
+
+    return {
+        "dolfinopt": __version__,
+        "dolfinx": compat.dolfinx_version(),
+        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "slepc": ".".join(map(str, SLEPc.Sys.getVersion())),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }
+
+
+# -- views: what pictures and ParaView need of an arm ----------------------------------------
+
+
+@dataclass(frozen=True)
+class ArmView:
+    """One whole arm on the root, cells in the order of their centroids.
+
+    Attributes:
+        name: the arm's.
+        corners: (n_cells, 3 or 4, 2) m, around each cell.
+        centroid: (n_cells, 2) m.
+        density: (n_cells,) physical densities.
+        modes: (n_cells, 3 or 4, 2, q) the reduced basis at the corners; q = 0 if not reduced.
+    """
+
+    name: str
+    corners: np.ndarray
+    centroid: np.ndarray
+    density: np.ndarray
+    modes: np.ndarray
+
+
+def gather_views(
+    share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+) -> list[ArmView]:
+    """Collect every arm on the root (collective); empty list elsewhere."""
+
+    def collect(values: Any) -> list[np.ndarray]:
+        return gather_cells(share, {index: values(index, arm) for index, arm in arms.items()})
+
+    def modes(index: int, arm: Arm) -> np.ndarray:
+        cells = arm.elastic.operators.cells
+        if arm.basis is None:
+            return np.zeros((*cells.shape, 2, 0))
+        return arm.basis.V[cells]
+
+    corners = collect(lambda _, arm: arm.elastic.points[arm.elastic.operators.cells])
+    fields_ = [
+        corners,
+        collect(lambda _, arm: arm.mesh.centroid),
+        collect(lambda index, _: x_phys[index]),
+        collect(modes),
+    ]
+    names = [arm.name for arm in next(iter(arms.values())).scene.arms]
+    views = []
+    for name, corner, centroid, density, mode in zip(names, *fields_, strict=share.world.rank == 0):
+        order = _canonical_order(centroid)
+        # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
+        around = [0, 1, 3, 2] if corner.shape[1] == 4 else [0, 1, 2]
+        views.append(
+            ArmView(
+                name,
+                corner[order][:, around],
+                centroid[order],
+                density[order],
+                mode[order][:, around],
+            )
+        )
+    return views
+
+
+def _canonical_order(points: np.ndarray) -> np.ndarray:
+    """Sort points by x, then y, as equal to 1e-9 of their extent: the same on any partition."""
+    size = np.ptp(points, axis=0).max() or 1.0
+    rounded = np.round(points / (1e-9 * size))
+    return np.lexsort((rounded[:, 1], rounded[:, 0]))
+
+
+def write_design(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.npz: centroids and physical densities of every arm."""
+    arrays = {}
+    for view in views:
+        arrays[f"{view.name}/centroid"] = view.centroid
+        arrays[f"{view.name}/density"] = view.density
+    write_arrays(folder / "design.npz", arrays)
+
+
+def write_xdmf(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.xdmf for ParaView: the arms in a column, density and arm number by cell."""
+    import meshio
+
+    points, blocks, density, number = [], [], [], []
+    offset, first = 0.0, 0
+    for index, view in enumerate(views):
+        flat = view.corners.reshape(-1, 2)
+        _, kept, place = np.unique(
+            np.round(flat / (1e-9 * np.ptp(flat, axis=0).max())),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
+        )
+        points.append(flat[kept] + [0.0, offset])
+        kind = "quad" if view.corners.shape[1] == 4 else "triangle"
+        blocks.append((kind, first + place.reshape(view.corners.shape[:2])))
+        density.append(view.density)
+        number.append(np.full(len(view.density), index))
+        first += len(kept)
+        offset -= 2.0 * np.ptp(flat[:, 1])
+    mesh = meshio.Mesh(
+        np.concatenate(points), blocks, cell_data={"density": density, "arm": number}
+    )
+    path = folder / "design.xdmf"
+    temporary = folder / ".design.part.xdmf"
+    meshio.write(temporary, mesh, file_format="xdmf", data_format="XML")
+    os.replace(temporary, path)
+
+
+# -- reading designs -------------------------------------------------------------------------
+
+
+def read_design(path: Path, share: ArmShare, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
+    """Return the physical densities of a design.npz on this rank's cells (collective).
+
+    Cells take the value of the nearest centroid in the file.
+
+    Raises:
+        InputError: the file is missing, damaged, or made for other arms.
+    """
+    arrays = on_root(share.world, _load_design, path)
+    fitted, problem = {}, None
+    for index, arm in arms.items():
+        try:
+            fitted[index] = _fit(path, arm, arrays)
+        except InputError as error:
+            problem = str(error)
+    problems = [p for p in share.world.allgather(problem) if p is not None]
+    if problems:
+        raise InputError(problems[0])
+    return fitted
+
+
+def _load_design(path: Path) -> dict[str, np.ndarray]:
+    with _open(path) as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as data:
+                return {key: data[key] for key in data.files}
+        except (ValueError, OSError, EOFError, KeyError, _zip_error()) as error:
+            raise InputError(
+                f"{path}: --design is no readable .npz file ({error}); give a design.npz "
+                "that dolfinopt wrote"
+            ) from None
+
+
+def _zip_error() -> type[Exception]:
+    from zipfile import BadZipFile
+
+    return BadZipFile
+
+
+def _open(path: Path) -> IO[bytes]:
+    try:
+        return open(path, "rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _fit(path: Path, arm: Arm, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the file's densities on the arm's cells by nearest centroid."""
+    from scipy.spatial import cKDTree
+
+    name = arm.mesh.name
+    keys = (f"{name}/centroid", f"{name}/density")
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        found = sorted({key.split("/")[0] for key in arrays})
+        raise InputError(
+            f"{path}: missing key {missing[0]!r} for arm {name!r}; the file holds "
+            f"{', '.join(map(repr, found)) or 'nothing'}; give a design made for these arms"
+        )
+    centroid, density = (np.asarray(arrays[key]) for key in keys)
+    if centroid.ndim != 2 or centroid.shape[1] < 2 or density.shape != centroid.shape[:1]:
+        raise InputError(
+            f"{path}: {keys[1]} has shape {density.shape} beside centroids of shape "
+            f"{centroid.shape}; expected (n,) and (n, 2)"
+        )
+    try:
+        centroid, density = centroid.astype(float)[:, :2], density.astype(float)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: {keys[1]} holds {density.dtype}, not numbers") from None
+    if len(density) == 0 or not np.isfinite(centroid).all():
+        raise InputError(f"{path}: {keys[0]} is empty or not finite; give a complete design")
+    outside = ~((density >= 0.0) & (density <= 1.0))  # catches NaN
+    if outside.any():
+        raise InputError(
+            f"{path}: {keys[1]} = {density[outside][0]:g} at cell {np.flatnonzero(outside)[0]}: "
+            "physical densities lie in [0, 1]"
+        )
+    return density[_nearest(path, arm, centroid, cKDTree)]
+
+
+def _nearest(path: Path, arm: Arm, centroid: np.ndarray, tree: Any) -> np.ndarray:
+    """Return the nearest design point of each cell; both must cover the same region."""
+    cells = arm.mesh.centroid
+    comm = arm.mesh.comm
+    low = np.min(comm.allgather(cells.min(axis=0)), axis=0)
+    high = np.max(comm.allgather(cells.max(axis=0)), axis=0)
+    size = np.sqrt(comm.allreduce(arm.mesh.area.max(), op=MPI.MAX))
+    points = tree(centroid)
+    spacing = points.query(centroid, k=2)[0][:, 1].max() if len(centroid) > 1 else np.inf
+    reach = 2.0 * (size + min(spacing, np.ptp(centroid, axis=0).max()))
+    edge = np.concatenate([centroid.min(axis=0) - low, centroid.max(axis=0) - high])
+    distance, place = points.query(cells)
+    if np.abs(edge).max() > reach or distance.max() > reach:
+        a, b = centroid.min(axis=0), centroid.max(axis=0)
+        raise InputError(
+            f"{path}: the design of arm {arm.mesh.name!r} covers x {a[0]:.4g}..{b[0]:.4g} m, "
+            f"y {a[1]:.4g}..{b[1]:.4g} m, its mesh x {low[0]:.4g}..{high[0]:.4g} m, "
+            f"y {low[1]:.4g}..{high[1]:.4g} m; give a design made for these arms"
+        )
+    return place
+
+
+def counts_dict(counts: Any) -> dict[str, int]:
+    """Return counts as plain data for summary.json."""
+    return asdict(counts)

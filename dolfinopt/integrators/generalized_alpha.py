@@ -1,0 +1,1 @@
+"""Generalised-alpha, step by step."""
