@@ -56,7 +56,7 @@ step() {
   say "$1"
   shift
   echo "+ $*" >>"$log"
-  "$@" >>"$log" 2>&1 </dev/null 9<&- && return
+  "$@" >>"$log" 2>&1 </dev/null && return
   say "failed; the end of $log:"
   tail -n 15 "$log" >&2
   exit 1
@@ -209,6 +209,7 @@ fi
 case ${1-} in
   "" | -h)
     usage
+    [ -z "$ranks" ] || exit 2
     ;;
   test)
     shift
