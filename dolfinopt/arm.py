@@ -54,6 +54,10 @@ class Arm:
         # The filter keeps bounds up to rounding, and only they are in the laws' domain.
         return np.where(self.mesh.passive, 1.0, np.clip(x_phys, 0.0, 1.0))
 
+    def uniform(self, density: float) -> np.ndarray:
+        """Return the physical densities of the same design variable in every cell."""
+        return self.physical(np.full(self.mesh.num_cells, density))
+
     def chain(self, slope: np.ndarray) -> np.ndarray:
         """Return the derivative with respect to x from that with respect to x_phys."""
         with self.ledger.phase("filter"):

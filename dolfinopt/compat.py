@@ -63,15 +63,14 @@ def _rows(adjacency: Any, columns: int) -> np.ndarray:
 
 def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
     """Return the (block) dof numbers (num_cells, nodes a cell) of the first cells, local."""
-    nodes = space.dofmap.cell_dofs(0).size
+    nodes = space.dofmap.dof_layout.num_dofs  # not of the first cell: a rank may have none
     return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
 
 
 def cell_geometry_nodes(mesh: Any, num_cells: int) -> np.ndarray:
     """Return the geometry's node numbers (num_cells, points a cell) of the first cells, local."""
-    dofmap = mesh.geometry.dofmap
-    points = dofmap.links(0).size if hasattr(dofmap, "links") else np.asarray(dofmap).shape[1]
-    return _rows(dofmap, points)[:num_cells]
+    points = mesh.geometry.cmap.create_dof_layout().num_dofs  # as above
+    return _rows(mesh.geometry.dofmap, points)[:num_cells]
 
 
 def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:

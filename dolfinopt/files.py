@@ -11,12 +11,11 @@ import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from mpi4py import MPI
 
 from dolfinopt import __version__, compat
 from dolfinopt.arm import Arm
@@ -152,6 +151,14 @@ def write_trajectory(
     write_text(folder / "trajectory.csv", _csv_lines(header, table))
 
 
+def read_initial_deviation(path: Path) -> np.ndarray | None:
+    """Return the initial design's deviation (n, 2), m, if trajectory.npz holds it."""
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as data:
+        return data["initial_deviation"] if "initial_deviation" in data.files else None
+
+
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json."""
     write_text(folder / "summary.json", json.dumps(summary, indent=2, sort_keys=False) + "\n")
@@ -217,9 +224,11 @@ def gather_views(
         collect(lambda index, _: x_phys[index]),
         collect(modes),
     ]
-    names = [arm.name for arm in next(iter(arms.values())).scene.arms]
+    if share.world.rank != 0:
+        return []
+    names = [arm.name for arm in arms[0].scene.arms]
     views = []
-    for name, corner, centroid, density, mode in zip(names, *fields_, strict=share.world.rank == 0):
+    for name, corner, centroid, density, mode in zip(names, *fields_, strict=True):
         order = _canonical_order(centroid)
         # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
         around = [0, 1, 3, 2] if corner.shape[1] == 4 else [0, 1, 2]
@@ -251,34 +260,72 @@ def write_design(folder: Path, views: Sequence[ArmView]) -> None:
     write_arrays(folder / "design.npz", arrays)
 
 
-def write_xdmf(folder: Path, views: Sequence[ArmView]) -> None:
-    """Write design.xdmf for ParaView: the arms in a column, density and arm number by cell."""
-    import meshio
+def write_gradient(
+    path: Path,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    slopes: Mapping[int, np.ndarray],
+    objective: float,
+) -> None:
+    """Write the gradient with respect to the physical densities (collective)."""
+    centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
+    gathered = gather_cells(share, slopes)
+    if share.world.rank != 0:
+        return
+    arrays: dict[str, Any] = {"objective": objective}
+    names = [arm.name for arm in arms[0].scene.arms]
+    for name, centroid, values in zip(names, centroids, gathered, strict=True):
+        order = _canonical_order(centroid)
+        arrays[f"{name}/centroid"] = centroid[order]
+        arrays[f"{name}/gradient"] = values[order]
+    write_arrays(path, arrays)
 
-    points, blocks, density, number = [], [], [], []
-    offset, first = 0.0, 0
-    for index, view in enumerate(views):
-        flat = view.corners.reshape(-1, 2)
-        _, kept, place = np.unique(
-            np.round(flat / (1e-9 * np.ptp(flat, axis=0).max())),
-            axis=0,
-            return_index=True,
-            return_inverse=True,
-        )
-        points.append(flat[kept] + [0.0, offset])
-        kind = "quad" if view.corners.shape[1] == 4 else "triangle"
-        blocks.append((kind, first + place.reshape(view.corners.shape[:2])))
-        density.append(view.density)
-        number.append(np.full(len(view.density), index))
-        first += len(kept)
-        offset -= 2.0 * np.ptp(flat[:, 1])
-    mesh = meshio.Mesh(
-        np.concatenate(points), blocks, cell_data={"density": density, "arm": number}
+
+def write_xdmf(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.xdmf for ParaView: one grid an arm, one below the other, density by cell."""
+    from xml.etree import ElementTree as Xml
+
+    root = Xml.Element("Xdmf", Version="3.0")
+    arms = Xml.SubElement(
+        Xml.SubElement(root, "Domain"), "Grid", Name="arms", GridType="Collection"
     )
-    path = folder / "design.xdmf"
-    temporary = folder / ".design.part.xdmf"
-    meshio.write(temporary, mesh, file_format="xdmf", data_format="XML")
-    os.replace(temporary, path)
+    arms.set("CollectionType", "Spatial")
+    offset = 0.0
+    for view in views:
+        points, cells = _merge_corners(view.corners)
+        kind = "Quadrilateral" if cells.shape[1] == 4 else "Triangle"
+        grid = Xml.SubElement(arms, "Grid", Name=view.name, GridType="Uniform")
+        topology = Xml.SubElement(grid, "Topology", TopologyType=kind)
+        topology.set("NumberOfElements", str(len(cells)))
+        _data_item(topology, cells, "Int")
+        geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
+        shifted = np.column_stack([points[:, 0], points[:, 1] + offset, np.zeros(len(points))])
+        _data_item(geometry, shifted, "Float")
+        attribute = Xml.SubElement(grid, "Attribute", Name="density", Center="Cell")
+        attribute.set("AttributeType", "Scalar")
+        _data_item(attribute, view.density, "Float")
+        offset -= 2.0 * np.ptp(points[:, 1])
+    write_atomically(folder / "design.xdmf", lambda stream: Xml.ElementTree(root).write(stream))
+
+
+def _data_item(parent: Any, values: np.ndarray, number_type: str) -> None:
+    from xml.etree import ElementTree as Xml
+
+    item = Xml.SubElement(parent, "DataItem", Format="XML", NumberType=number_type)
+    item.set("Dimensions", " ".join(map(str, values.shape)))
+    if number_type == "Float":
+        item.set("Precision", "8")
+    form = "%d" if number_type == "Int" else "%.10g"
+    rows = values if values.ndim == 2 else values[:, None]
+    item.text = "\n" + "\n".join(" ".join(form % v for v in row) for row in rows) + "\n"
+
+
+def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 2) and cells (n_cells, corners) of cells that share their corners."""
+    flat = corners.reshape(-1, 2)
+    rounded = np.round(flat / (1e-9 * np.ptp(flat, axis=0).max()))
+    _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    return flat[kept], place.reshape(corners.shape[:2])
 
 
 # -- reading designs -------------------------------------------------------------------------
@@ -370,7 +417,7 @@ def _nearest(path: Path, arm: Arm, centroid: np.ndarray, tree: Any) -> np.ndarra
     comm = arm.mesh.comm
     low = np.min(comm.allgather(cells.min(axis=0)), axis=0)
     high = np.max(comm.allgather(cells.max(axis=0)), axis=0)
-    size = np.sqrt(comm.allreduce(arm.mesh.area.max(), op=MPI.MAX))
+    size = np.sqrt(comm.allreduce(arm.mesh.area.max(), op=max))
     points = tree(centroid)
     spacing = points.query(centroid, k=2)[0][:, 1].max() if len(centroid) > 1 else np.inf
     reach = 2.0 * (size + min(spacing, np.ptp(centroid, axis=0).max()))
@@ -384,8 +431,3 @@ def _nearest(path: Path, arm: Arm, centroid: np.ndarray, tree: Any) -> np.ndarra
             f"y {low[1]:.4g}..{high[1]:.4g} m; give a design made for these arms"
         )
     return place
-
-
-def counts_dict(counts: Any) -> dict[str, int]:
-    """Return counts as plain data for summary.json."""
-    return asdict(counts)

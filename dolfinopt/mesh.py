@@ -98,7 +98,9 @@ def _read_geo(comm: MPI.Comm, path: Path, parameters: dict[str, float]) -> tuple
     if comm.rank == 0:
         gmsh.initialize()
         gmsh.option.setNumber("General.Terminal", 0)
-        # ONELAB parameters override the defaults of DefineConstant when the file is read.
+        # ONELAB parameters override the defaults of DefineConstant when the file is read. They
+        # outlive gmsh.finalize: drop those of the mesh before.
+        gmsh.onelab.clear()
         for key, value in parameters.items():
             gmsh.onelab.setNumber(f"Parameters/{key}", [float(value)])
         gmsh.open(str(path))

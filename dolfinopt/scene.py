@@ -328,6 +328,11 @@ class Scene(_Table):
         """Return the path of the scene's file as messages show it."""
         return self._source
 
+    @property
+    def cell_counts(self) -> tuple[int, ...]:
+        """Number of cells of every arm."""
+        return tuple(arm.cells[0] * arm.cells[1] for arm in self.arms)
+
     def to_dict(self) -> dict[str, Any]:
         """Return all resolved values as JSON-able data, from which `scene_from_dict` restores."""
         return self.model_dump(mode="json")

@@ -18,7 +18,7 @@ from dolfinopt.files import HistoryRow, HistoryWriter
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
 from dolfinopt.mma import MMAState, initial_state, mma_step
-from dolfinopt.parallel import ArmShare, on_root, share_arms
+from dolfinopt.parallel import ArmShare, on_root, share_arms, sum_over_arms
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
 
@@ -64,7 +64,7 @@ class _Variables:
 
     def __init__(self, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
         self.arms = arms
-        self.world = share.world
+        self.share = share
         sizes = [arm.mesh.num_cells for arm in arms.values()]
         ends = np.cumsum([0, *sizes])
         self.slices = {k: slice(a, b) for k, a, b in zip(arms, ends[:-1], ends[1:], strict=True)}
@@ -75,17 +75,15 @@ class _Variables:
             self.xmin[part][arms[k].mesh.passive] = 1.0
         # Volume constraints sum V x_phys / (fraction sum V) - 1 <= 0, one an arm or one for all;
         # the filter is linear, so their gradients are constant.
-        count = 1 if scene.design.shared_volume else len(scene.arms)
-        total = np.zeros(count)
-        self.volume_slopes = np.zeros((count, self.size))
-        for k, part in self.slices.items():
-            row = 0 if scene.design.shared_volume else k
-            total[row] += arms[k].mesh.area.sum()
-            self.volume_slopes[row, part] = arms[k].chain(arms[k].mesh.area)
-        total = self.world.allreduce(total)
-        self.limit = scene.design.volume_fraction * total
         self.shared = scene.design.shared_volume
-        self.volume_slopes /= self.limit[:, None]
+        self.count = 1 if self.shared else len(scene.arms)
+        self.limit = scene.design.volume_fraction * self._volumes(
+            {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
+        )
+        self.volume_slopes = np.zeros((self.count, self.size))
+        for k, part in self.slices.items():
+            row = 0 if self.shared else k
+            self.volume_slopes[row, part] = arms[k].chain(arms[k].mesh.area) / self.limit[row]
 
     def split(self, x: np.ndarray) -> dict[int, np.ndarray]:
         """Return each arm's part."""
@@ -93,14 +91,19 @@ class _Variables:
 
     def join(self, parts: Mapping[int, np.ndarray]) -> np.ndarray:
         """Return the parts as one vector."""
-        return np.concatenate([parts[k] for k in self.slices])
+        return np.concatenate([parts[k] for k in self.slices] or [np.empty(0)])
 
     def volume_constraints(self, x_phys: Mapping[int, np.ndarray]) -> np.ndarray:
         """Return f (m,), below zero where there is volume left (collective)."""
-        volume = np.zeros(len(self.limit))
+        return self._volumes(x_phys) / self.limit - 1.0
+
+    def _volumes(self, x_phys: Mapping[int, np.ndarray]) -> np.ndarray:
+        """Return sum V x_phys of each constraint's arms (m,)."""
+        volume = {}
         for k, arm in self.arms.items():
-            volume[0 if self.shared else k] += arm.mesh.area @ x_phys[k]
-        return self.world.allreduce(volume) / self.limit - 1.0
+            volume[k] = np.zeros(self.count)
+            volume[k][0 if self.shared else k] = arm.mesh.area @ x_phys[k]
+        return sum_over_arms(self.share, volume)
 
 
 def optimize(
@@ -130,7 +133,7 @@ def optimize(
     if folder is not None and not resume:
         on_root(world, checkpoint.begin, folder, scene)
     ledger = Ledger()
-    share = share_arms(world, len(scene.arms))
+    share = share_arms(world, scene.cell_counts)
     arms = build_arms(scene, share, ledger)
     run = _Run(scene, share, arms, ledger, folder, report)
     memory = None
@@ -250,11 +253,11 @@ class _Run:
 
     def _record(self, evaluation: Evaluation, x_phys: Mapping[int, np.ndarray]) -> None:
         """Add a row to the history; collective, kept on the root."""
-        parts = np.zeros(3)
+        parts = {}
         for k, arm in self.arms.items():
             x, area = x_phys[k], arm.mesh.area
-            parts += [area.sum(), area @ x, area @ (4.0 * x * (1.0 - x))]
-        total, volume, grey = self.share.world.allreduce(parts)
+            parts[k] = np.array([area.sum(), area @ x, area @ (4.0 * x * (1.0 - x))])
+        total, volume, grey = sum_over_arms(self.share, parts)
         if self.share.world.rank != 0:
             return
         row = HistoryRow(
@@ -304,7 +307,7 @@ class _Run:
         )
 
     def _restore(self, memory: Memory) -> None:
-        columns = self.variables.join(memory.cells)
+        columns = self.variables.join(memory.cells).reshape(-1, 5)
         self.x = columns[:, 0].copy()
         self.state = MMAState(
             iteration=memory.iteration,

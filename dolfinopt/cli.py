@@ -1,0 +1,355 @@
+"""The `dolfinopt` command: parse, call, exit code."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dolfinopt import __version__
+from dolfinopt.errors import InputError
+from dolfinopt.scene import Scene, load_scene, scene_from_dict
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.arm import Arm
+    from dolfinopt.files import ArmView, HistoryRow
+    from dolfinopt.optimization import Result
+    from dolfinopt.parallel import ArmShare
+    from dolfinopt.simulation import Trajectory
+
+BEGUN = time.perf_counter()
+
+
+def main() -> None:
+    """Run the command line on every rank and exit: 0, 1 (failed), 2 (bad input)."""
+    import petsc4py
+
+    # PETSc would turn a closed pipe or Ctrl-C into an abort with a page of advice.
+    petsc4py.init(["dolfinopt", "-no_signal_handler"])
+    from mpi4py import MPI
+
+    from dolfinopt.parallel import one_ending
+
+    world = MPI.COMM_WORLD
+    with one_ending(world):
+        try:
+            commands.main(args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=world)
+        except click.ClickException as error:
+            raise InputError(f"{error.format_message()} (see dolfinopt --help)") from None
+        except click.Abort:
+            raise KeyboardInterrupt from None
+
+
+class _Quiet(click.Group):
+    """A group whose help is printed by the root alone."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
+        world: MPI.Comm = kwargs["obj"]
+        silent = nullcontext() if world.rank == 0 else _no_output()
+        with silent:
+            return super().main(*args, **kwargs)
+
+
+def _no_output() -> AbstractContextManager[Any]:
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    return redirect_stdout(StringIO())
+
+
+@click.group(cls=_Quiet, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="dolfinopt")
+def commands() -> None:
+    """Stiffen the flexible arms of a moving machine by topology optimisation.
+
+    Every command also runs under mpirun, with the same result.
+    """
+
+
+scene_argument = click.argument("scene", type=click.Path(path_type=Path))
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a scene value"
+)
+design_option = click.option(
+    "--design", type=click.Path(path_type=Path), help="design.npz; default: the initial design"
+)
+plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
+
+
+def out_option(what: str) -> Callable[..., Any]:
+    """Return the --out option of a command that writes a folder."""
+    return click.option(
+        "--out", type=click.Path(path_type=Path), metavar="DIR", help=f"folder for {what}"
+    )
+
+
+@commands.command()
+@scene_argument
+@out_option("the results; default: results/SCENE")
+@click.option("--resume", is_flag=True, help="go on from the folder's checkpoint")
+@set_option
+@plots_option
+@click.pass_obj
+def optimize(
+    world: MPI.Comm,
+    scene: Path,
+    out: Path | None,
+    resume: bool,
+    overrides: tuple[str, ...],
+    plots: bool,
+) -> None:
+    """Optimise the arms of SCENE for the loads of their motion."""
+    from dolfinopt import checkpoint
+    from dolfinopt.optimization import optimize as run
+    from dolfinopt.parallel import on_root
+
+    loaded = _load(world, scene, overrides)
+    folder = out or Path("results") / scene.stem
+    if resume:
+        on_root(world, checkpoint.check, folder, loaded)
+    _prepare(world, folder)
+    with _progress(world, loaded) as report:
+        result = run(loaded, folder, resume=resume, world=world, report=report)
+    _write_result(loaded, folder, result, plots)
+
+
+@commands.command()
+@scene_argument
+@design_option
+@out_option("the results; default: results/SCENE-simulation")
+@set_option
+@plots_option
+@click.pass_obj
+def simulate(
+    world: MPI.Comm,
+    scene: Path,
+    design: Path | None,
+    out: Path | None,
+    overrides: tuple[str, ...],
+    plots: bool,
+) -> None:
+    """Simulate SCENE with a given design and report compliance and deviation."""
+    from dolfinopt.evaluation import evaluate
+    from dolfinopt.files import gather_views, write_summary, write_trajectory
+    from dolfinopt.ledger import Ledger
+    from dolfinopt.summary import summarise
+
+    loaded = _load(world, scene, overrides)
+    folder = out or Path("results") / f"{scene.stem}-simulation"
+    ledger = Ledger()
+    share, arms, x_phys = _design(world, loaded, design, ledger)
+    _prepare(world, folder)
+    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
+    views = gather_views(share, arms, x_phys)
+    summary = summarise(
+        loaded, share, arms, x_phys, evaluation, ledger, wall=time.perf_counter() - BEGUN
+    )
+    if trajectory is None:
+        return
+    _write_design(folder, views)
+    write_trajectory(folder, trajectory)
+    write_summary(folder, summary)
+    if plots:
+        _draw(folder, loaded, views, trajectory, [], None)
+    _conclude(summary, folder)
+
+
+@commands.command()
+@scene_argument
+@design_option
+@click.option("--kind", type=click.Choice(["esl"]), default="esl", help="which gradient")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help="gradient.npz"
+)
+@set_option
+@click.pass_obj
+def gradient(
+    world: MPI.Comm,
+    scene: Path,
+    design: Path | None,
+    kind: str,
+    out: Path,
+    overrides: tuple[str, ...],
+) -> None:
+    """Write the objective's gradient with respect to the physical densities to FILE."""
+    from dolfinopt.evaluation import evaluate
+    from dolfinopt.evaluation import gradient as slopes
+    from dolfinopt.files import write_gradient
+    from dolfinopt.ledger import Ledger
+
+    loaded = _load(world, scene, (*overrides, f'objective.gradient="{kind}"'))
+    ledger = Ledger()
+    share, arms, x_phys = _design(world, loaded, design, ledger)
+    _prepare(world, out.parent)
+    evaluation, _ = evaluate(loaded, share, arms, x_phys, ledger)
+    write_gradient(out, share, arms, slopes(arms, evaluation), evaluation.objective)
+    if world.rank == 0:
+        unit = "N m" if loaded.objective.kind == "esl" else "N m s"
+        click.echo(f"objective {evaluation.objective:.6g} {unit}; {kind} gradient in {out}")
+
+
+@commands.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.pass_obj
+def plot(world: MPI.Comm, folder: Path) -> None:
+    """Draw the pictures of a finished run in DIR anew."""
+    from dolfinopt.evaluation import evaluate
+    from dolfinopt.files import gather_views, read_history, read_initial_deviation
+    from dolfinopt.ledger import Ledger
+    from dolfinopt.parallel import on_root
+
+    loaded = on_root(world, _scene_of, folder)
+    ledger = Ledger()
+    share, arms, x_phys = _design(world, loaded, folder / "design.npz", ledger)
+    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
+    views = gather_views(share, arms, x_phys)
+    if trajectory is None:
+        return
+    history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
+    initial = read_initial_deviation(folder / "trajectory.npz")
+    _draw(folder, loaded, views, trajectory, history, initial)
+    click.echo(f"pictures in {folder}")
+
+
+# -- steps the commands share ----------------------------------------------------------------
+
+
+def _load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
+    """Read the scene on the root, check what can be checked, and hand it to all ranks."""
+    from dolfinopt.parallel import on_root
+
+    def load() -> Scene:
+        from dolfinopt.motion import check_motion
+
+        scene = load_scene(path, overrides)
+        check_motion(scene)
+        return scene
+
+    return on_root(world, load)
+
+
+def _prepare(world: MPI.Comm, folder: Path) -> None:
+    from dolfinopt.files import prepare_folder
+    from dolfinopt.parallel import on_root
+
+    on_root(world, prepare_folder, folder)
+
+
+def _scene_of(folder: Path) -> Scene:
+    path = folder / "summary.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))["scene"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({type(error).__name__}); name the folder of a finished "
+            "optimize or simulate run"
+        ) from None
+    return scene_from_dict(data, source=str(path))
+
+
+def _design(
+    world: MPI.Comm, scene: Scene, design: Path | None, ledger: Any
+) -> tuple[ArmShare, dict[int, Arm], dict[int, Any]]:
+    """Build the arms and return them with the physical densities of a file or the initial ones."""
+    from dolfinopt.arm import build_arms
+    from dolfinopt.files import read_design
+    from dolfinopt.parallel import share_arms
+
+    share = share_arms(world, scene.cell_counts)
+    arms = build_arms(scene, share, ledger)
+    if design is not None:
+        return share, arms, read_design(design, share, arms)
+    return share, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+
+
+def _write_result(scene: Scene, folder: Path, result: Result, plots: bool) -> None:
+    """Write everything an optimisation leaves behind (collective)."""
+    from dolfinopt.files import gather_views, write_summary, write_trajectory
+    from dolfinopt.summary import summarise
+
+    views = gather_views(result.share, result.arms, result.x_phys)
+    summary = summarise(
+        scene,
+        result.share,
+        result.arms,
+        result.x_phys,
+        result.evaluation,
+        result.ledger,
+        wall=time.perf_counter() - BEGUN,
+        iterations=result.iterations,
+        converged=result.converged,
+        stop_reason=result.stop_reason,
+    )
+    if result.trajectory is None:
+        return
+    _write_design(folder, views)
+    write_trajectory(folder, result.trajectory, result.initial_deviation)
+    write_summary(folder, summary)
+    if plots:
+        history, initial = result.history, result.initial_deviation
+        _draw(folder, scene, views, result.trajectory, history, initial)
+    _conclude(summary, folder)
+
+
+def _write_design(folder: Path, views: list[ArmView]) -> None:
+    from dolfinopt.files import write_design, write_xdmf
+
+    write_design(folder, views)
+    write_xdmf(folder, views)
+
+
+def _draw(
+    folder: Path,
+    scene: Scene,
+    views: list[ArmView],
+    trajectory: Trajectory,
+    history: list[HistoryRow],
+    initial: Any,
+) -> None:
+    """Draw all pictures of a run (root only)."""
+    from dolfinopt import plots
+
+    unit = "N m" if scene.objective.kind == "esl" else "N m s"
+    plots.draw_design(folder / "design.png", views, scene.name)
+    if len(history) > 1:
+        plots.draw_history(folder / "history.png", history, f"objective [{unit}]")
+    plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
+    plots.draw_motion(
+        folder / "motion.gif",
+        views,
+        trajectory.mechanism,
+        trajectory.t,
+        trajectory.q_r,
+        trajectory.q_e,
+    )
+
+
+def _conclude(summary: Mapping[str, Any], folder: Path) -> None:
+    """Print the run's figures in one line."""
+    click.echo(
+        f"{summary['name']}: {summary['iterations']} iterations ({summary['stop_reason']}), "
+        f"compliance {summary['compliance']:.4g} N m, "
+        f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
+        f"at {summary['max_deviation_time']:.3f} s, "
+        f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
+        f"{folder}"
+    )
+
+
+def _progress(
+    world: MPI.Comm, scene: Scene
+) -> AbstractContextManager[Callable[[HistoryRow], None] | None]:
+    """Return a live line an iteration on the root's terminal, nothing elsewhere."""
+    if world.rank != 0 or not sys.stderr.isatty():
+        return nullcontext(None)
+    from dolfinopt.progress import live_line
+
+    return live_line(scene.optimizer.max_iterations)
