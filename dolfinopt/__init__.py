@@ -16,6 +16,8 @@ The pipeline in ten lines:
 
 from __future__ import annotations
 
+# ruff: noqa: F401 - names for type checkers; `__getattr__` imports them at run time
+
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

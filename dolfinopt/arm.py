@@ -36,9 +36,7 @@ class Arm:
                 comm, arm.name, arm.length, arm.height, arm.cells, arm.passive
             )
         with ledger.phase("element operators"):
-            operators = element_operators(
-                self.mesh, arm.thickness, scene.material.poisson_ratio
-            )
+            operators = element_operators(self.mesh, arm.thickness, scene.material.poisson_ratio)
             self.elastic = ElasticArm(self.mesh, operators, ledger)
             self.filter = HelmholtzFilter(self.mesh, scene.design.filter_radius)
         self.ledger = ledger

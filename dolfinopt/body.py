@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
-from dolfinopt.reduction import Basis
+if TYPE_CHECKING:
+    from dolfinopt.elasticity import ElasticArm
+    from dolfinopt.reduction import Basis
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,18 @@ import json
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.arm import Arm
 from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.parallel import ArmShare, gather_cells, on_root
 from dolfinopt.scene import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
 
 NAME = "checkpoint.npz"
 # Keys a resumed run may change: they say when to stop, not what is computed.
@@ -88,9 +90,7 @@ def check(folder: Path, scene: Scene) -> None:
     _read(folder, scene)
 
 
-def load(
-    folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
-) -> Memory | None:
+def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> Memory | None:
     """Return the memory of an interrupted run, or None when it had only begun (collective).
 
     Rows go to the cells and nodes at the same place, on any number of ranks.

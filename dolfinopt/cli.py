@@ -41,7 +41,9 @@ def main() -> None:
     world = MPI.COMM_WORLD
     with one_ending(world):
         try:
-            commands.main(args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=world)
+            commands.main(
+                args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=world
+            )
         except click.ClickException as error:
             raise InputError(f"{error.format_message()} (see dolfinopt --help)") from None
         except click.Abort:

@@ -191,7 +191,8 @@ class ElasticArm:
         self.points = operators.points
         self._find_interfaces()
         size = len(self.points)
-        dofs = (2 * operators.cells[:, :, None] + np.arange(2)).reshape(len(operators.cells), -1)
+        dofs = np.repeat(2 * operators.cells, 2, axis=1)
+        dofs[:, 1::2] += 1
         self._stiffness = AffineMatrix(dofs, operators.stiffness, 2 * size)
         self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self._number_interior()
@@ -280,7 +281,7 @@ class ElasticArm:
         field = np.zeros((len(self.points), 2, columns))
         field[self.interior_nodes] = interior.reshape(-1, 2, columns)
         if self.comm.size > 1:
-            flat = self._from_owners(field.reshape(len(field), -1))
+            flat = self._from_owners(field.reshape(len(field), 2 * columns))
             field = flat.reshape(field.shape)
         rigid = np.flatnonzero(self.outboard)
         field[rigid] = self.rigid[rigid] @ outboard
@@ -344,7 +345,7 @@ class ElasticArm:
 
     def mass_times(self, field: np.ndarray) -> np.ndarray:
         """Return M u (n_nodes, 2, k) of this rank's cells; kg m for u in m."""
-        flat = field.reshape(len(field), -1)
+        flat = field.reshape(len(field), 2 * field.shape[2])
         return (self._mass_local() @ flat).reshape(field.shape)
 
     def interior_stiffness(self) -> PETSc.Mat:
@@ -419,9 +420,7 @@ class ElasticArm:
         values = self._on_cells(field)
         columns = field.shape[2]
         products = (self.operators.stiffness @ values) * self._young[:, None, None]
-        energy = self.comm.allreduce(
-            values.reshape(-1, columns).T @ products.reshape(-1, columns)
-        )
+        energy = self.comm.allreduce(values.reshape(-1, columns).T @ products.reshape(-1, columns))
         return 0.5 * (energy + energy.T)
 
     def _on_cells(self, field: np.ndarray) -> np.ndarray:
@@ -432,7 +431,7 @@ class ElasticArm:
         cells = self.operators.cells
         values = field[cells]
         values -= values.mean(axis=1, keepdims=True)
-        return values.reshape(len(cells), -1, field.shape[2])
+        return values.reshape(len(cells), 2 * cells.shape[1], field.shape[2])
 
 
 def _cell_products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:

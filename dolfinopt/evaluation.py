@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arm import Arm
 from dolfinopt.body import first_frequency
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
@@ -16,6 +16,9 @@ from dolfinopt.parallel import ArmShare, gather_bodies, on_root
 from dolfinopt.scene import Scene
 from dolfinopt.sensitivity import esl_gradient
 from dolfinopt.simulation import Trajectory, simulate
+
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt import __version__, compat
-from dolfinopt.arm import Arm
+from dolfinopt import __version__
 from dolfinopt.errors import InputError
 from dolfinopt.parallel import ArmShare, gather_cells, on_root
-from dolfinopt.simulation import Trajectory
+
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
+    from dolfinopt.simulation import Trajectory
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,8 @@ def versions() -> dict[str, str]:
     import scipy
     from petsc4py import PETSc
     from slepc4py import SLEPc
+
+    from dolfinopt import compat
 
     return {
         "dolfinopt": __version__,

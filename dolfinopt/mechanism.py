@@ -136,9 +136,7 @@ def _outward(
         )
         shapes.append(shape)
         frames.append(frame)
-        a = np.conj(frame.swing) * (
-            a + (1j * wd - w * w) * frame.d + 2j * w * frame.dd + frame.ddd
-        )
+        a = np.conj(frame.swing) * (a + (1j * wd - w * w) * frame.d + 2j * w * frame.dd + frame.ddd)
         w = w + ed @ shape.turn + beta_d
         wd = wd + edd @ shape.turn + beta_dd
     return shapes, frames, (a, w, wd)
@@ -210,12 +208,7 @@ def _inertia(body: FloatingBody, frame: _Frame, e: np.ndarray) -> np.ndarray:
 def _body_force(body: FloatingBody, frame: _Frame) -> np.ndarray:
     """Return the inertia force F (n,) complex, body components, N."""
     w = frame.w
-    return (
-        body.mass * frame.a
-        + (1j * frame.wd - w * w) * frame.s
-        + 2j * w * frame.sd
-        + frame.sdd
-    )
+    return body.mass * frame.a + (1j * frame.wd - w * w) * frame.s + 2j * w * frame.sd + frame.sdd
 
 
 def tangent(
@@ -343,9 +336,7 @@ def _body_load(
     force[:, cv] += 2j * w * shape.C
     force[:, ca] += shape.C
     spin = 2.0 * np.einsum("nk,nk->n", frame.jM, ed)[:, None]
-    moment = (
-        (np.conj(s) * a_v).imag + _inertia(body, frame, e)[:, None] * wd_v + spin * w_v
-    )
+    moment = (np.conj(s) * a_v).imag + _inertia(body, frame, e)[:, None] * wd_v + spin * w_v
     moment[:, cq] += (
         (np.conj(shape.C) * frame.a[:, None]).imag
         + 2.0 * wd * frame.jM

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
 from dolfinopt import checkpoint
-from dolfinopt.arm import Arm, build_arms
 from dolfinopt.checkpoint import Memory
 from dolfinopt.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.files import HistoryRow, HistoryWriter
@@ -21,6 +21,9 @@ from dolfinopt.mma import MMAState, initial_state, mma_step
 from dolfinopt.parallel import ArmShare, on_root, share_arms, sum_over_arms
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
+
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
 
 # Checkpoints are written when this much time has passed: a kill costs no more than that, and
 # writing (some ms) stays below a percent of the run.
@@ -132,6 +135,9 @@ def optimize(
     world = MPI.COMM_WORLD if world is None else world
     if folder is not None and not resume:
         on_root(world, checkpoint.begin, folder, scene)
+    # Only now, so that a run killed while DOLFINx is imported can be resumed like any other.
+    from dolfinopt.arm import build_arms
+
     ledger = Ledger()
     share = share_arms(world, scene.cell_counts)
     arms = build_arms(scene, share, ledger)

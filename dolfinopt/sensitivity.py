@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from dolfinopt.arm import Arm
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
+
 
 # Directions of Q below this share of its largest are rounding.
 RANK_TOLERANCE = 1e-14

@@ -86,7 +86,9 @@ class _FreeArm:
 class _Bordered:
     """[A_II, A_Ib; A_Ib', A_bb] as the context of a PETSc Python matrix."""
 
-    def __init__(self, layout: _FreeArm, inner: PETSc.Mat, coupling: np.ndarray, corner: np.ndarray):
+    def __init__(
+        self, layout: _FreeArm, inner: PETSc.Mat, coupling: np.ndarray, corner: np.ndarray
+    ):
         self.layout, self.inner, self.coupling, self.corner = layout, inner, coupling, corner
         self.x, self.y = inner.createVecs()
 
