@@ -36,7 +36,7 @@ STREET = (
     "mma",
     "files",
     "checkpoint",
-    "optimize",
+    "optimization",
     "summary",
     "progress",
     "study",
@@ -121,7 +121,7 @@ def test_imports_point_one_way(path):
 @pytest.mark.parametrize(
     ("name", "source", "found"),
     [
-        ("mesh", "from dolfinopt.optimize import optimize", "optimize, which comes later"),
+        ("mesh", "from dolfinopt.optimization import optimize", "optimization, which comes later"),
         ("mesh", "from dolfinopt import cli", "cli, which comes later"),
         ("mesh", "import dolfinopt.cli", "cli, which comes later"),
         ("mesh", "from . import cli", "cli, which comes later"),
@@ -152,7 +152,7 @@ def test_checker_finds(name, source, found):
         ("reduction.__init__", "from .modal import reduce_modal"),
         ("plots", "def f():\n    import pyvista"),
         ("plots", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import pyvista"),
-        ("__init__", "from dolfinopt.optimize import optimize"),
+        ("__init__", "from dolfinopt.optimization import optimize"),
     ],
 )
 def test_checker_allows(name, source):
