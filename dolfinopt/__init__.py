@@ -17,7 +17,6 @@ The pipeline in ten lines:
 from __future__ import annotations
 
 # ruff: noqa: F401 - names for type checkers; `__getattr__` imports them at run time
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from dolfinopt.files import gather_views
     from dolfinopt.ledger import Ledger
     from dolfinopt.optimization import Result, optimize
-    from dolfinopt.parallel import one_ending, share_arms
+    from dolfinopt.parallel import gather_bodies, one_ending, share_arms
     from dolfinopt.scene import Scene, load_scene, scene_from_dict
     from dolfinopt.simulation import Trajectory, simulate
 
@@ -43,6 +42,7 @@ _HOME = {
     "evaluate": "evaluation",
     "gradient": "evaluation",
     "gather_views": "files",
+    "gather_bodies": "parallel",
     "Ledger": "ledger",
     "Result": "optimization",
     "optimize": "optimization",

@@ -187,6 +187,8 @@ def gradient(
     from dolfinopt.files import write_gradient
     from dolfinopt.ledger import Ledger
 
+    if out.is_dir():
+        raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
     loaded = _load(world, scene, (*overrides, f'objective.gradient="{kind}"'))
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, design, ledger)
@@ -211,7 +213,7 @@ def plot(world: MPI.Comm, folder: Path) -> None:
     loaded = on_root(world, _scene_of, folder)
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, folder / "design.npz", ledger)
-    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
+    _, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
     views = gather_views(share, arms, x_phys)
     if trajectory is None:
         return

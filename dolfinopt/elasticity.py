@@ -8,6 +8,7 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,7 +37,7 @@ class ElementOperators:
         mass: (n_cells, n, n) of one displacement component, m3; times rho0 gives kg.
     """
 
-    space: object
+    space: Any
     cells: np.ndarray
     points: np.ndarray
     stiffness: np.ndarray

@@ -119,9 +119,8 @@ class HistoryWriter:
 def read_history(path: Path) -> list[HistoryRow]:
     """Read history.csv back."""
     with _open(path) as stream:
-        kinds = [int] + [float] * (len(fields(HistoryRow)) - 1)
         rows = list(csv.reader(stream.read().decode().splitlines()))[1:]
-        return [HistoryRow(*(kind(v) for kind, v in zip(kinds, r, strict=True))) for r in rows]
+        return [HistoryRow(int(row[0]), *map(float, row[1:])) for row in rows]
 
 
 def write_trajectory(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,8 +38,8 @@ class Mechanism:
     @property
     def slices(self) -> tuple[slice, ...]:
         """Each body's place in the vector of all elastic coordinates."""
-        ends = np.cumsum([0] + [body.coordinates for body in self.bodies])
-        return tuple(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        ends = np.cumsum([0, *(body.coordinates for body in self.bodies)])
+        return tuple(slice(a, b) for a, b in pairwise(ends))
 
     @property
     def coordinates(self) -> int:

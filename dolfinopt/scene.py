@@ -779,7 +779,8 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
         return f"an array of two {_allowed_type(args[0], plural='s')}"
     if isinstance(annotation, type) and issubclass(annotation, _Table):
         return f"a table with the keys {', '.join(annotation.model_fields)}"
-    noun = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}[annotation]
+    nouns = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}
+    noun = nouns[annotation]
     noun = noun.split()[1] + plural if plural else noun
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [

@@ -76,7 +76,7 @@ def build_mechanism(scene: Scene, bodies: list[FloatingBody]) -> Mechanism:
         bodies=tuple(bodies),
         payload_mass=scene.payload.mass,
         payload_inertia=scene.payload.inertia,
-        gravity=tuple(scene.motion.gravity),
+        gravity=scene.motion.gravity,
         joint_height=scene.motion.joint_height,
     )
 

@@ -1,0 +1,280 @@
+"""The command line: files, exit status, and one line for whatever the user got wrong."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.cli import commands
+from dolfinopt.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+SCENE = ROOT / "demos" / "two_arm.toml"
+SMALL = ["--set", "arms.cells=[40,4]", "--set", "simulation.sample=0.005"]
+WORLD = MPI.COMM_WORLD
+
+
+def run(*arguments: object) -> None:
+    """Run a command in this process, on all ranks."""
+    commands.main([str(a) for a in arguments], standalone_mode=False, obj=WORLD)
+
+
+def shell(*arguments: object, ranks: int = 0) -> subprocess.CompletedProcess:
+    """Run the command in a process of its own, or under mpirun."""
+    command = [sys.executable, "-m", "dolfinopt", *map(str, arguments)]
+    if ranks:
+        command = ["mpirun", "-n", str(ranks), *command]
+    # os.environ is as it was before this process began MPI, which would confuse another mpirun.
+    environment = dict(os.environ)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, cwd="/", env=environment
+    )
+
+
+@pytest.fixture(scope="module")
+def optimised(tmp_path_factory):
+    """A short optimisation's folder, with pictures."""
+    path = tmp_path_factory.mktemp("run") if WORLD.rank == 0 else None
+    folder = WORLD.bcast(path, root=0) / "out"
+    run("optimize", SCENE, *SMALL, "--set", "optimizer.max_iterations=3", "--out", folder)
+    WORLD.barrier()
+    return folder
+
+
+def test_optimize_writes_every_file(optimised):
+    expected = {
+        "checkpoint.npz",
+        "design.npz",
+        "design.png",
+        "design.xdmf",
+        "deviation.png",
+        "history.csv",
+        "history.png",
+        "motion.gif",
+        "summary.json",
+        "trajectory.csv",
+        "trajectory.npz",
+    }
+    assert {path.name for path in optimised.iterdir()} == expected
+
+
+def test_design_file(optimised):
+    with np.load(optimised / "design.npz") as design:
+        assert set(design.files) == {f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "density")}
+        centroid, density = design["arm1/centroid"], design["arm1/density"]
+    assert centroid.shape == (160, 2) and density.shape == (160,)
+    assert 0.0 <= density.min() and density.max() <= 1.0
+    # Half a cell from the ends and edges.
+    np.testing.assert_allclose(centroid.min(axis=0), [0.0125, -0.0225], atol=1e-12)
+    np.testing.assert_allclose(centroid.max(axis=0), [0.9875, 0.0225], atol=1e-12)
+
+
+def test_trajectory_files(optimised):
+    with np.load(optimised / "trajectory.npz") as data:
+        shapes = {key: data[key].shape for key in data.files}
+        deviation, compliance, t = data["deviation"], data["compliance"], data["t"]
+    assert shapes == {
+        "t": (601,),
+        "q_r": (601, 3),
+        "q_e": (601, 8),
+        "deviation": (601, 2),
+        "compliance": (601, 2),
+        "joint_forces": (601, 3),
+        "initial_deviation": (601, 2),
+    }
+    lines = (optimised / "trajectory.csv").read_text().splitlines()
+    assert lines[0] == "t,deviation_x,deviation_y,deviation,compliance"
+    table = np.array([[float(v) for v in line.split(",")] for line in lines[1:]])
+    np.testing.assert_allclose(table[:, 0], t, atol=1e-12)
+    # Ten digits are written.
+    np.testing.assert_allclose(table[:, 1:3], deviation, atol=1e-11)
+    np.testing.assert_allclose(table[:, 4], compliance.sum(axis=1), atol=1e-9)
+
+
+def test_history_ends_in_the_summary(optimised):
+    lines = (optimised / "history.csv").read_text().splitlines()
+    header = "iteration,objective,max_deviation,grayness,volume_fraction,change,seconds"
+    assert lines[0] == header
+    assert [int(line.split(",")[0]) for line in lines[1:]] == [0, 1, 2, 3]
+    last = dict(zip(header.split(","), map(float, lines[-1].split(",")), strict=True))
+    summary = json.loads((optimised / "summary.json").read_text())
+    assert last["objective"] == pytest.approx(summary["objective"], rel=1e-9)
+    assert last["objective"] == pytest.approx(summary["compliance"], rel=1e-9)
+    assert last["max_deviation"] == pytest.approx(summary["max_deviation"], rel=1e-9)
+    assert last["grayness"] == pytest.approx(summary["grayness"], rel=1e-9)
+    assert summary["iterations"] == 3 and summary["converged"] is False
+    assert "max_iterations" in summary["stop_reason"]
+
+
+def test_summary_counts(optimised):
+    """Four designs, two arms: nothing is assembled, factorised or solved more often than needed.
+
+    With one normal mode an arm needs 3 constraint modes and at least one Lanczos step more.
+    """
+    counts = json.loads((optimised / "summary.json").read_text())["counts"]
+    assert counts["simulations"] == 4
+    assert counts["factorisations"] == counts["eigenproblems"] == 8
+    assert counts["assemblies"] == 16  # stiffness and mass
+    assert 8 * 4 <= counts["solves"] <= 8 * 20
+
+
+def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
+    run(
+        "simulate",
+        SCENE,
+        *SMALL,
+        "--design",
+        optimised / "design.npz",
+        "--out",
+        shared_tmp_path,
+        "--no-plots",
+    )
+    WORLD.barrier()
+    ours, theirs = (
+        json.loads((folder / "summary.json").read_text()) for folder in (shared_tmp_path, optimised)
+    )
+    # Both simulations are right to simulation.tolerance = 1e-4, on grids of their own.
+    assert ours["compliance"] == pytest.approx(theirs["compliance"], rel=2e-4)
+    assert ours["max_deviation"] == pytest.approx(theirs["max_deviation"], rel=2e-4)
+    assert ours["first_frequency"] == pytest.approx(theirs["first_frequency"], rel=1e-9)
+    assert not list(shared_tmp_path.glob("*.png"))
+
+
+def test_gradient_file(optimised, shared_tmp_path):
+    out = shared_tmp_path / "deep" / "g.npz"
+    run("gradient", SCENE, *SMALL, "--kind", "esl", "--out", out)
+    WORLD.barrier()
+    with np.load(out) as data:
+        assert set(data.files) == {
+            "objective",
+            *(f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "gradient")),
+        }
+        assert data["objective"] > 0.0
+        assert (data["arm1/gradient"] < 0.0).all()  # more material is always stiffer
+
+
+def test_plot_draws_anew(optimised):
+    before = (optimised / "design.png").read_bytes()
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        (optimised / "design.png").unlink()
+    WORLD.barrier()
+    run("plot", optimised)
+    WORLD.barrier()
+    assert (optimised / "design.png").read_bytes() == before
+
+
+# -- bad input -------------------------------------------------------------------------------
+
+
+def bad(tmp: Path) -> list[tuple[str, list[object], list[str]]]:
+    """Return (name, arguments, words of the message) of commands that must be refused."""
+    opt = ["optimize", SCENE, *SMALL, "--set", "optimizer.max_iterations=1", "--out", tmp / "o"]
+    sim = ["simulate", SCENE, *SMALL, "--out", tmp / "o"]
+    return [
+        ("unknown key", [*opt, "--set", "payload.mas=1"], ["payload.mas", "payload.mass"]),
+        ("negative", [*opt, "--set", "arms.length=-1"], ["arms.0.length", "-1", "> 0"]),
+        ("nan", [*opt, "--set", "payload.mass=nan"], ["payload.mass", "nan"]),
+        ("type", [*opt, "--set", 'payload.mass="six"'], ["payload.mass", "six", "number"]),
+        ("volume", [*opt, "--set", "design.volume_fraction=1.5"], ["volume_fraction", "1.5"]),
+        ("modes", [*opt, "--set", "reduction.coordinates=100000"], ["coordinates", "100000"]),
+        ("reach", [*opt, "--set", "motion.radius=5"], ["at t =", "m from the shoulder", "5"]),
+        ("no scene", ["optimize", tmp / "no.toml"], ["no.toml"]),
+        ("a folder", ["optimize", tmp], [str(tmp)]),
+        ("unwritable", [*opt[:-1], "/proc/nowhere/o"], ["/proc/nowhere/o", "--out"]),
+        ("no checkpoint", [*opt, "--resume"], ["checkpoint.npz", "--resume"]),
+        ("no design", [*sim, "--design", tmp / "no.npz"], ["no.npz"]),
+        ("no design file", [*sim, "--design", SCENE], [str(SCENE), ".npz"]),
+        ("no run", ["plot", tmp], ["summary.json"]),
+        ("gradient to folder", ["gradient", SCENE, "--out", tmp], [str(tmp), "--out"]),
+        ("no such option", [*opt, "--nonsense"], ["--nonsense"]),
+        ("no such command", ["optimise", SCENE], ["optimise"]),
+    ]
+
+
+NAMES = [name for name, _, _ in bad(Path("x"))]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bad_input_is_one_line(name, shared_tmp_path):
+    import click
+
+    [(arguments, words)] = [(a, w) for n, a, w in bad(shared_tmp_path) if n == name]
+    with pytest.raises((InputError, click.UsageError)) as caught:
+        run(*arguments)
+    error = caught.value
+    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+    WORLD.barrier()
+    assert not list(shared_tmp_path.iterdir())  # nothing written
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.pop("arm2/density"), ["arm2/density", "missing"]),
+        (lambda d: d.update({"arm1/density": d["arm1/density"][:-1]}), ["shape"]),
+        (lambda d: d.update({"arm1/density": d["arm1/density"] + 1.0}), ["[0, 1]"]),
+        (lambda d: d.update({"arm1/density": d["arm1/density"] * np.nan}), ["nan"]),
+        (lambda d: d.update({"arm1/centroid": 2.0 * d["arm1/centroid"]}), ["covers"]),
+        (lambda d: d.update({"arm1/centroid": d["arm1/centroid"][:, ::-1]}), ["covers"]),
+    ],
+)
+def test_design_that_does_not_fit(optimised, shared_tmp_path, change, words):
+    with np.load(optimised / "design.npz") as data:
+        arrays = {key: data[key] for key in data.files}
+    change(arrays)
+    path = shared_tmp_path / "bad.npz"
+    if WORLD.rank == 0:
+        np.savez(path, **arrays)
+    WORLD.barrier()
+    with pytest.raises(InputError) as caught:
+        run("simulate", SCENE, *SMALL, "--design", path, "--out", shared_tmp_path / "o")
+    for word in [str(path), *words]:
+        assert word in str(caught.value)
+    assert not (shared_tmp_path / "o").exists()
+
+
+def test_resume_of_another_scene(optimised):
+    with pytest.raises(InputError, match=r"payload\.mass = 6\.0 there, 7\.0 here"):
+        run(
+            "optimize",
+            SCENE,
+            *SMALL,
+            "--set",
+            "payload.mass=7",
+            "--out",
+            optimised,
+            "--resume",
+        )
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_exit_status_and_streams(shared_tmp_path, ranks):
+    """Status 2 and one line on standard error, from the process itself and through mpirun."""
+    done = shell("optimize", SCENE, "--set", "payload.mas=1", "--out", shared_tmp_path, ranks=ranks)
+    assert done.returncode == 2
+    ours = [line for line in done.stderr.splitlines() if "payload.mas" in line]
+    assert len(ours) == 1 and ours[0].startswith("dolfinopt: ")
+    assert "Traceback" not in done.stderr and done.stdout == ""
+    if not ranks:
+        assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.serial
+def test_help_and_version_need_no_dolfinx():
+    done = shell("--help")
+    assert done.returncode == 0
+    for command in ("optimize", "simulate", "gradient", "plot"):
+        assert command in done.stdout
+    assert shell("--version").stdout.startswith("dolfinopt")
+    code = "import dolfinopt.cli, sys; sys.exit('dolfinx' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], env=os.environ).returncode == 0
