@@ -25,6 +25,7 @@ class Arm:
         mesh: see `ArmMesh`.
         elastic: stiffness and mass of the current design.
         basis: of the current design; None before the first `reduce`.
+        start: (interior dofs, k) eigenvectors from which the next `reduce` sets out, or None.
     """
 
     def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, ledger: Ledger):
@@ -41,6 +42,7 @@ class Arm:
             self.filter = HelmholtzFilter(self.mesh, scene.design.filter_radius)
         self.ledger = ledger
         self.basis: Basis | None = None
+        self.start: np.ndarray | None = None
         self._body: FloatingBody | None = None
         self._x_phys = np.empty(0)
         self._material: Interpolated | None = None
@@ -79,9 +81,10 @@ class Arm:
             material.density * self._material.mass,
         )
         reduction = self.scene.reduction
-        start = None if self.basis is None else self.basis.start
         with self.ledger.phase("reduction"):
-            self.basis = METHODS[reduction.method](self.elastic, reduction.coordinates, start)
+            reduce = METHODS[reduction.method]
+            self.basis = reduce(self.elastic, reduction.coordinates, self.start)
+        self.start = self.basis.start
         with self.ledger.phase("inertia integrals"):
             damping = self.scene.damping.stiffness_proportional
             self._body = floating_body(self.elastic, self.basis, damping)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
 NAME = "checkpoint.npz"
+SOLUTION = ("edges", "nodes", "q", "qd", "a")
 # Keys a resumed run may change: they say when to stop, not what is computed.
 MAY_CHANGE = ("max_iterations", "tolerance")
 
@@ -31,9 +32,10 @@ class Memory:
     Attributes:
         iteration: design updates made.
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
-        modes: per arm (n_interior_nodes, 2 * k): eigenvectors to start from, owned nodes.
+        modes: per arm (interior dofs, k): eigenvectors from which this design's reduction set out;
+            k = 0 when it began from nothing.
         multipliers: MMA's, on all ranks.
-        solution: the last simulation; on the root only.
+        solution: from which this design's simulation set out, or None; on the root only.
         history: rows so far; on the root only.
         initial_deviation: (n, 2) m of the initial design; on the root only.
         finished: reason, or "" while running.
@@ -68,7 +70,6 @@ def save(
     modes = gather_cells(share, memory.modes)
     if share.world.rank != 0:
         return
-    assert memory.solution is not None
     arrays: dict[str, Any] = {
         "scene": np.array(_scene_text(scene)),
         "iteration": memory.iteration,
@@ -77,8 +78,9 @@ def save(
         "initial_deviation": memory.initial_deviation,
         "finished": np.array(memory.finished),
     }
-    for field in ("edges", "nodes", "q", "qd", "a", "error"):
-        arrays[f"solution/{field}"] = getattr(memory.solution, field)
+    if memory.solution is not None:
+        for field in (*SOLUTION, "error"):
+            arrays[f"solution/{field}"] = getattr(memory.solution, field)
     for k, values in enumerate(zip(centroids, cells, nodes, modes, strict=True)):
         for key, value in zip(("centroid", "cells", "points", "modes"), values, strict=True):
             arrays[f"arm{k}/{key}"] = value
@@ -106,12 +108,11 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
         rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
         cells[k] = arrays[f"arm{k}/cells"][rows]
         rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
-        modes[k] = arrays[f"arm{k}/modes"][rows]
-    solution = Solution(
-        **{f: arrays[f"solution/{f}"] for f in ("edges", "nodes", "q", "qd", "a")},
-        error=float(arrays["solution/error"]),
-        iterations=0,
-    )
+        modes[k] = arrays[f"arm{k}/modes"][(2 * rows[:, None] + [0, 1]).ravel()]
+    solution = None
+    if "solution/error" in arrays:
+        parts = {field: arrays[f"solution/{field}"] for field in SOLUTION}
+        solution = Solution(**parts, error=float(arrays["solution/error"]), iterations=0)
     history = [HistoryRow(int(row[0]), *map(float, row[1:])) for row in arrays["history"]]
     return Memory(
         iteration=int(arrays["iteration"]),

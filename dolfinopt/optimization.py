@@ -168,6 +168,9 @@ class _Run:
         self.x = np.maximum(np.full(self.variables.size, scene.design.initial), self.variables.xmin)
         self.state = initial_state(self.x)
         self.solution: Solution | None = None
+        # Where the current design's evaluation set out: kept, so that it can be repeated.
+        self.start: Solution | None = None
+        self.modes: dict[int, np.ndarray] = {}
         self.trajectory: Trajectory | None = None
         self.initial_deviation = np.empty((0, 2))
         self.history: list[HistoryRow] = []
@@ -224,6 +227,11 @@ class _Run:
         return bool(self.finished)
 
     def _evaluate(self) -> tuple[Evaluation, dict[int, np.ndarray]]:
+        self.start = self.solution
+        self.modes = {
+            k: np.empty((arm.elastic.num_interior, 0)) if arm.start is None else arm.start
+            for k, arm in self.arms.items()
+        }
         parts = self.variables.split(self.x)
         x_phys = {k: arm.physical(parts[k]) for k, arm in self.arms.items()}
         evaluation, trajectory = evaluate(
@@ -297,16 +305,12 @@ class _Run:
     def _memory(self) -> Memory:
         state = self.state
         columns = [self.x, state.x_old1, state.x_old2, state.low, state.upp]
-        modes = {}
-        for k, arm in self.arms.items():
-            assert arm.basis is not None
-            modes[k] = arm.basis.start
         return Memory(
             iteration=self.iteration,
             cells=self.variables.split(np.column_stack(columns)),
-            modes=modes,
+            modes=self.modes,
             multipliers=state.multipliers,
-            solution=self.solution,
+            solution=self.start,
             history=self.history,
             initial_deviation=self.initial_deviation,
             finished=self.finished,
@@ -324,6 +328,8 @@ class _Run:
             multipliers=memory.multipliers,
         )
         self.solution = memory.solution
+        for k, arm in self.arms.items():
+            arm.start = memory.modes[k]
         self.history = memory.history
         self.initial_deviation = memory.initial_deviation
         self.iteration = memory.iteration

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from PIL.Image import Image
+    from PIL.Image import Image as Picture
 
 COLOURS = "YlGnBu"  # void is light, solid is dark, lightness falls evenly between
 DENSITY = "physical density [-]"
@@ -180,9 +180,9 @@ def _draw_ruler(page: _Page, layout: Layout) -> None:
     low, high = layout.span
     marks = ticks(low, high, max(2, int((high - low) * layout.scale / 130.0)))
     x = layout.left + layout.scale * marks
-    page.line([[layout.left + layout.scale * low, y], [layout.left + layout.scale * high, y]])
+    page.lines([[[layout.left + layout.scale * low, y], [layout.left + layout.scale * high, y]]])
+    page.lines([[[where, y], [where, y - 10.0]] for where in x])
     for mark, where in zip(marks, x):
-        page.line([[where, y], [where, y - 10.0]])
         unit = " m" if mark == marks[-1] else ""
         page.write(f"{mark:.6g}{unit}", where, y - 40.0, TEXT, centred=True)
 
@@ -199,7 +199,7 @@ def _draw_colour_scale(page: _Page, layout: Layout) -> None:
     page.fill(corners, np.linspace(0.0, 1.0, steps))
     for mark in (0.0, 0.25, 0.5, 0.75, 1.0):
         where = x + mark * long
-        page.line([[where, y], [where, y - 8.0]])
+        page.lines([[[where, y], [where, y - 8.0]]])
         page.write(f"{mark:g}", where, y - 36.0, TEXT, centred=True)
     page.write(DENSITY, x - 20.0, y, TEXT, ends=True)
 
@@ -241,13 +241,17 @@ class _Page:
         outline = mesh.clean().extract_feature_edges(
             boundary_edges=True, feature_edges=False, non_manifold_edges=False, manifold_edges=False
         )
-        outline.points[:, 2] = 1.0
-        self.plotter.add_mesh(outline, color=GREY, line_width=2, lighting=False, reset_camera=False)
+        self.lines(outline.points[outline.lines.reshape(-1, 3)[:, 1:], :2], GREY)
 
-    def line(self, points: Any) -> None:
-        """Draw a line through points (n, 2)."""
-        mesh = self.pv.lines_from_points(_in_space(np.asarray(points, float), 1.0))
-        self.plotter.add_mesh(mesh, color="black", line_width=2, lighting=False, reset_camera=False)
+    def lines(self, ends: Any, colour: str = "black") -> None:
+        """Draw lines between pairs of points (n, 2, 2)."""
+        ends = np.asarray(ends, dtype=float)
+        along = ends[:, 1] - ends[:, 0]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        # A little longer, so that no gap is left between one and the next.
+        ends = ends + 0.7 * np.stack([-along, along], axis=1)
+        mesh = self.pv.line_segments_from_points(_in_space(ends, 1.0))
+        self.plotter.add_mesh(mesh, color=colour, line_width=2, lighting=False, reset_camera=False)
 
     def write(
         self,
@@ -315,6 +319,11 @@ def draw_history(path: PathLike, rows: Sequence[HistoryRow], objective_label: st
     Returns:
         The path.
     """
+    return _save(history_figure(rows, objective_label), path)
+
+
+def history_figure(rows: Sequence[HistoryRow], objective_label: str) -> Figure:
+    """Return the figure of `draw_history`: three panels, one below the other."""
     from matplotlib.ticker import MaxNLocator
 
     figure = _figure(9.0, 8.0)
@@ -327,11 +336,13 @@ def draw_history(path: PathLike, rows: Sequence[HistoryRow], objective_label: st
     )
     for axes, (label, values) in zip(panels, curves):
         _draw_curve(axes, iteration, values, label)
+        if axes is not panels[2] and spans_decade(values):
+            _log_scale(axes)
     panels[2].set_ylim(0.0, 1.05 * max(1e-3, *curves[2][1]))
     panels[2].set_xlabel("iteration")
     panels[2].set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
-    panels[2].xaxis.set_major_locator(MaxNLocator(integer=True))
-    return _save(figure, path)
+    panels[2].xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+    return figure
 
 
 def _draw_curve(axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str) -> None:
@@ -341,8 +352,6 @@ def _draw_curve(axes: Axes, iteration: np.ndarray, values: np.ndarray, label: st
     axes.set_title(label, loc="left", fontsize=11, parse_math=False)
     ends = f"{values[0]:.4g}" if len(values) == 1 else f"{values[0]:.4g} → {values[-1]:.4g}"
     axes.set_title(ends, loc="right", fontsize=11)
-    if spans_decade(values):
-        _log_scale(axes)
     axes.grid(True, alpha=0.3)
 
 
@@ -373,6 +382,13 @@ def draw_deviation(
     Returns:
         The path.
     """
+    return _save(deviation_figure(t, deviation, initial_deviation), path)
+
+
+def deviation_figure(
+    t: np.ndarray, deviation: np.ndarray, initial_deviation: np.ndarray | None
+) -> Figure:
+    """Return the figure of `draw_deviation`."""
     figure = _figure(9.0, 5.0)
     axes = figure.subplots()
     curves = [("", deviation, BLUE)]
@@ -393,7 +409,7 @@ def draw_deviation(
     axes.set_ylabel("deviation from the rigid path [mm]")
     axes.grid(True, alpha=0.3)
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, fontsize=11)
-    return _save(figure, path)
+    return figure
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -461,8 +477,8 @@ def deformed_cells(view: ArmView, place: complex, swing: complex, q: np.ndarray)
 def thin(view: ArmView, limit: int) -> ArmView:
     """Return the arm with about `limit` cells at most: itself, or a raster of rectangles.
 
-    A rectangle takes the mean density of the cells whose centroid lies in it, or that of the cell
-    around it, and its corners move like the nearest of the arm's.
+    A rectangle takes the mean density of the cells whose centroid lies in it, or else that of the
+    cell around its middle. Its corners move like the arm's nearest.
     """
     from scipy.spatial import cKDTree
 
@@ -473,27 +489,38 @@ def thin(view: ArmView, limit: int) -> ArmView:
     nx, ny = np.maximum(1, np.round((high - low) / side)).astype(int)
     size = (high - low) / [nx, ny]
     column, row = np.minimum(((view.centroid - low) / size).astype(int), [nx - 1, ny - 1]).T
-    area = cell_areas(view.corners)
-    inside = np.bincount(column * ny + row, area, nx * ny)
-    mass = np.bincount(column * ny + row, area * view.density, nx * ny)
+    areas = cell_areas(view.corners)
+    area = np.bincount(column * ny + row, areas, nx * ny)
+    mass = np.bincount(column * ny + row, areas * view.density, nx * ny)
     first = low + size * np.stack(np.divmod(np.arange(nx * ny), ny), axis=1)
-    centroid = first + 0.5 * size
-    gap, nearest = cKDTree(view.centroid).query(centroid)
-    radius = np.linalg.norm(view.corners - view.centroid[:, None], axis=2).max(axis=1)
-    kept = (inside > 0.0) | (gap < radius[nearest])
-    density = np.where(
-        inside > 0.0, mass / np.where(inside > 0.0, inside, 1.0), view.density[nearest]
-    )
+    around = cells_around(first + 0.5 * size, view)
+    kept = (area > 0.0) | (around >= 0)
+    density = np.divide(mass, area, out=view.density[around], where=area > 0.0)
     corners = first[kept, None] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    near = cKDTree(view.corners.reshape(-1, 2)).query(corners.reshape(-1, 2))[1]
-    modes = view.modes.reshape(-1, *view.modes.shape[2:])[near]
+    near = cKDTree(np.concatenate(view.corners)).query(np.concatenate(corners))[1]
+    modes = np.concatenate(view.modes)[near]
     return replace(
         view,
         corners=corners,
-        centroid=centroid[kept],
+        centroid=corners.mean(axis=1),
         density=density[kept],
-        modes=modes.reshape(*corners.shape, -1),
+        modes=modes.reshape(*corners.shape, modes.shape[-1]),
     )
+
+
+def cells_around(points: np.ndarray, view: ArmView) -> np.ndarray:
+    """Return which convex cell of an arm each point (n, 2), m, lies in (n,); -1 is none."""
+    from scipy.spatial import cKDTree
+
+    # Neighbours may differ in size: the cell around a point need not be the one nearest to it.
+    near = cKDTree(view.centroid).query(points, k=min(8, len(view.centroid)))[1]
+    near = near.reshape(len(points), -1)
+    to = view.corners[near] - points[:, None, None, :]
+    after = np.roll(to, -1, axis=2)
+    turn = to[..., 0] * after[..., 1] - to[..., 1] * after[..., 0]
+    inside = np.all(turn >= 0.0, axis=2) | np.all(turn <= 0.0, axis=2)
+    first = np.argmax(inside, axis=1)
+    return np.where(inside.any(axis=1), near[np.arange(len(points)), first], -1)
 
 
 @dataclass(frozen=True)
@@ -602,49 +629,67 @@ def draw_motion(
     film = make_film(views, mechanism, t, q_r, q_e, magnification, frames)
     delay = max(20.0, 10.0 * round(100.0 * duration / len(film.t)))  # ms; GIF counts in 10 ms
     speed = (t[-1] - t[0]) / (1e-3 * delay * len(film.t))
-    stage = _Stage(film, mechanism, speed)
-    first, *others = _indexed(stage, len(film.t))
+    stage = Stage(film, mechanism, speed)
+    pictures = _indexed(stage, len(film.t))
+    first = next(pictures)
     target = Path(path)
     write_atomically(
         target,
         lambda stream: first.save(
-            stream, format="GIF", save_all=True, append_images=others, duration=delay, loop=0
+            stream, format="GIF", save_all=True, append_images=pictures, duration=delay, loop=0
         ),
     )
     return target
 
 
-def _indexed(stage: _Stage, count: int) -> Iterator[Image]:
-    """Yield every frame in the same 256 colours.
+def _indexed(stage: Stage, count: int) -> Iterator[Picture]:
+    """Yield every frame in the same few colours.
 
     A palette of each frame's own would take longer to find than the frame to draw, and would let
     the colours flicker.
     """
     from PIL import Image
 
+    palette = Image.new("P", (1, 1))
     samples = [stage.draw(frame) for frame in (0, count // 2, count - 1)]
-    palette = Image.fromarray(np.concatenate(samples)).quantize(256)
-    colours = np.reshape(palette.getpalette() or [], (-1, 3))
-    colours[np.argmax(colours.sum(axis=1))] = 255  # the mean of nearly white ones: the paper
-    palette.putpalette(colours.ravel().tolist())
+    palette.putpalette(common_colours(np.stack(samples), 128).tobytes())
     for frame in range(count):
         picture = Image.fromarray(stage.draw(frame))
         yield picture.quantize(palette=palette, dither=Image.Dither.NONE)
+
+
+def common_colours(pictures: np.ndarray, limit: int) -> np.ndarray:
+    """Return the most frequent colours (n, 3), uint8, most frequent first.
+
+    Colours are told apart by 32 levels a channel, so that shades of nearly white are white.
+
+    Args:
+        pictures: (..., 3), uint8.
+        limit: largest n.
+    """
+    red, green, blue = (pictures.reshape(-1, 3).T >> 3).astype(np.int64)
+    counts = np.bincount((red * 32 + green) * 32 + blue, minlength=32**3)
+    chosen = np.argsort(-counts, kind="stable")[: min(limit, np.count_nonzero(counts))]
+    levels = np.stack([chosen // 1024, chosen // 32 % 32, chosen % 32], axis=1)
+    return np.round(levels * (255.0 / 31.0)).astype(np.uint8)
 
 
 def film_bounds(film: Film) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest (x, y), m, that anything reaches in the film, and a margin."""
     cart = CART * film.size
     feet = np.stack([film.place[:, 0].real, film.place[:, 0].imag], axis=1)
-    points = [film.desired, film.trace, feet - cart, feet + cart]
+    parts = [film.desired, film.trace, feet - cart, feet + cart]
+    lows, highs = [p.min(axis=0) for p in parts], [p.max(axis=0) for p in parts]
     for frame in range(len(film.t)):
-        points += [film.cells(k, frame).reshape(-1, 2) for k in range(len(film.views))]
-    every = np.concatenate(points)
+        for index in range(len(film.views)):
+            cells = film.cells(index, frame)
+            lows.append(cells.min(axis=(0, 1)))
+            highs.append(cells.max(axis=(0, 1)))
     margin = 0.04 * film.size
-    return every.min(axis=0) - margin, every.max(axis=0) + margin
+    return np.min(lows, axis=0) - margin, np.max(highs, axis=0) + margin
 
 
-class _Stage:
+class Stage:
     """A picture whose still parts are drawn once, the moving ones in every frame."""
 
     def __init__(self, film: Film, mechanism: Mechanism, speed: float):

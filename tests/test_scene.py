@@ -108,7 +108,7 @@ def test_demo_states_every_other_key():
     text = TWO_ARM.read_text(encoding="utf-8")
     stated = {line.split(" =")[0].strip() for line in text.splitlines() if " = " in line}
     known = {info.key.rpartition(".")[2] for info in describe_keys()}
-    assert known - stated == {"integrator", "rho_inf", "stages", "sample"}
+    assert known - stated == {"integrator", "rho_inf", "stages", "sample", "shared_volume"}
 
 
 def test_arm_takes_missing_keys_from_the_arm_before():
@@ -463,6 +463,7 @@ BAD_VALUES = [
     ("design.filter_radius", -1e-9, "-1e-09", "a number >= 0"),
     ("design.projection", True, "true", "false"),
     ("design.projection", 0, "0", "false"),
+    ("design.shared_volume", 1, "1", "true or false"),
     ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
     ("optimizer.max_iterations", 16**5000, "2**20000...", "an integer >= 0 and <= 1000000"),
     ("optimizer.max_iterations", 400.0, "400.0", "an integer >= 0"),
@@ -800,7 +801,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 43
+    assert len({info.key for info in keys}) == len(keys) == 44
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info

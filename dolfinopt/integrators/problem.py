@@ -57,7 +57,8 @@ class Solution:
         step = np.clip(np.searchsorted(self.edges, t, side="left") - 1, 0, len(self.a) - 1)
         h = np.diff(self.edges)[step]
         tau = (t - self.edges[step]) / h
-        weights = lagrange_integrals(self.nodes, tau)[2 - derivative] * (h ** (2 - derivative))[:, None]
+        integrals = lagrange_integrals(self.nodes, tau)[2 - derivative]
+        weights = integrals * (h ** (2 - derivative))[:, None]
         value = (weights[:, None] @ self.a[step])[:, 0]
         if derivative == 0:
             value += self.q[step] + (h * tau)[:, None] * self.qd[step]
@@ -83,6 +84,31 @@ def lagrange_integrals(
     return value @ coefficients, first @ coefficients, second @ coefficients
 
 
+def even_steps(problem: ElasticProblem, count: int) -> np.ndarray:
+    """Return about `count` even steps that end at the breakpoints."""
+    ends = np.asarray(problem.breakpoints)
+    lengths = np.diff(ends)
+    steps = np.maximum(np.ceil(count * lengths / lengths.sum() - 1e-9), 1).astype(int)
+    pieces = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(ends[:-1], ends[1:], steps, strict=True)
+    ]
+    return np.append(np.concatenate(pieces), ends[-1])
+
+
+def first_count(problem: ElasticProblem) -> int:
+    """Return a number of steps from cold: eight a period of the slowest vibration at t = 0."""
+    mechanism = problem.mechanism
+    size = mechanism.coordinates
+    rest = np.zeros((1, size))
+    blocks = tangent(mechanism, problem.motion(np.zeros(1)), rest, rest, rest)[0]
+    stiffness, mass = mechanism.stiffness(), blocks[:, 2 * size :]
+    slowest = np.sqrt(1.0 / np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass))).max())
+    horizon = problem.breakpoints[-1]
+    smooth = 20 * (len(problem.breakpoints) - 1)
+    return int(np.clip(8.0 * horizon * slowest / (2.0 * np.pi), smooth, 20_000))
+
+
 def static_start(problem: ElasticProblem) -> np.ndarray:
     """Return the elastic coordinates (N,) at rest at t = 0: zero unless loads act there.
 
@@ -93,18 +119,20 @@ def static_start(problem: ElasticProblem) -> np.ndarray:
     motion = problem.motion(np.zeros(1))
     size = mechanism.coordinates
     q, rest = np.zeros((1, size)), np.zeros((1, size))
-    scale = 1.0 / np.sqrt(np.diag(mechanism.stiffness()))
-    first = None
+    moved_before = np.inf
     for _ in range(50):
         rows, _ = inverse_dynamics(mechanism, motion, q, rest, rest)
-        norm = np.abs(rows * scale).max()
-        first = norm if first is None else first
-        if norm <= 1e-12 * first or norm == 0.0:
-            return q[0]
-        step = np.linalg.solve(tangent(mechanism, motion, q, rest, rest)[0, :, :size], -rows[0])
+        slopes = tangent(mechanism, motion, q, rest, rest)[0, :, :size]
+        try:
+            step = np.linalg.solve(slopes, -rows[0])[None]
+        except np.linalg.LinAlgError:
+            break
         q = q + step
-        if np.abs(step / scale).max() <= 1e-13 * np.abs(q / scale).max():
+        moved = relative_error(mechanism, step, q)
+        # Down to rounding, wherever the stiffness' condition puts it.
+        if moved <= 1e-14 or (moved <= 1e-8 and moved >= 0.5 * moved_before):
             return q[0]
+        moved_before = moved
     raise ConvergenceError(
         "the mechanism finds no static equilibrium at t = 0: the arms are too soft for gravity; "
         "raise material.young_modulus or interpolation.floor, or lower motion.gravity"

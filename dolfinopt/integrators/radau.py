@@ -20,6 +20,8 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators.problem import (
     ElasticProblem,
     Solution,
+    even_steps,
+    first_count,
     lagrange_integrals,
     relative_error,
     static_start,
@@ -100,73 +102,70 @@ def integrate(
         ConvergenceError: neither Newton over the whole horizon nor marching window by window
             converges, or the tolerance is beyond rounding.
     """
-    method = radau_iia(stages)
-    p = 2 * stages - 1
-    finer = radau_iia(stages + 1)
-    edges = _next_edges(problem, start, tolerance, p)
-    initial = static_start(problem)
+    edges = _next_edges(problem, start, tolerance, stages)
     iterations = 0
     for _ in range(MAX_GRIDS):
-        stage_problem = _stages(problem, method, edges)
-        guess = _first_guess(method, edges, start, len(initial))
-        a, spent = _march(stage_problem, (initial, np.zeros_like(initial)), guess, tolerance)
-        solution = _with_error(problem, stage_problem, finer, edges, initial, a)
-        iterations += spent
-        start = replace(solution, iterations=iterations)
-        if solution.error <= tolerance:
+        start = on_grid(problem, edges, tolerance, stages, start)
+        iterations += start.iterations
+        if start.error <= tolerance:
             ledger.counts.newton_iterations += iterations
-            return start
-        edges = _next_edges(problem, start, tolerance, p)
+            return replace(start, iterations=iterations)
+        edges = _next_edges(problem, start, tolerance, stages)
+    assert start is not None
     raise ConvergenceError(
         f"the simulation reaches an error of {start.error:.2g} with {len(start.a)} steps, not the "
         f"simulation.tolerance of {tolerance:g}; raise it, or simulation.stages"
     )
 
 
+def on_grid(
+    problem: ElasticProblem,
+    edges: np.ndarray,
+    tolerance: float,
+    stages: int,
+    start: Solution | None = None,
+) -> Solution:
+    """Solve on given steps, whatever the error; `tolerance` bounds what Newton leaves of it.
+
+    Args:
+        problem: what to solve.
+        edges: (n + 1,) ends of the steps, the breakpoints among them, s.
+        tolerance, stages, start: as of `integrate`.
+
+    Raises:
+        ConvergenceError: neither Newton over the whole horizon nor marching window by window
+            converges.
+    """
+    method = radau_iia(stages)
+    initial = static_start(problem)
+    stage_problem = _stages(problem, method, edges)
+    guess = _first_guess(method, edges, start, len(initial))
+    state = (initial, np.zeros_like(initial))
+    a, spent = _march(stage_problem, state, guess, tolerance)
+    solution = _with_error(problem, stage_problem, radau_iia(stages + 1), edges, initial, a)
+    return replace(solution, iterations=spent)
+
+
 # -- grids -----------------------------------------------------------------------------------
 
 
-def _edges(problem: ElasticProblem, count: int) -> np.ndarray:
-    """Return about `count` even steps that end at the breakpoints."""
-    ends = np.asarray(problem.breakpoints)
-    lengths = np.diff(ends)
-    steps = np.maximum(np.ceil(count * lengths / lengths.sum() - 1e-9), 1).astype(int)
-    pieces = [
-        np.linspace(a, b, n, endpoint=False)
-        for a, b, n in zip(ends[:-1], ends[1:], steps, strict=True)
-    ]
-    return np.append(np.concatenate(pieces), ends[-1])
-
-
-def _first_count(problem: ElasticProblem) -> int:
-    """Return a number of steps from cold: eight a period of the slowest vibration at t = 0."""
-    mechanism = problem.mechanism
-    size = mechanism.coordinates
-    rest = np.zeros((1, size))
-    blocks = tangent(mechanism, problem.motion(np.zeros(1)), rest, rest, rest)[0]
-    stiffness, mass = mechanism.stiffness(), blocks[:, 2 * size :]
-    slowest = np.sqrt(1.0 / np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass))).max())
-    horizon = problem.breakpoints[-1]
-    smooth = 20 * (len(problem.breakpoints) - 1)
-    return int(np.clip(8.0 * horizon * slowest / (2.0 * np.pi), smooth, 20_000))
-
-
 def _next_edges(
-    problem: ElasticProblem, start: Solution | None, tolerance: float, order: int
+    problem: ElasticProblem, start: Solution | None, tolerance: float, stages: int
 ) -> np.ndarray:
     """Return steps that should meet the tolerance, from the estimated error of `start`.
 
     Steps that are good enough stay, unless a fifth of them can be saved.
     """
     if start is None:
-        return _edges(problem, _first_count(problem))
+        return even_steps(problem, first_count(problem))
     count = len(start.a)
+    order = 2 * stages - 1  # at the steps' ends
     growth = (start.error / (AIM * tolerance)) ** (1.0 / order)
     if start.error > tolerance:
-        return _edges(problem, int(np.ceil(count * min(max(growth, 1.1), 8.0))))
+        return even_steps(problem, int(np.ceil(count * min(max(growth, 1.1), 8.0))))
     if growth > 0.8 and np.isin(problem.breakpoints, start.edges).all():
         return start.edges
-    return _edges(problem, int(np.ceil(count * min(max(growth, 0.5), 1.0))))
+    return even_steps(problem, int(np.ceil(count * min(max(growth, 0.5), 1.0))))
 
 
 def _stages(problem: ElasticProblem, method: Collocation, edges: np.ndarray) -> _Stages:
@@ -239,7 +238,8 @@ def _newton(
         if not np.isfinite(step).all():
             return a, iteration, False
         size = stages.mechanism.coordinates
-        moved = relative_error(stages.mechanism, shift.reshape(-1, size), (q + shift).reshape(-1, size))
+        shift, moved_q = shift.reshape(-1, size), (q + shift).reshape(-1, size)
+        moved = relative_error(stages.mechanism, shift, moved_q)
         if moved <= 1e-3 * tolerance:
             return a + step, iteration, True
         length = 1.0
@@ -251,8 +251,8 @@ def _newton(
             if new <= (1.0 - 0.1 * length) * norm:
                 break
             length *= 0.5
-            if length < SHORTEST:
-                return a, iteration, False
+            if length < SHORTEST:  # rounding, where the step is small: nothing is left to gain
+                return a, iteration, moved <= tolerance
         a, norm = trial, new
     return a, MAX_NEWTON, False
 
@@ -351,9 +351,7 @@ def _solve_blocks(
     for i in range(s):
         right[:, i, :, 1 + size :] = -by_v[:, i] - method.c[i] * h * by_q[:, i]
         for j in range(s):
-            block[:, i, :, j] = h * (
-                method.A[i, j] * by_v[:, i] + method.A2[i, j] * h * by_q[:, i]
-            )
+            block[:, i, :, j] = h * (method.A[i, j] * by_v[:, i] + method.A2[i, j] * h * by_q[:, i])
         block[:, i, :, i] += by_a[:, i]
     shape = (count, s * size, -1)
     return np.linalg.solve(block.reshape(shape), right.reshape(shape)).reshape(right.shape)

@@ -15,6 +15,7 @@ from dolfinopt.errors import ConvergenceError
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
 # equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
 EIGEN_TOLERANCE = 1e-12
+RAMP_SHARE = 1e-6  # of the start without symmetry beside the old modes, in norm
 
 
 @dataclass(frozen=True)
@@ -118,11 +119,23 @@ def _as_ksp(operator: PETSc.Mat, solve: Callable[[PETSc.Vec, PETSc.Vec], None]) 
 
 
 def _initial_space(like: PETSc.Vec, start: np.ndarray | None) -> Sequence[PETSc.Vec]:
-    """Return start vectors: those given, summed for Krylov's single start, or ones from cold."""
-    first = like.duplicate()
-    # The sum of the wanted modes spans their space in one Krylov sequence.
-    first.array = 1.0 if start is None or start.shape[1] == 0 else start.sum(axis=1)
-    return [first]
+    """Return Krylov's single start: the sum of the vectors given, or from cold a ramp.
+
+    The sum of the wanted modes spans their space in one Krylov sequence.
+    """
+    first, last = like.getOwnershipRange()
+    ramp = like.duplicate()
+    # Rows run along the arm: the ramp has no symmetry of an arm, so that no mode is missed.
+    ramp.array = 1.0 + np.arange(first, last) / max(like.getSize(), 1)
+    if start is None or start.shape[1] == 0:
+        return [ramp]
+    vector = like.duplicate()
+    vector.array = start.sum(axis=1)
+    # Old modes of a symmetric design stay within their symmetry for ever, even when a mode of
+    # another one has become the lowest. From a share of 1e-8 on the search finds it, up to 1e-4
+    # nothing is slower.
+    vector.axpy(RAMP_SHARE * vector.norm() / ramp.norm(), ramp)
+    return [vector]
 
 
 def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
