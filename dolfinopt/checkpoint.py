@@ -35,9 +35,9 @@ class Memory:
         modes: per arm (interior dofs, k): eigenvectors from which this design's reduction set out;
             k = 0 when it began from nothing.
         multipliers: MMA's, on all ranks.
-        solution: from which this design's simulation set out, or None; on the root only.
-        history: rows so far; on the root only.
-        initial_deviation: (n, 2) m of the initial design; on the root only.
+        solution: from which this design's simulation set out, or None; the root's counts.
+        history: rows so far.
+        initial_deviation: (n, 2) m of the initial design.
         finished: reason, or "" while running.
     """
 

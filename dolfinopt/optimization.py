@@ -330,7 +330,7 @@ class _Run:
         self.solution = memory.solution
         for k, arm in self.arms.items():
             arm.start = memory.modes[k]
-        self.history = memory.history
+        self.history = memory.history if self.share.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
         self.iteration = memory.iteration
         self.change = memory.history[-1].change

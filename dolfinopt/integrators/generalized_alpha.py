@@ -114,6 +114,7 @@ def integrate(
         coarse, edges = fine, _divided(edges, ratio)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a diverging step ends in a ConvergenceError
 def on_grid(
     problem: ElasticProblem, edges: np.ndarray, tolerance: float, rho_inf: float
 ) -> Solution:

@@ -32,6 +32,10 @@ from dolfinopt.motion import RigidMotion
 
 MAX_NEWTON = 30
 MAX_GRIDS = 12
+# Newton may fail for too long a step: so many times four times more steps are tried, up to
+# a number of them whose attempt still ends in a minute.
+MAX_FAILURES = 3
+MAX_RETRY = 80_000
 SHORTEST = 1.0 / 64.0  # of a damped Newton step; then windows are tried
 BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
 # Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent
@@ -103,21 +107,30 @@ def integrate(
             converges, or the tolerance is beyond rounding.
     """
     edges = _next_edges(problem, start, tolerance, stages)
-    iterations = 0
+    iterations = failures = 0
     for _ in range(MAX_GRIDS):
-        start = on_grid(problem, edges, tolerance, stages, start)
+        try:
+            start = on_grid(problem, edges, tolerance, stages, start)
+        except ConvergenceError:
+            failures += 1
+            count = 4 * (len(edges) - 1)
+            if failures == MAX_FAILURES or count > MAX_RETRY:
+                raise
+            start, edges = None, even_steps(problem, count)
+            continue
         iterations += start.iterations
         if start.error <= tolerance:
             ledger.counts.newton_iterations += iterations
             return replace(start, iterations=iterations)
         edges = _next_edges(problem, start, tolerance, stages)
-    assert start is not None
+    assert start is not None  # the last grid is no failure: there are fewer of them
     raise ConvergenceError(
         f"the simulation reaches an error of {start.error:.2g} with {len(start.a)} steps, not the "
         f"simulation.tolerance of {tolerance:g}; raise it, or simulation.stages"
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # Newton's trial steps may lead anywhere
 def on_grid(
     problem: ElasticProblem,
     edges: np.ndarray,
@@ -354,7 +367,10 @@ def _solve_blocks(
             block[:, i, :, j] = h * (method.A[i, j] * by_v[:, i] + method.A2[i, j] * h * by_q[:, i])
         block[:, i, :, i] += by_a[:, i]
     shape = (count, s * size, -1)
-    return np.linalg.solve(block.reshape(shape), right.reshape(shape)).reshape(right.shape)
+    try:
+        return np.linalg.solve(block.reshape(shape), right.reshape(shape)).reshape(right.shape)
+    except np.linalg.LinAlgError:
+        return np.full_like(right, np.nan)  # refused by whoever asked
 
 
 # -- error -----------------------------------------------------------------------------------
@@ -382,4 +398,5 @@ def _with_error(
     _, shift = _newton_step(richer, q_finer, qd_finer, a_finer, rows)
     size = len(initial)
     error = relative_error(problem.mechanism, shift.reshape(-1, size), q_finer.reshape(-1, size))
+    error = error if np.isfinite(error) else np.inf
     return Solution(edges, stages.method.c, q[:-1], qd[:-1], a, error, 0)
