@@ -321,10 +321,10 @@ def _draw(
     """Draw all pictures of a run (root only)."""
     from dolfinopt import plots
 
-    unit = "N m" if scene.objective.kind == "esl" else "N m s"
+    labels = {"esl": "compliance of the load cases [N m]", "compliance": "compliance [N m s]"}
     plots.draw_design(folder / "design.png", views, scene.name)
-    if len(history) > 1:
-        plots.draw_history(folder / "history.png", history, f"objective [{unit}]")
+    if history:
+        plots.draw_history(folder / "history.png", history, labels[scene.objective.kind])
     plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
     plots.draw_motion(
         folder / "motion.gif",

@@ -7,6 +7,7 @@ is computed by small functions of arrays, so that it can be checked without look
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -208,6 +209,9 @@ class _Page:
     """A PyVista picture whose world coordinates are its pixels, so that text meets geometry."""
 
     def __init__(self, width: int, height: int):
+        if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+            # Without a display VTK would look for an X server first and complain.
+            os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
         import pyvista as pv
 
         self.pv, self.width = pv, width

@@ -45,7 +45,7 @@ STREET = (
     "__main__",
 )
 # Slow to import or missing on a cluster: imported where they are used.
-HEAVY = {"gmsh", "imageio", "matplotlib", "meshio", "pyvista"}
+HEAVY = {"PIL", "gmsh", "matplotlib", "pyvista"}
 
 PACKAGE = Path(dolfinopt.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
