@@ -135,7 +135,7 @@ def test_imports_point_one_way(path):
         ("plots", "import pyvista as pv", "import pyvista where it is used"),
         ("plots", "try:\n    import matplotlib.pyplot\nexcept ImportError: ...", "line 2"),
         ("plots", "class A:\n    from gmsh import model", "import gmsh where"),
-        ("__init__", "import meshio", "import meshio where"),
+        ("__init__", "import matplotlib", "import matplotlib where"),
     ],
 )
 def test_checker_finds(name, source, found):
