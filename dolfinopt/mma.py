@@ -15,6 +15,7 @@ of function i becomes
 which has no difference of large numbers, and whose minimiser over s_j costs one square root.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,6 +95,7 @@ def mma_step(
     *,
     move: float = 0.2,
     comm: MPI.Comm | None = None,
+    pieces: Mapping[int, int] | None = None,
 ) -> tuple[Array, MMAState]:
     """Minimise Svanberg's convex approximation of min f0(x), f_i(x) <= 0, xmin <= x <= xmax.
 
@@ -112,6 +114,10 @@ def mma_step(
         state: what the step before returned, or `initial_state(x)`.
         move: largest step of a variable, in units of its range.
         comm: communicator over which the variables are distributed; None: all are here.
+        pieces: number and length of the consecutive pieces of this rank's variables. Sums are
+            taken piece by piece and added in the order of their numbers: as long as no piece is
+            divided, the result has the same bits however the pieces are dealt out. By default a
+            rank's variables are one piece.
 
     Returns:
         The new design (n,) and the state for the next step; both are new arrays.
@@ -133,6 +139,7 @@ def mma_step(
         xmax if xmax.ndim else np.full(x.shape, xmax),
         state,
         move,
+        {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
     )
     f_agreed, largest = _agree(given, comm)
     felt = largest[1:] > 0.0
@@ -156,6 +163,7 @@ class _Given:
     xmax: Array
     state: MMAState
     move: float
+    pieces: Mapping[int, int]
 
     def gradients(self, columns: slice) -> Array:
         """Return (1 + m, columns) derivatives per range of the variable: 0 where it is passive."""
@@ -164,10 +172,21 @@ class _Given:
             both *= self.xmax[columns] - self.xmin[columns]
         return both
 
-    def blocks(self) -> list[slice]:
-        """Cut the variables into blocks of about _BLOCK_ENTRIES entries of `gradients`."""
+    def blocks(self) -> list[tuple[int, slice]]:
+        """Cut the pieces into blocks of about _BLOCK_ENTRIES entries of `gradients`.
+
+        Returns:
+            The number of its piece and the variables of every block.
+        """
         columns = max(_BLOCK_ENTRIES // (1 + self.f.size), 256)
-        return [slice(k, k + columns) for k in range(0, self.x.size, columns)]
+        blocks, first = [], 0
+        for number, length in self.pieces.items():
+            last = first + length
+            blocks += [
+                (number, slice(k, min(k + columns, last))) for k in range(first, last, columns)
+            ]
+            first = last
+        return blocks
 
 
 def _fault(given: _Given) -> str:
@@ -185,6 +204,8 @@ def _fault(given: _Given) -> str:
         value = getattr(given.state, name)
         if value.shape != (n,) or not np.isfinite(value).all():
             return f"state.{name} does not hold {n} finite numbers"
+    if sum(given.pieces.values()) != n:
+        return f"pieces hold {sum(given.pieces.values())} variables, x {n}"
     if not 0.0 < given.move <= 1.0:
         return f"move is {given.move}, expected 0 < move <= 1"
     outside = (given.x < given.xmin) | (given.x > given.xmax)
@@ -203,7 +224,7 @@ def _agree(given: _Given, comm: MPI.Comm | None) -> tuple[Array, Array]:
     fault = _fault(given)
     largest = np.zeros(1 + given.f.size)
     if not fault:
-        for columns in given.blocks():
+        for _, columns in given.blocks():
             np.maximum(largest, np.abs(given.gradients(columns)).max(axis=1), out=largest)
         if not np.isfinite(largest).all():
             fault = "a gradient times the range of its variable overflows"
@@ -287,21 +308,23 @@ class _Dual:
         with np.errstate(over="ignore"):
             self.f = np.clip(f[felt[1:]] / scale[1:], -1e30, 1e30)
         self.comm = comm
-        self.blocks = [_block(given, columns, felt, scale) for columns in given.blocks()]
-        total = np.zeros(scale.size)
-        for block in self.blocks:
-            total += block.H.sum(axis=1)
+        self.numbers = list(given.pieces)
+        self.blocks = [(k, _block(given, columns, felt, scale)) for k, columns in given.blocks()]
+        totals = {number: np.zeros(scale.size) for number in given.pieces}
+        for number, block in self.blocks:
+            totals[number] += block.H.sum(axis=1)
         # Sizes of the sums, to know when what is left of them is rounding.
-        self.size = _sum(total, comm)
+        self.size = _sum(totals, comm)
         self.size[1:] += np.abs(self.f)
 
     def at(self, multipliers: Array) -> _DualPoint:
         """Evaluate the dual function at multipliers (m,)."""
         m = multipliers.size
         weights = np.concatenate(([1.0], multipliers))
-        sums = np.zeros(1 + m + m * m)
+        parts = {number: np.zeros(1 + m + m * m) for number in self.numbers}
         steps = []
-        for block in self.blocks:
+        for number, block in self.blocks:
+            sums = parts[number]
             G, H = weights @ block.G, weights @ block.H
             root = np.sqrt((H - G) * (H + G))
             unbounded = -G / (H + root)
@@ -314,7 +337,7 @@ class _Dual:
             compliance = (s == unbounded) * 2.0 / (gap * gap * root)
             sums[1 + m :] += ((half_slope * compliance) @ half_slope.T).ravel()
             steps.append(s)
-        sums = _sum(sums, self.comm)
+        sums = _sum(parts, self.comm)
         violation = np.maximum(multipliers - _PENALTY, 0.0)
         constraints = self.f + sums[1 : 1 + m]
         value = sums[0] + multipliers @ constraints - 0.5 * violation @ violation
@@ -325,17 +348,20 @@ class _Dual:
         return _DualPoint(multipliers, steps, value, gradient, sums[1 + m :].reshape(m, m))
 
 
-def _sum(values: Array, comm: MPI.Comm | None) -> Array:
-    """Sum arrays over the ranks, to the same bits on each of them.
+def _sum(parts: Mapping[int, Array], comm: MPI.Comm | None) -> Array:
+    """Add the pieces' arrays in the order of their numbers, to the same bits on every rank.
 
-    The sums steer the iteration: an allreduce is only recommended, not required, to give every
-    rank the same rounding, so rank 0 adds and tells.
+    The sums steer the iteration: an allreduce is neither bound to give every rank the same
+    rounding nor to give one rank the rounding of two.
     """
-    if comm is None or comm.size == 1:
-        return values
-    total = np.empty_like(values)
-    comm.Reduce(values, total)
-    comm.Bcast(total)
+    everywhere = dict(parts)
+    if comm is not None and comm.size > 1:
+        for other in comm.allgather(everywhere):
+            everywhere.update(other)
+    first, *rest = (everywhere[number] for number in sorted(everywhere))
+    total: Array = first.copy()
+    for part in rest:
+        total += part
     return total
 
 
@@ -470,7 +496,7 @@ def _conclude(
 ) -> tuple[Array, MMAState]:
     """Return the design at the solution of the dual, and the state for the next step."""
     empty: list[Array] = [np.empty(0)]
-    distance = np.concatenate([block.distance for block in dual.blocks] or empty)
+    distance = np.concatenate([block.distance for _, block in dual.blocks] or empty)
     x_new = given.x + distance * np.concatenate(point.steps or empty)
     x_new = np.minimum(np.maximum(x_new, given.xmin), given.xmax)
     state = MMAState(

@@ -70,6 +70,9 @@ class _Variables:
         self.share = share
         sizes = [arm.mesh.num_cells for arm in arms.values()]
         ends = np.cumsum([0, *sizes])
+        # Whole arms add up in the same order on any number of ranks; parts of one are numbered on.
+        first = share.comm.rank * len(scene.arms)
+        self.pieces = {first + k: size for k, size in zip(arms, sizes, strict=True)}
         self.slices = {k: slice(a, b) for k, a, b in zip(arms, ends[:-1], ends[1:], strict=True)}
         self.size = int(ends[-1])
         self.xmin = np.full(self.size, scene.design.minimum)
@@ -259,6 +262,7 @@ class _Run:
                 self.state,
                 move=self.scene.optimizer.move,
                 comm=self.share.world,
+                pieces=self.variables.pieces,
             )
         change = np.abs(x - self.x).max() if len(x) else 0.0
         self.change = float(self.share.world.allreduce(change, op=MPI.MAX))

@@ -127,8 +127,7 @@ def on_grid(
         rho_inf: as of `integrate`.
 
     Returns:
-        The solution, with `error` nan. Between the steps' ends q is the cubic through the
-        method's own q and qd at both: linear accelerations.
+        The solution, with `error` nan: the cubic spline through the method's q.
 
     Raises:
         ConvergenceError: Newton's method fails in a step.
@@ -139,11 +138,11 @@ def on_grid(
     enough = max(REST * tolerance, ROUNDING) * _static_size(mechanism, motion)
     newton = _Newton(mechanism, weights, enough)
     q = np.empty((len(edges), mechanism.coordinates))
-    qd = np.zeros_like(q)
     q[0] = static_start(problem)
+    qd = np.zeros_like(q[:1])
     a = before = older = _first_acceleration(problem, q[:1])
     for n in range(len(h)):
-        state = (q[n : n + 1], qd[n : n + 1], a)
+        state = (q[n : n + 1], qd, a)
         here = RigidMotion(motion.q[n : n + 1], motion.qd[n : n + 1], motion.qdd[n : n + 1])
         new = newton.step(here, h[n], state, 3.0 * (a - before) + older)
         if new is None:
@@ -153,9 +152,9 @@ def on_grid(
                 "(material.young_modulus, interpolation.floor, design.minimum) or slow the "
                 "motion (motion.duration)"
             )
-        q[n + 1], qd[n + 1] = _newmark(weights, h[n], state, new)
+        q[n + 1 : n + 2], qd = _newmark(weights, h[n], state, new)
         a, before, older = new, a, before
-    return _interpolated(edges, q, qd[-1], newton.iterations)
+    return _interpolated(edges, q, newton.iterations)
 
 
 def _divided(edges: np.ndarray, ratio: int) -> np.ndarray:
@@ -166,10 +165,9 @@ def _divided(edges: np.ndarray, ratio: int) -> np.ndarray:
 
 def _richardson(mechanism: Mechanism, coarse: Solution, fine: Solution, ratio: int) -> float:
     """Return the relative error of `fine`, from the states at the steps of `coarse`."""
-    q = fine.q[::ratio]
-    last = fine.edges[-1:]
-    q = np.concatenate([q, fine.sample(last)])
-    other = np.concatenate([coarse.q, coarse.sample(last)])
+    end = fine.edges[-1:]
+    q = np.concatenate([fine.q[::ratio], fine.sample(end)])
+    other = np.concatenate([coarse.q, coarse.sample(end)])
     return relative_error(mechanism, q - other, q) / (ratio**2 - 1)
 
 
@@ -306,16 +304,16 @@ def _first_acceleration(problem: ElasticProblem, q: np.ndarray) -> np.ndarray:
     return -np.linalg.solve(mass, rows.T).T
 
 
-def _interpolated(edges: np.ndarray, q: np.ndarray, last: np.ndarray, iterations: int) -> Solution:
-    """Return the cubic spline through q (n + 1, N), at rest at first, with speed `last` at last.
+def _interpolated(edges: np.ndarray, q: np.ndarray, iterations: int) -> Solution:
+    """Return the cubic spline through q (n + 1, N), at rest at first.
 
     Twice differentiable as the motion is. A cubic through both q and qd of a step would have
     accelerations of first order only: Newmark's qd is the derivative of his q up to h^2, a
-    difference that two derivatives turn into h.
+    difference that a further derivative turns into h.
     """
-    ends = ((1, np.zeros_like(last)), (1, last))
-    spline = CubicSpline(edges, q, bc_type=ends)
+    at_rest = (1, np.zeros(q.shape[1]))
+    spline = CubicSpline(edges, q, bc_type=(at_rest, "not-a-knot"))
     a = spline(edges, 2)
+    ends = np.stack([a[:-1], a[1:]], axis=1)
     nodes = np.array([0.0, 1.0])
-    ahead = np.stack([a[:-1], a[1:]], axis=1)
-    return Solution(edges, nodes, q[:-1], spline(edges[:-1], 1), ahead, np.nan, iterations)
+    return Solution(edges, nodes, q[:-1], spline(edges[:-1], 1), ends, np.nan, iterations)
