@@ -10,7 +10,7 @@ The pipeline in ten lines:
     arms = do.build_arms(scene, share, ledger := do.Ledger())       # mesh, elements, filter
     x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}       # physical densities
     evaluation, trajectory = do.evaluate(scene, share, arms, x_phys, ledger)  # reduce, simulate
-    slopes = do.gradient(arms, evaluation)                          # d objective / d x_phys
+    slopes = do.gradient(scene, share, arms, trajectory, ledger)    # d objective / d x_phys
     result = do.optimize(scene)                                     # again, until it rests
 """
 

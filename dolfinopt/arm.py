@@ -82,7 +82,7 @@ class Arm:
         )
         reduction = self.scene.reduction
         with self.ledger.phase("reduction"):
-            reduce = METHODS[reduction.method]
+            reduce = METHODS[reduction.method].reduce
             self.basis = reduce(self.elastic, reduction.coordinates, self.start)
         self.start = self.basis.start
         with self.ledger.phase("inertia integrals"):

@@ -167,7 +167,7 @@ def simulate(
 @commands.command()
 @scene_argument
 @design_option
-@click.option("--kind", type=click.Choice(["esl"]), default="esl", help="which gradient")
+@click.option("--kind", type=click.Choice(["esl", "exact"]), default="esl", help="which gradient")
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help="gradient.npz"
 )
@@ -193,8 +193,9 @@ def gradient(
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, out.parent)
-    evaluation, _ = evaluate(loaded, share, arms, x_phys, ledger)
-    write_gradient(out, share, arms, slopes(arms, evaluation), evaluation.objective)
+    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
+    by_cell = slopes(loaded, share, arms, trajectory, ledger)
+    write_gradient(out, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
         unit = "N m" if loaded.objective.kind == "esl" else "N m s"
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {kind} gradient in {out}")

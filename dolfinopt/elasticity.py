@@ -411,6 +411,15 @@ class ElasticArm:
         """
         return _cell_products(self.operators.stiffness, self._on_cells(left), self._on_cells(right))
 
+    def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, 2, k).
+
+        The derivative of left . M right with respect to the mass density of each owned cell.
+        """
+        cells, mass = self.operators.cells, self.operators.mass
+        shape = (*cells.shape, -1)  # both components and all columns alike
+        return _cell_products(mass, left[cells].reshape(shape), right[cells].reshape(shape))
+
     def energy_matrix(self, field: np.ndarray) -> np.ndarray:
         """Return field' K field (k, k), summed over the ranks.
 

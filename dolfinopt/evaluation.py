@@ -11,10 +11,17 @@ import numpy as np
 from dolfinopt.body import first_frequency
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
-from dolfinopt.objective import load_cases, objective, second_moments, worst_instants
+from dolfinopt.mechanism import BodySlopes
+from dolfinopt.objective import (
+    body_slopes_of,
+    load_cases,
+    objective,
+    second_moments,
+    worst_instants,
+)
 from dolfinopt.parallel import ArmShare, gather_bodies, on_root
 from dolfinopt.scene import Scene
-from dolfinopt.sensitivity import esl_gradient
+from dolfinopt.sensitivity import esl_gradient, exact_gradient
 from dolfinopt.simulation import Trajectory, simulate
 
 if TYPE_CHECKING:
@@ -30,7 +37,6 @@ class Evaluation:
         compliance: sum of the load cases' compliance, whatever the objective, N m.
         max_deviation, max_deviation_time: m, s.
         first_frequencies: of every arm, clamped-free, Hz.
-        moments: Q (q, q) of every arm, see `objective.second_moments`.
         error: estimated relative error of the elastic coordinates.
     """
 
@@ -39,7 +45,6 @@ class Evaluation:
     max_deviation: float
     max_deviation_time: float
     first_frequencies: tuple[float, ...]
-    moments: tuple[np.ndarray, ...]
     error: float
 
 
@@ -84,7 +89,6 @@ def evaluate(
                 max_deviation=distance,
                 max_deviation_time=when,
                 first_frequencies=tuple(first_frequency(body) for body in bodies),
-                moments=tuple(second_moments(trajectory, cases)),
                 error=trajectory.solution.error,
             )
 
@@ -92,6 +96,33 @@ def evaluate(
     return evaluation, kept[0] if kept else None
 
 
-def gradient(arms: Mapping[int, Arm], evaluation: Evaluation) -> dict[int, np.ndarray]:
-    """Return the ESL gradient with respect to the physical densities of this rank's arms."""
-    return {index: esl_gradient(arm, evaluation.moments[index]) for index, arm in arms.items()}
+def gradient(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    trajectory: Trajectory | None,
+    ledger: Ledger,
+) -> dict[int, np.ndarray]:
+    """Return the objective's gradient by the physical densities of this rank's arms (collective).
+
+    Args:
+        scene: says which gradient: "esl" freezes the loads, "exact" follows everything.
+        share, arms: as for `evaluate`, with the design reduced.
+        trajectory: what `evaluate` returned.
+        ledger: of this rank.
+    """
+
+    def moments() -> list[np.ndarray]:
+        assert trajectory is not None
+        return second_moments(trajectory, load_cases(trajectory, scene))
+
+    def slopes() -> list[BodySlopes]:
+        assert trajectory is not None
+        with ledger.phase("adjoint"):
+            return body_slopes_of(trajectory, load_cases(trajectory, scene))
+
+    if scene.objective.gradient == "esl":
+        Q = on_root(share.world, moments)
+        return {index: esl_gradient(arm, Q[index]) for index, arm in arms.items()}
+    by_body = on_root(share.world, slopes)
+    return {index: exact_gradient(arm, by_body[index]) for index, arm in arms.items()}

@@ -379,3 +379,188 @@ def compliance(bodies: Sequence[FloatingBody], parts: Sequence[slice], q: np.nda
         ],
         axis=1,
     )
+
+
+# -- adjoint ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BodySlopes:
+    """Derivatives of a scalar with respect to one body's constants; shapes as in `FloatingBody`.
+
+    Those of D are part of K's only where the caller says so; M, G, K need not be symmetric.
+    """
+
+    mass: float
+    moment: np.ndarray
+    inertia: float
+    C: np.ndarray
+    j: np.ndarray
+    r: np.ndarray
+    M: np.ndarray
+    G: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    outboard: np.ndarray
+
+
+def body_slopes(
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    multipliers: np.ndarray,
+) -> list[BodySlopes]:
+    """Return d(sum_n multipliers_n . rows_n) / d(constants) of every body, motion held.
+
+    The multipliers are a virtual displacement of the elastic coordinates: the sum is the virtual
+    work of all inertia and elastic forces, linear in every shape integral. Only the outboard
+    interface enters through the kinematics, too; its slopes come from a pass back along the chain
+    that carries the derivatives with respect to the frames' motion beside the forces.
+
+    Args:
+        mechanism, motion, q, qd, qdd: as for `inverse_dynamics`; n instants.
+        multipliers: (n, N).
+    """
+    shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
+    moves, (tip_p, tip_turn) = _virtual_motion(mechanism, shapes, frames, multipliers)
+    outer = _Outer(
+        force=mechanism.payload_mass * tip[0],
+        moment=mechanism.payload_inertia * tip[2],
+        a=mechanism.payload_mass * tip_p,
+        w=np.zeros_like(tip_turn),
+        wd=mechanism.payload_inertia * tip_turn,
+        next_a=tip[0],
+        next_p=tip_p,
+    )
+    slopes: list[BodySlopes] = []
+    for k in reversed(range(len(shapes))):
+        part = mechanism.slices[k]
+        rates = (q[:, part], qd[:, part], qdd[:, part])
+        virtual = (*moves[k], multipliers[:, part])
+        outboard, outer = _outboard_slopes(shapes[k], frames[k], rates, virtual, outer)
+        slopes.insert(0, _integral_slopes(frames[k], rates, virtual, outboard))
+        outer = _with_body(shapes[k], frames[k], rates, virtual, outer)
+    return slopes
+
+
+@dataclass(frozen=True)
+class _Outer:
+    """Everything from one frame outwards, as seen in it: forces and slopes of the virtual work.
+
+    Attributes:
+        force, moment: of the bodies outboard; also the slopes by the frame's virtual motion.
+        a, w, wd: slopes by the frame's acceleration (complex), angular velocity, acceleration.
+        next_a, next_p: the frame's own acceleration and virtual displacement.
+    """
+
+    force: np.ndarray
+    moment: np.ndarray
+    a: np.ndarray
+    w: np.ndarray
+    wd: np.ndarray
+    next_a: np.ndarray
+    next_p: np.ndarray
+
+
+def _virtual_motion(
+    mechanism: Mechanism, shapes: list[_Shapes], frames: list[_Frame], multipliers: np.ndarray
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], tuple[np.ndarray, np.ndarray]]:
+    """Return every frame's virtual displacement (complex, its components) and turn."""
+    p = np.zeros(len(multipliers), dtype=complex)
+    turn = np.zeros(len(multipliers))
+    moves = []
+    for part, shape, frame in zip(mechanism.slices, shapes, frames, strict=True):
+        moves.append((p, turn))
+        p = np.conj(frame.swing) * (p + 1j * turn * frame.d + multipliers[:, part] @ shape.B)
+        turn = turn + multipliers[:, part] @ shape.turn
+    return moves, (p, turn)
+
+
+_Rates = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _outboard_slopes(
+    shape: _Shapes, frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer
+) -> tuple[np.ndarray, _Outer]:
+    """Return the slopes (3, q) of the outboard modes and `outer` brought into this frame."""
+    q, qd, qdd = rates
+    _, turn, multipliers = virtual
+    w = frame.w
+    kappa = 1j * frame.wd - w * w
+    force, a = frame.swing * outer.force, frame.swing * outer.a
+    d = a * np.conj(kappa) - 1j * turn * force
+    phi = (np.conj(outer.a) * -1j * outer.next_a).real
+    phi += (np.conj(outer.force) * -1j * outer.next_p).real
+    place = d @ q + (-2j * w * a) @ qd + a @ qdd + force @ multipliers
+    rotation = phi @ q + outer.w @ qd + outer.wd @ qdd + outer.moment @ multipliers
+    inner = _Outer(
+        force=force,
+        moment=outer.moment + (np.conj(frame.d) * force).imag,
+        a=a,
+        w=outer.w + (np.conj(a) * (2j * frame.dd - 2.0 * w * frame.d)).real,
+        wd=outer.wd + (np.conj(a) * 1j * frame.d).real,
+        next_a=frame.a,
+        next_p=virtual[0],
+    )
+    # The virtual work of the outboard force on a turned lever is part of d above.
+    return np.stack([place.real, place.imag, rotation]), inner
+
+
+def _integral_slopes(
+    frame: _Frame, rates: _Rates, virtual: _Rates, outboard: np.ndarray
+) -> BodySlopes:
+    """Return the slopes of one body's virtual work by its shape integrals."""
+    q, qd, qdd = rates
+    p, turn, multipliers = virtual
+    w, wd = frame.w, frame.wd
+    kappa = 1j * wd - w * w
+    moment = p * np.conj(kappa) - 1j * turn * frame.a
+    by_C = moment @ q + (p * -2j * w) @ qd + p @ qdd + frame.a @ multipliers
+    turned = turn[:, None]
+    return BodySlopes(
+        mass=float((np.conj(p) * frame.a).real.sum()),
+        moment=np.array([moment.real.sum(), moment.imag.sum()]),
+        inertia=float(wd @ turn),
+        C=np.stack([by_C.real, by_C.imag]),
+        j=(2.0 * turn * wd) @ q + (2.0 * turn * w) @ qd - (w * w) @ multipliers,
+        r=turn @ qdd + wd @ multipliers,
+        M=(turned * (wd[:, None] * q + 2.0 * w[:, None] * qd)).T @ q
+        + multipliers.T @ (qdd - (w * w)[:, None] * q),
+        G=(turned * qdd).T @ q + multipliers.T @ (wd[:, None] * q + 2.0 * w[:, None] * qd),
+        K=multipliers.T @ q,
+        D=multipliers.T @ qd,
+        outboard=outboard,
+    )
+
+
+def _with_body(
+    shape: _Shapes, frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer
+) -> _Outer:
+    """Add one body's own force and slopes to what lies outboard of it."""
+    body = shape.body
+    q, qd, qdd = rates
+    p, turn, multipliers = virtual
+    w = frame.w
+    spin = np.einsum("nk,nk->n", frame.jM, qd)
+    gyro = -2.0 * w[:, None] * frame.jM - 2.0 * (qd @ body.G)
+    return _Outer(
+        force=outer.force + _body_force(body, frame),
+        moment=outer.moment
+        + (np.conj(frame.s) * frame.a).imag
+        + _inertia(body, frame, q) * frame.wd
+        + 2.0 * w * spin
+        + np.einsum("nk,nk->n", frame.rG, qdd),
+        a=outer.a + body.mass * p + 1j * frame.s * turn + multipliers @ shape.C,
+        w=outer.w
+        + (np.conj(p) * (2j * frame.sd - 2.0 * w * frame.s)).real
+        + 2.0 * spin * turn
+        + np.einsum("nk,nk->n", gyro, multipliers),
+        wd=outer.wd
+        + (np.conj(p) * 1j * frame.s).real
+        + _inertia(body, frame, q) * turn
+        + np.einsum("nk,nk->n", frame.rG, multipliers),
+        next_a=outer.next_a,
+        next_p=outer.next_p,
+    )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dolfinopt.integrators.adjoint import trajectory_slopes
+from dolfinopt.mechanism import BodySlopes
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
 
@@ -55,6 +57,22 @@ def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
 def objective(trajectory: Trajectory, cases: LoadCases) -> float:
     """Return sum_j weight_j sum_arms q_j' K q_j; N m, or N m s for the integral."""
     return float(cases.weights @ trajectory.compliance[cases.indices].sum(axis=1))
+
+
+def body_slopes_of(trajectory: Trajectory, cases: LoadCases) -> list[BodySlopes]:
+    """Return the objective's exact slopes by the constants of every body.
+
+    Its own by the stiffness, with the coordinates held, and the trajectory's, whose coordinates
+    follow. The choice of load cases is held: where two instants of an interval are equally bad the
+    objective has a kink.
+    """
+    q = trajectory.q_e[cases.indices]
+    by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
+    followed = trajectory_slopes(
+        trajectory.problem, trajectory.solution, trajectory.t[cases.indices], by_q
+    )
+    own = second_moments(trajectory, cases)
+    return [replace(s, K=s.K + Q) for s, Q in zip(followed, own, strict=True)]
 
 
 def second_moments(trajectory: Trajectory, cases: LoadCases) -> list[np.ndarray]:

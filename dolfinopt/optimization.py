@@ -249,7 +249,7 @@ class _Run:
 
     def _update(self, evaluation: Evaluation, x_phys: Mapping[int, np.ndarray]) -> None:
         """Make one MMA step."""
-        slopes = gradient(self.arms, evaluation)
+        slopes = gradient(self.scene, self.share, self.arms, self.trajectory, self.ledger)
         df0dx = self.variables.join({k: arm.chain(slopes[k]) for k, arm in self.arms.items()})
         with self.ledger.phase("mma"):
             x, self.state = mma_step(

@@ -44,7 +44,7 @@ Path2D = Literal["arc"]
 ReductionMethod = Literal["craig-bampton", "modal"]
 Integrator = Literal["radau", "generalized-alpha"]
 ObjectiveKind = Literal["esl", "compliance"]
-GradientKind = Literal["esl"]
+GradientKind = Literal["esl", "exact"]
 Projection = Literal[False]
 
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher

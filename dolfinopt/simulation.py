@@ -21,16 +21,21 @@ class Trajectory:
     """A simulated motion; samples are taken from the integrator's own interpolant.
 
     Attributes:
-        mechanism: what moved.
-        scene: how.
+        problem: what moved, and how.
+        scene: its scene.
         solution: the integrator's.
         t: (n,) sample instants, s.
     """
 
-    mechanism: Mechanism
+    problem: ElasticProblem
     scene: Scene
     solution: Solution
     t: np.ndarray
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What moved."""
+        return self.problem.mechanism
 
     @cached_property
     def q_e(self) -> np.ndarray:
@@ -112,4 +117,4 @@ def simulate(
     ledger.counts.simulations += 1
     count = round(motion.horizon / options.sample)
     t = np.arange(count + 1) * options.sample
-    return Trajectory(problem.mechanism, scene, solution, t[t <= motion.horizon * (1 + 1e-12)])
+    return Trajectory(problem, scene, solution, t[t <= motion.horizon * (1 + 1e-12)])

@@ -15,6 +15,9 @@ from dolfinopt.errors import ConvergenceError
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
 # equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
 EIGEN_TOLERANCE = 1e-12
+# Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it.
+ADJOINT_TOLERANCE = 1e-10
+MAX_ADJOINT = 500
 RAMP_SHARE = 1e-6  # of the start without symmetry beside the old modes, in norm
 
 
@@ -136,6 +139,77 @@ def _initial_space(like: PETSc.Vec, start: np.ndarray | None) -> Sequence[PETSc.
     # nothing is slower.
     vector.axpy(RAMP_SHARE * vector.norm() / ramp.norm(), ramp)
     return [vector]
+
+
+def complement_solve(
+    arm: ElasticArm,
+    stiffness: PETSc.Mat,
+    mass: PETSc.Mat,
+    solve: Callable[[PETSc.Vec, PETSc.Vec], None],
+    modes: np.ndarray,
+    values: np.ndarray,
+    right: np.ndarray,
+) -> np.ndarray:
+    """Solve (K - lambda_k M) mu_k = right_k in the M-complement of the modes, for every k.
+
+    The adjoint of the eigenproblem, less its part within the modes' span. A reduced model depends
+    on nothing but that span, so what the modes do among themselves has no slope: neither close nor
+    repeated eigenvalues divide by zero. In the complement K - lambda_k M is positive definite, and
+    conjugate gradients with the factor of K at hand converge as 1 - lambda_k / lambda_next allows.
+
+    Args:
+        arm: for its communicator.
+        stiffness, mass, solve: as for `lowest_eigenpairs`.
+        modes: (rows, k) all modes below the complement, M-orthonormal.
+        values: (k,) their eigenvalues, rad2/s2.
+        right: (rows, k).
+
+    Returns:
+        mu (rows, k).
+
+    Raises:
+        ConvergenceError: the next eigenvalue is too close to the last.
+    """
+    x, y = stiffness.createVecs()
+
+    def times(mat: PETSc.Mat, vector: np.ndarray) -> np.ndarray:
+        x.array = vector
+        mat.mult(x, y)
+        return y.array_r.copy()
+
+    def inverse(vector: np.ndarray) -> np.ndarray:
+        x.array = vector
+        solve(x, y)
+        return y.array_r.copy()
+
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return arm.comm.allreduce(a.T @ b)
+
+    weighted = np.column_stack([times(mass, mode) for mode in modes.T])
+    out = np.zeros_like(right)
+    for k, value in enumerate(values):
+        residual = right[:, k] - weighted @ dot(modes, right[:, k])
+        z = inverse(residual)
+        z -= modes @ dot(weighted, z)
+        step, energy = z.copy(), dot(residual, z)
+        goal = ADJOINT_TOLERANCE**2 * energy
+        for _ in range(MAX_ADJOINT):
+            if energy <= goal:
+                break
+            image = times(stiffness, step) - value * times(mass, step)
+            length = energy / dot(step, image)
+            out[:, k] += length * step
+            residual -= length * image
+            z = inverse(residual)
+            z -= modes @ dot(weighted, z)
+            previous, energy = energy, dot(residual, z)
+            step = z + (energy / previous) * step
+        else:
+            raise ConvergenceError(
+                f"arm {arm.mesh.name!r}: the slopes of mode {k + 1} do not converge, the next "
+                "mode's frequency is too close; take one of reduction.coordinates more or less"
+            )
+    return out
 
 
 def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:

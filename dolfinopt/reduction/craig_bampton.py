@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.elasticity import ElasticArm
-from dolfinopt.reduction.basis import Basis, lowest_eigenpairs, orient
+from dolfinopt.reduction.basis import Basis, complement_solve, lowest_eigenpairs, orient
 
 
 def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = None) -> Basis:
@@ -39,3 +39,30 @@ def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = 
     stiffness = np.diag(np.diag(energy))
     stiffness[:3, :3] = energy[:3, :3]
     return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[3:])
+
+
+def craig_bampton_adjoint(
+    arm: ElasticArm, basis: Basis, interior: np.ndarray, outboard: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (mu, lambda) with d(slopes . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
+
+    Constraint modes: K_II mu = slopes, one solve each with the factor at hand. Normal modes: see
+    `complement_solve`. The outboard rows of V are constant.
+
+    Args:
+        arm, basis: of the current design.
+        interior: (num_interior, q) slopes by the owned interior rows of V.
+        outboard: (3, q) slopes by its outboard rows; without effect here.
+
+    Returns:
+        mu as a nodal field (n_nodes, 2, q), and lambda (q,), zero for constraint modes.
+    """
+    mu = arm.solve(interior[:, :3])
+    values = np.concatenate([np.zeros(3), np.diag(basis.stiffness)[3:]])
+    if interior.shape[1] > 3:
+        K, M = arm.interior_stiffness(), arm.interior_mass()
+        normal = complement_solve(
+            arm, K, M, arm.solve_vector, basis.start, values[3:], interior[:, 3:]
+        )
+        mu = np.hstack([mu, normal])
+    return arm.expand(mu, np.zeros_like(outboard)), values

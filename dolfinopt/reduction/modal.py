@@ -6,7 +6,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from dolfinopt.elasticity import ElasticArm
-from dolfinopt.reduction.basis import Basis, lowest_eigenpairs, orient
+from dolfinopt.reduction.basis import Basis, complement_solve, lowest_eigenpairs, orient
 
 
 def modal(arm: ElasticArm, coordinates: int, start: np.ndarray | None = None) -> Basis:
@@ -30,6 +30,28 @@ def modal(arm: ElasticArm, coordinates: int, start: np.ndarray | None = None) ->
     sign = orient(arm, V, MV)
     stiffness = np.diag(np.diag(arm.energy_matrix(V)))
     return Basis(V * sign, MV * sign, stiffness, outboard * sign, vectors * sign)
+
+
+def modal_adjoint(
+    arm: ElasticArm, basis: Basis, interior: np.ndarray, outboard: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (mu, lambda) with d(slopes . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
+
+    Args:
+        arm, basis: of the current design.
+        interior: (num_interior, q) slopes by the owned interior rows of V.
+        outboard: (3, q) slopes by its outboard rows.
+
+    Returns:
+        mu as a nodal field (n_nodes, 2, q), and lambda (q,).
+    """
+    operator = _FreeArm(arm)
+    values = np.diag(basis.stiffness)
+    right = np.vstack([interior, outboard]) if operator.last else interior
+    mu = complement_solve(
+        arm, operator.stiffness, operator.mass, operator.solve, basis.start, values, right
+    )
+    return arm.expand(*operator.split(mu)), values
 
 
 class _FreeArm:
