@@ -33,7 +33,7 @@ class Evaluation:
     """What one design does; the same on all ranks.
 
     Attributes:
-        objective: N m, or N m s for an integral over the horizon.
+        objective: see `objective.objective`; N m, N m s or m.
         compliance: sum of the load cases' compliance, whatever the objective, N m.
         max_deviation, max_deviation_time: m, s.
         first_frequencies: of every arm, clamped-free, Hz.
@@ -80,11 +80,10 @@ def evaluate(
         trajectory = simulate(scene, bodies, ledger, start)
         kept.append(trajectory)
         with ledger.phase("objective"):
-            cases = load_cases(trajectory, scene)
             worst = worst_instants(trajectory, scene.objective.load_cases)
             distance, when = trajectory.max_deviation
             return Evaluation(
-                objective=objective(trajectory, cases),
+                objective=objective(trajectory, scene),
                 compliance=float(trajectory.compliance[worst].sum()),
                 max_deviation=distance,
                 max_deviation_time=when,
@@ -119,7 +118,7 @@ def gradient(
     def slopes() -> list[BodySlopes]:
         assert trajectory is not None
         with ledger.phase("adjoint"):
-            return body_slopes_of(trajectory, load_cases(trajectory, scene))
+            return body_slopes_of(trajectory, scene)
 
     if scene.objective.gradient == "esl":
         Q = on_root(share.world, moments)

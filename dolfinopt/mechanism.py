@@ -370,6 +370,45 @@ def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.nd
     return end_effector(mechanism, motion, q) - rigid
 
 
+def end_effector_slopes(
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the slopes of sum_n weights_n . end_effector_n.
+
+    Args:
+        mechanism, motion, q: as for `end_effector`, n instants.
+        weights: (n, 2).
+
+    Returns:
+        By q (n, N), and by every body's outboard modes (3, q).
+    """
+    w = weights[:, 0] + 1j * weights[:, 1]
+    swings, levers = [], []
+    swing = np.ones(len(q), dtype=complex)
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        shape = _shapes(body)
+        swing = swing * np.exp(1j * motion.q[:, k + 1])
+        swings.append(swing)
+        levers.append(swing * (shape.reach + q[:, part] @ shape.B))
+        swing = swing * np.exp(1j * (q[:, part] @ shape.turn))
+    by_q = np.empty_like(q)
+    by_outboard: list[np.ndarray] = []
+    beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
+    for k in reversed(range(len(swings))):
+        part, shape = mechanism.slices[k], _shapes(mechanism.bodies[k])
+        place = np.conj(swings[k]) * w
+        turn = (np.conj(w) * 1j * beyond).real
+        by_q[:, part] = (
+            np.outer(place.real, shape.B.real)
+            + np.outer(place.imag, shape.B.imag)
+            + np.outer(turn, shape.turn)
+        )
+        rows = [weight @ q[:, part] for weight in (place.real, place.imag, turn)]
+        by_outboard.insert(0, np.stack(rows))
+        beyond = beyond + levers[k]
+    return by_q, by_outboard
+
+
 def compliance(bodies: Sequence[FloatingBody], parts: Sequence[slice], q: np.ndarray) -> np.ndarray:
     """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper."""
     return np.stack(

@@ -1,4 +1,4 @@
-"""What is minimised: sums of the arms' compliance over instants of the motion."""
+"""What is minimised: the arms' compliance, or the end-effector's deviation, over the motion."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dolfinopt.integrators.adjoint import trajectory_slopes
-from dolfinopt.mechanism import BodySlopes
+from dolfinopt.mechanism import BodySlopes, end_effector_slopes
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
 
 
 @dataclass(frozen=True)
 class LoadCases:
-    """Objective = sum_k weight_k sum_arms q' K q at sample k.
+    """Instants that make up the objective, and how much each counts.
 
     Attributes:
         indices: (n,) samples.
@@ -44,7 +44,7 @@ def worst_instants(trajectory: Trajectory, count: int) -> np.ndarray:
 def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
     """Choose the instants of the scene's objective.
 
-    "esl": the worst instant of each interval. "compliance": all samples, trapezoidal rule.
+    "esl": the worst instant of each interval. Others: all samples, trapezoidal rule.
     """
     if scene.objective.kind == "esl":
         indices = worst_instants(trajectory, scene.objective.load_cases)
@@ -54,25 +54,59 @@ def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
     return LoadCases(np.arange(len(weights)), weights)
 
 
-def objective(trajectory: Trajectory, cases: LoadCases) -> float:
-    """Return sum_j weight_j sum_arms q_j' K q_j; N m, or N m s for the integral."""
+def objective(trajectory: Trajectory, scene: Scene) -> float:
+    """Return the scene's objective.
+
+    "esl": sum over the load cases of q' K q, N m. "compliance": int q' K q dt, N m s.
+    "deviation": (1/T int |e|^p dt)^(1/p), m; close to the largest deviation and smooth, with e
+    from eq. (6) of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
+    """
+    cases = load_cases(trajectory, scene)
+    if scene.objective.kind == "deviation":
+        return _deviation_norm(trajectory, cases, scene.objective.exponent)[0]
     return float(cases.weights @ trajectory.compliance[cases.indices].sum(axis=1))
 
 
-def body_slopes_of(trajectory: Trajectory, cases: LoadCases) -> list[BodySlopes]:
+def _deviation_norm(
+    trajectory: Trajectory, cases: LoadCases, exponent: float
+) -> tuple[float, np.ndarray]:
+    """Return the deviation's p-mean and its slope by the deviation (n, 2)."""
+    e = trajectory.deviation
+    distance = np.hypot(e[:, 0], e[:, 1])
+    largest = distance.max()
+    if largest == 0.0:
+        return 0.0, np.zeros_like(e)
+    relative = distance / largest  # powers neither over- nor underflow
+    share = cases.weights / cases.weights.sum()
+    mean = float(share @ relative**exponent)
+    value = largest * mean ** (1.0 / exponent)
+    # (distance / largest)^(p - 2) e / largest: no division by a distance of zero for p >= 2.
+    slope = mean ** (1.0 / exponent - 1.0) * share * relative ** (exponent - 2.0) / largest
+    return value, slope[:, None] * e
+
+
+def body_slopes_of(trajectory: Trajectory, scene: Scene) -> list[BodySlopes]:
     """Return the objective's exact slopes by the constants of every body.
 
-    Its own by the stiffness, with the coordinates held, and the trajectory's, whose coordinates
-    follow. The choice of load cases is held: where two instants of an interval are equally bad the
-    objective has a kink.
+    Its own, with the coordinates held, and the trajectory's, whose coordinates follow. The choice
+    of load cases is held: where two instants of an interval are equally bad, "esl" has a kink.
     """
-    q = trajectory.q_e[cases.indices]
-    by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
+    cases = load_cases(trajectory, scene)
+    mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
+    if scene.objective.kind == "deviation":
+        _, weights = _deviation_norm(trajectory, cases, scene.objective.exponent)
+        by_q, by_outboard = end_effector_slopes(mechanism, trajectory.motion, q, weights)
+        own = [{"outboard": rows} for rows in by_outboard]
+    else:
+        by_q = 2.0 * cases.weights[:, None] * (q @ mechanism.stiffness())
+        own = [{"K": Q} for Q in second_moments(trajectory, cases)]
     followed = trajectory_slopes(
         trajectory.problem, trajectory.solution, trajectory.t[cases.indices], by_q
     )
-    own = second_moments(trajectory, cases)
-    return [replace(s, K=s.K + Q) for s, Q in zip(followed, own, strict=True)]
+    return [
+        replace(slopes, **{key: getattr(slopes, key) + value for key, value in part.items()})
+        for slopes, part in zip(followed, own, strict=True)
+    ]
 
 
 def second_moments(trajectory: Trajectory, cases: LoadCases) -> list[np.ndarray]:

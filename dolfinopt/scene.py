@@ -43,7 +43,7 @@ Law = Literal["two-material"]
 Path2D = Literal["arc"]
 ReductionMethod = Literal["craig-bampton", "modal"]
 Integrator = Literal["radau", "generalized-alpha"]
-ObjectiveKind = Literal["esl", "compliance"]
+ObjectiveKind = Literal["esl", "compliance", "deviation"]
 GradientKind = Literal["esl", "exact"]
 Projection = Literal[False]
 
@@ -246,14 +246,31 @@ class Objective(_Table):
     """What is minimised."""
 
     kind: ObjectiveKind = Field(
-        default="esl", description="compliance under load cases, or over the whole horizon [-]"
+        default="esl",
+        description="compliance under load cases or over the horizon, or end-effector deviation [-]",
     )
     load_cases: int = Field(
         default=30,
         ge=1,
         description="equal intervals of the horizon; each gives its worst instant [-]",
     )
-    gradient: GradientKind = Field(default="esl", description="gradient of the objective [-]")
+    gradient: GradientKind = Field(
+        default="esl", description="with the loads frozen, or exact [-]"
+    )
+    exponent: float = Field(
+        default=20.0, ge=2, le=200, description="p of the deviation's p-mean over time [-]"
+    )
+
+    @model_validator(mode="after")
+    def _check_gradient(self) -> Objective:
+        if self.kind == "deviation" and self.gradient != "exact":
+            raise _Refusal(
+                'expected "exact" with objective.kind = "deviation": frozen loads say nothing '
+                "about it",
+                ("gradient",),
+                ("kind",),
+            )
+        return self
 
 
 class Design(_Table):

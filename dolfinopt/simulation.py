@@ -45,12 +45,12 @@ class Trajectory:
     @cached_property
     def q_r(self) -> np.ndarray:
         """Rigid coordinates (n, 1 + arms): m, rad."""
-        return self._motion.q
+        return self.motion.q
 
     @cached_property
     def deviation(self) -> np.ndarray:
         """Flexible minus rigid end-effector (n, 2), m."""
-        return deviation(self.mechanism, self._motion, self.q_e)
+        return deviation(self.mechanism, self.motion, self.q_e)
 
     @cached_property
     def compliance(self) -> np.ndarray:
@@ -61,10 +61,11 @@ class Trajectory:
     def joint_forces(self) -> np.ndarray:
         """Drive forces of cart (N) and joints (N m), (n, 1 + arms)."""
         qd, qdd = self.solution.sample(self.t, 1), self.solution.sample(self.t, 2)
-        return inverse_dynamics(self.mechanism, self._motion, self.q_e, qd, qdd)[1]
+        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
     @cached_property
-    def _motion(self) -> RigidMotion:
+    def motion(self) -> RigidMotion:
+        """Rigid coordinates at the samples."""
         return rigid_motion(self.t, self.scene)
 
     @property
