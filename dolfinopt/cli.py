@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt import __version__
-from dolfinopt.errors import InputError
+from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.scene import Scene, load_scene, scene_from_dict
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dolfinopt.parallel import ArmShare
     from dolfinopt.simulation import Trajectory
 
+UNITS = {"esl": "N m", "compliance": "N m s", "deviation": "m"}
 BEGUN = time.perf_counter()
 
 
@@ -171,6 +172,7 @@ def simulate(
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help="gradient.npz"
 )
+@click.option("--check", is_flag=True, help="Taylor test along the complete chain")
 @set_option
 @click.pass_obj
 def gradient(
@@ -179,6 +181,7 @@ def gradient(
     design: Path | None,
     kind: str,
     out: Path,
+    check: bool,
     overrides: tuple[str, ...],
 ) -> None:
     """Write the objective's gradient with respect to the physical densities to FILE."""
@@ -197,8 +200,10 @@ def gradient(
     by_cell = slopes(loaded, share, arms, trajectory, ledger)
     write_gradient(out, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
-        unit = "N m" if loaded.objective.kind == "esl" else "N m s"
+        unit = UNITS[loaded.objective.kind]
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {kind} gradient in {out}")
+    if check:
+        _check_gradient(world, loaded, share, arms, x_phys, ledger)
 
 
 @commands.command()
@@ -222,6 +227,36 @@ def plot(world: MPI.Comm, folder: Path) -> None:
     initial = read_initial_deviation(folder / "trajectory.npz")
     _draw(folder, loaded, views, trajectory, history, initial)
     click.echo(f"pictures in {folder}")
+
+
+def _check_gradient(
+    world: MPI.Comm,
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x: Mapping[int, Any],
+    ledger: Any,
+) -> None:
+    """Print the Taylor test; raise ConvergenceError where a rate is too low."""
+    from dolfinopt.taylor import PASSES, STEPS, taylor_test
+
+    test = taylor_test(scene, share, arms, x, ledger)
+    if world.rank == 0:
+        steps = "".join(f"{f'h = {h:g}':>12}" for h in STEPS)
+        click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
+        for row in test.rows:
+            remainders = "".join(f"{r:12.2e}" for r in row.remainders)
+            slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
+            click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
+        click.echo(
+            f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
+            f"{test.ratio:.3f} times as long"
+        )
+    if not test.passed:
+        raise ConvergenceError(
+            f"the remainders fall at a rate below {PASSES}: the gradient is not exact here; a "
+            "tighter simulation.tolerance tells whether the simulation is to blame"
+        )
 
 
 # -- steps the commands share ----------------------------------------------------------------
@@ -322,7 +357,11 @@ def _draw(
     """Draw all pictures of a run (root only)."""
     from dolfinopt import plots
 
-    labels = {"esl": "compliance of the load cases [N m]", "compliance": "compliance [N m s]"}
+    labels = {
+        "esl": "compliance of the load cases [N m]",
+        "compliance": "integral of the compliance [N m s]",
+        "deviation": "p-mean of the deviation [m]",
+    }
     plots.draw_design(folder / "design.png", views, scene.name)
     if history:
         plots.draw_history(folder / "history.png", history, labels[scene.objective.kind])

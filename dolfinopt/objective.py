@@ -54,14 +54,14 @@ def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
     return LoadCases(np.arange(len(weights)), weights)
 
 
-def objective(trajectory: Trajectory, scene: Scene) -> float:
-    """Return the scene's objective.
+def objective(trajectory: Trajectory, scene: Scene, cases: LoadCases | None = None) -> float:
+    """Return the scene's objective, at the instants it chooses or at given ones.
 
     "esl": sum over the load cases of q' K q, N m. "compliance": int q' K q dt, N m s.
     "deviation": (1/T int |e|^p dt)^(1/p), m; close to the largest deviation and smooth, with e
     from eq. (6) of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
     """
-    cases = load_cases(trajectory, scene)
+    cases = load_cases(trajectory, scene) if cases is None else cases
     if scene.objective.kind == "deviation":
         return _deviation_norm(trajectory, cases, scene.objective.exponent)[0]
     return float(cases.weights @ trajectory.compliance[cases.indices].sum(axis=1))

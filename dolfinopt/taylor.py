@@ -1,0 +1,175 @@
+"""Taylor test of the exact gradient along the complete chain, and how far frozen loads are off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.evaluation import evaluate, gradient
+from dolfinopt.integrators.radau import AIM
+from dolfinopt.ledger import Ledger
+from dolfinopt.objective import load_cases, objective
+from dolfinopt.parallel import ArmShare, on_root, sum_over_arms
+from dolfinopt.scene import Scene
+from dolfinopt.simulation import Trajectory
+
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
+
+STEPS = tuple(0.01 / 2**k for k in range(4))  # of the design variable
+MARGIN = 0.05  # design variables are drawn this far inside [0, 1]: the steps must not leave it
+ROUNDING = 1e-10  # of the objective: what Newton's tolerance leaves of it
+PASSES = 1.9  # least rate; 2 is exact
+
+Cells = Mapping[int, np.ndarray]
+
+
+@dataclass(frozen=True)
+class TaylorRow:
+    """Remainders |J(x + h d) - J(x) - h g . d| along one direction d.
+
+    Attributes:
+        direction: its name.
+        slope: g . d with the exact gradient; unit of the objective.
+        slope_frozen: the same with the ESL gradient; nan where there is none.
+        remainders: for every h of `STEPS`.
+        rate: order in h of the two finest remainders above rounding; 2 when g is the gradient,
+            inf when J is linear to rounding.
+    """
+
+    direction: str
+    slope: float
+    slope_frozen: float
+    remainders: tuple[float, ...]
+    rate: float
+
+
+@dataclass(frozen=True)
+class TaylorTest:
+    """The rows, and the ESL gradient against the exact one by x: angle in degrees, ratio of norms."""
+
+    rows: tuple[TaylorRow, ...]
+    angle: float
+    ratio: float
+
+    @property
+    def passed(self) -> bool:
+        """True when every direction's rate says that the gradient is one."""
+        return all(row.rate >= PASSES for row in self.rows)
+
+
+def taylor_test(
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm], x: Cells, ledger: Ledger
+) -> TaylorTest:
+    """Test the gradient by the design variables x: filter, reduction, simulation, objective.
+
+    The instants of the objective and the time steps are those of x throughout; with them the
+    objective is smooth. Variables are moved `MARGIN` inside their bounds first.
+
+    Args:
+        scene, share, arms, ledger: as for `evaluate`.
+        x: (n_cells,) design variables of this rank's arms, in [0, 1].
+    """
+    exact = _with(scene, gradient="exact")
+    x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
+    evaluation, base = evaluate(exact, share, arms, _physical(arms, x), ledger)
+    fixed = _with(exact, tolerance=min(evaluation.error / AIM, 0.1))
+    value = _fixed_objective(fixed, share, arms, ledger, base)
+    here = value(x)
+    slope = _by_x(arms, gradient(exact, share, arms, base, ledger))
+    frozen = None
+    if scene.objective.kind != "deviation":
+        frozen = _by_x(arms, gradient(_with(scene, gradient="esl"), share, arms, base, ledger))
+    rows = []
+    for name, direction in _directions(arms).items():
+        along = _dot(share, slope, direction)
+        frozen_along = np.nan if frozen is None else _dot(share, frozen, direction)
+        remainders = tuple(
+            abs(value({k: x[k] + h * direction[k] for k in x}) - here - h * along) for h in STEPS
+        )
+        rows.append(TaylorRow(name, along, frozen_along, remainders, _rate(remainders, here)))
+    if frozen is None:
+        return TaylorTest(tuple(rows), np.nan, np.nan)
+    lengths = [np.sqrt(_dot(share, g, g)) for g in (slope, frozen)]
+    cosine = _dot(share, slope, frozen) / (lengths[0] * lengths[1])
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return TaylorTest(tuple(rows), angle, lengths[1] / lengths[0])
+
+
+def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None = None) -> Scene:
+    """Return the scene with another gradient or tolerance."""
+    update: dict[str, object] = {}
+    if gradient is not None:
+        update["objective"] = scene.objective.model_copy(update={"gradient": gradient})
+    if tolerance is not None:
+        update["simulation"] = scene.simulation.model_copy(update={"tolerance": tolerance})
+    return scene.model_copy(update=update)
+
+
+def _physical(arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
+    return {k: arm.physical(x[k]) for k, arm in arms.items()}
+
+
+def _by_x(arms: Mapping[int, Arm], slopes: Cells) -> dict[int, np.ndarray]:
+    return {k: arm.chain(slopes[k]) for k, arm in arms.items()}
+
+
+def _dot(share: ArmShare, a: Cells, b: Cells) -> float:
+    return float(sum_over_arms(share, {k: np.array(a[k] @ b[k]) for k in a}))
+
+
+def _fixed_objective(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    ledger: Ledger,
+    base: Trajectory | None,
+) -> Callable[[Cells], float]:
+    """Return J(x) with the load cases and time steps of `base`."""
+    start = None if base is None else base.solution
+
+    def value(x: Cells) -> float:
+        _, trajectory = evaluate(scene, share, arms, _physical(arms, x), ledger, start)
+
+        def at_base_instants() -> float:
+            assert trajectory is not None and base is not None
+            return objective(trajectory, scene, load_cases(base, scene))
+
+        return on_root(share.world, at_base_instants)
+
+    return value
+
+
+def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
+    """Return directions of largest entry 1: random, smooth, and boxes at both ends of the chain.
+
+    They are functions of the place, the same on any partition.
+    """
+
+    def along(k: int) -> np.ndarray:
+        return arms[k].mesh.centroid[:, 0] / arms[k].mesh.outboard_point[0]
+
+    def noise(k: int) -> np.ndarray:
+        x, y = arms[k].mesh.centroid.T * 1e3
+        return 2.0 * np.modf(np.abs(np.sin(12.9898 * x + 78.233 * y + k) * 43758.5453))[0] - 1.0
+
+    last = max((len(arm.scene.arms) for arm in arms.values()), default=0) - 1
+    chosen: dict[str, Callable[[int], np.ndarray]] = {
+        "random": noise,
+        "smooth": lambda k: np.sin(3.0 * np.pi * along(k) + k),
+        "root of the first arm": lambda k: ((along(k) < 0.1) & (k == 0)).astype(float),
+        "tip of the last arm": lambda k: ((along(k) > 0.9) & (k == last)).astype(float),
+    }
+    return {
+        name: {k: np.where(arm.mesh.passive, 0.0, field(k)) for k, arm in arms.items()}
+        for name, field in chosen.items()
+    }
+
+
+def _rate(remainders: tuple[float, ...], value: float) -> float:
+    """Return the order of the finest remainders in h; those at rounding level say nothing."""
+    known = [r for r in remainders if r > ROUNDING * abs(value)]
+    return float(np.log2(known[-2] / known[-1])) if len(known) > 1 else np.inf
