@@ -242,7 +242,7 @@ def _check_gradient(
 
     test = taylor_test(scene, share, arms, x, ledger)
     if world.rank == 0:
-        steps = "".join(f"{f'h = {h:g}':>12}" for h in STEPS)
+        steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
         click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
         for row in test.rows:
             remainders = "".join(f"{r:12.2e}" for r in row.remainders)

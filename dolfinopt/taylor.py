@@ -19,7 +19,8 @@ from dolfinopt.simulation import Trajectory
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
-STEPS = tuple(0.01 / 2**k for k in range(4))  # of the design variable
+FALL = 4.0  # from one step to the next
+STEPS = tuple(0.01 / FALL**k for k in range(4))  # of the design variable
 MARGIN = 0.05  # design variables are drawn this far inside [0, 1]: the steps must not leave it
 ROUNDING = 1e-10  # of the objective: what Newton's tolerance leaves of it
 PASSES = 1.9  # least rate; 2 is exact
@@ -172,4 +173,4 @@ def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
 def _rate(remainders: tuple[float, ...], value: float) -> float:
     """Return the order of the finest remainders in h; those at rounding level say nothing."""
     known = [r for r in remainders if r > ROUNDING * abs(value)]
-    return float(np.log2(known[-2] / known[-1])) if len(known) > 1 else np.inf
+    return float(np.log(known[-2] / known[-1]) / np.log(FALL)) if len(known) > 1 else np.inf
