@@ -155,8 +155,6 @@ class InteriorMatrix:
             )
             self.mat = PETSc.Mat().createAIJ(((owned, None), (owned, None)), nnz=40, comm=comm)
             self.mat.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
     def update(self, data: np.ndarray) -> None:
         """Take the values from the local matrix's data array."""
@@ -170,6 +168,9 @@ class InteriorMatrix:
                 indptr, cols, data[self._source], addv=PETSc.InsertMode.ADD_VALUES, rowmap=row_ids
             )
         self.mat.assemble()
+        # Forgotten whenever values change; without them MUMPS pivots.
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
 
 class ElasticArm:

@@ -2,7 +2,7 @@
 //
 // The inboard joint axis lies at the origin, the arm points along +x, the outboard reference
 // point (the next joint's axis, or the end-effector) is (length, 0). Open this file in Gmsh and
-// change the parameters on the left, or pass them with -setnumber.
+// change the parameters on the left, or pass them with -setnumber, e.g. -setnumber length 0.8.
 
 SetFactory("Built-in");
 

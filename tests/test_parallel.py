@@ -1,0 +1,231 @@
+"""Arms dealt out over ranks, collection on the root, and one ending for all ranks."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.parallel import (
+    SPLIT_CELLS,
+    direct_solver,
+    gather_bodies,
+    gather_cells,
+    on_root,
+    one_ending,
+    share_arms,
+    sum_over_arms,
+)
+
+COMM = MPI.COMM_WORLD
+
+
+class FakeWorld:
+    """One of `size` ranks; `Split` notes what was asked for."""
+
+    def __init__(self, size, rank):
+        self.size, self.rank = size, rank
+
+    def Split(self, color, key):
+        return SimpleNamespace(color=color, key=key)
+
+
+def teams(size, cells):
+    """Deal arms out over `size` ranks; return the shares and, a communicator, its ranks."""
+    shares = [share_arms(FakeWorld(size, rank), cells) for rank in range(size)]
+    assert [share.comm.key for share in shares] == list(range(size))  # ranks keep their order
+    groups = {}
+    for rank, share in enumerate(shares):
+        groups.setdefault(share.comm.color, []).append(rank)
+    return shares, list(groups.values())
+
+
+@pytest.mark.parametrize("num_arms", [1, 2, 3, 5])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
+def test_small_arms_stay_whole(size, num_arms):
+    shares, groups = teams(size, [2400] * num_arms)
+    dealt = [arm for share in shares for arm in share.arms]
+    assert sorted(dealt) == list(range(num_arms))
+    assert all(len(group) == 1 for group in groups)
+    loads = [len(share.arms) for share in shares]
+    assert max(loads) - min(loads) <= 1
+    assert all(share.arms == tuple(sorted(share.arms)) for share in shares)
+
+
+@pytest.mark.parametrize("num_arms", [1, 2, 3, 5])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
+def test_large_arms_get_all_ranks(size, num_arms):
+    # One large arm is enough: it sets the time that all wait for.
+    shares, groups = teams(size, [2400] * (num_arms - 1) + [SPLIT_CELLS])
+    dealt = []
+    for ranks in groups:
+        arms = {shares[rank].arms for rank in ranks}
+        assert len(arms) == 1  # those who share a communicator share its arms
+        dealt += arms.pop()
+        assert ranks == list(range(ranks[0], ranks[-1] + 1))  # neighbours
+    assert sorted(dealt) == list(range(num_arms))
+    assert all(share.arms for share in shares)
+    sizes = [len(ranks) for ranks in groups]
+    assert max(sizes) - min(sizes) <= 1
+
+
+@pytest.mark.parametrize("cells", [2400, SPLIT_CELLS])
+@pytest.mark.parametrize("num_arms", [1, 2, 3, 4])
+def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
+    share = share_arms(COMM, [cells] * num_arms)
+    expected = {k: f"arm {k}" for k in range(num_arms)}
+    # Given in any order, and by every rank of a team: the leader's counts.
+    mine = {k: expected[k] if share.leads else "not the leader's" for k in reversed(share.arms)}
+    bodies = gather_bodies(share, mine)
+    assert bodies == (list(expected.values()) if COMM.rank == 0 else [])
+    assert COMM.allreduce(int(share.leads)) == min(num_arms, COMM.size)
+    team = {k: n for arms, n in COMM.allgather((share.arms, share.comm.size)) for k in arms}
+    whole = gather_cells(
+        share,
+        {k: np.full((2 + share.comm.rank, 3), 10.0 * k + share.comm.rank) for k in share.arms},
+    )
+    if COMM.rank > 0:
+        assert whole == []
+        return
+    assert len(whole) == num_arms
+    for k, values in enumerate(whole):
+        pieces = [np.full((2 + rank, 3), 10.0 * k + rank) for rank in range(team[k])]
+        assert np.array_equal(values, np.concatenate(pieces))
+
+
+@pytest.mark.parametrize("cells", [2400, SPLIT_CELLS])
+@pytest.mark.parametrize("num_arms", [1, 2, 3])
+def test_sums_over_arms_have_the_same_bits_on_any_number_of_ranks(num_arms, cells):
+    share = share_arms(COMM, [cells] * num_arms)
+    # Cancelling numbers: any other order of the arms gives other bits.
+    values = np.array([[1.0, 0.1], [1e17, 0.2], [-1e17, 0.3]])[:num_arms]
+    first = share.comm.rank == 0  # a team's parts are added before
+    total = sum_over_arms(share, {k: values[k] * first for k in share.arms})
+    expected = values[0].copy()
+    for value in values[1:]:
+        expected += value
+    assert np.array_equal(total, expected)
+
+
+def test_the_root_works_for_all():
+    calls = []
+
+    def double(values):
+        calls.append(COMM.rank)
+        return {"twice": 2 * values}
+
+    result = on_root(COMM, double, np.arange(3) + COMM.rank)
+    assert np.array_equal(result["twice"], [0, 2, 4])  # of the root's argument
+    assert COMM.allreduce(calls) == [0]
+
+
+@pytest.mark.parametrize("kind", [InputError, ConvergenceError])
+def test_all_ranks_raise_what_the_root_raised(kind):
+    def fail():
+        raise kind(f"on rank {COMM.rank}")
+
+    with pytest.raises(kind, match=r"^on rank 0$"):
+        on_root(COMM, fail)
+
+
+def test_a_good_end_goes_unnoticed():
+    with one_ending(COMM):
+        passed = True
+    assert passed
+    with pytest.raises(SystemExit) as ending, one_ending(COMM):
+        sys.exit(7)
+    assert ending.value.code == 7  # a status chosen on purpose stays
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (InputError("scene.toml: no"), 2, "dolfinopt: scene.toml: no\n"),
+        (ConvergenceError("stuck"), 1, "dolfinopt: stuck\n"),
+        (KeyboardInterrupt(), 1, "dolfinopt: interrupted\n"),
+    ],
+)
+def test_what_all_ranks_raise_the_root_reports_in_one_line(error, status, message, capsys):
+    with pytest.raises(SystemExit) as ending, one_ending(COMM):
+        raise error
+    assert ending.value.code == status
+    assert capsys.readouterr().err == (message if COMM.rank == 0 else "")
+
+
+def test_an_internal_error_shows_where(capsys):
+    with pytest.raises(SystemExit) as ending, one_ending(COMM):
+        raise ZeroDivisionError("by nothing")
+    assert ending.value.code == 1
+    err = capsys.readouterr().err
+    if COMM.rank == 0:
+        assert "test_parallel.py" in err and err.endswith("ZeroDivisionError: by nothing\n")
+    else:
+        assert err == ""
+
+
+LONE = "if world.rank == 1: raise {}\nworld.Barrier()"
+ENDINGS = [
+    pytest.param(LONE.format("RuntimeError('lost')"), 1, "RuntimeError: lost", id="lone rank"),
+    pytest.param(LONE.format("InputError('lost')"), 2, "dolfinopt: lost", id="lone input error"),
+    pytest.param("raise InputError('all')", 2, "dolfinopt: all", id="all ranks"),
+]
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
+@pytest.mark.parametrize(("body", "status", "line"), ENDINGS)
+def test_ranks_end_together(body, status, line):
+    """Nobody waits for ever, the message stands once, and the status says what happened."""
+    script = (
+        "from mpi4py import MPI\n"
+        "from dolfinopt.errors import InputError\n"
+        "from dolfinopt.parallel import one_ending\n"
+        "world = MPI.COMM_WORLD\n"
+        "assert world.size == 2\n"
+        "with one_ending(world):\n    " + body.replace("\n", "\n    ") + "\n"
+    )
+    # The environment as it was: MPI has added to this process's since, which misleads mpirun.
+    run = subprocess.run(
+        ["mpirun", "-n", "2", sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=dict(os.environ),
+    )
+    assert run.returncode == status, run.stderr
+    assert run.stderr.splitlines().count(line) == 1
+    # What the user can mend needs no traceback, what he cannot has one.
+    assert ("Traceback" in run.stderr) == ("RuntimeError" in body)
+    assert run.stdout == ""
+
+
+@pytest.mark.parametrize("ordering", ["natural", "rcm", "nd"])
+def test_direct_solver(ordering):
+    """A chain of springs, distributed: exact up to rounding, on any number of ranks."""
+    size = 30
+    mat = PETSc.Mat().createAIJ((size, size), nnz=3, comm=COMM)
+    for row in range(*mat.getOwnershipRange()):
+        for col, value in ((row - 1, -1.0), (row, 2.5), (row + 1, -1.0)):
+            if 0 <= col < size:
+                mat.setValue(row, col, value)
+    mat.assemble()
+    for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
+        mat.setOption(option, True)
+    x, b = mat.createVecs()
+    first, last = mat.getOwnershipRange()
+    x.array = np.sin(np.arange(first, last))
+    mat.mult(x, b)
+    solver = direct_solver(mat, ordering)
+    found = x.duplicate()
+    solver.solve(b, found)
+    assert np.abs(found.array_r - x.array_r).max(initial=0.0) < 1e-14 * 9.0  # the condition
+    kind = solver.getPC().getFactorSolverType()
+    assert kind == ("petsc" if COMM.size == 1 else "mumps")
