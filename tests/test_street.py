@@ -33,6 +33,7 @@ STREET = (
     "objective",
     "sensitivity",
     "evaluation",
+    "taylor",
     "mma",
     "files",
     "checkpoint",
