@@ -39,7 +39,9 @@ def main(folder: Path = Path("results/demo_two_arm")) -> do.Result:
         folder.mkdir(parents=True, exist_ok=True)
         motion = result.trajectory
         plots.draw_design(folder / "design.png", views, scene.name)
-        plots.draw_history(folder / "history.png", result.history, "compliance of the load cases [N m]")
+        plots.draw_history(
+            folder / "history.png", result.history, "compliance of the load cases [N m]"
+        )
         plots.draw_deviation(
             folder / "deviation.png", motion.t, motion.deviation, result.initial_deviation
         )

@@ -247,16 +247,14 @@ class Objective(_Table):
 
     kind: ObjectiveKind = Field(
         default="esl",
-        description="compliance under load cases or over the horizon, or end-effector deviation [-]",
+        description="compliance of load cases, compliance over the horizon, or deviation [-]",
     )
     load_cases: int = Field(
         default=30,
         ge=1,
         description="equal intervals of the horizon; each gives its worst instant [-]",
     )
-    gradient: GradientKind = Field(
-        default="esl", description="with the loads frozen, or exact [-]"
-    )
+    gradient: GradientKind = Field(default="esl", description="with the loads frozen, or exact [-]")
     exponent: float = Field(
         default=20.0, ge=2, le=200, description="p of the deviation's p-mean over time [-]"
     )

@@ -50,7 +50,7 @@ class TaylorRow:
 
 @dataclass(frozen=True)
 class TaylorTest:
-    """The rows, and the ESL gradient against the exact one by x: angle in degrees, ratio of norms."""
+    """The rows, and the ESL gradient beside the exact one: angle in degrees, ratio of norms."""
 
     rows: tuple[TaylorRow, ...]
     angle: float

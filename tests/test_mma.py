@@ -88,14 +88,6 @@ class Ranks:
         self.barrier.wait()
         return values
 
-    def Reduce(self, values, total):
-        parts = self.allgather(values.copy())
-        if self.rank == 0:
-            total[...] = sum(parts)
-
-    def Bcast(self, values):
-        values[...] = self.allgather(values.copy())[0]
-
 
 def on_threads(size, run):
     """Return what run(communicator) returns on each of `size` threads."""
@@ -450,6 +442,32 @@ def test_pieces_do_not_matter(size):
         np.testing.assert_array_equal(multipliers, results[0][1])
 
 
+@pytest.mark.parametrize("deal", [[[0, 1], [2]], [[2, 0], [1]], [[1], [], [2], [0]]])
+def test_undivided_pieces_give_the_same_bits_on_any_ranks(deal):
+    n = 500
+    places = np.split(np.arange(n), [123, 321])
+    problem, lo, hi = two_arms(n), np.full(n, 1e-3), np.ones(n)
+
+    def run(comm, deal):
+        own = np.concatenate([places[k] for k in deal[comm.rank]] or [np.empty(0, int)])
+        pieces = {k: places[k].size for k in deal[comm.rank]}
+        x = np.full(n, 0.4)
+        state = initial_state(x[own])
+        for _ in range(12):
+            df0dx, f, dfdx = problem(x)
+            inputs = x[own], df0dx[own], f, dfdx[:, own], lo[own], hi[own], state
+            y, state = mma_step(*inputs, comm=comm, pieces=pieces)
+            x = np.empty(n)
+            for indices, values in comm.allgather((own, y)):
+                x[indices] = values
+        return x
+
+    (alone,) = on_threads(1, lambda comm: run(comm, [[0, 1, 2]]))
+    assert np.abs(alone - 0.4).max() > 0.1
+    for x in on_threads(len(deal), lambda comm: run(comm, deal)):
+        np.testing.assert_array_equal(x, alone)
+
+
 def test_resumed_run_has_the_same_bits():
     problem, x = waves(7)
     lo, hi, state = np.zeros(x.size), np.ones(x.size), initial_state(x)
@@ -706,6 +724,21 @@ def test_foreign_state_is_named(name, spoil):
 def test_design_outside_its_bounds_is_named():
     with pytest.raises(ValueError, match=r"MMA: x\[0\] = 0.4 is not between 0.5 and 1.0"):
         bad_step(xmin=lambda lo: lo + 0.499)
+
+
+def test_pieces_that_do_not_add_up_are_an_error():
+    x = np.full(4, 0.4)
+    with pytest.raises(ValueError, match="MMA: pieces hold 3 variables, x 4"):
+        mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), pieces={0: 1, 1: 2})
+
+
+def test_piece_on_two_ranks_is_an_error():
+    def run(comm):
+        x = np.full(4, 0.4)
+        with pytest.raises(ValueError, match=r"MMA: piece 7 is on another rank, too \(rank 1\)"):
+            mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), comm=comm, pieces={7: 4})
+
+    on_threads(2, run)
 
 
 @pytest.mark.parametrize("move", [0.0, -0.1, 1.5, np.nan])

@@ -176,9 +176,7 @@ def test_same_design_on_any_number_of_ranks(tmp_path):
         folder = tmp_path / str(ranks)
         line = ["optimize", SCENE, "--no-plots", "--out", folder]
         line += ["--set", "arms.cells=[100,6]", "--set", "optimizer.max_iterations=15"]
-        subprocess.run(
-            command(*line, ranks=ranks), env=ENVIRONMENT, check=True, timeout=120
-        )
+        subprocess.run(command(*line, ranks=ranks), env=ENVIRONMENT, check=True, timeout=120)
         with np.load(folder / "design.npz") as data:
             designs.append(np.concatenate([data[key].ravel() for key in data.files]))
     for other in designs[1:]:

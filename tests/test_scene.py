@@ -108,7 +108,14 @@ def test_demo_states_every_other_key():
     text = TWO_ARM.read_text(encoding="utf-8")
     stated = {line.split(" =")[0].strip() for line in text.splitlines() if " = " in line}
     known = {info.key.rpartition(".")[2] for info in describe_keys()}
-    assert known - stated == {"integrator", "rho_inf", "stages", "sample", "shared_volume"}
+    assert known - stated == {
+        "integrator",
+        "rho_inf",
+        "stages",
+        "sample",
+        "shared_volume",
+        "exponent",
+    }
 
 
 def test_arm_takes_missing_keys_from_the_arm_before():
@@ -453,7 +460,9 @@ BAD_VALUES = [
     ("objective.load_cases", 0, "0", "an integer >= 1"),
     ("objective.load_cases", 3001, "3001", "at most 3000"),
     ("objective.load_cases", 16**5000, "2**20000...", "at most 3000"),
-    ("objective.gradient", "exact", '"exact"', '"esl"'),
+    ("objective.gradient", "adjoint", '"adjoint"', '"esl" | "exact"'),
+    ("objective.kind", "deviation", "deviation", "exact"),
+    ("objective.exponent", 1.0, "1.0", "a number >= 2"),
     ("design.volume_fraction", 0.0, "0.0", "a number > 0 and <= 1"),
     ("design.volume_fraction", 1.5, "1.5", "a number > 0 and <= 1"),
     ("design.volume_fraction", 5e-4, "0.001 (default)", "at most volume_fraction = 0.0005"),
@@ -801,7 +810,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 44
+    assert len({info.key for info in keys}) == len(keys) == 45
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info

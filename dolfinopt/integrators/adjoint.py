@@ -49,10 +49,8 @@ def add_slopes(first: list[BodySlopes], second: list[BodySlopes]) -> list[BodySl
     ]
 
 
-def _sampled(
-    solution: Solution, t: np.ndarray, by_q: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return dJ by the steps' accelerations (n, s, N) and beginnings (n, 2 N): `sample` reversed."""
+def _sampled(solution: Solution, t: np.ndarray, by_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return dJ by the steps' accelerations (n, s, N) and beginnings (n, 2 N); undoes `sample`."""
     step = np.clip(np.searchsorted(solution.edges, t, side="left") - 1, 0, len(solution.a) - 1)
     h = np.diff(solution.edges)[step]
     tau = (t - solution.edges[step]) / h

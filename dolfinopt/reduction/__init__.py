@@ -24,9 +24,7 @@ class Method:
     """
 
     reduce: Callable[[ElasticArm, int, np.ndarray | None], Basis]
-    adjoint: Callable[
-        [ElasticArm, Basis, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]
-    ]
+    adjoint: Callable[[ElasticArm, Basis, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 METHODS = {
