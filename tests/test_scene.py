@@ -461,7 +461,7 @@ BAD_VALUES = [
     ("objective.load_cases", 3001, "3001", "at most 3000"),
     ("objective.load_cases", 16**5000, "2**20000...", "at most 3000"),
     ("objective.gradient", "adjoint", '"adjoint"', '"esl" | "exact"'),
-    ("objective.kind", "deviation", "deviation", "exact"),
+    ("objective.kind", "deviation", '"esl" (default)', "exact"),
     ("objective.exponent", 1.0, "1.0", "a number >= 2"),
     ("design.volume_fraction", 0.0, "0.0", "a number > 0 and <= 1"),
     ("design.volume_fraction", 1.5, "1.5", "a number > 0 and <= 1"),
@@ -490,6 +490,7 @@ SHOWN_KEY = {
     ("design.volume_fraction", 5e-4): "design.minimum",
     ("design.initial", 1e-3): "design.minimum",
     ("arms.0.name", "ARM2"): "arms.1.name",
+    ("objective.kind", "deviation"): "objective.gradient",
 }
 
 

@@ -143,8 +143,7 @@ def on_grid(
     newton = _Newton(mechanism, weights, enough)
     q = np.empty((len(edges), mechanism.coordinates))
     q[0] = static_start(problem)
-    qd = np.zeros_like(q[:1])
-    a = before = older = _first_acceleration(problem, q[:1])
+    qd = a = before = older = np.zeros_like(q[:1])  # in equilibrium at rest
     for n in range(len(h)):
         state = (q[n : n + 1], qd, a)
         here = RigidMotion(motion.q[n : n + 1], motion.qd[n : n + 1], motion.qdd[n : n + 1])
@@ -307,14 +306,6 @@ def _static_size(mechanism: Mechanism, motion: RigidMotion) -> float:
     loads = inverse_dynamics(mechanism, motion, rest, rest, rest)[0]
     deflections = np.linalg.solve(mechanism.stiffness(), loads.T).T
     return float(np.sqrt(np.maximum((loads * deflections).sum(axis=1), 0.0).max()))
-
-
-def _first_acceleration(problem: ElasticProblem, q: np.ndarray) -> np.ndarray:
-    """Return the acceleration (1, N) that makes the rows zero at t = 0, at rest in q."""
-    motion, rest = problem.motion(np.zeros(1)), np.zeros_like(q)
-    rows = inverse_dynamics(problem.mechanism, motion, q, rest, rest)[0]
-    mass = tangent(problem.mechanism, motion, q, rest, rest)[0, :, 2 * q.shape[1] :]
-    return -np.linalg.solve(mass, rows.T).T
 
 
 def _interpolated(edges: np.ndarray, q: np.ndarray, iterations: int) -> Solution:
