@@ -94,12 +94,21 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Itera
     return report
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def _clean_ranks() -> Iterator[None]:
-    """Free what the test left, on all ranks together, before the next one begins."""
+    """Free what a file's tests left on all ranks together, and at no other time.
+
+    Freeing PETSc's objects is collective, so that the collector must not run when it pleases; a
+    run of it takes 0.1 s, too long for every test.
+    """
+    if COMM.size == 1:
+        yield
+        return
+    gc.disable()
     yield
+    gc.enable()
     gc.collect()
-    PETSc.garbage_cleanup()  # collective: objects that Python dropped in a different order
+    PETSc.garbage_cleanup()
 
 
 @pytest.fixture

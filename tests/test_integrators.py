@@ -15,6 +15,7 @@ from dolfinopt.integrators import generalized_alpha, radau
 from dolfinopt.integrators.problem import (
     ElasticProblem,
     Solution,
+    energy_norm,
     even_steps,
     lagrange_integrals,
     relative_error,
@@ -355,6 +356,21 @@ def test_generalized_alpha_meets_the_tolerance(
     assert true <= tolerance
     assert solution.error <= tolerance
     assert 0.7 <= solution.error / true <= 4.0
+
+
+def test_relative_error_is_of_the_worst_arm() -> None:
+    """sqrt(q'Kq), largest in time; an arm at rest is measured against a thousandth of the other."""
+    problem, _ = two_arms()
+    mechanism = problem.mechanism
+    K = mechanism.bodies[0].K[0, 0]
+    q, error = np.zeros((2, 3, 6))
+    q[:, 0] = [1.0, -4.0, 2.0]  # the first arm's tip
+    error[:, 0] = [0.0, 0.1, 0.2]
+    assert_close(energy_norm(mechanism, q), [4.0 * np.sqrt(K), 0.0], 1e-15)
+    assert relative_error(mechanism, error, q) == pytest.approx(0.2 / 4.0, rel=1e-14)
+    error[2, 3] = 1e-3  # the second arm's tip
+    assert relative_error(mechanism, error, q) == pytest.approx(1e-3 / 4e-3, rel=1e-14)
+    assert relative_error(mechanism, error, 0.0 * q) == 0.2  # nothing to compare with
 
 
 def test_tolerance_beyond_rounding() -> None:

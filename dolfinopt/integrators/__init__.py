@@ -1,4 +1,4 @@
 """Time integrators of the elastic coordinates under prescribed rigid motion.
 
-One signature: (problem, tolerance, start) -> `Solution` with an estimate of its error.
+Each takes an `ElasticProblem` and a tolerance, and returns a `Solution` with its estimated error.
 """
