@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,18 @@ def dolfinx_version() -> str:
     return dolfinx.__version__
 
 
+@contextmanager
+def _quiet_compilers() -> Iterator[None]:
+    """Keep the C compiler's command lines, which setuptools logs, from standard error."""
+    before = logging.root.manager.disable
+    logging.disable(logging.INFO)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+@_quiet_compilers()
 def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]:
     """Distribute the Gmsh model of rank 0 over `comm`; return (mesh, cell tags, facet tags).
 
@@ -45,6 +59,7 @@ def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]
     return data.mesh, data.cell_tags, data.facet_tags
 
 
+@_quiet_compilers()
 def lagrange_space(mesh: Any, degree: int, components: int = 1) -> Any:
     """Return the continuous Lagrange space of `degree` with 1 or more components a node."""
     if VERSION < (0, 7):
@@ -97,6 +112,7 @@ def scatter_reverse_add(function: Any) -> None:
         function.x.scatter_reverse(la.ScatterMode.add)
 
 
+@_quiet_compilers()
 def compile_form(form: ufl.Form) -> Any:
     """Compile a UFL form; the JIT cache of DOLFINx keeps it between runs."""
     return fem.form(form)

@@ -16,7 +16,14 @@ from dataclasses import fields
 import numpy as np
 
 from dolfinopt.integrators.problem import ElasticProblem, Solution, lagrange_integrals
-from dolfinopt.integrators.radau import BATCH_BYTES, Stages, radau_iia, stage_values, stages_of
+from dolfinopt.integrators.radau import (
+    BATCH_BYTES,
+    Stages,
+    blocks,
+    radau_iia,
+    stage_values,
+    stages_of,
+)
 from dolfinopt.mechanism import BodySlopes, body_slopes, tangent
 
 
@@ -79,11 +86,11 @@ def _backwards(
     for first in range(0, count, chunk):
         part = slice(first, min(first + chunk, count))
         window = stages.window(part.start, part.stop)
-        block, beginning = _transposed(window, q[part], qd[part], a[part])
-        right = np.concatenate([by_a[part].reshape(-1, s * size, 1), _end_gain(window)], axis=2)
-        answer = np.linalg.solve(block, right)
+        block, beginning = blocks(window, q[part], qd[part], a[part])
+        right = np.concatenate([by_a[part].reshape(-1, s * size, 1), _end_slopes(window)], axis=2)
+        answer = np.linalg.solve(block.swapaxes(1, 2), right)
         base[part], gain[part] = answer[:, :, 0], answer[:, :, 1:]
-        drop[part] = beginning @ answer
+        drop[part] = beginning.swapaxes(1, 2) @ answer
     p = np.zeros(2 * size)
     multipliers = np.empty((count, s * size))
     for n in reversed(range(count)):
@@ -94,28 +101,7 @@ def _backwards(
     return multipliers.reshape(a.shape), p
 
 
-def _transposed(
-    stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return J_n' (n, s N, s N) and S_n' (n, 2 N, s N)."""
-    count, s, size = a.shape
-    method = stages.method
-    flat = (x.reshape(-1, size) for x in (q, qd, a))
-    slopes = tangent(stages.mechanism, stages.motion, *flat).reshape(count, s, size, 3 * size)
-    by_q, by_v, by_a = (x.swapaxes(2, 3) for x in np.split(slopes, 3, axis=3))
-    h = stages.h[:, None, None]
-    block = np.empty((count, s, size, s, size))
-    beginning = np.empty((count, 2 * size, s, size))
-    for i in range(s):
-        beginning[:, :size, i] = by_q[:, i]
-        beginning[:, size:, i] = by_v[:, i] + method.c[i] * h * by_q[:, i]
-        for j in range(s):
-            block[:, j, :, i] = h * (method.A[i, j] * by_v[:, i] + method.A2[i, j] * h * by_q[:, i])
-        block[:, i, :, i] += by_a[:, i]
-    return block.reshape(count, s * size, -1), beginning.reshape(count, 2 * size, -1)
-
-
-def _end_gain(stages: Stages) -> np.ndarray:
+def _end_slopes(stages: Stages) -> np.ndarray:
     """Return Gamma_n' (n, s N, 2 N): the accelerations' effect on the state after the step."""
     size = stages.mechanism.coordinates
     h = stages.h[:, None]
