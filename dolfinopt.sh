@@ -177,7 +177,7 @@ check() {
 run_tests() {
   local output summary="" failed=()
   output=$(mktemp) || exit 1
-  trap 'rm -f "$output"' EXIT
+  trap "rm -f '$output'" EXIT
   cd "$here" || exit 1
   answer_soon
   export NO_COLOR=1 # mpirun gives the ranks a terminal even when there is none
