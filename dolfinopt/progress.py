@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 from dolfinopt.files import HistoryRow
 
+WIDE = 110  # characters a line
+
 
 @contextmanager
 def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
@@ -15,16 +17,18 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
     The time left assumes all `iterations`; convergence may end the run before.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.table import Column
 
-    progress = Progress(
-        TextColumn("{task.completed}/{task.total}"),
-        BarColumn(bar_width=None),
-        TextColumn("{task.description}"),
+    console = Console(stderr=True)
+    # Eighty characters hold the figures; a bar wants more.
+    columns: list[ProgressColumn] = [
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
         TimeRemainingColumn(compact=True),
-        console=Console(stderr=True),
-    )
-    with progress:
+    ]
+    if console.width >= WIDE:
+        columns.insert(1, BarColumn(bar_width=None))
+    with Progress(*columns, console=console, expand=console.width >= WIDE) as progress:
         task = progress.add_task("setting up", total=iterations)
 
         def show(row: HistoryRow) -> None:
@@ -32,9 +36,9 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
                 task,
                 completed=row.iteration,
                 description=(
-                    f"objective {row.objective:.4g} · deviation {1e3 * row.max_deviation:.3g} mm "
-                    f"· grayness {row.grayness:.3f} · volume {row.volume_fraction:.4f} "
-                    f"· change {row.change:.3f}"
+                    f"{row.iteration}/{iterations} objective {row.objective:.4g} "
+                    f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
+                    f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
                 ),
             )
 
