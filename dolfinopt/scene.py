@@ -390,6 +390,17 @@ class Scene(_Table):
         return self
 
     @model_validator(mode="after")
+    def _check_adjoint(self) -> Scene:
+        if self.objective.gradient == "exact" and self.simulation.integrator != "radau":
+            raise _Refusal(
+                'expected "radau" with objective.gradient = "exact": only its trajectory has an '
+                "adjoint",
+                ("simulation", "integrator"),
+                ("objective", "gradient"),
+            )
+        return self
+
+    @model_validator(mode="after")
     def _check_sampling(self) -> Scene:
         horizon, sample = self.motion.horizon, self.simulation.sample
         n_samples = horizon / sample * (1.0 + 1e-9)  # 3 s in steps of 1e-3 s are 3000 of them

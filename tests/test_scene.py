@@ -600,6 +600,13 @@ def test_unknown_key(path, unknown, closest, allowed):
     assert message.startswith(f"{FILE}: unknown key {unknown}{advice}{allowed}")
 
 
+def test_exact_gradient_needs_radau():
+    data = minimal()
+    data["objective"] = {"gradient": "exact"}
+    data["simulation"] = {"integrator": "generalized-alpha"}
+    assert 'simulation.integrator = "generalized-alpha": expected "radau"' in message_of(data)
+
+
 def test_misspelt_key_comes_before_the_missing_one():
     data = minimal()
     data["material"]["youngs_modulus"] = data["material"].pop("young_modulus")
