@@ -52,7 +52,8 @@ def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]
         from dolfinx.io import gmshio
     if VERSION < (0, 6):
         return gmshio.model_to_mesh(model, comm, 0, gdim)
-    partitioner = dolfinx.mesh.create_cell_partitioner(GhostMode.shared_facet)
+    links = (2,) if VERSION >= (0, 11) else ()  # cells a facet joins at most
+    partitioner = dolfinx.mesh.create_cell_partitioner(GhostMode.shared_facet, *links)
     data = gmshio.model_to_mesh(model, comm, 0, gdim, partitioner=partitioner)
     if isinstance(data, tuple) and not hasattr(data, "cell_tags"):
         return data[0], data[1], data[2]

@@ -216,7 +216,7 @@ class _Newton:
         self._mechanism, self._weights = mechanism, weights
         self._flexibility = np.linalg.inv(mechanism.stiffness())
         self._enough = enough
-        self._inverse_t = np.empty((0, 0))
+        self._inverse_t: np.ndarray = np.empty((0, 0))
         self._h, self._rate = np.inf, 1.0
 
     def step(
