@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
 FALL = 4.0  # from one step to the next
-STEPS = tuple(0.01 / FALL**k for k in range(4))  # of the design variable
+STEPS = tuple(0.01 / FALL**k for k in range(5))  # of the design variable
 MARGIN = 0.05  # design variables are drawn this far inside [0, 1]: the steps must not leave it
 ROUNDING = 1e-10  # of the objective: what Newton's tolerance leaves of it
 PASSES = 1.9  # least rate; 2 is exact
