@@ -16,8 +16,8 @@ from dolfinopt.errors import ConvergenceError
 # equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
 EIGEN_TOLERANCE = 1e-12
 # Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
-# which leaves seven digits more than an optimiser can use.
-ADJOINT_TOLERANCE = 1e-9
+# which leaves more digits than an optimiser can use.
+ADJOINT_TOLERANCE = 1e-8
 MAX_ADJOINT = 500
 RAMP_SHARE = 1e-6  # of the start without symmetry beside the old modes, in norm
 
