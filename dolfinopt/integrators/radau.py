@@ -7,8 +7,8 @@ The unknowns are the accelerations a (n, s, N) at all stages of all steps. With 
     qd_i = qd_n + h sum_j A_ij a_j,   q_i = q_n + c_i h qd_n + h^2 sum_j (A A)_ij a_j
 and the last stage ends the step. Newton's matrix is block lower bidiagonal: the blocks of all
 steps are solved in one batch for an affine map of the state at their beginning, then a short
-recursion runs over the steps. Paper's example, 4 + 4 coordinates to 1e-4, one core: 176 steps, 42 ms
-from cold, 28 ms from the solution for a payload 5 % lighter; generalised-alpha takes 3.2 s.
+recursion runs over the steps. Paper's example, 4 + 4 coordinates to 1e-4, one core: 176 steps,
+42 ms from cold, 28 ms from the solution for a payload 5 % lighter; generalised-alpha takes 3.2 s.
 """
 
 from __future__ import annotations
