@@ -16,7 +16,8 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -31,6 +32,7 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
+from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 
 if sys.version_info >= (3, 11):
@@ -39,18 +41,29 @@ else:
     import tomli as tomllib
 
 # What this version offers; a new method is added here and nowhere else in this file.
-Law = Literal["two-material"]
-Path2D = Literal["arc"]
-ReductionMethod = Literal["craig-bampton", "modal"]
+Law = Literal["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
+Path2D = Literal["arc", "line", "points", "joints"]
+TimeLaw = Literal["quintic", "septic"]
+Base = Literal["cart", "fixed"]
+ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
 Integrator = Literal["radau", "generalized-alpha"]
-ObjectiveKind = Literal["esl", "compliance", "deviation"]
+ObjectiveKind = Literal["esl", "compliance", "deviation", "static", "eigenfrequency"]
 GradientKind = Literal["esl", "exact"]
-Projection = Literal[False]
+Projection = Literal[False, "heaviside", "robust"]
+Attached = Literal["rigid-body", "point-mass", "none"]
+WorstBy = Literal["compliance", "deviation"]
+CellShape = Literal["quadrilateral", "triangle"]
 
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
+Frequency = Annotated[float, Field(ge=0)]  # Hz
+Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
 MAX_ITERATIONS = 1_000_000
 MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation
+
+# Keys that name a file, as (table, key); a scene holds their absolute paths.
+MESH_FILES = (".geo", ".msh", ".step", ".stp")
+FILE_KEYS = (("motion", "file"), ("arms", "mesh"), ("arms", "sid"))
 
 _Loc = tuple[Any, ...]  # path of a key in the scene's data, e.g. ("arms", 0, "length")
 
@@ -76,13 +89,21 @@ class _Table(BaseModel):
     @classmethod
     def _check_type(cls, value: Any, info: ValidationInfo) -> Any:
         """Turn a TOML array into a tuple; keep 1, 1.0 and true apart where choices are listed."""
-        annotation = cls.model_fields[str(info.field_name)].annotation
+        annotation = _without_none(cls.model_fields[str(info.field_name)].annotation)
         if get_origin(annotation) is tuple and isinstance(value, list):
-            return tuple(value)
+            return tuple(tuple(item) if isinstance(item, list) else item for item in value)
         # Literal compares with ==, for which True, 1 and 1.0 are the same.
-        if get_origin(annotation) is Literal and type(value) not in map(type, get_args(annotation)):
+        kinds = map(type, get_args(annotation))
+        if get_origin(annotation) is Literal and value is not None and type(value) not in kinds:
             raise ValueError
         return value
+
+
+def _without_none(annotation: Any) -> Any:
+    """Return T for an annotation `T | None`, which stands for a key that may be left out."""
+    kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+    union = get_origin(annotation) in (Union, UnionType)  # of a Literal it is the former
+    return kinds[0] if union and len(kinds) == 1 else annotation
 
 
 def _check_arm_name(name: str) -> str:
@@ -118,9 +139,15 @@ class Interpolation(_Table):
     law: Law = Field(
         default="two-material", description="interpolation law of stiffness and mass [-]"
     )
-    penalty: float = Field(default=3.0, ge=1, description="exponent p of x in the stiffness [-]")
+    penalty: float = Field(
+        default=3.0, ge=1, description='exponent p of x in the stiffness; q of "ramp" [-]'
+    )
     floor: float = Field(
-        default=1e-6, gt=0, lt=1, description="stiffness and mass of void relative to solid [-]"
+        default=1e-6,
+        gt=0,
+        lt=1,
+        description="stiffness and mass of void relative to solid; its square but for "
+        '"two-material" [-]',
     )
 
 
@@ -133,10 +160,66 @@ class Arm(_Table):
     length: float = Field(gt=0, description="from joint axis to joint axis, or to the end [m]")
     height: float = Field(gt=0, description="height in the plane of motion [m]")
     thickness: float = Field(gt=0, description="thickness normal to the plane of motion [m]")
-    cells: tuple[CellCount, CellCount] = Field(
-        default=(200, 12), description="number of cells along and across the arm [-]"
+    cells: tuple[CellCount, CellCount] | None = Field(
+        default=(200, 12), description="number of cells along and across a rectangular arm [-]"
     )
-    passive: float = Field(default=0.0, ge=0, description="solid material kept at both ends [m]")
+    mesh: str | None = Field(
+        default=None, description="geometry or mesh (.geo, .msh, .step) in place of cells [-]"
+    )
+    mesh_size: float | None = Field(
+        default=None, gt=0, description="of the cells of a .geo or .step file [m]"
+    )
+    cell_shape: CellShape | None = Field(
+        default=None, description="of the cells of a .geo or .step file [-]"
+    )
+    passive: float = Field(
+        default=0.0,
+        ge=0,
+        description="solid material kept around both interfaces; 0 leaves it to a mesh file [m]",
+    )
+    symmetric: bool = Field(
+        default=False, description="design symmetric about the arm's axis y = 0 [-]"
+    )
+    design: str | None = Field(
+        default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
+    )
+    rigid: bool = Field(
+        default=False, description="a solid bar that does not bend and is not optimised [-]"
+    )
+    sid: str | None = Field(
+        default=None, description="standard input data file (SID) in place of a geometry [-]"
+    )
+    young_modulus: float | None = Field(
+        default=None, gt=0, description="instead of material.young_modulus [Pa]"
+    )
+    poisson_ratio: float | None = Field(
+        default=None, gt=-1, lt=0.5, description="instead of material.poisson_ratio [-]"
+    )
+    density: float | None = Field(
+        default=None, gt=0, description="instead of material.density [kg/m3]"
+    )
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Arm:
+        stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
+        if self.rigid:
+            stated.append("rigid")
+        if len(stated) > 1:
+            raise _Refusal(
+                f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
+                *((key,) for key in stated),
+            )
+        return self
+
+    @property
+    def own(self) -> bool:
+        """Whether the arm has a design of its own."""
+        return self.flexible and self.design is None
+
+    @property
+    def flexible(self) -> bool:
+        """Whether the arm is meshed and reduced here, alone or with the arm it shares with."""
+        return not self.rigid and self.sid is None
 
     @model_validator(mode="after")
     def _check_ends(self) -> Arm:
@@ -146,20 +229,73 @@ class Arm(_Table):
             )
         return self
 
+    @model_validator(mode="before")
+    @classmethod
+    def _mesh_or_cells(cls, data: Any) -> Any:
+        """Let a mesh take the place of the default of `cells`."""
+        if not isinstance(data, dict):
+            return data
+        if data.get("mesh") is not None:
+            return {"cells": None} | data
+        return {key: value for key, value in data.items() if (key, value) != ("cells", None)}
+
+    @model_validator(mode="after")
+    def _check_mesh(self) -> Arm:
+        if self.mesh is None:
+            for key in ("mesh_size", "cell_shape"):
+                if getattr(self, key) is not None:
+                    raise _Refusal("expected only with mesh; a rectangular arm has cells", (key,))
+            return self
+        if self.cells is not None:
+            raise _Refusal(
+                "expected either cells (a rectangular arm) or mesh (a file), not both",
+                ("mesh",),
+                ("cells",),
+            )
+        kind = Path(self.mesh).suffix.lower()
+        if kind not in MESH_FILES:
+            raise _Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
+        for key in ("mesh_size", "cell_shape"):
+            if kind == ".msh" and getattr(self, key) is not None:
+                raise _Refusal(
+                    "expected only with .geo or .step: a .msh file has its cells", (key,), ("mesh",)
+                )
+        return self
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells; of a mesh file an estimate, 0 where there is nothing to go by."""
+        if self.cells is not None:
+            return self.cells[0] * self.cells[1]
+        if self.mesh_size is None:
+            return 0
+        squares = self.length * self.height / self.mesh_size**2
+        return round(2.0 * squares if self.cell_shape == "triangle" else squares)
+
     @property
     def passive_columns(self) -> int:
-        """Count the columns of cells at each end with centroids nearer to it than `passive`."""
+        """Count the columns of cells at each end with centroids nearer to it than `passive`.
+
+        0 for a mesh file, whose solid cells are known when it is read.
+        """
+        if self.cells is None:
+            return 0
         # The expression of meshes/arm.geo, so that rounding cannot tell the two apart.
         return math.ceil(self.passive / self.length * self.cells[0] - 0.5)
 
     @property
     def passive_share(self) -> float:
-        """Return the share of the arm's volume that stays solid, in [0, 1]."""
-        return 2.0 * self.passive_columns / self.cells[0]
+        """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
+        return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
 
     @property
-    def n_reducible(self) -> int:
-        """Count the dofs a reduction can keep: interior nodes, and 3 of the outboard interface."""
+    def n_reducible(self) -> int | None:
+        """Count the dofs a reduction can keep: interior nodes, and 3 of the outboard interface.
+
+        None for a mesh file.
+        """
+        if self.cells is None:
+            return None
         n_along, n_across = self.cells
         return 2 * (n_along - 1) * (n_across + 1) + 3
 
@@ -167,25 +303,82 @@ class Arm(_Table):
 class Motion(_Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
-    path: Path2D = Field(default="arc", description="desired path of the end-effector [-]")
+    path: Path2D = Field(
+        default="arc",
+        description="of the end-effector: arc, line or table of points; or a table of joint "
+        "coordinates [-]",
+    )
     radius: float = Field(
-        default=1.0, gt=0, description="radius of the semicircle about the origin [m]"
+        default=1.0, gt=0, description="radius of the semicircle about the origin, of an arc [m]"
     )
     flattening: float = Field(
-        default=1.0, ge=0, le=1, description="factor of the path's y; 0 is the straight line [-]"
+        default=1.0, ge=0, le=1, description="factor of an arc's y; 0 is the straight line [-]"
+    )
+    start: tuple[float, float] = Field(default=(-1.0, 0.0), description="where a line begins [m]")
+    end: tuple[float, float] = Field(default=(1.0, 0.0), description="where a line ends [m]")
+    file: str | None = Field(
+        default=None,
+        description="table (CSV) of points or joints, from the scene's folder or the working "
+        "directory [-]",
+    )
+    law: TimeLaw = Field(
+        default="quintic", description="time law along the path; not of a table with times [-]"
     )
     duration: float = Field(default=1.9, gt=0, description="time from start to end of the path [s]")
     horizon: float = Field(
         default=3.0, gt=0, description="simulated time; at rest after duration [s]"
     )
-    cart_follow: float = Field(
-        default=0.5, description="position of the cart over the desired x of the end-effector [-]"
+    base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
+    base_position: float = Field(
+        default=0.0, description="x of the shoulder joint on a fixed base [m]"
     )
-    joint_height: float = Field(default=-0.5, description="y of the shoulder joint on the cart [m]")
-    elbow: Literal[-1, 1] = Field(default=-1, description="sign of the elbow angle beta [-]")
+    cart_follow: float = Field(
+        default=0.5,
+        description="position of the cart over the desired x of the end-effector; with one arm, a "
+        "fixed base or a table of joints there is no choice [-]",
+    )
+    joint_height: float = Field(default=-0.5, description="y of the shoulder joint [m]")
+    elbow: Literal[-1, 1] = Field(
+        default=-1,
+        description="sign of the elbow angle beta; with one arm, of its cosine with +x [-]",
+    )
     gravity: tuple[float, float] = Field(
         default=(0.0, 0.0), description="gravitational acceleration in x and y [m/s2]"
     )
+
+    @model_validator(mode="after")
+    def _check_path(self) -> Motion:
+        tabulated = self.path in ("points", "joints")
+        if tabulated and self.file is None:
+            raise _Refusal(
+                f'expected the path of a table (CSV) with motion.path = "{self.path}"',
+                ("file",),
+                ("path",),
+            )
+        if self.path == "line" and self.start == self.end:
+            raise _Refusal("expected another point than motion.start", ("end",), ("start",))
+        self._refuse_idle(self.path == "arc", "path", "radius", "flattening")
+        self._refuse_idle(self.path == "line", "path", "start", "end")
+        self._refuse_idle(tabulated, "path", "file")
+        self._refuse_idle(self.path != "joints", "path", "cart_follow", "elbow")
+        self._refuse_idle(self.base == "cart", "base", "cart_follow")
+        self._refuse_idle(self.base == "fixed", "base", "base_position")
+        return self
+
+    def _refuse_idle(self, used: bool, choice: str, *keys: str) -> None:
+        """Raise unless `keys` have their defaults or are `used` with this value of `choice`."""
+        for key in keys:
+            default = type(self).model_fields[key].default
+            if not used and getattr(self, key) != default:
+                found = f"motion.{choice} = {_shown(getattr(self, choice))}"
+                raise _Refusal(
+                    f"expected none with {found}, which does not use it"
+                    if default is None
+                    else f"expected {_shown(default)}, the default, with {found}, which does not "
+                    "use it",
+                    (key,),
+                    (choice,),
+                )
 
 
 class Payload(_Table):
@@ -212,6 +405,26 @@ class Reduction(_Table):
         default="craig-bampton", description="how the basis is made [-]"
     )
     coordinates: int = Field(default=4, ge=1, description="elastic coordinates q of each arm [-]")
+    shifts: tuple[Frequency, ...] = Field(
+        default=(0.0,), description='where "krylov" matches moments [Hz]'
+    )
+    band: tuple[Frequency, Frequency] = Field(
+        default=(0.0, 50.0), description='from where to where "balanced" weights responses [Hz]'
+    )
+
+    @field_validator("shifts")
+    @classmethod
+    def _check_shifts(cls, shifts: tuple[float, ...]) -> tuple[float, ...]:
+        if not shifts or len(set(shifts)) < len(shifts):
+            raise _Refusal("expected at least one number >= 0, none of them twice")
+        return shifts
+
+    @field_validator("band")
+    @classmethod
+    def _check_band(cls, band: tuple[float, float]) -> tuple[float, float]:
+        if band[0] >= band[1]:
+            raise _Refusal("expected the lower of the two frequencies first")
+        return band
 
     @model_validator(mode="after")
     def _check_coordinates(self) -> Reduction:
@@ -222,6 +435,27 @@ class Reduction(_Table):
                 ("coordinates",),
                 ("method",),
             )
+        if self.method == "krylov" and self.coordinates < 3 * len(self.shifts):
+            raise _Refusal(
+                f'expected an integer >= {3 * len(self.shifts)} with reduction.method = "krylov" '
+                "(the interface loads at each of reduction.shifts)",
+                ("coordinates",),
+                ("method",),
+                ("shifts",),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_idle(self) -> Reduction:
+        for key, method in (("shifts", "krylov"), ("band", "balanced")):
+            default = type(self).model_fields[key].default
+            if self.method != method and getattr(self, key) != default:
+                raise _Refusal(
+                    f"expected {_shown(default)}, the default, with reduction.method = "
+                    f"{_shown(self.method)}, which does not use it",
+                    (key,),
+                    ("method",),
+                )
         return self
 
 
@@ -247,28 +481,72 @@ class Objective(_Table):
 
     kind: ObjectiveKind = Field(
         default="esl",
-        description="compliance of load cases, compliance over the horizon, or deviation [-]",
+        description="compliance of load cases or over the horizon, deviation, static "
+        "compliance, or first eigenfrequency [-]",
     )
     load_cases: int = Field(
         default=30,
         ge=1,
         description="equal intervals of the horizon; each gives its worst instant [-]",
     )
+    worst: WorstBy = Field(
+        default="compliance", description="what makes an instant the worst of its interval [-]"
+    )
     gradient: GradientKind = Field(default="esl", description="with the loads frozen, or exact [-]")
     exponent: float = Field(
-        default=20.0, ge=2, le=200, description="p of the deviation's p-mean over time [-]"
+        default=20.0,
+        ge=2,
+        le=200,
+        description="p of p-means: deviation over time, squared periods over modes [-]",
+    )
+    loads: tuple[Load, ...] = Field(
+        default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="static load cases (F_x N, F_y N, moment N m) at each arm's outboard "
+        "interface [-]",
+    )
+    attached: Attached = Field(
+        default="rigid-body", description="what an arm carries while it vibrates [-]"
+    )
+    elbow_angle: float | None = Field(
+        default=None,
+        description="of every joint behind an arm while it vibrates; default: mid-path [rad]",
+    )
+    modes: int = Field(
+        default=3, ge=1, le=50, description="lowest modes in the p-mean of the eigenfrequency [-]"
+    )
+    follow: bool = Field(
+        default=False,
+        description="follow the initial design's first mode by MAC instead of the p-mean [-]",
     )
 
-    @model_validator(mode="after")
-    def _check_gradient(self) -> Objective:
-        if self.kind == "deviation" and self.gradient != "exact":
-            raise _Refusal(
-                'expected "exact" with objective.kind = "deviation": frozen loads say nothing '
-                "about it",
-                ("gradient",),
-                ("kind",),
-            )
-        return self
+    @field_validator("loads")
+    @classmethod
+    def _check_loads(cls, loads: tuple[Load, ...]) -> tuple[Load, ...]:
+        if not loads or not all(any(load) for load in loads):
+            raise _Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
+        return loads
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the objective needs the motion."""
+        return self.kind in ("esl", "compliance", "deviation")
+
+
+class Constraints(_Table):
+    """What a design must keep besides its volume, arm by arm."""
+
+    first_frequency: float | None = Field(
+        default=None,
+        gt=0,
+        description="least first frequency of every arm with what it carries "
+        "(objective.attached) [Hz]",
+    )
+    tip_deflection: float | None = Field(
+        default=None,
+        gt=0,
+        description="largest static deflection of every arm's outboard interface under "
+        "objective.loads [m]",
+    )
 
 
 class Design(_Table):
@@ -286,7 +564,21 @@ class Design(_Table):
         default=0.0075, ge=0, description="radius of the equivalent cone filter; 0 is no filter [m]"
     )
     projection: Projection = Field(
-        default=False, description="Heaviside projection after the filter [-]"
+        default=False,
+        description="after the filter: none, Heaviside, or eroded, nominal and dilated designs "
+        "at once [-]",
+    )
+    sharpness: float = Field(
+        default=128.0, ge=1, le=1e4, description="beta of the projection in the end [-]"
+    )
+    continuation: int = Field(
+        default=25, ge=1, description="iterations until the projection's beta doubles [-]"
+    )
+    erosion: float = Field(
+        default=0.1,
+        gt=0,
+        lt=0.5,
+        description="distance of the robust thresholds from one half [-]",
     )
 
     @model_validator(mode="after")
@@ -333,6 +625,9 @@ class Scene(_Table):
     reduction: Reduction = Field(default=Reduction(), description="model reduction")
     simulation: Simulation = Field(default=Simulation(), description="time integration")
     objective: Objective = Field(default=Objective(), description="what is minimised")
+    constraints: Constraints = Field(
+        default=Constraints(), description="limits besides the volume"
+    )
     design: Design = Field(default=Design(), description="design variables")
     optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
 
@@ -344,9 +639,29 @@ class Scene(_Table):
         return self._source
 
     @property
-    def cell_counts(self) -> tuple[int, ...]:
-        """Number of cells of every arm."""
-        return tuple(arm.cells[0] * arm.cells[1] for arm in self.arms)
+    def owners(self) -> tuple[int | None, ...]:
+        """For every arm the index of the arm that has its design; None where there is none."""
+        index = {arm.name: i for i, arm in enumerate(self.arms)}
+        return tuple(
+            (index[arm.design] if arm.design is not None else i) if arm.flexible else None
+            for i, arm in enumerate(self.arms)
+        )
+
+    @property
+    def cell_counts(self) -> dict[int, int]:
+        """Number of cells of every arm with a design of its own, by the arm's index."""
+        return {
+            i: self.arms[i].n_cells
+            for i, owner in enumerate(self.owners)
+            if owner == i
+        }
+
+    def material_of(self, index: int) -> Material:
+        """Return the material of arm number `index`: its own values, or else the scene's."""
+        arm = self.arms[index]
+        own = {key: getattr(arm, key) for key in Material.model_fields}
+        given = {key: value for key, value in own.items() if value is not None}
+        return self.material.model_copy(update=given)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all resolved values as JSON-able data, from which `scene_from_dict` restores."""
@@ -378,19 +693,104 @@ class Scene(_Table):
         return self
 
     @model_validator(mode="after")
+    def _check_sharing(self) -> Scene:
+        names = [arm.name for arm in self.arms]
+        for i, arm in enumerate(self.arms):
+            if arm.design is None:
+                continue
+            before = [name for name, a in zip(names[:i], self.arms[:i], strict=True) if a.own]
+            if arm.design not in before:
+                allowed = " | ".join(map(_shown, before)) or "no arm before it has one"
+                raise _Refusal(
+                    f"expected the name of an earlier arm with a design of its own: {allowed}",
+                    ("arms", i, "design"),
+                )
+            j = names.index(arm.design)
+            for key in Arm.model_fields:
+                if key not in ("name", "design") and getattr(arm, key) != getattr(
+                    self.arms[j], key
+                ):
+                    raise _Refusal(
+                        f"expected {_shown(getattr(self.arms[j], key))} as {arm.design} has, whose "
+                        "design it shares",
+                        ("arms", i, key),
+                        ("arms", i, "design"),
+                    )
+        if not self.cell_counts:
+            raise _Refusal(
+                "expected at least one arm with a design: none is flexible", ("arms", 0, "rigid")
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_attached(self) -> Scene:
+        vibrates = self.objective.kind == "eigenfrequency" or self.constraints.first_frequency
+        if not vibrates or self.objective.attached != "none":
+            return self
+        for i in self.cell_counts:
+            if self.arms[i].passive == 0.0:
+                raise _Refusal(
+                    'expected more than 0 with objective.attached = "none": without a mass at its '
+                    "end the optimiser would cut an arm off",
+                    ("arms", i, "passive"),
+                    ("objective", "attached"),
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_joints(self) -> Scene:
+        motion = self.motion
+        if len(self.arms) > 1 or motion.path == "joints":
+            return self
+        if motion.base == "fixed":
+            raise _Refusal(
+                f'expected "cart" with one arm and motion.path = "{motion.path}": a single joint '
+                'follows no path; prescribe its angle with motion.path = "joints"',
+                ("motion", "base"),
+                ("motion", "path"),
+            )
+        if motion.cart_follow != Motion.model_fields["cart_follow"].default:
+            raise _Refusal(
+                "expected 0.5, the default, with one arm: its angle and the path leave the cart "
+                "no choice",
+                ("motion", "cart_follow"),
+            )
+        return self
+
+    @model_validator(mode="after")
     def _check_coordinates(self) -> Scene:
         for i, arm in enumerate(self.arms):
-            if self.reduction.coordinates > arm.n_reducible:
+            if not arm.flexible:
+                continue
+            if arm.n_reducible is not None and self.reduction.coordinates > arm.n_reducible:
                 raise _Refusal(
                     f"expected at most {arm.n_reducible}, the degrees of freedom of "
-                    f'arm "{arm.name}" with cells = {list(arm.cells)}',
+                    f'arm "{arm.name}" with cells = {list(arm.cells or ())}',
                     ("reduction", "coordinates"),
                     ("arms", i, "cells"),
                 )
         return self
 
     @model_validator(mode="after")
+    def _check_resonances(self) -> Scene:
+        if self.reduction.method == "balanced" and not self.damping.stiffness_proportional:
+            raise _Refusal(
+                'expected a number > 0 with reduction.method = "balanced": the Gramian of '
+                "undamped resonances is infinite",
+                ("damping", "stiffness_proportional"),
+                ("reduction", "method"),
+            )
+        return self
+
+    @model_validator(mode="after")
     def _check_adjoint(self) -> Scene:
+        if self.objective.gradient == "exact" and self.reduction.method == "balanced":
+            raise _Refusal(
+                'expected "craig-bampton", "modal" or "krylov" with objective.gradient = "exact": '
+                "the Gramian's basis has no adjoint",
+                ("reduction", "method"),
+                ("objective", "gradient"),
+            )
         if self.objective.gradient == "exact" and self.simulation.integrator != "radau":
             raise _Refusal(
                 'expected "radau" with objective.gradient = "exact": only its trajectory has an '
@@ -422,12 +822,13 @@ class Scene(_Table):
     @model_validator(mode="after")
     def _check_volume(self) -> Scene:
         limit = self.design.volume_fraction
-        shares = [arm.passive_share for arm in self.arms]
+        flexible = {i: arm for i, arm in enumerate(self.arms) if arm.flexible}
+        shares = {i: arm.passive_share for i, arm in flexible.items()}
         if self.design.shared_volume:
-            areas = [arm.length * arm.height for arm in self.arms]
-            together = sum(s * a for s, a in zip(shares, areas, strict=True)) / sum(areas)
-            shares = [together] * len(areas)
-        for i, share in enumerate(shares):
+            volumes = {i: a.length * a.height * a.thickness for i, a in flexible.items()}
+            together = sum(shares[i] * volumes[i] for i in shares) / sum(volumes.values())
+            shares = dict.fromkeys(shares, together)
+        for i, share in shares.items():
             if share + (1.0 - share) * self.design.minimum > limit:
                 raise _Refusal(
                     f"expected so little that volume_fraction = {limit} can be met: with "
@@ -488,12 +889,16 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     tree = _copy_tables(data)
     tree.setdefault("name", name)
     tree.setdefault("material", {})  # so that the message names the first key missing in it
-    inherited = _inherit(tree)
+    inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
     changes = [_override(tree, text, source) for text in overrides]
     for change in changes:
         inherited.difference_update(change.locs[:1])
         inherited.update(change.locs[1:])
-    inherited |= _inherit(tree)  # an override may have supplied what the first arm lacked
+    # An override may have supplied what the first arm lacked; otherwise it changes what it names.
+    required = [key for key, field in Arm.model_fields.items() if field.is_required()]
+    inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
+    _resolve_files(tree, source, changes)
+    _measure_bodies(tree, inherited)
     try:
         scene = Scene.model_validate(tree)
     except ValidationError as error:
@@ -501,6 +906,73 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
         raise InputError(message) from None
     scene._source = source
     return scene
+
+
+def _resolve_files(tree: dict[str, Any], source: str, changes: list[_Override]) -> None:
+    """Put absolute paths in place of the files that `tree` names.
+
+    What is no string and keys that a table does not have are left for validation to refuse.
+    """
+    for table, key in FILE_KEYS:
+        model, node = _model_at((table,)), tree.get(table)
+        if model is None or key not in model.model_fields:
+            continue
+        for i, row in enumerate(node if isinstance(node, list) else [node]):
+            value = row.get(key) if isinstance(row, dict) else None
+            if not isinstance(value, str):
+                continue
+            loc = (table, i, key) if isinstance(node, list) else (table, key)
+            where = _blamed(source, changes, (loc,))
+            row[key] = resolve_file(source, value, _dotted(loc, tree), where)
+
+
+def _measure_bodies(tree: dict[str, Any], inherited: set[_Loc]) -> None:
+    """Take the length of arms with standard input data from their files, unless it is stated.
+
+    Height and thickness are only drawn then: a twentieth of the length unless stated.
+    """
+    arms = tree.get("arms")
+    for i, arm in enumerate(arms if isinstance(arms, list) else []):
+        if not isinstance(arm, dict) or not isinstance(arm.get("sid"), str):
+            continue
+        from dolfinopt.sid import read_sid  # NumPy, which other scenes do not need
+
+        x, y = read_sid(Path(arm["sid"])).nodes[-1].origin.M0.ravel()[:2]
+        length = math.hypot(x, y)
+        if ("arms", i, "length") in inherited or "length" not in arm:
+            arm["length"] = length
+        for key in ("height", "thickness"):
+            arm.setdefault(key, length / 20.0)
+        # What a mesh would need says nothing about a body from a file.
+        for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
+            if loc[2] in ("passive", *MESH_KEYS):
+                arm.pop(loc[2], None)
+
+
+def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
+    """Return the absolute path of the file that the scene `source` names as `value`.
+
+    A relative path is looked for from the scene's folder, then from the working directory, and
+    "meshes/..." at last among the package's own. `key` and `where` (default `source`) stand in
+    the message.
+
+    Raises:
+        InputError: there is no such file; names the key and all places.
+    """
+    folders = [Path(source).parent, Path()]
+    if Path(value).parts[:1] == (mesh_folder().name,):
+        folders.append(mesh_folder().parent)
+    paths = list(dict.fromkeys(os.path.abspath(folder / value) for folder in folders))
+    for path in paths:
+        if os.path.isfile(path):
+            return path
+    tried = "neither " if len(paths) > 1 else "not "
+    tried += " nor ".join(paths)
+    raise _input_error(
+        where or source,
+        f"{key} = {_shown(value)}: expected the path of a file, from the scene's folder or the "
+        f"working directory; found {tried}",
+    )
 
 
 def _read_toml(source: str) -> dict[str, Any]:
@@ -558,8 +1030,14 @@ def _copy_tables(data: Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def _inherit(tree: dict[str, Any]) -> set[_Loc]:
-    """Fill each arm's missing keys, except its name, from the arm before; return their paths."""
+# What an arm is, is its own; sizes and material are taken from the arm before.
+# What an arm is meshed from: an arm that states one of the first two takes none of the others.
+MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
+OWN_KEYS = ("name", "design", "rigid", "sid")
+
+
+def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[_Loc]:
+    """Fill each arm's missing `keys` from the arm before; return their paths."""
     arms = tree.get("arms")
     inherited: set[_Loc] = set()
     if not isinstance(arms, list):
@@ -568,8 +1046,9 @@ def _inherit(tree: dict[str, Any]) -> set[_Loc]:
         before, arm = arms[i - 1], arms[i]
         if not (isinstance(before, dict) and isinstance(arm, dict)):
             continue
-        for key in Arm.model_fields:
-            if key != "name" and key in before and key not in arm:
+        taken = MESH_KEYS if any(key in arm for key in MESH_KEYS[:2]) else ()
+        for key in keys:
+            if key in before and key not in arm and key not in taken:
                 arm[key] = before[key]
                 inherited.add(("arms", i, key))
     return inherited
@@ -595,8 +1074,20 @@ def _override(tree: dict[str, Any], text: str, source: str) -> _Override:
         raise _input_error(where, "expected key.path=value, for example payload.mass=4.0")
     locs = _override_locs(tree, parts, where)
     for loc in locs:
+        if loc[0] == "arms" and loc[2:] in (("cells",), ("mesh",)):
+            _drop_mesh(tree, loc)
         _store(tree, loc, _parse_value(value.strip()))
     return _Override(text, locs)
+
+
+def _drop_mesh(tree: dict[str, Any], loc: _Loc) -> None:
+    """Let `cells` or `mesh` at `loc` take the place of what the arm is meshed from so far."""
+    arm = tree["arms"][loc[1]]
+    if not isinstance(arm, dict):
+        return
+    others = MESH_KEYS if loc[2] == "cells" else ("cells",)
+    for key in others:
+        arm.pop(key, None)
 
 
 def _parse_value(text: str) -> Any:
@@ -685,12 +1176,18 @@ def _first_problem(
     # A misspelt key is also a missing one: the spelling is the message that helps.
     problems.sort(key=lambda problem: problem.kind != "unknown")
     first, n_more = problems[0], len(problems) - 1
-    where = source
-    for change in changes:
-        if any(_starts(loc, changed) for loc in first.locs for changed in change.locs):
-            where = f"{source} with --set {_cut(change.text)}"
+    where = _blamed(source, changes, first.locs)
     more = f" (and {n_more} more)" if n_more else ""
     return _one_line(f"{where}: {first.text}{more}")
+
+
+def _blamed(source: str, changes: list[_Override], locs: tuple[_Loc, ...]) -> str:
+    """Return the place to blame for the values at `locs`: the file, or the last --set of them."""
+    where = source
+    for change in changes:
+        if any(_starts(loc, changed) for loc in locs for changed in change.locs):
+            where = f"{source} with --set {_cut(change.text)}"
+    return where
 
 
 def _is_echo(
@@ -749,6 +1246,8 @@ def _closest(above: _Loc, key: str, known: list[str]) -> list[str]:
     paths = [info.key for info in describe_keys()]
     if elsewhere := [path for path in paths if path.endswith(f".{key}")]:
         return elsewhere  # the right key in the wrong table
+    if starts := [name for name in known if name.startswith(key) and key]:
+        return [".".join(map(_key, (*above, name))) for name in starts]
     if near := difflib.get_close_matches(key, known, 1):
         return [".".join(map(_key, (*above, near[0])))]
     names = {path.rpartition(".")[2]: path for path in paths}
@@ -793,6 +1292,7 @@ def _allowed(field: FieldInfo) -> str:
 
 
 def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "") -> str:
+    annotation = _without_none(annotation)
     origin, args = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
@@ -802,7 +1302,10 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
     if origin is tuple and _element_model(annotation):
         return "an array of tables [[arms]], at least one"
     if origin is tuple:
-        return f"an array of two {_allowed_type(args[0], plural='s')}"
+        rows = get_origin(args[0]) is tuple
+        inner = "arrays of three numbers" if rows else _allowed_type(args[0], plural="s")
+        count = "" if args[-1] is Ellipsis else "two "
+        return f"an array of {count}{inner}"
     if isinstance(annotation, type) and issubclass(annotation, _Table):
         return f"a table with the keys {', '.join(annotation.model_fields)}"
     nouns = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}
@@ -907,4 +1410,5 @@ def _describe(model: type[_Table], prefix: str) -> Iterator[KeyInfo]:
             yield from _describe(below, f"{prefix}{key}.")
             continue
         default = "" if field.is_required() else _shown(field.default)
+        default = "none" if default == "None" else default
         yield KeyInfo(f"{prefix}{key}", _allowed(field), default, str(field.description))

@@ -12,7 +12,7 @@ from dolfinopt.integrators import generalized_alpha, radau
 from dolfinopt.integrators.problem import ElasticProblem, Solution
 from dolfinopt.ledger import Ledger
 from dolfinopt.mechanism import Mechanism, compliance, deviation, inverse_dynamics
-from dolfinopt.motion import RigidMotion, rigid_motion
+from dolfinopt.motion import RigidMotion, breakpoints, rigid_motion
 from dolfinopt.scene import Scene
 
 
@@ -59,7 +59,10 @@ class Trajectory:
 
     @cached_property
     def joint_forces(self) -> np.ndarray:
-        """Drive forces of cart (N) and joints (N m), (n, 1 + arms)."""
+        """Drive forces of cart (N) and joints (N m), (n, 1 + arms).
+
+        A fixed base bears the cart's as the horizontal force on the first joint.
+        """
         qd, qdd = self.solution.sample(self.t, 1), self.solution.sample(self.t, 2)
         return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
@@ -102,11 +105,8 @@ def simulate(
         ConvergenceError: the integrator gave up; the message says what to try.
     """
     motion, options = scene.motion, scene.simulation
-    breakpoints = [0.0, motion.horizon]
-    if motion.duration < motion.horizon:
-        breakpoints.insert(1, motion.duration)
     problem = ElasticProblem(
-        build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), tuple(breakpoints)
+        build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), breakpoints(scene)
     )
     with ledger.phase("simulation"):
         if options.integrator == "radau":

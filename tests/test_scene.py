@@ -16,6 +16,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene import (
     MAX_CELLS,
@@ -23,6 +24,7 @@ from dolfinopt.scene import (
     Scene,
     describe_keys,
     load_scene,
+    resolve_file,
     scene_from_dict,
 )
 
@@ -115,6 +117,31 @@ def test_demo_states_every_other_key():
         "sample",
         "shared_volume",
         "exponent",
+        "start",
+        "end",
+        "file",
+        "base",
+        "base_position",
+        "shifts",
+        "band",
+        "worst",
+        "loads",
+        "attached",
+        "elbow_angle",
+        "modes",
+        "follow",
+        "first_frequency",
+        "tip_deflection",
+        "sharpness",
+        "continuation",
+        "erosion",
+        "mesh",
+        "mesh_size",
+        "cell_shape",
+        "symmetric",
+        "design",
+        "rigid",
+        "sid",
     }
 
 
@@ -193,6 +220,8 @@ def test_integer_stands_for_a_number():
         ("motion.flattening", 0),
         ("motion.horizon", 1.0),  # the motion may be cut short
         ("motion.elbow", 1),
+        ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
+        ("motion", {"base": "fixed", "base_position": -1.0}),
         ("payload.mass", 0),
         ("damping.stiffness_proportional", 0.0),
         ("simulation.tolerance", 0.1),
@@ -308,14 +337,14 @@ def test_override_finds_an_arm_by_its_new_name():
         ("payload.mass.x=1", ["unknown key payload.mass.x", "set payload.mass as a whole"]),
         ("motion.gravity.1=1", ["unknown key motion.gravity.1", "an array of two numbers"]),
         ("payloads.mass=1", ["unknown key payloads", "did you mean payload?", "optimizer"]),
-        ("density=1", ["unknown key density", "did you mean material.density?"]),
+        ("density=1", ["unknown key density", "did you mean material.density or arms.density?"]),
         ("source=x", ["unknown key source", "allowed: name, material"]),
         ("arms.lenght=1", ["unknown key arms.lenght", "did you mean arms.length?", "arm2"]),
         ("arms.arm3.length=1", ["unknown key arms.arm3", "allowed: 0, 1, arm1, arm2"]),
         ("arms.2.length=1", ["unknown key arms.2", "allowed: 0, 1, arm1, arm2"]),
         ("arms.-1.length=1", ["unknown key arms.-1"]),
         ("arms." + 5000 * "1" + ".length=1", ['unknown key arms."111']),
-        ("arms.1.mesh=a.geo", ["unknown key arms.1.mesh (arm2)", "allowed: name, length"]),
+        ("arms.1.grid=a.geo", ["unknown key arms.1.grid (arm2)", "allowed: name, length"]),
         ("arms.1.length=0", ["arms.1.length (arm2) = 0", "a number > 0", "[m]"]),
         ("arms.arm2.length=0", ["arms.1.length (arm2) = 0"]),
         ("arms=3", ["arms = 3", "an array of tables [[arms]]"]),
@@ -391,7 +420,7 @@ BAD_VALUES = [
     ("material.poisson_ratio", 0.5, "0.5", "a number > -1 and < 0.5"),
     ("material.poisson_ratio", -1.0, "-1.0", "a number > -1 and < 0.5"),
     ("material.density", -2700.0, "-2700.0", "a number > 0"),
-    ("interpolation.law", "simp", '"simp"', '"two-material"'),
+    ("interpolation.law", "SIMP", '"SIMP"', '"two-material" | "simp" | "pedersen"'),
     ("interpolation.penalty", 0.9, "0.9", "a number >= 1"),
     ("interpolation.floor", 0.0, "0.0", "a number > 0 and < 1"),
     ("interpolation.floor", 1, "1", "a number > 0 and < 1"),
@@ -407,6 +436,14 @@ BAD_VALUES = [
     ("arms.0.name", 65 * "a", 65 * "a", "1 to 64"),
     ("arms.0.name", "ARM2", '"arm2"', "no other arm has"),
     ("arms.0.length", 0.0, "0.0", "a number > 0"),
+    ("arms.0.design", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
+    ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
+    ("arms.0.design", 1, "1", "a string"),
+    ("arms.0.rigid", 1, "1", "true or false"),
+    ("arms.0.sid", 1, "1", "a string"),
+    ("arms.0.young_modulus", 0, "0", "a number > 0"),
+    ("arms.0.poisson_ratio", 0.5, "0.5", "a number > -1 and < 0.5"),
+    ("arms.0.density", "steel", '"steel"', "a number > 0"),
     ("arms.0.height", -0.06, "-0.06", "a number > 0"),
     ("arms.0.thickness", math.inf, "inf", "a finite number > 0"),
     ("arms.0.cells", [0, 12], "[0, 12]", "two integers >= 1"),
@@ -416,13 +453,28 @@ BAD_VALUES = [
     ("arms.0.cells", [200, 12, 1], "[200, 12, 1]", "an array of two integers"),
     ("arms.0.cells", [200.0, 12], "[200.0, 12]", "two integers"),
     ("arms.0.cells", "200x12", '"200x12"', "two integers"),
+    ("arms.0.mesh", 1, "1", "a string"),
+    ("arms.0.mesh_size", 0.0, "0.0", "a number > 0"),
+    ("arms.0.mesh_size", 0.01, "0.01", "only with mesh"),
+    ("arms.0.cell_shape", "hexagon", '"hexagon"', '"quadrilateral" | "triangle"'),
+    ("arms.0.cell_shape", "triangle", '"triangle"', "only with mesh"),
+    ("arms.0.symmetric", 1, "1", "true or false"),
     ("arms.0.passive", -0.01, "-0.01", "a number >= 0"),
     ("arms.0.passive", 0.5, "0.5", "less than half of length = 1.0 [m]"),
     ("arms.0.passive", 0.26, "0.26", "volume_fraction = 0.5 can be met"),
-    ("motion.path", "line", '"line"', '"arc"'),
+    ("motion.path", "circle", '"circle"', '"arc" | "line" | "points" | "joints"'),
+    ("motion.path", "joints", "None (default)", 'a table (CSV) with motion.path = "joints"'),
     ("motion.radius", 0.0, "0.0", "a number > 0"),
     ("motion.flattening", -0.1, "-0.1", "a number >= 0 and <= 1"),
     ("motion.flattening", 1.1, "1.1", "a number >= 0 and <= 1"),
+    ("motion.start", [0.0], "[0.0]", "an array of two numbers"),
+    ("motion.start", [0.0, 1.0], "[0.0, 1.0]", 'the default, with motion.path = "arc"'),
+    ("motion.end", [0.0, math.inf], "[0.0, inf]", "an array of two finite numbers"),
+    ("motion.file", 5, "5", "a string"),
+    ("motion.file", "absent.csv", '"absent.csv"', "found neither /"),
+    ("motion.law", "cubic", '"cubic"', '"quintic" | "septic"'),
+    ("motion.base", "rail", '"rail"', '"cart" | "fixed"'),
+    ("motion.base_position", 1, "1", '0.0, the default, with motion.base = "cart"'),
     ("motion.duration", 0.0, "0.0", "a number > 0"),
     ("motion.horizon", 0, "0", "a number > 0"),
     ("motion.cart_follow", math.nan, "nan", "a finite number"),
@@ -440,12 +492,20 @@ BAD_VALUES = [
     ("payload.mass", [[[[1.0]]]], "[[[...]]]", "a number >= 0"),
     ("payload.inertia", -1, "-1", "a number >= 0"),
     ("damping.stiffness_proportional", -2e-4, "-0.0002", "a number >= 0"),
-    ("reduction.method", "krylov", '"krylov"', '"craig-bampton" | "modal"'),
+    ("reduction.method", "guyan", '"guyan"', '"craig-bampton" | "modal" | "krylov" | "balanced"'),
     ("reduction.coordinates", 0, "0", "an integer >= 1"),
     ("reduction.coordinates", 2, "2", 'an integer >= 3 with reduction.method = "craig-bampton"'),
     ("reduction.coordinates", 4.0, "4.0", "an integer >= 1"),
     ("reduction.coordinates", True, "true", "an integer >= 1"),
     ("reduction.coordinates", 5178, "5178", "at most 5177"),  # 2*199*13 + 3
+    ("reduction.shifts", 5.0, "5.0", "an array of numbers >= 0"),
+    ("reduction.shifts", [0.0, -1.0], "[0.0, -1.0]", "an array of numbers >= 0"),
+    ("reduction.shifts", [], "[]", "at least one number >= 0, none of them twice"),
+    ("reduction.shifts", [5.0, 5.0], "[5.0, 5.0]", "none of them twice"),
+    ("reduction.shifts", [5.0], "[5.0]", '[0.0], the default, with reduction.method = "craig'),
+    ("reduction.band", [0.0], "[0.0]", "an array of two numbers >= 0"),
+    ("reduction.band", [9.0, 9.0], "[9.0, 9.0]", "the lower of the two frequencies first"),
+    ("reduction.band", [0.0, 9.0], "[0.0, 9.0]", '[0.0, 50.0], the default, with reduction.method'),
     ("simulation.tolerance", 0.0, "0.0", "a number > 0 and <= 0.1"),
     ("simulation.tolerance", 0.11, "0.11", "a number > 0 and <= 0.1"),
     ("simulation.integrator", "euler", '"euler"', '"radau" | "generalized-alpha"'),
@@ -456,12 +516,22 @@ BAD_VALUES = [
     ("simulation.sample", 3.1, "3.1", "motion.horizon = 3.0 [s]"),
     ("simulation.sample", 1e-9, "1e-09", "between 3e-07 and"),
     ("simulation.sample", 5e-324, "5e-324", "between 3e-07 and"),
-    ("objective.kind", "static", '"static"', '"esl" | "compliance"'),
+    ("objective.kind", "strain", '"strain"', '"esl" | "compliance"'),
     ("objective.load_cases", 0, "0", "an integer >= 1"),
     ("objective.load_cases", 3001, "3001", "at most 3000"),
     ("objective.load_cases", 16**5000, "2**20000...", "at most 3000"),
     ("objective.gradient", "adjoint", '"adjoint"', '"esl" | "exact"'),
-    ("objective.kind", "deviation", '"esl" (default)', "exact"),
+    ("objective.worst", "stress", '"stress"', '"compliance" | "deviation"'),
+    ("objective.loads", [], "[]", "at least one load [F_x, F_y, moment]"),
+    ("objective.loads", [[0, 0, 0]], "[[0, 0, 0]]", "none of them all zero"),
+    ("objective.loads", [[0, 1]], "[[0, 1]]", "an array of arrays of three numbers"),
+    ("objective.loads", [0, 1, 0], "[0, 1, 0]", "an array of arrays of three numbers"),
+    ("objective.attached", "springs", '"springs"', '"rigid-body" | "point-mass" | "none"'),
+    ("objective.elbow_angle", "bent", '"bent"', "a number"),
+    ("objective.modes", 0, "0", "an integer >= 1 and <= 50"),
+    ("objective.follow", 1, "1", "true or false"),
+    ("constraints.first_frequency", 0.0, "0.0", "a number > 0"),
+    ("constraints.tip_deflection", -1e-3, "-0.001", "a number > 0"),
     ("objective.exponent", 1.0, "1.0", "a number >= 2"),
     ("design.volume_fraction", 0.0, "0.0", "a number > 0 and <= 1"),
     ("design.volume_fraction", 1.5, "1.5", "a number > 0 and <= 1"),
@@ -472,6 +542,10 @@ BAD_VALUES = [
     ("design.filter_radius", -1e-9, "-1e-09", "a number >= 0"),
     ("design.projection", True, "true", "false"),
     ("design.projection", 0, "0", "false"),
+    ("design.projection", "tanh", '"tanh"', 'false | "heaviside" | "robust"'),
+    ("design.sharpness", 0.5, "0.5", "a number >= 1"),
+    ("design.continuation", 0, "0", "an integer >= 1"),
+    ("design.erosion", 0.5, "0.5", "a number > 0 and < 0.5"),
     ("design.shared_volume", 1, "1", "true or false"),
     ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
     ("optimizer.max_iterations", 16**5000, "2**20000...", "an integer >= 0 and <= 1000000"),
@@ -490,7 +564,7 @@ SHOWN_KEY = {
     ("design.volume_fraction", 5e-4): "design.minimum",
     ("design.initial", 1e-3): "design.minimum",
     ("arms.0.name", "ARM2"): "arms.1.name",
-    ("objective.kind", "deviation"): "objective.gradient",
+    ("motion.path", "joints"): "motion.file",
 }
 
 
@@ -511,19 +585,168 @@ def test_bad_value(path, value, shown, allowed):
     assert "more)" not in message
 
 
+def test_a_mesh_excludes_cells():
+    """Where both are stated; one that is stated takes the place of one that is inherited."""
+    bores = "meshes/arm_bores.geo"
+    data = minimal(3)
+    data["arms"][0] |= {"mesh": bores, "mesh_size": 0.01, "cell_shape": "triangle"}
+    data["arms"][2] |= {"cells": [20, 2]}
+    first, second, third = scene_from_dict(data).arms
+    assert first.cells is None and Path(first.mesh).name == "arm_bores.geo"
+    assert second == first.model_copy(update={"name": "arm2"})
+    assert third == Arm(**ARM | {"name": "arm3"}, cells=(20, 2))
+    data["arms"][2] |= {"mesh": bores}
+    assert "not both" in message_of(data)
+    scene = scene_from_dict(minimal(), overrides=[f"arms.mesh={bores}", "arms.1.mesh_size=0.01"])
+    assert [arm.mesh_size for arm in scene.arms] == [None, 0.01]
+    assert scene.cell_counts == {0: 0, 1: 600}
+    restored = scene_from_dict(json.loads(json.dumps(scene.to_dict())))
+    assert restored == scene and restored.arms == scene.arms
+    back = scene_from_dict(scene.to_dict(), overrides=["arms.cells=[20, 2]"])
+    assert back.arms == (Arm(**ARM, cells=(20, 2)), Arm(**ARM | {"name": "arm2"}, cells=(20, 2)))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "keys", "reason"),
+    [
+        (".toml", {}, "ends in .geo, .msh, .step, .stp"),
+        (".msh", {"mesh_size": 0.01}, "a .msh file has its cells"),
+        (".msh", {"cell_shape": "triangle"}, "a .msh file has its cells"),
+    ],
+)
+def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
+    path = tmp_path / f"arm{suffix}"
+    path.write_text("")
+    data = minimal(1)
+    data["arms"][0] |= {"mesh": str(path)} | keys
+    assert reason in message_of(data)
+
+
 def test_every_key_refuses_something():
     refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
     assert {info.key for info in describe_keys()} <= refused
 
 
 @pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
-@pytest.mark.parametrize("method", ["modal", "craig-bampton"])
+@pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov", "balanced"])
 @pytest.mark.parametrize("kind", ["esl", "compliance"])
 def test_all_choices_are_accepted(integrator, method, kind):
     tables = {"simulation": {"integrator": integrator}, "objective": {"kind": kind}}
     scene = scene_from_dict(minimal(reduction={"method": method}, **tables))
     assert (scene.simulation.integrator, scene.reduction.method) == (integrator, method)
     assert scene.objective.kind == kind
+
+
+@pytest.mark.parametrize(
+    ("n_arms", "motion", "shown", "reason"),
+    [
+        (2, {"path": "line", "radius": 2.0}, "radius = 2.0", "1.0, the default, with motion.path"),
+        (2, {"path": "line", "flattening": 0}, "flattening = 0", "1.0, the default"),
+        (2, {"path": "line", "end": [-1, 0]}, "end = [-1, 0]", "another point than motion.start"),
+        (2, {"base": "fixed", "cart_follow": 0.2}, "cart_follow = 0.2", "0.5, the default"),
+        (2, {"file": str(TWO_ARM)}, "file = ", 'none with motion.path = "arc"'),
+        (2, {"path": "points"}, "file = None (default)", "the path of a table (CSV)"),
+        (2, {"path": "joints", "file": str(TWO_ARM), "elbow": 1}, "elbow = 1", "-1, the default"),
+        (1, {"cart_follow": 0.0}, "cart_follow = 0.0", "0.5, the default, with one arm"),
+        (1, {"base": "fixed"}, 'base = "fixed"', '"cart" with one arm and motion.path = "arc"'),
+    ],
+    ids=str,
+)
+def test_motion_keys_that_do_nothing(n_arms, motion, shown, reason):
+    message = message_of(minimal(n_arms, motion=motion))
+    assert message.startswith(f"{FILE}: motion.{shown}")
+    assert f": expected {reason}" in message and "more)" not in message
+
+
+def test_one_arm_without_choices_is_accepted():
+    assert scene_from_dict(minimal(1)).motion.base == "cart"
+    fixed = {"path": "joints", "file": str(TWO_ARM), "base": "fixed"}
+    assert scene_from_dict(minimal(1, motion=fixed)).motion.base == "fixed"
+
+
+# --- files a scene names ---------------------------------------------------------------------
+
+TABLE = {"path": "points", "file": "table.csv"}
+
+
+def test_file_is_found_beside_the_scene_first_then_in_the_working_directory(tmp_path, monkeypatch):
+    beside, working = tmp_path / "scenes", tmp_path / "working"
+    for folder in (beside, working):
+        folder.mkdir()
+        (folder / "table.csv").write_text("")
+    monkeypatch.chdir(working)
+    source = "../scenes/some.toml"
+    assert scene_from_dict(minimal(motion=TABLE), source).motion.file == str(beside / "table.csv")
+    (beside / "table.csv").unlink()
+    scene = scene_from_dict(minimal(motion=TABLE), source)
+    assert scene.motion.file == str(working / "table.csv")
+    monkeypatch.chdir(tmp_path)  # and loaded again from elsewhere
+    assert scene_from_dict(scene.to_dict(), "results/summary.json") == scene
+
+
+def test_file_of_the_package_is_found_last(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert resolve_file("x.toml", "meshes/arm.geo", "key") == str(mesh_folder() / "arm.geo")
+    with pytest.raises(InputError, match=r"motion\.py"):  # its meshes, not its modules
+        resolve_file("x.toml", "motion.py", "key")
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "arm.geo").write_text("")
+    assert resolve_file("x.toml", "meshes/arm.geo", "key") == str(tmp_path / "meshes" / "arm.geo")
+
+
+def test_missing_file_is_named_with_all_places(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = message_of(minimal(motion=TABLE))
+    assert message.startswith(f'{FILE}: motion.file = "table.csv": expected the path of a file')
+    places = [tmp_path / "some" / "table.csv", tmp_path / "table.csv"]
+    assert message.endswith(f"found neither {places[0]} nor {places[1]}")
+    message = message_of(minimal(), "motion.path=points", "motion.file=table.csv")
+    assert message.startswith(f'{FILE} with --set motion.file=table.csv: motion.file = "table.csv"')
+
+
+@pytest.mark.parametrize("value", ["", ".", "a\0b", 5000 * "x", "\ud800", "/"], ids=range(6))
+def test_what_is_no_file_name_is_refused(value):
+    assert "motion.file = " in message_of(changed("motion.file", value))
+
+
+@pytest.mark.parametrize(
+    ("tables", "shown", "reason"),
+    [
+        (
+            {"reduction": {"method": "krylov", "shifts": [0.0, 9.0], "coordinates": 5}},
+            "reduction.coordinates = 5",
+            "an integer >= 6",
+        ),
+        (
+            {"reduction": {"method": "krylov", "coordinates": 2}},
+            "reduction.coordinates = 2",
+            "an integer >= 3",
+        ),
+        (
+            {"reduction": {"method": "balanced"}, "damping": {"stiffness_proportional": 0.0}},
+            "damping.stiffness_proportional = 0.0",
+            'a number > 0 with reduction.method = "balanced"',
+        ),
+        (
+            {"reduction": {"method": "balanced"}, "objective": {"gradient": "exact"}},
+            'reduction.method = "balanced"',
+            '"craig-bampton", "modal" or "krylov" with objective.gradient = "exact"',
+        ),
+    ],
+    ids=["shifts", "loads", "undamped", "adjoint"],
+)
+def test_reductions_that_cannot_be(tables, shown, reason):
+    message = message_of(minimal(**tables))
+    assert message.startswith(f"{FILE}: {shown}: expected {reason}") and "more)" not in message
+
+
+def test_several_shifts_and_a_band_are_accepted():
+    krylov = {"method": "krylov", "shifts": [0.0, 9, 25.5, 80.0], "coordinates": 12}
+    assert scene_from_dict(minimal(reduction=krylov)).reduction.shifts == (0.0, 9.0, 25.5, 80.0)
+    exact = minimal(reduction=krylov, objective={"gradient": "exact"})
+    assert scene_from_dict(exact).objective.gradient == "exact"
+    balanced = {"method": "balanced", "band": [5, 80.0]}
+    assert scene_from_dict(minimal(reduction=balanced)).reduction.band == (5.0, 80.0)
 
 
 def test_arm_is_named_in_the_path():
@@ -582,11 +805,11 @@ def test_scene_that_is_no_table(data, found):
         ("nam", "nam", "name", "name, material, interpolation, arms"),
         ("payload.mas", "payload.mas", "payload.mass", "mass, inertia"),
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
-        ("payload.density", "payload.density", "material.density", "mass, inertia"),
+        ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
         ("radius", "radius", "motion.radius", "name, material"),
         ("tolerance", "tolerance", "simulation.tolerance or optimizer.tolerance", "name, mat"),
         ("volum_fraction", "volum_fraction", "design.volume_fraction", "name, material"),
-        ("arms.0.mesh", "arms.0.mesh (arm1)", None, "name, length, height, thickness, cells"),
+        ("arms.0.blocks", "arms.0.blocks (arm1)", None, "name, length, height, thickness, cells"),
         ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
         ("payload.x y", 'payload."x y"', None, "mass, inertia"),
         ("payload.", 'payload.""', None, "mass, inertia"),
@@ -818,7 +1041,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 45
+    assert len({info.key for info in keys}) == len(keys) == 74
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info
