@@ -32,7 +32,7 @@ def main(folder: Path = Path("results/demo_two_arm")) -> do.Result:
 
     # Optimise: filter, reduce, simulate, load cases, gradient, MMA; again and again.
     result = do.optimize(scene, world=world)
-    final, views = result.evaluation, do.gather_views(share, result.arms, result.x_phys)
+    final, views = result.evaluation, do.gather_views(scene, share, result.arms, result.x_phys)
 
     # Plot on the root, which alone has the whole arms and the motion.
     if world.rank == 0:

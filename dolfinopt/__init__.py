@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dolfinopt.files import gather_views
     from dolfinopt.ledger import Ledger
     from dolfinopt.optimization import Result, optimize
-    from dolfinopt.parallel import gather_bodies, one_ending, share_arms
+    from dolfinopt.parallel import gather_arms, one_ending, share_arms
     from dolfinopt.scene import Scene, load_scene, scene_from_dict
     from dolfinopt.simulation import Trajectory, simulate
 
@@ -42,7 +42,7 @@ _HOME = {
     "evaluate": "evaluation",
     "gradient": "evaluation",
     "gather_views": "files",
-    "gather_bodies": "parallel",
+    "gather_arms": "parallel",
     "Ledger": "ledger",
     "Result": "optimization",
     "optimize": "optimization",

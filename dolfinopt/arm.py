@@ -2,18 +2,45 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 from mpi4py import MPI
 
 from dolfinopt import scene as scenes
-from dolfinopt.body import FloatingBody, floating_body
+from dolfinopt.body import FloatingBody, floating_body, rigid_bar
 from dolfinopt.elasticity import ElasticArm, element_operators
+from dolfinopt.errors import InputError
 from dolfinopt.filters import HelmholtzFilter
 from dolfinopt.ledger import Ledger
 from dolfinopt.material import Interpolated, interpolate
-from dolfinopt.mesh import structured_arm
-from dolfinopt.parallel import ArmShare
-from dolfinopt.reduction import METHODS, Basis
+from dolfinopt.mesh import arm_mesh
+from dolfinopt.parallel import ArmShare, sum_over_arms
+from dolfinopt.projection import Projected, preserving_threshold, project, robust_thresholds
+from dolfinopt.reduction import METHODS, Basis, Options
+from dolfinopt.standard_input import load_body
+from dolfinopt.symmetry import AxisSymmetry
+from dolfinopt.vibration import LoadedModes, RigidIntegrals, loaded_modes
+
+
+THRESHOLDS = 0.25, 0.75
+
+
+@dataclass(frozen=True)
+class Realised:
+    """One design that design variables stand for.
+
+    Attributes:
+        x_phys: (n_cells,) physical densities.
+        projected: the way back through the projection, None where there is none.
+    """
+
+    x_phys: np.ndarray
+    projected: Projected | None
 
 
 class Arm:
@@ -24,33 +51,47 @@ class Arm:
     Attributes:
         mesh: see `ArmMesh`.
         elastic: stiffness and mass of the current design.
-        basis: of the current design; None before the first `reduce`.
-        start: (interior dofs, k) eigenvectors from which the next `reduce` sets out, or None.
+        solid: the arm's solid material.
+        basis: of the current design; None before `reduce`.
+        start: (owned rows, k) eigenvectors from which the next `reduce` sets out, or None.
+        loaded_starts: the same for every `loaded_modes`, by the place in the chain.
+        places: of the arms in the chain that have this design.
     """
 
     def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, ledger: Ledger):
         """Mesh arm number `index` on the ranks of `comm` (collective there)."""
         arm = scene.arms[index]
         self.scene = scene
+        self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
+        self.solid = scene.material_of(index)
         with ledger.phase("mesh"):
-            self.mesh = structured_arm(
-                comm, arm.name, arm.length, arm.height, arm.cells, arm.passive
-            )
+            self.mesh = arm_mesh(comm, arm)
+            self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
         with ledger.phase("element operators"):
-            operators = element_operators(self.mesh, arm.thickness, scene.material.poisson_ratio)
+            operators = element_operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
             self.elastic = ElasticArm(self.mesh, operators, ledger)
             self.filter = HelmholtzFilter(self.mesh, scene.design.filter_radius)
+        if scene.reduction.coordinates > self.elastic.num_dofs:  # of a mesh file known only now
+            raise InputError(
+                f"{scene.source}: reduction.coordinates = {scene.reduction.coordinates}: expected "
+                f"at most {self.elastic.num_dofs}, the degrees of freedom of arm {arm.name!r}"
+            )
         self.ledger = ledger
         self.basis: Basis | None = None
         self.start: np.ndarray | None = None
+        self.loaded_starts: dict[int, np.ndarray] = {}
         self._body: FloatingBody | None = None
+        self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
         self._x_phys = np.empty(0)
         self._material: Interpolated | None = None
 
     def physical(self, x: np.ndarray) -> np.ndarray:
         """Return the physical densities of design variables x: filtered, passive cells solid."""
+        x = np.where(self.mesh.passive, 1.0, x)
         with self.ledger.phase("filter"):
-            x_phys = self.filter.forward(np.where(self.mesh.passive, 1.0, x))
+            if self.symmetry is not None:
+                x = self.symmetry.forward(x)
+            x_phys = self.filter.forward(x)
         # The filter keeps bounds up to rounding, and only they are in the laws' domain.
         return np.where(self.mesh.passive, 1.0, np.clip(x_phys, 0.0, 1.0))
 
@@ -58,13 +99,68 @@ class Arm:
         """Return the physical densities of the same design variable in every cell."""
         return self.physical(np.full(self.mesh.num_cells, density))
 
-    def chain(self, slope: np.ndarray) -> np.ndarray:
-        """Return the derivative with respect to x from that with respect to x_phys."""
+    def realise(self, x: np.ndarray, sharpness: float, threshold: float) -> tuple[Realised, ...]:
+        """Return the designs that x stands for.
+
+        One; or eroded, dilated and nominal with the robust projection, the nominal one last.
+
+        Args:
+            x: (n_cells,) design variables.
+            sharpness: beta of the scene's projection.
+            threshold: its eta.
+        """
+        x_phys = self.physical(x)
+        kind = self.scene.design.projection
+        if not kind:
+            return (Realised(x_phys, None),)
+        thresholds: Sequence[float] = (threshold,)
+        if kind == "robust":
+            eroded, nominal, dilated = robust_thresholds(self.scene.design.erosion)
+            thresholds = (eroded, dilated, nominal)
+        projected = [project(x_phys, sharpness, eta) for eta in thresholds]
+        return tuple(Realised(np.where(self.mesh.passive, 1.0, p.value), p) for p in projected)
+
+    def preserving_threshold(self, x: np.ndarray, sharpness: float) -> float:
+        """Return the projection's threshold that keeps the volume of x (collective on the arm).
+
+        Within `THRESHOLDS`: where all that is left between void and solid is nearly void, the
+        volume alone would choose a threshold among the void cells.
+        """
+        area = self._active(self.mesh.area)
+        eta = preserving_threshold(self.physical(x), area, sharpness, self.mesh.comm)
+        return float(np.clip(eta, *THRESHOLDS))
+
+    def chain(self, slope: np.ndarray, realised: Realised | None = None) -> np.ndarray:
+        """Return the derivative with respect to x from that with respect to x_phys.
+
+        Args:
+            slope: (n_cells,).
+            realised: what `realise` made of x; None: not projected.
+        """
+        if realised is not None and realised.projected is not None:
+            slope = realised.projected.backward(self._active(slope))
         with self.ledger.phase("filter"):
-            return self._active(self.filter.backward(self._active(slope)))
+            slope = self.filter.backward(self._active(slope))
+            if self.symmetry is not None:
+                slope = self.symmetry.backward(slope)
+            return self._active(slope)
 
     def _active(self, values: np.ndarray) -> np.ndarray:
         return np.where(self.mesh.passive, 0.0, values)
+
+    def set_design(self, x_phys: np.ndarray) -> None:
+        """Take physical densities in [0, 1]; what was made of others is forgotten."""
+        if np.array_equal(x_phys, self._x_phys):
+            return
+        options = self.scene.interpolation
+        self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
+        self.elastic.set_design(
+            self.solid.young_modulus * self._material.stiffness,
+            self.solid.density * self._material.mass,
+        )
+        self._x_phys = x_phys.copy()
+        self.basis = self._body = None
+        self._loaded = {}
 
     def reduce(self, x_phys: np.ndarray) -> FloatingBody:
         """Return the floating body of physical densities in [0, 1] (collective on the arm).
@@ -72,28 +168,57 @@ class Arm:
         The modes found before are where the search for the new ones starts. Nothing is done
         twice for the same densities.
         """
-        if self._body is not None and np.array_equal(x_phys, self._x_phys):
+        self.set_design(x_phys)
+        if self._body is not None:
             return self._body
-        options, material = self.scene.interpolation, self.scene.material
-        self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
-        self.elastic.set_design(
-            material.young_modulus * self._material.stiffness,
-            material.density * self._material.mass,
-        )
-        reduction = self.scene.reduction
         with self.ledger.phase("reduction"):
-            reduce = METHODS[reduction.method].reduce
-            self.basis = reduce(self.elastic, reduction.coordinates, self.start)
+            reduce = METHODS[self.scene.reduction.method].reduce
+            self.basis = reduce(self.elastic, self.reduction_options, self.start)
         self.start = self.basis.start
         with self.ledger.phase("inertia integrals"):
             damping = self.scene.damping.stiffness_proportional
             self._body = floating_body(self.elastic, self.basis, damping)
-        self._x_phys = x_phys.copy()
         return self._body
+
+    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
+        """Return the current design's modes with what is carried (collective on the arm).
+
+        Args:
+            place: of the arm in the chain; several arms may share this design.
+            carried: about the outboard point.
+        """
+        known = self._loaded.get(place)
+        if known is None or known[0] != carried:
+            count, start = self.scene.objective.modes, self.loaded_starts.get(place)
+            with self.ledger.phase("vibration"):
+                known = carried, loaded_modes(self.elastic, carried, count, start)
+            self._loaded[place] = known
+            self.loaded_starts[place] = known[1].start
+        return known[1]
+
+    @property
+    def starts(self) -> list[np.ndarray]:
+        """`start` and every place's `loaded_starts`; without columns where there is none yet."""
+        empty = np.empty((self.elastic.num_interior, 0))
+        loaded = [self.loaded_starts.get(place, empty) for place in self.places]
+        return [empty if self.start is None else self.start, *loaded]
+
+    @starts.setter
+    def starts(self, starts: Sequence[np.ndarray]) -> None:
+        self.start = starts[0] if starts[0].shape[1] else None
+        loaded = zip(self.places, starts[1:], strict=True)
+        self.loaded_starts = {place: one for place, one in loaded if one.shape[1]}
+
+    @property
+    def reduction_options(self) -> Options:
+        """What the scene tells the reduction method."""
+        options = self.scene.reduction
+        damping = self.scene.damping.stiffness_proportional
+        return Options(options.coordinates, options.shifts, options.band, damping)
 
     @property
     def material(self) -> Interpolated:
-        """Interpolated stiffness and mass of the design that was reduced last."""
+        """Interpolated stiffness and mass of the current design."""
         assert self._material is not None
         return self._material
 
@@ -111,5 +236,72 @@ class Arm:
 
 
 def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int, Arm]:
-    """Build this rank's arms, keyed by their index in the scene (collective on `share.comm`)."""
-    return {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
+    """Build this rank's arms, keyed by their index in the scene (collective on `share.comm`).
+
+    Only arms with a design of their own: those that share one, rigid arms and those from a file
+    need no mesh.
+
+    Raises:
+        InputError: a mesh file cannot be an arm, or holds more solid cells than the volume allows.
+    """
+    arms = {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
+    if any(scene.arms[index].mesh is not None for index in scene.cell_counts):
+        _check_solid(scene, share, arms)
+    return arms
+
+
+def _check_solid(scene: scenes.Scene, share: ArmShare, arms: Mapping[int, Arm]) -> None:
+    """Raise InputError if solid cells exceed the volume limit, which a scene cannot know.
+
+    Collective on `share.world`.
+    """
+    owners = list(scene.cell_counts)
+    parts = {}
+    for k, arm in arms.items():
+        weight = scene.owners.count(k) * scene.arms[k].thickness
+        parts[k] = np.zeros((len(owners), 2))
+        parts[k][owners.index(k)] = [
+            weight * arm.mesh.area @ arm.mesh.passive,
+            weight * arm.mesh.area.sum(),
+        ]
+    volumes = sum_over_arms(share, parts)
+    names = [f"arm {scene.arms[k].name!r}" for k in owners]
+    if scene.design.shared_volume:
+        volumes, names = volumes.sum(axis=0, keepdims=True), ["all arms together"]
+    limit, least = scene.design.volume_fraction, scene.design.minimum
+    for name, (solid, total) in zip(names, volumes, strict=True):
+        fraction = solid / total
+        if fraction + (1.0 - fraction) * least > limit:
+            raise InputError(
+                f"{scene.source}: design.volume_fraction = {limit}: the solid cells are "
+                f"{fraction:.4g} of the volume of {name}, more than that with design.minimum = "
+                f"{least} between them; make group passive smaller, shorten arms.passive or raise "
+                "the volume"
+            )
+
+
+def chain_of(scene: scenes.Scene, owned: Mapping[int, FloatingBody]) -> list[FloatingBody]:
+    """Return the bodies from the cart outwards.
+
+    Args:
+        scene: says which arm has its own design, shares one, is rigid or comes from a file.
+        owned: bodies of the arms with a design of their own, by their index.
+    """
+    return [
+        fixed_body(scene, index) if owner is None else owned[owner]
+        for index, owner in enumerate(scene.owners)
+    ]
+
+
+@cache
+def _read_body(sid: str, changed: int, length: float) -> FloatingBody:
+    """Read a body once for every state of its file: 4 ms, as long as the rest of an evaluation."""
+    return load_body(Path(sid), length)
+
+
+def fixed_body(scene: scenes.Scene, index: int) -> FloatingBody:
+    """Return the body of an arm that is not designed here: rigid, or from a file."""
+    arm = scene.arms[index]
+    if arm.sid is not None:
+        return _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
+    return rigid_bar(arm.length, arm.height, arm.thickness, scene.material_of(index).density)

@@ -102,8 +102,30 @@ def floating_body(arm: ElasticArm, basis: Basis, stiffness_proportional: float) 
     )
 
 
+def rigid_bar(length: float, height: float, thickness: float, density: float) -> FloatingBody:
+    """Return a solid bar without elastic coordinates; m, kg/m3."""
+    mass = density * length * height * thickness
+    none, square = np.zeros(0), np.zeros((0, 0))
+    return FloatingBody(
+        mass=mass,
+        moment=np.array([0.5 * mass * length, 0.0]),
+        inertia=mass * (length**2 / 3.0 + height**2 / 12.0),
+        C=np.zeros((2, 0)),
+        j=none,
+        r=none,
+        M=square,
+        G=square,
+        K=square,
+        D=square,
+        outboard=np.zeros((3, 0)),
+        outboard_point=np.array([length, 0.0]),
+    )
+
+
 def first_frequency(body: FloatingBody) -> float:
-    """Return the lowest natural frequency of the reduced clamped-free body, Hz."""
+    """Return the lowest natural frequency of the reduced clamped-free body, Hz; inf if rigid."""
+    if body.coordinates == 0:
+        return float("inf")
     lower = np.linalg.cholesky(body.M)
     inverse = np.linalg.inv(lower)
     values = np.linalg.eigvalsh(inverse @ body.K @ inverse.T)

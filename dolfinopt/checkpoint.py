@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
 from dolfinopt.integrators.problem import Solution
-from dolfinopt.parallel import ArmShare, gather_cells, on_root
+from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root
 from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
@@ -32,23 +32,27 @@ class Memory:
     Attributes:
         iteration: design updates made.
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
-        modes: per arm (interior dofs, k): eigenvectors from which this design's reduction set out;
-            k = 0 when it began from nothing.
+        modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
+            loaded modes set out; k = 0 when they began from nothing.
         multipliers: MMA's, on all ranks.
         solution: from which this design's simulation set out, or None; the root's counts.
         history: rows so far.
         initial_deviation: (n, 2) m of the initial design.
         finished: reason, or "" while running.
+        sharpness: the projection's beta.
+        thresholds: per arm its eta.
     """
 
     iteration: int
     cells: Mapping[int, np.ndarray]
-    modes: Mapping[int, np.ndarray]
+    modes: Mapping[int, Sequence[np.ndarray]]
     multipliers: np.ndarray
     solution: Solution | None
     history: list[HistoryRow]
     initial_deviation: np.ndarray
     finished: str
+    sharpness: float
+    thresholds: Mapping[int, float]
 
 
 def _scene_text(scene: Scene) -> str:
@@ -64,10 +68,16 @@ def save(
     folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm], memory: Memory
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
-    centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
-    cells = gather_cells(share, memory.cells)
-    nodes = gather_cells(share, {k: _interior_points(arm) for k, arm in arms.items()})
-    modes = gather_cells(share, memory.modes)
+    columns: dict[str, Mapping[int, Any]] = {
+        "centroid": gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()}),
+        "cells": gather_cells(share, memory.cells),
+        "threshold": gather_arms(share, memory.thresholds),
+        "points": gather_cells(share, {k: _interior_points(arm) for k, arm in arms.items()}),
+    }
+    for j in range(len(scene.arms) + 1):
+        known = {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()}
+        columns[f"modes{j}"] = gather_cells(share, {k: rows for k, (rows, _) in known.items()})
+        columns[f"outboard{j}"] = gather_cells(share, {k: last for k, (_, last) in known.items()})
     if share.world.rank != 0:
         return
     arrays: dict[str, Any] = {
@@ -77,12 +87,13 @@ def save(
         "history": np.array([astuple(row) for row in memory.history]),
         "initial_deviation": memory.initial_deviation,
         "finished": np.array(memory.finished),
+        "sharpness": memory.sharpness,
     }
     if memory.solution is not None:
         for field in (*SOLUTION, "error"):
             arrays[f"solution/{field}"] = getattr(memory.solution, field)
-    for k, values in enumerate(zip(centroids, cells, nodes, modes, strict=True)):
-        for key, value in zip(("centroid", "cells", "points", "modes"), values, strict=True):
+    for key, by_arm in columns.items():
+        for k, value in by_arm.items():
             arrays[f"arm{k}/{key}"] = value
     write_arrays(folder / NAME, arrays)
 
@@ -103,12 +114,18 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
     arrays = on_root(share.world, _read, folder, scene)
     if int(arrays["iteration"]) < 0:
         return None
-    cells, modes = {}, {}
+    cells: dict[int, np.ndarray] = {}
+    modes: dict[int, list[np.ndarray]] = {}
     for k, arm in arms.items():
         rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
         cells[k] = arrays[f"arm{k}/cells"][rows]
         rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
-        modes[k] = arrays[f"arm{k}/modes"][(2 * rows[:, None] + [0, 1]).ravel()]
+        rows = (2 * rows[:, None] + [0, 1]).ravel()
+        last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
+        modes[k] = []
+        for j in range(len(arm.starts)):
+            interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
+            modes[k].append(np.vstack([interior[rows], outboard if last else outboard[:0]]))
     solution = None
     if "solution/error" in arrays:
         parts = {field: arrays[f"solution/{field}"] for field in SOLUTION}
@@ -123,7 +140,16 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
         history=history,
         initial_deviation=arrays["initial_deviation"],
         finished=str(arrays["finished"]),
+        sharpness=float(arrays["sharpness"]),
+        thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in arms},
     )
+
+
+def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
+    inner = arm.elastic.num_interior
+    whole = modes[j] if j < len(modes) else np.empty((inner, 0))
+    return whole[:inner], whole[inner:]
 
 
 def _interior_points(arm: Arm) -> np.ndarray:

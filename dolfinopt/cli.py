@@ -25,7 +25,13 @@ if TYPE_CHECKING:
     from dolfinopt.parallel import ArmShare
     from dolfinopt.simulation import Trajectory
 
-UNITS = {"esl": "N m", "compliance": "N m s", "deviation": "m"}
+UNITS = {
+    "esl": "N m",
+    "compliance": "N m s",
+    "deviation": "m",
+    "static": "N m",
+    "eigenfrequency": "s2",
+}
 BEGUN = time.perf_counter()
 
 
@@ -151,7 +157,7 @@ def simulate(
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, folder)
     evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
-    views = gather_views(share, arms, x_phys)
+    views = gather_views(loaded, share, arms, x_phys)
     summary = summarise(
         loaded, share, arms, x_phys, evaluation, ledger, wall=time.perf_counter() - BEGUN
     )
@@ -196,14 +202,75 @@ def gradient(
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, out.parent)
-    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
+    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger, simulated=False)
     by_cell = slopes(loaded, share, arms, trajectory, ledger)
-    write_gradient(out, share, arms, by_cell, evaluation.objective)
+    write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
         unit = UNITS[loaded.objective.kind]
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {kind} gradient in {out}")
     if check:
         _check_gradient(world, loaded, share, arms, x_phys, ledger)
+
+
+# -- export ----------------------------------------------------------------------------------
+
+
+@commands.command()
+@scene_argument
+@design_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="folder for the bodies",
+)
+@set_option
+@click.pass_obj
+def export(
+    world: MPI.Comm, scene: Path, design: Path | None, out: Path, overrides: tuple[str, ...]
+) -> None:
+    """Write the reduced arms of SCENE for other multibody codes: SID, .npz of it, MBDyn's .fem."""
+    from dolfinopt.files import write_arrays, write_text
+    from dolfinopt.ledger import Ledger
+    from dolfinopt.mbdyn import fem_text
+    from dolfinopt.parallel import gather_arms
+    from dolfinopt.sid import sid_arrays, sid_text
+
+    loaded = _load(world, scene, overrides)
+    share, arms, x_phys = _design(world, loaded, design, Ledger())
+    _prepare(world, out)
+    exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
+    bodies = gather_arms(share, exported)
+    if world.rank != 0:
+        return
+    for arm, owner in zip(loaded.arms, loaded.owners, strict=True):
+        if owner is None:
+            click.echo(f"{arm.name}: not exported, it is rigid or comes from a file")
+            continue
+        data, element = bodies[owner]
+        write_text(out / f"{arm.name}.sid", sid_text(data))
+        write_arrays(out / f"{arm.name}.sid.npz", sid_arrays(data))
+        write_text(out / f"{arm.name}.fem", fem_text(element))
+        click.echo(
+            f"{arm.name}: {data.mass:.6g} kg, {data.coordinates} coordinates, "
+            f"{len(element.labels)} nodes; in {out / arm.name}.sid, .sid.npz, .fem"
+        )
+
+
+def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
+    """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
+    from dolfinopt.mbdyn import lumped_nodes, modal_element
+    from dolfinopt.standard_input import spatial_moments, to_sid
+
+    body = arm.reduce(x_phys)
+    assert arm.basis is not None
+    moments = spatial_moments(arm.elastic, arm.basis, thickness)
+    nodes = lumped_nodes(arm.elastic, arm.basis)
+    if nodes is None:
+        return None
+    title = f"{arm.mesh.name} of {arm.scene.name}"
+    return to_sid(body, moments, comment=title), modal_element(body, moments, nodes, thickness)
 
 
 @commands.command()
@@ -220,7 +287,7 @@ def plot(world: MPI.Comm, folder: Path) -> None:
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, folder / "design.npz", ledger)
     _, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
-    views = gather_views(share, arms, x_phys)
+    views = gather_views(loaded, share, arms, x_phys)
     if trajectory is None:
         return
     history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
@@ -271,6 +338,11 @@ def _load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
 
         scene = load_scene(path, overrides)
         check_motion(scene)
+        for index, arm in enumerate(scene.arms):
+            if arm.sid is not None:
+                from dolfinopt.arm import fixed_body
+
+                fixed_body(scene, index)
         return scene
 
     return on_root(world, load)
@@ -315,7 +387,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool) -> No
     from dolfinopt.files import gather_views, write_summary, write_trajectory
     from dolfinopt.summary import summarise
 
-    views = gather_views(result.share, result.arms, result.x_phys)
+    views = gather_views(scene, result.share, result.arms, result.x_phys)
     summary = summarise(
         scene,
         result.share,
@@ -324,6 +396,8 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool) -> No
         result.evaluation,
         result.ledger,
         wall=time.perf_counter() - BEGUN,
+        counts=result.counts,
+        crisp=result.crisp,
         iterations=result.iterations,
         converged=result.converged,
         stop_reason=result.stop_reason,
@@ -356,13 +430,16 @@ def _draw(
 ) -> None:
     """Draw all pictures of a run (root only)."""
     from dolfinopt import plots
+    from dolfinopt.files import designed
 
     labels = {
         "esl": "compliance of the load cases [N m]",
         "compliance": "integral of the compliance [N m s]",
         "deviation": "p-mean of the deviation [m]",
+        "static": "compliance under static loads [N m]",
+        "eigenfrequency": "squared longest periods [s2]",
     }
-    plots.draw_design(folder / "design.png", views, scene.name)
+    plots.draw_design(folder / "design.png", designed(views), scene.name)
     if history:
         plots.draw_history(folder / "history.png", history, labels[scene.objective.kind])
     plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)

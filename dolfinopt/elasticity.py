@@ -173,6 +173,21 @@ class InteriorMatrix:
         self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
 
+@dataclass(frozen=True)
+class ConstraintModes:
+    """One arm under unit displacements (u_x, u_y, theta) of its outboard interface.
+
+    Attributes:
+        interior: (num_interior, 3) owned interior rows.
+        field: (n_nodes, 2, 3) nodal field.
+        stiffness: (3, 3) S, force and moment at the interface by its displacement.
+    """
+
+    interior: np.ndarray
+    field: np.ndarray
+    stiffness: np.ndarray
+
+
 class ElasticArm:
     """One arm's stiffness and mass for the current design, with one factorisation a design.
 
@@ -203,6 +218,7 @@ class ElasticArm:
         self._ksp: PETSc.KSP | None = None
         self._mass_ready = self._factor_ready = self._mass_matrix_ready = False
         self._young = self._density = np.empty(0)
+        self._constraint_modes: ConstraintModes | None = None
 
     # -- set-up ------------------------------------------------------------------------------
 
@@ -328,6 +344,7 @@ class ElasticArm:
                 self._stiffness.assemble(young)
             self.ledger.counts.assemblies += 1
             self._factor_ready = False
+            self._constraint_modes = None
         if not np.array_equal(density, self._density):
             self._density = density.copy()
             self._mass_ready = self._mass_matrix_ready = False
@@ -402,6 +419,18 @@ class ElasticArm:
         """Solve K_II u = right for PETSc vectors of owned interior dofs."""
         self.factorise().solve(right, solution)
         self.ledger.counts.solves += 1
+
+    def constraint_modes(self) -> ConstraintModes:
+        """Return the static fields of unit displacements of the outboard interface; once a design.
+
+        Psi = [-K_II^-1 K_Ib; I],  S = Psi' K Psi: three solves with the factor at hand.
+        """
+        if self._constraint_modes is None:
+            coupling, _ = self.restrict(self.stiffness_times(self.rigid))
+            interior = self.solve(-coupling)
+            field = self.expand(interior, np.eye(3))
+            self._constraint_modes = ConstraintModes(interior, field, self.energy_matrix(field))
+        return self._constraint_modes
 
     # -- cells -------------------------------------------------------------------------------
 

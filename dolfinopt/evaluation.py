@@ -1,62 +1,102 @@
-"""One pass down the street: physical densities -> bodies -> simulation -> objective."""
+"""One pass down the street: physical densities -> bodies -> what the scene asks of them.
+
+Only what is asked for is done: a static objective needs neither simulation nor mass matrix, an
+eigenfrequency no simulation.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from dolfinopt.arm import chain_of, fixed_body
 from dolfinopt.body import first_frequency
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
-from dolfinopt.mechanism import BodySlopes
+from dolfinopt.motion import rigid_motion
 from dolfinopt.objective import (
     body_slopes_of,
-    load_cases,
+    frozen_moments,
     objective,
-    second_moments,
     worst_instants,
 )
-from dolfinopt.parallel import ArmShare, gather_bodies, on_root
+from dolfinopt.parallel import ArmShare, gather_arms, on_root, sum_over_arms
 from dolfinopt.scene import Scene
-from dolfinopt.sensitivity import esl_gradient, exact_gradient
+from dolfinopt.sensitivity import (
+    deflection_gradient,
+    esl_gradient,
+    exact_gradient,
+    period_gradient,
+    rigid_gradient,
+    static_gradient,
+)
 from dolfinopt.simulation import Trajectory, simulate
+from dolfinopt.statics import static_response
+from dolfinopt.vibration import (
+    Chain,
+    LoadedModes,
+    RigidIntegrals,
+    rigid_integrals,
+    squared_period,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
+T = TypeVar("T")
+Cells = Mapping[int, np.ndarray]
+
 
 @dataclass(frozen=True)
-class Evaluation:
-    """What one design does; the same on all ranks.
+class Motion:
+    """What the simulated motion does to one design.
 
     Attributes:
-        objective: see `objective.objective`; N m, N m s or m.
-        compliance: sum of the load cases' compliance, whatever the objective, N m.
+        compliance: sum of the load cases' compliance, N m.
         max_deviation, max_deviation_time: m, s.
-        first_frequencies: of every arm, clamped-free, Hz.
+        first_frequencies: of every arm, clamped-free, Hz; inf of a rigid one.
         error: estimated relative error of the elastic coordinates.
     """
 
-    objective: float
-    compliance: float
-    max_deviation: float
-    max_deviation_time: float
-    first_frequencies: tuple[float, ...]
-    error: float
+    compliance: float = np.nan
+    max_deviation: float = np.nan
+    max_deviation_time: float = np.nan
+    first_frequencies: tuple[float, ...] = ()
+    error: float = np.nan
+
+
+@dataclass(frozen=True)
+class Evaluation(Motion):
+    """What one design does; the same on all ranks. What the scene did not ask for is nan.
+
+    Attributes:
+        objective: see `evaluate`; N m, N m s, m or s2.
+        constraints: (k,) of the scene's [constraints], relative, kept where <= 0.
+        loaded_frequencies: of every flexible arm with what it carries, Hz; empty unless asked for.
+    """
+
+    objective: float = np.nan
+    constraints: tuple[float, ...] = ()
+    loaded_frequencies: tuple[float, ...] = ()
 
 
 def evaluate(
     scene: Scene,
     share: ArmShare,
     arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
+    x_phys: Cells,
     ledger: Ledger,
     start: Solution | None = None,
+    *,
+    simulated: bool = True,
 ) -> tuple[Evaluation, Trajectory | None]:
     """Reduce every arm, simulate on the root, evaluate the objective (collective).
+
+    The objective is that of `objective.objective`, or: "static", the sum of the arms' compliance
+    under `objective.loads`; "eigenfrequency", the sum of the arms' `squared_period`.
 
     Args:
         scene: what is simulated and minimised.
@@ -65,34 +105,40 @@ def evaluate(
         x_phys: their physical densities (n_cells,).
         ledger: of this rank.
         start: solution of a nearby design; read on the root only.
+        simulated: False leaves out the motion where the objective does not need it.
 
     Returns:
-        The evaluation, and on the root the trajectory.
+        The evaluation, and on the root the trajectory, if there is one.
 
     Raises:
         ConvergenceError: on all ranks alike.
     """
-    mine = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
-    bodies = gather_bodies(share, mine)
-    kept: list[Trajectory] = []
-
-    def run() -> Evaluation:
-        trajectory = simulate(scene, bodies, ledger, start)
-        kept.append(trajectory)
-        with ledger.phase("objective"):
-            worst = worst_instants(trajectory, scene.objective.load_cases)
-            distance, when = trajectory.max_deviation
-            return Evaluation(
-                objective=objective(trajectory, scene),
-                compliance=float(trajectory.compliance[worst].sum()),
-                max_deviation=distance,
-                max_deviation_time=when,
-                first_frequencies=tuple(first_frequency(body) for body in bodies),
-                error=trajectory.solution.error,
-            )
-
-    evaluation = on_root(share.world, run)
-    return evaluation, kept[0] if kept else None
+    for index, arm in arms.items():
+        arm.set_design(x_phys[index])
+    kind = scene.objective.kind
+    value, motion, trajectory = np.nan, Motion(), None
+    if simulated or scene.objective.simulated:
+        value, motion, trajectory = _moved(scene, share, arms, x_phys, ledger, start)
+    if kind == "static":
+        value = _static_compliance(scene, share, arms)
+    constraints: list[float] = []
+    frequencies: tuple[float, ...] = ()
+    if kind == "eigenfrequency" or scene.constraints.first_frequency is not None:
+        periods, frequencies = _vibration(scene, share, arms)
+        if kind == "eigenfrequency":
+            value = float(periods.sum())
+        if scene.constraints.first_frequency is not None:
+            constraints += list(periods * scene.constraints.first_frequency**2 - 1.0)
+    if scene.constraints.tip_deflection is not None:
+        tips = _deflections(scene, share, arms)
+        constraints += list(tips / scene.constraints.tip_deflection - 1.0)
+    evaluation = Evaluation(
+        **vars(motion),
+        objective=value,
+        constraints=tuple(map(float, constraints)),
+        loaded_frequencies=frequencies,
+    )
+    return evaluation, trajectory
 
 
 def gradient(
@@ -111,17 +157,210 @@ def gradient(
         ledger: of this rank.
     """
 
-    def moments() -> list[np.ndarray]:
+    def moments() -> dict[int, np.ndarray]:
         assert trajectory is not None
-        return second_moments(trajectory, load_cases(trajectory, scene))
+        return _by_owner(scene, frozen_moments(trajectory, scene))
 
-    def slopes() -> list[BodySlopes]:
+    def slopes() -> dict[int, object]:
         assert trajectory is not None
         with ledger.phase("adjoint"):
-            return body_slopes_of(trajectory, scene)
+            return _by_owner(scene, body_slopes_of(trajectory, scene))
 
+    if scene.objective.kind == "static":
+        uses = _uses(scene)
+        response = {k: static_response(arm.elastic, _loads(scene)) for k, arm in arms.items()}
+        return {k: uses[k] * static_gradient(arm, response[k]) for k, arm in arms.items()}
+    if scene.objective.kind == "eigenfrequency":
+        rows = _period_rows(scene, share, arms)
+        return {k: np.sum([row[k] for row in rows], axis=0) for k in arms}
     if scene.objective.gradient == "esl":
-        Q = on_root(share.world, moments)
-        return {index: esl_gradient(arm, Q[index]) for index, arm in arms.items()}
+        A = on_root(share.world, moments)
+        return {index: esl_gradient(arm, A[index]) for index, arm in arms.items()}
     by_body = on_root(share.world, slopes)
     return {index: exact_gradient(arm, by_body[index]) for index, arm in arms.items()}
+
+
+def constraint_gradients(
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
+) -> list[dict[int, np.ndarray]]:
+    """Return the gradients of `Evaluation.constraints` by the physical densities (collective).
+
+    Args:
+        scene, share, arms: as for `gradient`.
+    """
+    limits, rows = scene.constraints, []
+    if limits.first_frequency is not None:
+        for row in _period_rows(scene, share, arms):
+            rows.append({k: limits.first_frequency**2 * values for k, values in row.items()})
+    if limits.tip_deflection is not None:
+        for owner in scene.cell_counts:
+            row = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
+            if owner in arms:
+                response = static_response(arms[owner].elastic, _loads(scene))
+                slope = deflection_gradient(arms[owner], response, scene.objective.exponent)
+                row[owner] = slope / limits.tip_deflection
+            rows.append(row)
+    return rows
+
+
+# -- the motion ------------------------------------------------------------------------------
+
+
+def _moved(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x_phys: Cells,
+    ledger: Ledger,
+    start: Solution | None,
+) -> tuple[float, Motion, Trajectory | None]:
+    """Reduce and simulate; return the objective, nan where it is none of the motion."""
+    mine = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
+    owned = gather_arms(share, mine)
+    kept: list[Trajectory] = []
+
+    def run() -> tuple[float, Motion]:
+        bodies = chain_of(scene, owned)
+        trajectory = simulate(scene, bodies, ledger, start)
+        kept.append(trajectory)
+        with ledger.phase("objective"):
+            worst = worst_instants(trajectory, scene.objective.load_cases)
+            distance, when = trajectory.max_deviation
+            value = objective(trajectory, scene) if scene.objective.simulated else np.nan
+            return value, Motion(
+                compliance=float(trajectory.compliance[worst].sum()),
+                max_deviation=distance,
+                max_deviation_time=when,
+                first_frequencies=tuple(first_frequency(body) for body in bodies),
+                error=trajectory.solution.error,
+            )
+
+    value, motion = on_root(share.world, run)
+    return value, motion, kept[0] if kept else None
+
+
+def _by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:
+    """Add up what belongs to the arms of one design; rigid arms and those from files have none."""
+    total: dict[int, T] = {}
+    for owner, part in zip(scene.owners, parts, strict=True):
+        if owner is not None:
+            total[owner] = total[owner] + part if owner in total else part  # type: ignore[operator]
+    return total
+
+
+def _uses(scene: Scene) -> dict[int, int]:
+    """Return how many arms have each design."""
+    return _by_owner(scene, [1] * len(scene.arms))
+
+
+# -- statics ---------------------------------------------------------------------------------
+
+
+def _loads(scene: Scene) -> np.ndarray:
+    return np.array(scene.objective.loads)
+
+
+def _static_compliance(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> float:
+    """Return the sum over all arms of their compliance under the unit loads (collective)."""
+    uses = _uses(scene)
+    values = {
+        k: uses[k] * static_response(arm.elastic, _loads(scene)).compliance
+        for k, arm in arms.items()
+    }
+    return float(sum(_everywhere(share, values).values()))
+
+
+def _deflections(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> np.ndarray:
+    """Return every design's deflection under the loads, m (collective)."""
+    exponent = scene.objective.exponent
+    values = {
+        k: static_response(arm.elastic, _loads(scene)).deflection(exponent)
+        for k, arm in arms.items()
+    }
+    return np.array(list(_everywhere(share, values).values()))
+
+
+def _everywhere(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:
+    """Return one object an arm on all ranks, in the arms' order (collective)."""
+    return share.world.bcast(gather_arms(share, mine), root=0)
+
+
+# -- vibration -------------------------------------------------------------------------------
+
+
+def _chain(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> Chain:
+    """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
+    owned = _everywhere(share, {k: rigid_integrals(arm.elastic) for k, arm in arms.items()})
+
+    def freeze() -> Chain:
+        bodies, reach = [], []
+        for place, owner in enumerate(scene.owners):
+            if owner is not None:
+                bodies.append(owned[owner])
+                reach.append(complex(scene.arms[place].length, 0.0))
+            else:
+                body = fixed_body(scene, place)
+                bodies.append(RigidIntegrals(body.mass, complex(*body.moment), body.inertia))
+                reach.append(complex(*body.outboard_point))
+        angle = scene.objective.elbow_angle
+        if angle is None:
+            middle = np.array([0.5 * scene.motion.duration])
+            angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
+        else:
+            angles = [angle] * len(bodies)
+        load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.inertia)
+        return Chain(bodies, reach, angles, load, scene.objective.attached)
+
+    return on_root(share.world, freeze)
+
+
+def _modes(arms: Mapping[int, Arm], chain: Chain) -> dict[int, LoadedModes]:
+    """Return the loaded modes of every arm of the chain that has one of this rank's designs."""
+    carried = chain.carried()
+    return {
+        place: arms[owner].loaded_modes(place, carried[place])
+        for owner in arms
+        for place in arms[owner].places
+    }
+
+
+def _vibration(
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return squared periods (s2) and first frequencies (Hz) of all flexible arms (collective)."""
+    modes = _modes(arms, _chain(scene, share, arms))
+    options = scene.objective
+    mine = {
+        place: (squared_period(one, options.exponent, options.follow)[0], one.frequency)
+        for place, one in modes.items()
+    }
+    values = _everywhere(share, mine).values()
+    return np.array([period for period, _ in values]), tuple(f for _, f in values)
+
+
+def _period_rows(
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
+) -> list[dict[int, np.ndarray]]:
+    """Return every flexible arm's gradient of its squared period (collective).
+
+    What an arm carries depends on the designs outboard of it.
+    """
+    chain = _chain(scene, share, arms)
+    options = scene.objective
+    modes = _modes(arms, chain)
+    slopes = {
+        place: period_gradient(arms[owner], modes[place], options.exponent, options.follow)
+        for owner in arms
+        for place in arms[owner].places
+    }
+    by_carried = _everywhere(share, {place: one.carried for place, one in slopes.items()})
+    rows = []
+    for place, matrix in by_carried.items():
+        zero = [np.zeros((3, 3))] * len(scene.arms)
+        by_body = _by_owner(scene, chain.body_slopes([*zero[:place], matrix, *zero[place + 1 :]]))
+        row = {k: rigid_gradient(arm, by_body[k]) for k, arm in arms.items()}
+        owner = scene.owners[place]
+        if owner in row:
+            row[owner] = row[owner] + slopes[place].cells
+        rows.append(row)
+    return rows

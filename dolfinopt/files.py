@@ -18,8 +18,11 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt import __version__
+from dolfinopt.arm import fixed_body
+from dolfinopt.body import FloatingBody
 from dolfinopt.errors import InputError
 from dolfinopt.parallel import ArmShare, gather_cells, on_root
+from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
@@ -197,6 +200,7 @@ class ArmView:
         centroid: (n_cells, 2) m.
         density: (n_cells,) physical densities.
         modes: (n_cells, 3 or 4, 2, q) the reduced basis at the corners; q = 0 if not reduced.
+        designed: False for arms without a design: rigid ones and those from a file.
     """
 
     name: str
@@ -204,14 +208,15 @@ class ArmView:
     centroid: np.ndarray
     density: np.ndarray
     modes: np.ndarray
+    designed: bool = True
 
 
 def gather_views(
-    share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> list[ArmView]:
     """Collect every arm on the root (collective); empty list elsewhere."""
 
-    def collect(values: Any) -> list[np.ndarray]:
+    def collect(values: Any) -> dict[int, np.ndarray]:
         return gather_cells(share, {index: values(index, arm) for index, arm in arms.items()})
 
     def modes(index: int, arm: Arm) -> np.ndarray:
@@ -221,30 +226,52 @@ def gather_views(
         return arm.basis.V[cells]
 
     corners = collect(lambda _, arm: arm.elastic.points[arm.elastic.operators.cells])
-    fields_ = [
-        corners,
-        collect(lambda _, arm: arm.mesh.centroid),
-        collect(lambda index, _: x_phys[index]),
-        collect(modes),
-    ]
-    if share.world.rank != 0:
-        return []
-    names = [arm.name for arm in arms[0].scene.arms]
+    centroids = collect(lambda _, arm: arm.mesh.centroid)
+    densities = collect(lambda index, _: x_phys[index])
+    shapes = collect(modes)
     views = []
-    for name, corner, centroid, density, mode in zip(names, *fields_, strict=True):
-        order = _canonical_order(centroid)
+    for index, owner in enumerate(scene.owners if share.world.rank == 0 else ()):
+        name = scene.arms[index].name
+        if owner is None:
+            views.append(_bar_view(name, scene.arms[index].height, fixed_body(scene, index)))
+            continue
+        order = _canonical_order(centroids[owner])
         # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
-        around = [0, 1, 3, 2] if corner.shape[1] == 4 else [0, 1, 2]
+        around = [0, 1, 3, 2] if corners[owner].shape[1] == 4 else [0, 1, 2]
         views.append(
             ArmView(
                 name,
-                corner[order][:, around],
-                centroid[order],
-                density[order],
-                mode[order][:, around],
+                corners[owner][order][:, around],
+                centroids[owner][order],
+                densities[owner][order],
+                shapes[owner][order][:, around],
             )
         )
     return views
+
+
+def _bar_view(name: str, height: float, body: FloatingBody) -> ArmView:
+    """Return a body whose shape is not known as a bar from joint to joint.
+
+    Between them it bends like a beam without loads: cubic polynomials that fit the outboard
+    interface's displacement and rotation.
+    """
+    length = float(np.hypot(*body.outboard_point))
+    axis = np.array([*body.outboard_point]) / length
+    across = np.array([-axis[1], axis[0]])
+    s = np.linspace(0.0, 1.0, 21)
+    station = np.stack([s[:-1], s[1:], s[1:], s[:-1]], axis=1)  # (n_cells, 4)
+    side = 0.5 * height * np.array([-1.0, -1.0, 1.0, 1.0])
+    corners = length * station[..., None] * axis + side[:, None] * across
+    u, v = axis @ body.outboard[:2], across @ body.outboard[:2]
+    bend, turn = 3.0 * station**2 - 2.0 * station**3, length * (station**3 - station**2)
+    slope = (6.0 * station - 6.0 * station**2) / length, 3.0 * station**2 - 2.0 * station
+    deflection = bend[..., None] * v + turn[..., None] * body.outboard[2]
+    rotation = slope[0][..., None] * v + slope[1][..., None] * body.outboard[2]
+    along = station[..., None] * u - side[:, None] * rotation
+    modes = along[:, :, None] * axis[:, None] + deflection[:, :, None] * across[:, None]
+    density = np.ones(len(corners))
+    return ArmView(name, corners, corners.mean(axis=1), density, modes, designed=False)
 
 
 def _canonical_order(points: np.ndarray) -> np.ndarray:
@@ -254,10 +281,15 @@ def _canonical_order(points: np.ndarray) -> np.ndarray:
     return np.lexsort((rounded[:, 1], rounded[:, 0]))
 
 
+def designed(views: Sequence[ArmView]) -> list[ArmView]:
+    """Return the arms that have a design."""
+    return [view for view in views if view.designed]
+
+
 def write_design(folder: Path, views: Sequence[ArmView]) -> None:
     """Write design.npz: centroids and physical densities of every arm."""
     arrays = {}
-    for view in views:
+    for view in designed(views):
         arrays[f"{view.name}/centroid"] = view.centroid
         arrays[f"{view.name}/density"] = view.density
     write_arrays(folder / "design.npz", arrays)
@@ -265,22 +297,25 @@ def write_design(folder: Path, views: Sequence[ArmView]) -> None:
 
 def write_gradient(
     path: Path,
+    scene: Scene,
     share: ArmShare,
     arms: Mapping[int, Arm],
     slopes: Mapping[int, np.ndarray],
     objective: float,
 ) -> None:
-    """Write the gradient with respect to the physical densities (collective)."""
+    """Write the gradient with respect to the physical densities (collective).
+
+    Of a shared design once, under the name of the arm it belongs to.
+    """
     centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
     gathered = gather_cells(share, slopes)
     if share.world.rank != 0:
         return
     arrays: dict[str, Any] = {"objective": objective}
-    names = [arm.name for arm in arms[0].scene.arms]
-    for name, centroid, values in zip(names, centroids, gathered, strict=True):
-        order = _canonical_order(centroid)
+    for index, centroid in centroids.items():
+        order, name = _canonical_order(centroid), scene.arms[index].name
         arrays[f"{name}/centroid"] = centroid[order]
-        arrays[f"{name}/gradient"] = values[order]
+        arrays[f"{name}/gradient"] = gathered[index][order]
     write_arrays(path, arrays)
 
 
@@ -294,7 +329,7 @@ def write_xdmf(folder: Path, views: Sequence[ArmView]) -> None:
     )
     arms.set("CollectionType", "Spatial")
     offset = 0.0
-    for view in views:
+    for view in designed(views):
         points, cells = _merge_corners(view.corners)
         kind = "Quadrilateral" if cells.shape[1] == 4 else "Triangle"
         grid = Xml.SubElement(arms, "Grid", Name=view.name, GridType="Uniform")

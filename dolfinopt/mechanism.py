@@ -8,7 +8,7 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -441,6 +441,9 @@ class BodySlopes:
     K: np.ndarray
     D: np.ndarray
     outboard: np.ndarray
+
+    def __add__(self, other: BodySlopes) -> BodySlopes:
+        return BodySlopes(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
 def body_slopes(

@@ -1,4 +1,4 @@
-"""What is minimised: the arms' compliance, or the end-effector's deviation, over the motion."""
+"""What the motion makes of a design: compliance and deviation, load cases, and their slopes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from dolfinopt.integrators.adjoint import trajectory_slopes
 from dolfinopt.mechanism import BodySlopes, end_effector_slopes
-from dolfinopt.scene import Scene
+from dolfinopt.scene import Scene, WorstBy
 from dolfinopt.simulation import Trajectory
 
 
@@ -25,17 +25,22 @@ class LoadCases:
     weights: np.ndarray
 
 
-def worst_instants(trajectory: Trajectory, count: int) -> np.ndarray:
-    """Return the sample of largest compliance, arms together, in each of `count` intervals.
+def worst_instants(
+    trajectory: Trajectory, count: int, worst: WorstBy = "compliance"
+) -> np.ndarray:
+    """Return the worst sample of each of `count` intervals.
 
-    (0, horizon] is cut into equal intervals, open below, closed above; intervals that hold no
+    The worst has the largest compliance, arms together, or the largest deviation. (0, horizon] is cut into equal intervals, open below, closed above; intervals that hold no
     sample give none. Source: Seifried, Moghadasi & Held (2015), text below eq. (9).
     """
-    total = trajectory.compliance.sum(axis=1)
+    if worst == "compliance":
+        badness = trajectory.compliance.sum(axis=1)
+    else:
+        badness = np.hypot(trajectory.deviation[:, 0], trajectory.deviation[:, 1])
     horizon = trajectory.scene.motion.horizon
     # The tolerance keeps a sample on an interval's end in that interval, whatever the rounding.
     interval = np.ceil(trajectory.t / horizon * count - 1e-9).astype(int) - 1
-    order = np.lexsort((-total, interval))
+    order = np.lexsort((-badness, interval))
     order = order[interval[order] >= 0]
     first = np.unique(interval[order], return_index=True)[1]
     return np.sort(order[first])
@@ -47,7 +52,7 @@ def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
     "esl": the worst instant of each interval. Others: all samples, trapezoidal rule.
     """
     if scene.objective.kind == "esl":
-        indices = worst_instants(trajectory, scene.objective.load_cases)
+        indices = worst_instants(trajectory, scene.objective.load_cases, scene.objective.worst)
         return LoadCases(indices, np.ones(len(indices)))
     steps = np.diff(trajectory.t)
     weights = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
@@ -109,8 +114,26 @@ def body_slopes_of(trajectory: Trajectory, scene: Scene) -> list[BodySlopes]:
     ]
 
 
+def frozen_moments(trajectory: Trajectory, scene: Scene) -> list[np.ndarray]:
+    """Return A = sum_j lambda_j q_j' (q, q) of every arm: all a gradient with frozen loads needs.
+
+    With the equivalent static loads K q_j held, a change of stiffness gives dJ = -lambda_j . dK q_j
+    with K lambda_j = dJ/dq_j. For compliances lambda_j = weight_j q_j and A = Q.
+    """
+    cases = load_cases(trajectory, scene)
+    if scene.objective.kind != "deviation":
+        return second_moments(trajectory, cases)
+    mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
+    _, weights = _deviation_norm(trajectory, cases, scene.objective.exponent)
+    by_q, _ = end_effector_slopes(mechanism, trajectory.motion, q, weights)
+    return [
+        np.linalg.solve(body.K, by_q[:, part].T) @ q[:, part]
+        for body, part in zip(mechanism.bodies, mechanism.slices, strict=True)
+    ]
+
+
 def second_moments(trajectory: Trajectory, cases: LoadCases) -> list[np.ndarray]:
-    """Return Q = sum_j weight_j q_j q_j' (q, q) of every arm: all the gradient needs to know."""
+    """Return Q = sum_j weight_j q_j q_j' (q, q) of every arm."""
     moments = []
     for part in trajectory.mechanism.slices:
         q = trajectory.q_e[cases.indices, part]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -51,8 +51,8 @@ class ArmShare:
         return bool(self.arms) and self.comm.rank == 0
 
 
-def share_arms(world: MPI.Comm, cells: Sequence[int]) -> ArmShare:
-    """Deal arms out over the ranks of `world` (collective).
+def share_arms(world: MPI.Comm, cells: Mapping[int, int]) -> ArmShare:
+    """Deal arms with a design of their own out over the ranks of `world` (collective).
 
     Up to as many ranks as arms, whole arms are dealt out and need no communication. Further
     ranks join them only where arms are large: neighbouring ranks then share one arm. Small arms
@@ -61,18 +61,18 @@ def share_arms(world: MPI.Comm, cells: Sequence[int]) -> ArmShare:
 
     Args:
         world: all ranks.
-        cells: number of cells of every arm.
+        cells: number of cells of every such arm, by its index in the scene.
     """
-    arms = len(cells)
-    if world.size <= arms:
-        mine = tuple(range(world.rank, arms, world.size))
+    arms = sorted(cells)
+    if world.size <= len(arms):
+        mine = tuple(arms[world.rank :: world.size])
         color = world.rank
-    elif max(cells) >= SPLIT_CELLS:
-        color = world.rank * arms // world.size
-        mine = (color,)
+    elif max(cells.values()) >= SPLIT_CELLS:
+        color = world.rank * len(arms) // world.size
+        mine = (arms[color],)
     else:
         color = world.rank
-        mine = (world.rank,) if world.rank < arms else ()
+        mine = (arms[world.rank],) if world.rank < len(arms) else ()
     return ArmShare(world=world, comm=world.Split(color, world.rank), arms=mine)
 
 
@@ -91,29 +91,29 @@ def sum_over_arms(share: ArmShare, mine: Mapping[int, np.ndarray]) -> np.ndarray
     return np.sum([pieces[arm] for arm in sorted(pieces)], axis=0)
 
 
-def gather_bodies(share: ArmShare, mine: Mapping[int, T]) -> list[T]:
-    """Collect one object an arm on the root, in the arms' order; empty list elsewhere."""
+def gather_arms(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:
+    """Collect one object an arm on the root, in the arms' order; empty elsewhere."""
     pieces = share.world.gather(dict(mine) if share.leads else {}, root=0)
     if pieces is None:
-        return []
+        return {}
     merged: dict[int, T] = {}
     for piece in pieces:
         merged.update(piece)
-    return [merged[arm] for arm in sorted(merged)]
+    return {arm: merged[arm] for arm in sorted(merged)}
 
 
-def gather_cells(share: ArmShare, mine: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+def gather_cells(share: ArmShare, mine: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Collect cell arrays (n_local, ...) of every arm on the root, ranks in order.
 
     Returns:
-        One array (n_cells, ...) an arm on the root, an empty list elsewhere.
+        One array (n_cells, ...) an arm on the root, empty elsewhere.
     """
     whole = {}
     for arm, values in mine.items():
         pieces = share.comm.gather(values, root=0)
         if pieces is not None:
             whole[arm] = np.concatenate(pieces)
-    return gather_bodies(share, whole)
+    return gather_arms(share, whole)
 
 
 def on_root(world: MPI.Comm, action: Any, *arguments: Any) -> Any:

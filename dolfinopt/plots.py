@@ -558,6 +558,11 @@ class Film:
     magnification: float
     size: float
 
+    @property
+    def stands(self) -> bool:
+        """Whether the shoulder never moves: a fixed base, or a cart at rest."""
+        return bool(np.ptp(self.place[:, 0].real) == 0.0)
+
     def cells(self, index: int, frame: int) -> np.ndarray:
         """Return an arm's deformed cells (n_cells, k, 2), m, in one frame."""
         return deformed_cells(
@@ -728,9 +733,13 @@ class Stage:
         self.still = self.canvas.copy_from_bbox(self.figure.bbox)
 
     def _draw_scenery(self, mechanism: Mechanism, speed: float) -> None:
-        """Draw the rail, the desired path and what is written above."""
-        rail = mechanism.joint_height - CART[1] * self.film.size
-        self.axes.axhline(rail, color=GREY, linewidth=2.0)
+        """Draw the rail or the ground, the desired path and what is written above."""
+        ground = mechanism.joint_height - CART[1] * self.film.size
+        if self.film.stands:
+            foot = self.film.place[0, 0].real + 2.0 * CART[0] * self.film.size * np.array([-1, 1])
+            self.axes.plot(foot, [ground, ground], color=GREY, linewidth=2.0)
+        else:
+            self.axes.axhline(ground, color=GREY, linewidth=2.0)
         self.desired = self.axes.plot(*self.film.desired.T, color="black", dashes=(4, 3), lw=1.2)[0]
         note = f"deformation x {self.film.magnification:g}, shown at {speed:.2g} x real time"
         self.axes.set_title(note, loc="right", fontsize=11)
@@ -790,7 +799,8 @@ class Stage:
         place, rigid = film.place[frame], film.rigid[frame]
         across, deep = CART * film.size
         foot = np.array([place[0].real, place[0].imag])
-        box = np.array([[-across, -deep], [across, -deep], [across, 0.0], [-across, 0.0]])
+        top = 0.25 * across if film.stands else across  # a pedestal, or the cart
+        box = np.array([[-across, -deep], [across, -deep], [top, 0.0], [-top, 0.0]])
         self.cart.set_xy(foot + box)
         for k, cells in enumerate(self.arms):
             cells.set_verts(film.cells(k, frame))

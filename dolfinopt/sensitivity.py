@@ -8,38 +8,40 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.mechanism import BodySlopes
-from dolfinopt.reduction import METHODS
+from dolfinopt.reduction import METHODS, frame_fields
+from dolfinopt.statics import StaticResponse
+from dolfinopt.vibration import LoadedModes, RigidIntegrals, squared_period
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
 
-# Directions of Q below this share of its largest are rounding.
+# Directions of A below this share of its largest are rounding.
 RANK_TOLERANCE = 1e-14
 
 
-def esl_gradient(arm: Arm, Q: np.ndarray) -> np.ndarray:
-    """Return d(sum_j q_j' K q_j)/dx_phys of one arm with the equivalent static loads frozen.
+def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
+    """Return the derivative by x_phys of one arm with the equivalent static loads frozen.
 
-    With f_j = K u_j held, dc/dE_e = -sum_j u_j' k_e u_j = -trace(V_e' k_e V_e Q): as many energy
-    fields as coordinates at most, however many load cases.
+    dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
+    coordinates at most, however many load cases. For the compliance lambda_j = q_j.
     Source: Seifried, Moghadasi & Held (2015), eq. (11), doi:10.1016/j.piutam.2015.01.018.
 
     Args:
         arm: with the design reduced.
-        Q: (q, q) sum of q_j q_j' over the load cases, weighted.
+        A: (q, q) see `objective.frozen_moments`.
 
     Returns:
         (n_cells,) over this rank's cells.
     """
     assert arm.basis is not None
     with arm.ledger.phase("gradient"):
-        values, vectors = np.linalg.eigh(Q)
-        keep = values > RANK_TOLERANCE * max(values[-1], 0.0)
-        fields = arm.basis.V @ (vectors[:, keep] * np.sqrt(values[keep]))
-        energies = arm.elastic.cell_stiffness_products(fields, fields)
-        modulus = arm.scene.material.young_modulus
-        return -modulus * arm.material.stiffness_slope * energies
+        left, values, right = np.linalg.svd(A)
+        keep = values > RANK_TOLERANCE * values[0]
+        energies = arm.elastic.cell_stiffness_products(
+            arm.basis.V @ (left[:, keep] * values[keep]), arm.basis.V @ right[keep].T
+        )
+        return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
 
 
 def exact_gradient(arm: Arm, slopes: BodySlopes) -> np.ndarray:
@@ -66,13 +68,72 @@ def exact_gradient(arm: Arm, slopes: BodySlopes) -> np.ndarray:
         by_V += elastic.stiffness_times(V @ (by_K + by_K.T))
         interior, outboard = elastic.restrict(by_V)
         method = METHODS[arm.scene.reduction.method]
-        mu, values = method.adjoint(elastic, arm.basis, interior, outboard + slopes.outboard)
-        energies = elastic.cell_stiffness_products(V @ by_K.T - mu, V)
-        masses = elastic.cell_mass_products(Y.quadratic + Y.linear + mu * values, V)
-        masses += elastic.cell_mass_products(*_rigid_partners(elastic.points, slopes))
-        modulus, density = arm.scene.material.young_modulus, arm.scene.material.density
-        slope = modulus * arm.material.stiffness_slope * energies
-        return slope + density * arm.material.mass_slope * masses
+        assert method.adjoint is not None  # the scene refuses the others
+        fields = method.adjoint(
+            elastic, arm.basis, arm.reduction_options, interior, outboard + slopes.outboard
+        )
+        energies = elastic.cell_stiffness_products(V @ by_K.T - fields.stiffness, V)
+        masses = elastic.cell_mass_products(Y.quadratic + Y.linear + fields.mass, V)
+        if fields.frame is not None:
+            masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
+        rigid = slopes.mass, slopes.moment, slopes.inertia
+        masses += elastic.cell_mass_products(*_rigid_partners(elastic.points, *rigid))
+        slope = arm.solid.young_modulus * arm.material.stiffness_slope * energies
+        return slope + arm.solid.density * arm.material.mass_slope * masses
+
+
+def static_gradient(arm: Arm, response: StaticResponse) -> np.ndarray:
+    """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads."""
+    return _static_slope(arm, response.tip, response.tip)
+
+
+def deflection_gradient(arm: Arm, response: StaticResponse, exponent: float) -> np.ndarray:
+    """Return d deflection / dx_phys (n_cells,), by one adjoint load a case."""
+    by_tip = response.deflection_slope(exponent)
+    adjoint = np.linalg.solve(arm.elastic.constraint_modes().stiffness, by_tip)
+    return _static_slope(arm, adjoint, response.tip)
+
+
+def _static_slope(arm: Arm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard displacements (3, k)."""
+    with arm.ledger.phase("gradient"):
+        field = arm.elastic.constraint_modes().field
+        energies = arm.elastic.cell_stiffness_products(field @ left, field @ right)
+        return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
+
+
+@dataclass(frozen=True)
+class PeriodGradient:
+    """Slopes of one arm's squared period.
+
+    Attributes:
+        cells: (n_cells,) by its own physical densities, what it carries held.
+        carried: (3, 3) by the matrix of what it carries.
+    """
+
+    cells: np.ndarray
+    carried: np.ndarray
+
+
+def period_gradient(arm: Arm, modes: LoadedModes, exponent: float, follow: bool) -> PeriodGradient:
+    """Differentiate `squared_period`: d lambda = phi' (dK - lambda dM) phi, phi of unit mass."""
+    with arm.ledger.phase("gradient"):
+        _, by_values = squared_period(modes, exponent, follow)
+        weighted = modes.field * by_values
+        energies = arm.elastic.cell_stiffness_products(weighted, modes.field)
+        masses = arm.elastic.cell_mass_products(weighted * modes.values, modes.field)
+        cells = arm.solid.young_modulus * arm.material.stiffness_slope * energies
+        cells -= arm.solid.density * arm.material.mass_slope * masses
+        carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
+        return PeriodGradient(cells, carried)
+
+
+def rigid_gradient(arm: Arm, by_rigid: RigidIntegrals) -> np.ndarray:
+    """Return the derivative by x_phys of one arm of a function of its rigid integrals (n_cells,)."""
+    moment = np.array([by_rigid.moment.real, by_rigid.moment.imag])
+    partners = _rigid_partners(arm.elastic.points, by_rigid.mass, moment, by_rigid.inertia)
+    masses = arm.elastic.cell_mass_products(*partners)
+    return arm.solid.density * arm.material.mass_slope * masses
 
 
 @dataclass(frozen=True)
@@ -98,11 +159,13 @@ def _mass_partners(points: np.ndarray, V: np.ndarray, slopes: BodySlopes) -> _Ma
     return _MassPartners(linear, quadratic)
 
 
-def _rigid_partners(points: np.ndarray, slopes: BodySlopes) -> tuple[np.ndarray, np.ndarray]:
-    """Return fields whose mass products are the slopes of m, c and J by the cells' mass."""
+def _rigid_partners(
+    points: np.ndarray, mass: float, moment: np.ndarray, inertia: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return fields whose mass products are the slopes by the cells' mass, from those by m, c, J."""
     ones = np.zeros((len(points), 2, 1))
     ones[:, 0] = 1.0
     first = np.zeros_like(ones)
-    first[:, 0, 0] = slopes.mass + points @ slopes.moment
-    left = np.concatenate([first, slopes.inertia * points[:, :, None]], axis=2)
+    first[:, 0, 0] = mass + points @ moment
+    left = np.concatenate([first, inertia * points[:, :, None]], axis=2)
     return left, np.concatenate([ones, points[:, :, None]], axis=2)

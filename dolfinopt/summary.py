@@ -14,7 +14,7 @@ from dolfinopt.arm import Arm
 from dolfinopt.evaluation import Evaluation
 from dolfinopt.files import versions
 from dolfinopt.ledger import Counts, Ledger
-from dolfinopt.parallel import ArmShare, gather_bodies
+from dolfinopt.parallel import ArmShare, gather_arms
 from dolfinopt.scene import Scene
 
 
@@ -27,6 +27,8 @@ def summarise(
     ledger: Ledger,
     *,
     wall: float,
+    counts: Counts | None = None,
+    crisp: Evaluation | None = None,
     iterations: int = 0,
     converged: bool = True,
     stop_reason: str = "simulated",
@@ -37,15 +39,18 @@ def summarise(
         scene, share, arms, x_phys, evaluation: of the design the summary is about.
         ledger: this rank's.
         wall: seconds since the command began, s.
+        counts: this rank's, where not all of the ledger's belong to the run.
+        crisp: evaluation of the design cut at one half.
         iterations, converged, stop_reason: of the optimisation.
     """
-    volumes = gather_bodies(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
-    areas = gather_bodies(share, {k: float(_total_area(a)) for k, a in arms.items()})
-    greys = gather_bodies(share, {k: a.grayness(x_phys[k]) for k, a in arms.items()})
+    volumes = gather_arms(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
+    sizes = gather_arms(share, {k: _volume(scene, k, a) for k, a in arms.items()})
+    greys = gather_arms(share, {k: a.grayness(x_phys[k]) for k, a in arms.items()})
     seconds = _slowest(share.world, ledger.seconds)
-    counts = share.world.gather(ledger.counts if share.leads else Counts(), root=0)
+    mine = (counts or ledger.counts) if share.leads else Counts()
+    counted = share.world.gather(mine, root=0)
     memory = share.world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
-    if counts is None or memory is None:
+    if counted is None or memory is None:
         return {}
     return {
         "name": scene.name,
@@ -53,20 +58,28 @@ def summarise(
         "compliance": evaluation.compliance,
         "max_deviation": evaluation.max_deviation,
         "max_deviation_time": evaluation.max_deviation_time,
-        "grayness": float(np.average(greys, weights=areas)),
+        "grayness": float(np.average([greys[k] for k in sizes], weights=list(sizes.values()))),
         "volume_fraction": {
-            arm.name: value for arm, value in zip(scene.arms, volumes, strict=True)
+            arm.name: volumes[owner]
+            for arm, owner in zip(scene.arms, scene.owners, strict=True)
+            if owner is not None
         },
         "first_frequency": {
             arm.name: value
             for arm, value in zip(scene.arms, evaluation.first_frequencies, strict=True)
+            if np.isfinite(value)
         },
+        "loaded_frequency": dict(
+            zip(_flexible_names(scene), evaluation.loaded_frequencies, strict=False)
+        ),
+        "constraints": list(evaluation.constraints),
+        **({} if crisp is None else {"crisp": _figures(crisp)}),
         "simulation_error_estimate": evaluation.error,
         "iterations": iterations,
         "converged": converged,
         "stop_reason": stop_reason,
         "seconds": {**seconds, "total": wall},
-        "counts": asdict(sum(counts, Counts())),
+        "counts": asdict(sum(counted, Counts())),
         "peak_memory_mb": max(memory),
         "ranks": share.world.size,
         "versions": versions(),
@@ -74,8 +87,22 @@ def summarise(
     }
 
 
-def _total_area(arm: Arm) -> float:
-    return arm.mesh.comm.allreduce(arm.mesh.area.sum())
+def _volume(scene: Scene, index: int, arm: Arm) -> float:
+    """Return the volume of all arms with one design, m3."""
+    area = arm.mesh.comm.allreduce(arm.mesh.area.sum())
+    return float(len(arm.places) * scene.arms[index].thickness * area)
+
+
+def _flexible_names(scene: Scene) -> list[str]:
+    return [arm.name for arm in scene.arms if arm.flexible]
+
+
+def _figures(evaluation: Evaluation) -> dict[str, float]:
+    return {
+        "objective": evaluation.objective,
+        "compliance": evaluation.compliance,
+        "max_deviation": evaluation.max_deviation,
+    }
 
 
 def _slowest(world: MPI.Comm, seconds: Mapping[str, float]) -> dict[str, float]:

@@ -57,7 +57,7 @@ def test_volume_limits():
         settings = ["design.shared_volume=true"] if shared else []
         result = do.optimize(small(*settings, iterations=25))
         mine = {k: arm.volume_fraction(result.x_phys[k]) for k, arm in result.arms.items()}
-        fractions = do.gather_bodies(result.share, mine)
+        fractions = list(do.gather_arms(result.share, mine).values())
         if WORLD.rank == 0:
             assert np.mean(fractions) == pytest.approx(0.5, abs=2e-3)
             if shared:

@@ -17,7 +17,7 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.parallel import (
     SPLIT_CELLS,
     direct_solver,
-    gather_bodies,
+    gather_arms,
     gather_cells,
     on_root,
     one_ending,
@@ -40,6 +40,7 @@ class FakeWorld:
 
 def teams(size, cells):
     """Deal arms out over `size` ranks; return the shares and, a communicator, its ranks."""
+    cells = dict(enumerate(cells))
     shares = [share_arms(FakeWorld(size, rank), cells) for rank in range(size)]
     assert [share.comm.key for share in shares] == list(range(size))  # ranks keep their order
     groups = {}
@@ -80,12 +81,13 @@ def test_large_arms_get_all_ranks(size, num_arms):
 @pytest.mark.parametrize("cells", [2400, SPLIT_CELLS])
 @pytest.mark.parametrize("num_arms", [1, 2, 3, 4])
 def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
-    share = share_arms(COMM, [cells] * num_arms)
+    share = share_arms(COMM, dict.fromkeys(range(num_arms), cells))
     expected = {k: f"arm {k}" for k in range(num_arms)}
     # Given in any order, and by every rank of a team: the leader's counts.
     mine = {k: expected[k] if share.leads else "not the leader's" for k in reversed(share.arms)}
-    bodies = gather_bodies(share, mine)
-    assert bodies == (list(expected.values()) if COMM.rank == 0 else [])
+    bodies = gather_arms(share, mine)
+    assert bodies == (expected if COMM.rank == 0 else {})
+    assert list(bodies) == sorted(bodies)
     assert COMM.allreduce(int(share.leads)) == min(num_arms, COMM.size)
     team = {k: n for arms, n in COMM.allgather((share.arms, share.comm.size)) for k in arms}
     whole = gather_cells(
@@ -93,10 +95,10 @@ def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
         {k: np.full((2 + share.comm.rank, 3), 10.0 * k + share.comm.rank) for k in share.arms},
     )
     if COMM.rank > 0:
-        assert whole == []
+        assert whole == {}
         return
     assert len(whole) == num_arms
-    for k, values in enumerate(whole):
+    for k, values in whole.items():
         pieces = [np.full((2 + rank, 3), 10.0 * k + rank) for rank in range(team[k])]
         assert np.array_equal(values, np.concatenate(pieces))
 
@@ -104,7 +106,7 @@ def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
 @pytest.mark.parametrize("cells", [2400, SPLIT_CELLS])
 @pytest.mark.parametrize("num_arms", [1, 2, 3])
 def test_sums_over_arms_have_the_same_bits_on_any_number_of_ranks(num_arms, cells):
-    share = share_arms(COMM, [cells] * num_arms)
+    share = share_arms(COMM, dict.fromkeys(range(num_arms), cells))
     # Cancelling numbers: any other order of the arms gives other bits.
     values = np.array([[1.0, 0.1], [1e17, 0.2], [-1e17, 0.3]])[:num_arms]
     first = share.comm.rank == 0  # a team's parts are added before

@@ -420,17 +420,17 @@ def test_real_arms_join():
     from dolfinopt.arm import build_arms
     from dolfinopt.files import gather_views
     from dolfinopt.ledger import Ledger
-    from dolfinopt.parallel import gather_bodies, share_arms
+    from dolfinopt.parallel import gather_arms, share_arms
     from dolfinopt.scene import load_scene
     from dolfinopt.simulation import build_mechanism
 
     cells = ["arms.0.cells=[20,4]", "arms.1.cells=[16,4]", "reduction.coordinates=5"]
     scene = load_scene("demos/two_arm.toml", cells)
-    share = share_arms(MPI.COMM_SELF, [80, 64])
+    share = share_arms(MPI.COMM_SELF, {0: 80, 1: 64})
     arms = build_arms(scene, share, Ledger())
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    bodies = gather_bodies(share, {k: arm.reduce(x[k]) for k, arm in arms.items()})
-    views = gather_views(share, arms, x)
+    bodies = list(gather_arms(share, {k: arm.reduce(x[k]) for k, arm in arms.items()}).values())
+    views = gather_views(scene, share, arms, x)
     mechanism = build_mechanism(scene, bodies)
     q_e = 0.01 * np.sin(np.arange(30.0)).reshape(3, 10)
     film = plots.make_film(views, mechanism, np.arange(3.0), np.zeros((3, 3)), q_e, 2.0, 3)

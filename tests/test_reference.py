@@ -15,7 +15,7 @@ from dolfinopt.body import first_frequency
 from dolfinopt.evaluation import evaluate, gradient
 from dolfinopt.ledger import Ledger
 from dolfinopt.objective import load_cases
-from dolfinopt.parallel import gather_bodies, share_arms
+from dolfinopt.parallel import gather_arms, share_arms
 from dolfinopt.scene import load_scene
 from dolfinopt.sensitivity import esl_gradient
 
@@ -57,11 +57,13 @@ class Run:
 
 def simulate(designs, *overrides):
     scene = load_scene(TWO_ARM, overrides)
-    share = share_arms(COMM, [arm.cells[0] * arm.cells[1] for arm in scene.arms])
+    share = share_arms(COMM, scene.cell_counts)
     arms = build_arms(scene, share, Ledger())
     x_phys = {k: DESIGNS[designs[k]](arm.mesh.centroid) for k, arm in arms.items()}
     evaluation, trajectory = evaluate(scene, share, arms, x_phys, Ledger())
-    bodies = gather_bodies(share, {k: arm.reduce(x_phys[k]) for k, arm in arms.items()})
+    bodies = list(
+        gather_arms(share, {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}).values()
+    )
     known = None
     if trajectory is not None:
         known = (
