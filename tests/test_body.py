@@ -11,7 +11,7 @@ from dolfinopt.body import FloatingBody, first_frequency, floating_body
 from dolfinopt.elasticity import ElasticArm, element_operators
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import structured_arm
-from dolfinopt.reduction import Basis, craig_bampton, modal
+from dolfinopt.reduction import Basis, Options, craig_bampton, modal
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.01  # m
@@ -52,7 +52,7 @@ def uneven_arm():
 
 
 def test_rigid_integrals_of_a_rectangle(uniform_arm):
-    body = floating_body(uniform_arm, craig_bampton(uniform_arm, 3), DAMPING)
+    body = floating_body(uniform_arm, craig_bampton(uniform_arm, Options(3)), DAMPING)
     mass = DENSITY * LENGTH * HEIGHT * THICKNESS
     assert body.mass == pytest.approx(mass, rel=PLACING)
     expected = [0.5 * mass * LENGTH, 0.0]
@@ -115,7 +115,7 @@ def quadrature(arm, x, V):
 @pytest.mark.parametrize("method", sorted(REDUCTORS))
 def test_integrals_of_modes_by_quadrature(uneven_arm, method):
     arm = uneven_arm
-    basis = REDUCTORS[method](arm, 6)
+    basis = REDUCTORS[method](arm, Options(6))
     body = floating_body(arm, basis, DAMPING)
     names = ("mass", "moment", "inertia", "C", "j", "r", "M", "G")
     for name, expected in zip(names, quadrature(arm, uneven(arm.mesh.centroid), basis.V)):
@@ -153,12 +153,12 @@ def test_first_frequency_of_a_spring_and_a_mass():
 
 
 def test_modes_give_the_first_frequency_of_the_body(uneven_arm):
-    body = floating_body(uneven_arm, modal(uneven_arm, 2), DAMPING)
+    body = floating_body(uneven_arm, modal(uneven_arm, Options(2)), DAMPING)
     values = np.sqrt(np.diag(body.K)) / (2.0 * np.pi)
     # Modes are orthonormal in M to 1e-12.
     assert first_frequency(body) == pytest.approx(values[0], rel=1e-11)
     # Every other basis gives an upper bound.
     for q in (3, 4, 8):
-        body = floating_body(uneven_arm, craig_bampton(uneven_arm, q), DAMPING)
+        body = floating_body(uneven_arm, craig_bampton(uneven_arm, Options(q)), DAMPING)
         assert first_frequency(body) > values[0] * (1.0 - 1e-11)
     assert first_frequency(body) == pytest.approx(values[0], rel=1e-5)  # measured: 3e-7

@@ -35,7 +35,7 @@ from dolfinopt.mechanism import (
 )
 from dolfinopt.motion import RigidMotion, check_motion
 from dolfinopt.parallel import sum_over_arms
-from dolfinopt.reduction import METHODS, Method
+from dolfinopt.reduction import METHODS, AdjointFields, Basis, Method
 from dolfinopt.scene import Scene
 from dolfinopt.taylor import TaylorTest, taylor_test
 
@@ -321,10 +321,11 @@ def test_gradient_is_one_in_random_scenes(seed: int) -> None:
 
 def no_modes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hold the modes."""
-    frozen = {
-        name: Method(method.reduce, lambda arm, basis, *_: (0.0 * basis.V, np.zeros(4)))
-        for name, method in METHODS.items()
-    }
+
+    def nothing(_: object, basis: Basis, *__: object) -> AdjointFields:
+        return AdjointFields(0.0 * basis.V, 0.0 * basis.V)
+
+    frozen = {name: Method(method.reduce, nothing) for name, method in METHODS.items()}
     monkeypatch.setattr("dolfinopt.sensitivity.METHODS", frozen)
 
 

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.elasticity import ElasticArm
-from dolfinopt.reduction.basis import Basis
+from dolfinopt.reduction.basis import AdjointFields, Basis, Options
+from dolfinopt.reduction.compare import BasisErrors, basis_errors, mac
 from dolfinopt.reduction.craig_bampton import craig_bampton, craig_bampton_adjoint
+from dolfinopt.reduction.free_arm import frame_fields
+from dolfinopt.reduction.gramian import balanced
+from dolfinopt.reduction.krylov import krylov, krylov_adjoint
 from dolfinopt.reduction.modal import modal, modal_adjoint
 
 
@@ -18,18 +22,34 @@ class Method:
     """A reduction method.
 
     Attributes:
-        reduce: (arm, coordinates, start) -> basis.
-        adjoint: (arm, basis, interior slopes, outboard slopes) -> (mu, lambda), see
-            `craig_bampton_adjoint`.
+        reduce: (arm, options, start) -> basis.
+        adjoint: (arm, basis, options, interior slopes, outboard slopes) -> fields, see
+            `craig_bampton_adjoint`; None where there is none.
     """
 
-    reduce: Callable[[ElasticArm, int, np.ndarray | None], Basis]
-    adjoint: Callable[[ElasticArm, Basis, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    reduce: Callable[[ElasticArm, Options, np.ndarray | None], Basis]
+    adjoint: Callable[[ElasticArm, Basis, Options, np.ndarray, np.ndarray], AdjointFields] | None
 
 
 METHODS = {
     "craig-bampton": Method(craig_bampton, craig_bampton_adjoint),
     "modal": Method(modal, modal_adjoint),
+    "krylov": Method(krylov, krylov_adjoint),
+    "balanced": Method(balanced, None),
 }
 
-__all__ = ["METHODS", "Basis", "Method", "craig_bampton", "modal"]
+__all__ = [
+    "METHODS",
+    "AdjointFields",
+    "Basis",
+    "BasisErrors",
+    "Method",
+    "Options",
+    "balanced",
+    "basis_errors",
+    "craig_bampton",
+    "frame_fields",
+    "krylov",
+    "mac",
+    "modal",
+]

@@ -23,6 +23,23 @@ RAMP_SHARE = 1e-6  # of the start without symmetry beside the old modes, in norm
 
 
 @dataclass(frozen=True)
+class Options:
+    """What a reduction method may be told.
+
+    Attributes:
+        coordinates: q, the columns of the basis.
+        shifts: frequencies at which Krylov subspaces match moments, Hz.
+        band: lowest and highest frequency of the Gramian, Hz.
+        damping: beta in D = beta K, s; the Gramian's resonances depend on it.
+    """
+
+    coordinates: int
+    shifts: tuple[float, ...] = (0.0,)
+    band: tuple[float, float] = (0.0, 50.0)
+    damping: float = 2e-4
+
+
+@dataclass(frozen=True)
 class Basis:
     """u(X, t) = V(X) q(t) on one arm; q coordinates.
 
@@ -39,6 +56,23 @@ class Basis:
     stiffness: np.ndarray
     outboard: np.ndarray
     start: np.ndarray
+
+
+@dataclass(frozen=True)
+class AdjointFields:
+    """Nodal fields that carry slopes by V to the cells.
+
+    d(slopes . V) = sum_k -stiffness_k . dK V_k + mass_k . dM V_k + frame_k . dM R_k  with the
+    rigid motions R of `frame_fields`.
+
+    Attributes:
+        stiffness, mass: (n_nodes, 2, q).
+        frame: (n_nodes, 2, 3), or None where the basis does not depend on M R.
+    """
+
+    stiffness: np.ndarray
+    mass: np.ndarray
+    frame: np.ndarray | None = None
 
 
 def lowest_eigenpairs(

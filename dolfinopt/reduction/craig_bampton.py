@@ -8,21 +8,28 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.elasticity import ElasticArm
-from dolfinopt.reduction.basis import Basis, complement_solve, lowest_eigenpairs, orient
+from dolfinopt.reduction.basis import (
+    AdjointFields,
+    Basis,
+    Options,
+    complement_solve,
+    lowest_eigenpairs,
+    orient,
+)
 
 
-def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = None) -> Basis:
-    """Reduce to 3 constraint modes and `coordinates` - 3 fixed-interface normal modes.
+def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
+    """Reduce to 3 constraint modes and q - 3 fixed-interface normal modes.
 
     Psi = [-K_II^-1 K_Ib; I],  K_II Phi = M_II Phi diag(lambda). The stiffness is block diagonal:
     Psi' K Psi and diag(lambda).
 
     Args:
         arm: with its design set.
-        coordinates: q >= 3; with q = 3 no eigenproblem is solved.
+        options: coordinates q >= 3; with q = 3 no eigenproblem is solved.
         start: `Basis.start` of a nearby design, or None.
     """
-    normal = coordinates - 3
+    normal = options.coordinates - 3
     coupling, _ = arm.restrict(arm.stiffness_times(arm.rigid))
     interior = arm.solve(-coupling)
     modes = np.empty((arm.num_interior, 0))
@@ -32,7 +39,7 @@ def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = 
     outboard = np.hstack([np.eye(3), np.zeros((3, normal))])
     V = arm.expand(np.hstack([interior, modes]), outboard)
     MV = arm.mass_times(V)
-    sign = np.ones(coordinates)
+    sign = np.ones(options.coordinates)
     sign[3:] = orient(arm, V[:, :, 3:], MV[:, :, 3:])
     # Constraint and normal modes are K-orthogonal, normal modes among themselves, too.
     energy = arm.energy_matrix(V)
@@ -42,20 +49,21 @@ def craig_bampton(arm: ElasticArm, coordinates: int, start: np.ndarray | None = 
 
 
 def craig_bampton_adjoint(
-    arm: ElasticArm, basis: Basis, interior: np.ndarray, outboard: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (mu, lambda) with d(slopes . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
+    arm: ElasticArm,
+    basis: Basis,
+    options: Options,
+    interior: np.ndarray,
+    outboard: np.ndarray,
+) -> AdjointFields:
+    """Return mu and lambda mu with d(slopes . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
     Constraint modes: K_II mu = slopes, one solve each with the factor at hand. Normal modes: see
     `complement_solve`. The outboard rows of V are constant.
 
     Args:
-        arm, basis: of the current design.
+        arm, basis, options: of the current design.
         interior: (num_interior, q) slopes by the owned interior rows of V.
         outboard: (3, q) slopes by its outboard rows; without effect here.
-
-    Returns:
-        mu as a nodal field (n_nodes, 2, q), and lambda (q,), zero for constraint modes.
     """
     mu = arm.solve(interior[:, :3])
     values = np.concatenate([np.zeros(3), np.diag(basis.stiffness)[3:]])
@@ -65,4 +73,5 @@ def craig_bampton_adjoint(
             arm, K, M, arm.solve_vector, basis.start, values[3:], interior[:, 3:]
         )
         mu = np.hstack([mu, normal])
-    return arm.expand(mu, np.zeros_like(outboard)), values
+    field = arm.expand(mu, np.zeros_like(outboard))
+    return AdjointFields(field, field * values)
