@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -25,7 +26,6 @@ from dolfinopt.reduction import METHODS, Basis, Options
 from dolfinopt.standard_input import load_body
 from dolfinopt.symmetry import AxisSymmetry
 from dolfinopt.vibration import LoadedModes, RigidIntegrals, loaded_modes
-
 
 THRESHOLDS = 0.25, 0.75
 
@@ -179,6 +179,30 @@ class Arm:
             damping = self.scene.damping.stiffness_proportional
             self._body = floating_body(self.elastic, self.basis, damping)
         return self._body
+
+    def under(self, scene: scenes.Scene) -> Arm:
+        """Return this arm in a scene that differs in what it does, not in what it is.
+
+        Mesh, element matrices, filter and the current design's factorisation are shared; so is
+        the basis unless the reduction differs. Use one or the other, not both in turn.
+
+        Args:
+            scene: with the same arms, material, interpolation and design options.
+        """
+        other = copy(self)
+        other.scene = scene
+        other._loaded, other.loaded_starts = {}, {}
+        old, new = self.scene, scene
+        # The Gramian knows the damping, other bases do not.
+        same_basis = old.reduction == new.reduction and (
+            old.damping == new.damping or new.reduction.method != "balanced"
+        )
+        if not same_basis or self.basis is None:
+            other.basis = other._body = other.start = None
+        elif old.damping != new.damping:
+            damping = scene.damping.stiffness_proportional
+            other._body = floating_body(other.elastic, self.basis, damping)
+        return other
 
     def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
         """Return the current design's modes with what is carried (collective on the arm).

@@ -147,9 +147,8 @@ def simulate(
 ) -> None:
     """Simulate SCENE with a given design and report compliance and deviation."""
     from dolfinopt.evaluation import evaluate
-    from dolfinopt.files import gather_views, write_summary, write_trajectory
     from dolfinopt.ledger import Ledger
-    from dolfinopt.summary import summarise
+    from dolfinopt.results import Simulated, write_simulation
 
     loaded = _load(world, scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
@@ -157,18 +156,13 @@ def simulate(
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, folder)
     evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
-    views = gather_views(loaded, share, arms, x_phys)
-    summary = summarise(
-        loaded, share, arms, x_phys, evaluation, ledger, wall=time.perf_counter() - BEGUN
-    )
-    if trajectory is None:
+    simulated = Simulated(loaded, share, arms, x_phys, evaluation, trajectory, ledger)
+    written = write_simulation(folder, simulated, time.perf_counter() - BEGUN)
+    if written is None or trajectory is None:
         return
-    _write_design(folder, views)
-    write_trajectory(folder, trajectory)
-    write_summary(folder, summary)
     if plots:
-        _draw(folder, loaded, views, trajectory, [], None)
-    _conclude(summary, folder)
+        _draw(folder, loaded, written.views, trajectory, [], None)
+    _conclude(written.summary, folder)
 
 
 @commands.command()
@@ -384,40 +378,15 @@ def _design(
 
 def _write_result(scene: Scene, folder: Path, result: Result, plots: bool) -> None:
     """Write everything an optimisation leaves behind (collective)."""
-    from dolfinopt.files import gather_views, write_summary, write_trajectory
-    from dolfinopt.summary import summarise
+    from dolfinopt.results import write_result
 
-    views = gather_views(scene, result.share, result.arms, result.x_phys)
-    summary = summarise(
-        scene,
-        result.share,
-        result.arms,
-        result.x_phys,
-        result.evaluation,
-        result.ledger,
-        wall=time.perf_counter() - BEGUN,
-        counts=result.counts,
-        crisp=result.crisp,
-        iterations=result.iterations,
-        converged=result.converged,
-        stop_reason=result.stop_reason,
-    )
-    if result.trajectory is None:
+    written = write_result(scene, folder, result, time.perf_counter() - BEGUN)
+    if written is None or result.trajectory is None:
         return
-    _write_design(folder, views)
-    write_trajectory(folder, result.trajectory, result.initial_deviation)
-    write_summary(folder, summary)
     if plots:
         history, initial = result.history, result.initial_deviation
-        _draw(folder, scene, views, result.trajectory, history, initial)
-    _conclude(summary, folder)
-
-
-def _write_design(folder: Path, views: list[ArmView]) -> None:
-    from dolfinopt.files import write_design, write_xdmf
-
-    write_design(folder, views)
-    write_xdmf(folder, views)
+        _draw(folder, scene, written.views, result.trajectory, history, initial)
+    _conclude(written.summary, folder)
 
 
 def _draw(

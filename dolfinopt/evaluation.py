@@ -23,7 +23,7 @@ from dolfinopt.objective import (
     objective,
     worst_instants,
 )
-from dolfinopt.parallel import ArmShare, gather_arms, on_root, sum_over_arms
+from dolfinopt.parallel import ArmShare, gather_arms, on_root
 from dolfinopt.scene import Scene
 from dolfinopt.sensitivity import (
     deflection_gradient,

@@ -1,19 +1,18 @@
-"""Gmsh geometry -> the distributed mesh of one arm, with its interfaces and solid cells."""
+"""Gmsh model -> the distributed mesh of one arm, with its interfaces and solid cells."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from dolfinopt import compat
+from dolfinopt import scene as scenes
 from dolfinopt.data import mesh_folder
-
-# Physical groups of the .geo files.
-INBOARD, OUTBOARD, DESIGN, PASSIVE = 1, 2, 3, 4
+from dolfinopt.geometry import INBOARD, OUTBOARD, PASSIVE, build_model, gmsh_on_root, mesh_geo
+from dolfinopt.parallel import on_root
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,22 @@ class ArmMesh:
         return len(self.area)
 
 
+def arm_mesh(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    """Mesh an arm of a scene: its mesh file if it names one, a grid of `cells` otherwise.
+
+    Args:
+        comm: ranks that share the arm.
+        arm: its keys.
+
+    Raises:
+        InputError: the mesh file cannot be the arm.
+    """
+    if arm.mesh is not None:
+        return file_arm(comm, arm)
+    assert arm.cells is not None
+    return structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, arm.passive)
+
+
 def structured_arm(
     comm: MPI.Comm,
     name: str,
@@ -66,13 +81,39 @@ def structured_arm(
         passive: length kept solid at both ends, m.
     """
     parameters = {
-        "1 length (m)": length,
-        "2 height (m)": height,
-        "3 cells along": cells[0],
-        "4 cells across": cells[1],
-        "5 solid length at both ends (m)": passive,
+        "Parameters/1 length (m)": length,
+        "Parameters/2 height (m)": height,
+        "Parameters/3 cells along": cells[0],
+        "Parameters/4 cells across": cells[1],
+        "Parameters/5 solid length at both ends (m)": passive,
     }
-    mesh, cell_tags, facet_tags = _read_geo(comm, mesh_folder() / "arm.geo", parameters)
+    with gmsh_on_root(comm) as gmsh:
+        if comm.rank == 0:
+            mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
+    return _arm_mesh(comm, name, length, *parts)
+
+
+def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    """Mesh an arm from its .geo, .msh or .step file.
+
+    Solid are the cells of group "passive" and those with centroids nearer to an interface than
+    `arm.passive`; a .geo file with a parameter for that length sees to it in its geometry.
+
+    Raises:
+        InputError: the file cannot be the arm; on all ranks of `comm`.
+    """
+    with gmsh_on_root(comm) as gmsh:
+        lines = on_root(comm, build_model, gmsh if comm.rank == 0 else None, arm)
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
+    mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+    mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.passive
+    return mesh
+
+
+def _arm_mesh(
+    comm: MPI.Comm, name: str, length: float, mesh: Any, cell_tags: Any, facet_tags: Any
+) -> ArmMesh:
     owned, _ = compat.local_cell_counts(mesh)
     corners = compat.cell_coordinates(mesh, owned)[:, :, :2]
     solid = np.zeros(owned, dtype=bool)
@@ -91,25 +132,14 @@ def structured_arm(
     )
 
 
-def _read_geo(comm: MPI.Comm, path: Path, parameters: dict[str, float]) -> tuple[Any, Any, Any]:
-    """Mesh a parametric .geo file on rank 0 and distribute it; return mesh, cell, facet tags."""
-    import gmsh
-
-    if comm.rank == 0:
-        gmsh.initialize()
-        gmsh.option.setNumber("General.Terminal", 0)
-        # ONELAB parameters override the defaults of DefineConstant when the file is read. They
-        # outlive gmsh.finalize: drop those of the mesh before.
-        gmsh.onelab.clear()
-        for key, value in parameters.items():
-            gmsh.onelab.setNumber(f"Parameters/{key}", [float(value)])
-        gmsh.open(str(path))
-        gmsh.model.mesh.generate(2)
-    try:
-        return compat.model_to_mesh(gmsh.model, comm, gdim=2)
-    finally:
-        if comm.rank == 0:
-            gmsh.finalize()
+def _distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of points (n, 2) from the nearest of lines (m, 2, 2)."""
+    nearest = np.full(len(points), np.inf)
+    for a, b in lines:
+        along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+        distance = np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
+        np.minimum(nearest, distance, out=nearest)
+    return nearest
 
 
 def _cell_area(corners: np.ndarray) -> np.ndarray:

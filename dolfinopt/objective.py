@@ -25,13 +25,12 @@ class LoadCases:
     weights: np.ndarray
 
 
-def worst_instants(
-    trajectory: Trajectory, count: int, worst: WorstBy = "compliance"
-) -> np.ndarray:
+def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "compliance") -> np.ndarray:
     """Return the worst sample of each of `count` intervals.
 
-    The worst has the largest compliance, arms together, or the largest deviation. (0, horizon] is cut into equal intervals, open below, closed above; intervals that hold no
-    sample give none. Source: Seifried, Moghadasi & Held (2015), text below eq. (9).
+    The worst has the largest compliance, arms together, or the largest deviation. (0, horizon] is
+    cut into equal intervals, open below, closed above; intervals that hold no sample give none.
+    Source: Seifried, Moghadasi & Held (2015), text below eq. (9).
     """
     if worst == "compliance":
         badness = trajectory.compliance.sum(axis=1)

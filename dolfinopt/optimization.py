@@ -123,7 +123,9 @@ class _Variables:
             slopes[row, part] = self.arms[k].chain(self.volume[k], realised[k]) / self.limit[row]
         return slopes
 
-    def by_x(self, slopes: Mapping[int, np.ndarray], realised: Mapping[int, Realised]) -> np.ndarray:
+    def by_x(
+        self, slopes: Mapping[int, np.ndarray], realised: Mapping[int, Realised]
+    ) -> np.ndarray:
         """Return a gradient by x (n,) from that by the physical densities."""
         return self.join({k: arm.chain(slopes[k], realised[k]) for k, arm in self.arms.items()})
 
@@ -178,7 +180,7 @@ def optimize(
 
 @dataclass(frozen=True)
 class _Slopes:
-    """Gradients by this rank's design variables: of the objective (n,), of the constraints (k, n)."""
+    """Gradients by this rank's design variables: objective (n,), constraints (k, n)."""
 
     objective: np.ndarray
     constraints: np.ndarray
@@ -321,7 +323,7 @@ class _Run:
 
     @property
     def _move(self) -> float:
-        """Return the move limit: shorter where the projection is so steep that x_phys would leap."""
+        """Return the move limit, shorter where the projection is steep and x_phys would leap."""
         move = self.scene.optimizer.move
         return move * min(1.0, (GENTLE / self.sharpness) ** 0.5)
 

@@ -625,9 +625,7 @@ class Scene(_Table):
     reduction: Reduction = Field(default=Reduction(), description="model reduction")
     simulation: Simulation = Field(default=Simulation(), description="time integration")
     objective: Objective = Field(default=Objective(), description="what is minimised")
-    constraints: Constraints = Field(
-        default=Constraints(), description="limits besides the volume"
-    )
+    constraints: Constraints = Field(default=Constraints(), description="limits besides the volume")
     design: Design = Field(default=Design(), description="design variables")
     optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
 
@@ -650,11 +648,7 @@ class Scene(_Table):
     @property
     def cell_counts(self) -> dict[int, int]:
         """Number of cells of every arm with a design of its own, by the arm's index."""
-        return {
-            i: self.arms[i].n_cells
-            for i, owner in enumerate(self.owners)
-            if owner == i
-        }
+        return {i: self.arms[i].n_cells for i, owner in enumerate(self.owners) if owner == i}
 
     def material_of(self, index: int) -> Material:
         """Return the material of arm number `index`: its own values, or else the scene's."""

@@ -129,7 +129,7 @@ def period_gradient(arm: Arm, modes: LoadedModes, exponent: float, follow: bool)
 
 
 def rigid_gradient(arm: Arm, by_rigid: RigidIntegrals) -> np.ndarray:
-    """Return the derivative by x_phys of one arm of a function of its rigid integrals (n_cells,)."""
+    """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,)."""
     moment = np.array([by_rigid.moment.real, by_rigid.moment.imag])
     partners = _rigid_partners(arm.elastic.points, by_rigid.mass, moment, by_rigid.inertia)
     masses = arm.elastic.cell_mass_products(*partners)
@@ -162,7 +162,7 @@ def _mass_partners(points: np.ndarray, V: np.ndarray, slopes: BodySlopes) -> _Ma
 def _rigid_partners(
     points: np.ndarray, mass: float, moment: np.ndarray, inertia: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return fields whose mass products are the slopes by the cells' mass, from those by m, c, J."""
+    """Return fields whose mass products are the slopes of a function of m, c, J by cell mass."""
     ones = np.zeros((len(points), 2, 1))
     ones[:, 0] = 1.0
     first = np.zeros_like(ones)

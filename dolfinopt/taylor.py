@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.errors import InputError
 from dolfinopt.evaluation import evaluate, gradient
 from dolfinopt.integrators.radau import AIM
 from dolfinopt.ledger import Ledger
 from dolfinopt.objective import load_cases, objective
 from dolfinopt.parallel import ArmShare, on_root, sum_over_arms
+from dolfinopt.reduction import METHODS
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
 
@@ -50,7 +52,10 @@ class TaylorRow:
 
 @dataclass(frozen=True)
 class TaylorTest:
-    """The rows, and the ESL gradient beside the exact one: angle in degrees, ratio of norms."""
+    """The rows, and the ESL gradient beside the exact one: angle in degrees, ratio of norms.
+
+    The latter are nan where the objective has no loads to freeze.
+    """
 
     rows: tuple[TaylorRow, ...]
     angle: float
@@ -73,19 +78,23 @@ def taylor_test(
     Args:
         scene, share, arms, ledger: as for `evaluate`.
         x: (n_cells,) design variables of this rank's arms, in [0, 1].
+
+    Raises:
+        InputError: the scene's objective has no exact gradient.
     """
+    check_exact(scene)
     exact = _with(scene, gradient="exact")
     x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
-    evaluation, base = evaluate(exact, share, arms, _physical(arms, x), ledger)
-    fixed = _with(exact, tolerance=min(evaluation.error / AIM, 0.1))
-    value = _fixed_objective(fixed, share, arms, ledger, base)
-    here = value(x)
+    evaluation, base = evaluate(exact, share, arms, _physical(arms, x), ledger, simulated=False)
     slope = _by_x(arms, gradient(exact, share, arms, base, ledger))
     frozen = None
-    if scene.objective.kind != "deviation":
+    if scene.objective.simulated:
         frozen = _by_x(arms, gradient(_with(scene, gradient="esl"), share, arms, base, ledger))
+        exact = _with(exact, tolerance=min(evaluation.error / AIM, 0.1))
+    value = _fixed_objective(exact, share, arms, ledger, base)
+    here = value(x)
     rows = []
-    for name, direction in _directions(arms).items():
+    for name, direction in _directions(scene, arms).items():
         along = _dot(share, slope, direction)
         frozen_along = np.nan if frozen is None else _dot(share, frozen, direction)
         remainders = tuple(
@@ -98,6 +107,24 @@ def taylor_test(
     cosine = _dot(share, slope, frozen) / (lengths[0] * lengths[1])
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     return TaylorTest(tuple(rows), angle, lengths[1] / lengths[0])
+
+
+def check_exact(scene: Scene) -> None:
+    """Raise InputError, of one line, where the objective has no exact gradient to test."""
+    if not scene.objective.simulated:
+        return
+    method, integrator = scene.reduction.method, scene.simulation.integrator
+    if METHODS[method].adjoint is None:
+        known = " | ".join(f'"{name}"' for name, one in METHODS.items() if one.adjoint is not None)
+        raise InputError(
+            f'{scene.source}: reduction.method = "{method}": --check tests the exact gradient, '
+            f"and this basis has no adjoint; expected {known}"
+        )
+    if integrator != "radau":
+        raise InputError(
+            f'{scene.source}: simulation.integrator = "{integrator}": --check tests the exact '
+            'gradient, and only the trajectory of "radau" has an adjoint; expected "radau"'
+        )
 
 
 def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None = None) -> Scene:
@@ -129,11 +156,16 @@ def _fixed_objective(
     ledger: Ledger,
     base: Trajectory | None,
 ) -> Callable[[Cells], float]:
-    """Return J(x) with the load cases and time steps of `base`."""
+    """Return J(x), of a motion with the load cases and time steps of `base`."""
     start = None if base is None else base.solution
 
     def value(x: Cells) -> float:
-        _, trajectory = evaluate(scene, share, arms, _physical(arms, x), ledger, start)
+        x_phys = _physical(arms, x)
+        evaluation, trajectory = evaluate(
+            scene, share, arms, x_phys, ledger, start, simulated=False
+        )
+        if not scene.objective.simulated:
+            return evaluation.objective
 
         def at_base_instants() -> float:
             assert trajectory is not None and base is not None
@@ -144,11 +176,13 @@ def _fixed_objective(
     return value
 
 
-def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
+def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
     """Return directions of largest entry 1: random, smooth, and boxes at both ends of the chain.
 
-    They are functions of the place, the same on any partition.
+    They are functions of the place, the same on any partition. First and last are among the arms
+    with a design of their own.
     """
+    designed = list(scene.cell_counts)
 
     def along(k: int) -> np.ndarray:
         return arms[k].mesh.centroid[:, 0] / arms[k].mesh.outboard_point[0]
@@ -157,12 +191,11 @@ def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
         x, y = arms[k].mesh.centroid.T * 1e3
         return 2.0 * np.modf(np.abs(np.sin(12.9898 * x + 78.233 * y + k) * 43758.5453))[0] - 1.0
 
-    last = max((len(arm.scene.arms) for arm in arms.values()), default=0) - 1
     chosen: dict[str, Callable[[int], np.ndarray]] = {
         "random": noise,
         "smooth": lambda k: np.sin(3.0 * np.pi * along(k) + k),
-        "root of the first arm": lambda k: ((along(k) < 0.1) & (k == 0)).astype(float),
-        "tip of the last arm": lambda k: ((along(k) > 0.9) & (k == last)).astype(float),
+        "root of the first arm": lambda k: ((along(k) < 0.1) & (k == designed[0])).astype(float),
+        "tip of the last arm": lambda k: ((along(k) > 0.9) & (k == designed[-1])).astype(float),
     }
     return {
         name: {k: np.where(arm.mesh.passive, 0.0, field(k)) for k, arm in arms.items()}

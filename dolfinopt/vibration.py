@@ -11,7 +11,6 @@ from dolfinopt.elasticity import ElasticArm
 from dolfinopt.reduction.basis import lowest_eigenpairs
 from dolfinopt.reduction.free_arm import FreeOperators
 
-
 # -- what an arm carries ---------------------------------------------------------------------
 
 
@@ -56,7 +55,8 @@ def rigid_integrals(arm: ElasticArm) -> RigidIntegrals:
     """Integrate the mass of an arm's design (collective on its ranks)."""
     X = arm.points
     fields = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))
-    parts = np.array([fields[:, 0, 0].sum(), *fields[:, :, 1].sum(axis=0), np.sum(X * fields[..., 1])])
+    second = np.sum(X * fields[:, :, 1])
+    parts = np.array([fields[:, 0, 0].sum(), *fields[:, :, 1].sum(axis=0), second])
     mass, x, y, inertia = arm.comm.allreduce(parts)
     return RigidIntegrals(float(mass), complex(x, y), float(inertia))
 
@@ -122,9 +122,7 @@ def _matrix_slopes(by_matrix: np.ndarray) -> RigidIntegrals:
 def _moved_slopes(slope: RigidIntegrals, lever: complex) -> RigidIntegrals:
     """Return the slopes by a body's integrals from those by its `moved` ones."""
     mass = slope.mass + (np.conj(slope.moment) * lever).real + slope.inertia * abs(lever) ** 2
-    return RigidIntegrals(
-        float(mass), slope.moment + 2.0 * slope.inertia * lever, slope.inertia
-    )
+    return RigidIntegrals(float(mass), slope.moment + 2.0 * slope.inertia * lever, slope.inertia)
 
 
 # -- modes -----------------------------------------------------------------------------------

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import dolfinx
 import numpy as np
 import pytest
 from mpi4py import MPI
 
+import dolfinopt as do
 from dolfinopt import compat
+from dolfinopt.arm import Arm as ScenesArm
 from dolfinopt.data import mesh_folder
-from dolfinopt.mesh import DESIGN, INBOARD, OUTBOARD, PASSIVE, interior_facets, structured_arm
+from dolfinopt.errors import InputError
+from dolfinopt.geometry import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh import interior_facets, structured_arm
 from dolfinopt.scene import Arm
 
 COMM = MPI.COMM_WORLD
@@ -230,3 +235,91 @@ def test_every_rank_holds_a_part():
     assert mesh.num_cells > 0
     alone = arm(cells=(40, 4), comm=MPI.COMM_SELF)
     assert alone.num_cells == 160
+
+
+# --- arms from files -------------------------------------------------------------------------
+
+BORES = str(mesh_folder() / "arm_bores.geo")
+SHAPED = ["quadrilateral", "triangle"]
+
+
+def solid(size, shape, comm=COMM):
+    """Return first frequency, Hz, flexibility (3, 3) and body of the solid arm with bores."""
+    entry = {
+        "name": "a",
+        "length": 0.5,
+        "height": 0.06,
+        "thickness": 0.01,
+        "mesh": BORES,
+        "mesh_size": size,
+        "cell_shape": shape,
+    }
+    material = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
+    data = {"material": material, "arms": [entry], "design": {"filter_radius": 0.0}}
+    arm = ScenesArm(do.scene_from_dict(data), 0, comm, do.Ledger())
+    body = arm.reduce(np.ones(arm.mesh.num_cells))
+    squares = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real
+    flexibility = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
+    return np.sqrt(squares.min()) / (2.0 * np.pi), flexibility, body
+
+
+def test_arm_with_bores_converges_to_the_same_frequency():
+    """Triangles and quadrilaterals, clamped at one bore and rigid at the other: order 2."""
+    limits = []
+    for shape in SHAPED:
+        f = np.array([solid(0.06 / n, shape, MPI.COMM_SELF)[0] for n in (6, 12, 24)])
+        steps = -np.diff(f)  # from above: too stiff
+        rate = np.log2(steps[0] / steps[1])
+        assert 1.6 < rate < 2.4, shape
+        limits.append(f[-1] - steps[1] / (2.0**rate - 1.0))
+    assert limits[0] == pytest.approx(limits[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", SHAPED)
+def test_arm_with_bores_is_a_beam_between_them(shape):
+    """u_x, u_y and theta of the outboard bore about its centre; pulling does not bend."""
+    _, flexibility, body = solid(0.005, shape)
+    EI, GA = 70e9 * 0.01 * 0.06**3 / 12.0, 70e9 / 2.66 * 0.01 * 0.06  # N m2, N
+    l = 0.5  # noqa: E741
+    # A beam with a rotational spring at each bore, whose flexibility the tip's rotation gives.
+    spring = 0.5 * (flexibility[2, 2] - l / EI)
+    assert 0.0 < spring < 0.1 * l / EI  # 0.055
+    assert flexibility[1, 2] == pytest.approx(l**2 / (2.0 * EI) + l * spring, rel=1e-3)  # 2e-4
+    bending = l**3 / (3.0 * EI) + l**2 * spring + l / (GA * 5.0 / 6.0)
+    assert flexibility[1, 1] == pytest.approx(bending, rel=1e-2)  # 2e-3
+    assert flexibility[0, 0] == pytest.approx(l / (70e9 * 0.01 * 0.06), rel=0.2)
+    scale = np.sqrt(np.outer(np.diag(flexibility), np.diag(flexibility)))
+    assert np.abs((flexibility / scale)[0, 1:]).max() < 1e-7  # mirror images to 1e-9 of the curves
+    assert np.array_equal(body.outboard_point, [0.5, 0.0])
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
+@pytest.mark.parametrize("shape", SHAPED)
+def test_ranks_that_share_an_arm_with_bores_agree(shape):
+    shared, flexibility, _ = solid(0.01, shape)
+    alone, other, _ = solid(0.01, shape, MPI.COMM_SELF)
+    assert shared == pytest.approx(alone, rel=1e-9)
+    assert np.abs(flexibility - other).max() < 1e-9 * np.abs(other).max()
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("design.volume_fraction=0.02", "of the volume of arm 'arm1'"),
+        ("design={volume_fraction=0.02, shared_volume=true}", "of the volume of all arms together"),
+        ("reduction.coordinates=9999", "expected at most"),
+    ],
+)
+def test_limits_that_only_the_mesh_can_tell(override, reason):
+    """The solid rings of the demo are 0.0207 of an arm; its coarse mesh has some 1000 dofs."""
+    file = Path(__file__).parents[1] / "demos" / "two_arm_bores.toml"
+    scene = do.load_scene(file, ["arms.mesh_size=0.015", override])
+    share = do.share_arms(COMM, scene.cell_counts)
+    problem = ""
+    try:
+        do.build_arms(scene, share, do.Ledger())
+    except InputError as error:
+        problem = str(error)
+    problems = [text for text in COMM.allgather(problem) if text]  # some ranks may have no arm
+    assert problems and all(reason in text for text in problems)
+    assert all(text.startswith(str(file)) and len(text.splitlines()) == 1 for text in problems)

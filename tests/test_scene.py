@@ -505,7 +505,7 @@ BAD_VALUES = [
     ("reduction.shifts", [5.0], "[5.0]", '[0.0], the default, with reduction.method = "craig'),
     ("reduction.band", [0.0], "[0.0]", "an array of two numbers >= 0"),
     ("reduction.band", [9.0, 9.0], "[9.0, 9.0]", "the lower of the two frequencies first"),
-    ("reduction.band", [0.0, 9.0], "[0.0, 9.0]", '[0.0, 50.0], the default, with reduction.method'),
+    ("reduction.band", [0.0, 9.0], "[0.0, 9.0]", "[0.0, 50.0], the default, with reduction.method"),
     ("simulation.tolerance", 0.0, "0.0", "a number > 0 and <= 0.1"),
     ("simulation.tolerance", 0.11, "0.11", "a number > 0 and <= 0.1"),
     ("simulation.integrator", "euler", '"euler"', '"radau" | "generalized-alpha"'),

@@ -1,0 +1,163 @@
+"""One display for many cases on many ranks: a live board on a terminal, plain lines elsewhere.
+
+Every rank tells the root what it does; the root listens whenever it has a moment. Nothing that is
+computed depends on it.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+IDLE = 0.02  # s between two looks
+
+
+@dataclass(frozen=True)
+class News:
+    """What a rank has to say.
+
+    Attributes:
+        rank: who.
+        label: of the case at hand.
+        done, total: steps made, and to make at most.
+        text: figures in words.
+        finished: cases that have ended with this piece of news.
+        last: the rank has nothing more to do.
+    """
+
+    rank: int
+    label: str = ""
+    done: int = 0
+    total: int = 0
+    text: str = ""
+    finished: int = 0
+    last: bool = False
+
+
+@dataclass
+class Board:
+    """Owns the messages under way and what was heard so far.
+
+    Attributes:
+        comm: of all ranks, for these messages alone.
+        total: cases to do.
+        finished: those that have ended; known on the root.
+    """
+
+    comm: MPI.Comm
+    total: int
+    finished: int = 0
+    ended: int = 0
+    _sent: list[Any] = field(default_factory=list)
+    _show: Any = None
+
+    def tell(
+        self,
+        label: str = "",
+        done: int = 0,
+        total: int = 0,
+        text: str = "",
+        *,
+        finished: int = 0,
+        last: bool = False,
+    ) -> None:
+        """Say what this rank does; see `News`."""
+        news = News(self.comm.rank, label, done, total, text, finished, last)
+        if self.comm.rank == 0:
+            self._hear(news)
+            self.listen()
+            return
+        self._sent = [request for request in self._sent if not request.test()[0]]
+        self._sent.append(self.comm.isend(news, dest=0))
+
+    def listen(self) -> None:
+        """Take in what has arrived (root; nothing elsewhere)."""
+        while self.comm.rank == 0 and self.comm.iprobe():
+            self._hear(self.comm.recv())
+
+    def wait_for_all(self) -> None:
+        """Return when every rank has said its last word (collective)."""
+        self.tell(last=True)
+        while self.comm.rank == 0 and self.ended < self.comm.size:
+            self.listen()
+            time.sleep(IDLE)
+        for request in self._sent:
+            request.wait()
+
+    def _hear(self, news: News) -> None:
+        self.finished += news.finished
+        self.ended += news.last
+        if self._show is not None:
+            self._show(self, news)
+
+
+@contextmanager
+def open_board(world: MPI.Comm, total: int, shown: bool = True) -> Iterator[Board]:
+    """Yield a board for `total` cases (collective).
+
+    Args:
+        world: all ranks.
+        total: cases to do.
+        shown: False draws nothing.
+    """
+    board = Board(world.Dup(), total)
+    if world.rank != 0 or not shown or total == 0:
+        yield board
+    elif sys.stderr.isatty():
+        with _live(board):
+            yield board
+    else:
+        board._show = _print_line
+        yield board
+    board.comm.Free()
+
+
+def _print_line(board: Board, news: News) -> None:
+    """Print a line for every case that ends."""
+    if news.finished:
+        width = len(str(board.total))
+        count = f"{board.finished:>{width}}/{board.total}"
+        print(f"{count}  {news.label}: {news.text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _live(board: Board) -> Iterator[None]:
+    """Show one bar for the whole and a line a rank."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+    from rich.table import Column
+
+    words = TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1))
+    progress = Progress(words, BarColumn(bar_width=20), TimeElapsedColumn(), expand=True,
+                        console=Console(stderr=True))  # fmt: skip
+    with progress:
+        whole = progress.add_task(f"0/{board.total} cases", total=board.total)
+        lines: dict[int, TaskID] = {}
+
+        def show(board: Board, news: News) -> None:
+            if news.finished:
+                progress.update(
+                    whole,
+                    completed=board.finished,
+                    description=f"{board.finished}/{board.total} cases",
+                )
+            if news.rank not in lines:
+                lines[news.rank] = progress.add_task("", total=None)
+            line = lines[news.rank]
+            progress.update(
+                line,
+                description="  at rest" if news.last else f"  {news.label}: {news.text}",
+                total=news.total or None,
+                completed=news.done,
+                visible=not news.last,
+            )
+
+        board._show = show
+        yield

@@ -1,0 +1,118 @@
+"""What a run leaves in its folder, for the commands and the cases of a study alike.
+
+The summary is written last: a folder that holds one is complete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.evaluation import Evaluation
+from dolfinopt.files import (
+    ArmView,
+    gather_views,
+    write_design,
+    write_summary,
+    write_trajectory,
+    write_xdmf,
+)
+from dolfinopt.ledger import Ledger
+from dolfinopt.optimization import Result
+from dolfinopt.parallel import ArmShare
+from dolfinopt.scene import Scene
+from dolfinopt.simulation import Trajectory
+from dolfinopt.summary import summarise
+
+if TYPE_CHECKING:
+    from dolfinopt.arm import Arm
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """One design in one scene, simulated; the trajectory is the root's, None elsewhere."""
+
+    scene: Scene
+    share: ArmShare
+    arms: Mapping[int, Arm]
+    x_phys: Mapping[int, np.ndarray]
+    evaluation: Evaluation
+    trajectory: Trajectory | None
+    ledger: Ledger
+
+
+@dataclass(frozen=True)
+class Written:
+    """What the root wrote: every arm as pictures need it, and the content of summary.json."""
+
+    views: list[ArmView]
+    summary: Mapping[str, Any]
+
+
+def write_simulation(
+    folder: Path, simulated: Simulated, wall: float, *, paraview: bool = True
+) -> Written | None:
+    """Write design, trajectory and summary of a simulation (collective); None but on the root.
+
+    Args:
+        folder: exists.
+        simulated: what.
+        wall: seconds that it took in all.
+        paraview: write design.xdmf, too.
+    """
+    s = simulated
+    views = gather_views(s.scene, s.share, s.arms, s.x_phys)
+    summary = summarise(s.scene, s.share, s.arms, s.x_phys, s.evaluation, s.ledger, wall=wall)
+    return _write(folder, views, s.trajectory, None, summary, paraview)
+
+
+def write_result(
+    scene: Scene, folder: Path, result: Result, wall: float, *, paraview: bool = True
+) -> Written | None:
+    """Write design, trajectory and summary of an optimisation (collective); None but on the root.
+
+    Args:
+        scene: that was optimised.
+        folder: exists; history and checkpoint are there already.
+        result: what `optimize` returned.
+        wall: seconds that it took in all.
+        paraview: write design.xdmf, too.
+    """
+    views = gather_views(scene, result.share, result.arms, result.x_phys)
+    summary = summarise(
+        scene,
+        result.share,
+        result.arms,
+        result.x_phys,
+        result.evaluation,
+        result.ledger,
+        wall=wall,
+        counts=result.counts,
+        crisp=result.crisp,
+        iterations=result.iterations,
+        converged=result.converged,
+        stop_reason=result.stop_reason,
+    )
+    return _write(folder, views, result.trajectory, result.initial_deviation, summary, paraview)
+
+
+def _write(
+    folder: Path,
+    views: list[ArmView],
+    trajectory: Trajectory | None,
+    initial: np.ndarray | None,
+    summary: Mapping[str, Any],
+    paraview: bool,
+) -> Written | None:
+    if trajectory is None:
+        return None
+    write_design(folder, views)
+    if paraview:
+        write_xdmf(folder, views)
+    write_trajectory(folder, trajectory, initial)
+    write_summary(folder, summary)
+    return Written(views, summary)

@@ -1,0 +1,82 @@
+"""Taylor remainders of functions of all arms' physical densities, for the tests of gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.arm import Arm
+from dolfinopt.parallel import ArmShare, sum_over_arms
+from dolfinopt.scene import Scene
+
+SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
+Cells = Mapping[int, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Built:
+    """A scene with this rank's arms."""
+
+    scene: Scene
+    share: ArmShare
+    arms: dict[int, Arm]
+    ledger: do.Ledger
+
+    def evaluate(self, x_phys: Cells, simulated: bool = False):
+        """Evaluate physical densities."""
+        place = self.scene, self.share, self.arms
+        return do.evaluate(*place, x_phys, self.ledger, simulated=simulated)
+
+    def gradient(self, trajectory=None):
+        """Return the objective's gradient at the design evaluated last."""
+        return do.gradient(self.scene, self.share, self.arms, trajectory, self.ledger)
+
+    def dot(self, a: Cells, b: Cells) -> float:
+        """Return the product over all cells of all arms, on all ranks."""
+        return float(sum_over_arms(self.share, {k: np.array(a[k] @ b[k]) for k in self.arms}))
+
+    def fields(self, function: Callable[[int, np.ndarray, np.ndarray], np.ndarray]) -> Cells:
+        """Return function(arm, x, y) of the cells' centroids over the arm's length."""
+        out = {}
+        for k, arm in self.arms.items():
+            x, y = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
+            out[k] = function(k, x, y)
+        return out
+
+
+def build(*overrides: str, cells: tuple[int, int] = (24, 3)) -> Built:
+    """Build the two-arm scene on few cells (collective)."""
+    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    ledger = do.Ledger()
+    share = do.share_arms(MPI.COMM_WORLD, scene.cell_counts)
+    return Built(scene, share, do.build_arms(scene, share, ledger), ledger)
+
+
+def wave(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return densities within [0.1, 0.9] that vary along and across the arm."""
+    return 0.5 + 0.3 * np.sin(7.0 * x + k) + 2.0 * y
+
+
+def uneven(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a direction in [-1, 1] without any symmetry."""
+    noise = np.sin(12.9898e3 * x + 78.233e3 * y + k) * 43758.5453
+    return 2.0 * (noise - np.floor(noise)) - 1.0
+
+
+def tip(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the direction that fills the outer fifth of the last of two arms."""
+    return ((x > 0.8) & (k == 1)).astype(float)
+
+
+def rates(
+    function: Callable[[float], float], slope: float, steps: Sequence[float] = (4e-3, 1e-3)
+) -> float:
+    """Return the order in h of |f(h) - f(0) - h slope|: 2 when the slope is right, 1 when not."""
+    here = function(0.0)
+    coarse, fine = (abs(function(h) - here - h * slope) for h in steps)
+    return float(np.log(coarse / fine) / np.log(steps[0] / steps[1]))
