@@ -413,7 +413,7 @@ class _Reader:
             "refmod",
             {
                 "mass": lambda: self.once(found, "mass", self.real),
-                "nelastq": lambda: self.once(found, "nelastq", lambda: self.integer(1, 100_000)),
+                "nelastq": lambda: self.once(found, "nelastq", lambda: self.integer(0, 100_000)),
                 "ielastq": name,
             },
         )

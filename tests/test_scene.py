@@ -1063,3 +1063,83 @@ def test_import_needs_no_mpi_nor_numpy():
     code = "import sys, dolfinopt.scene; print('numpy' in sys.modules, 'mpi4py' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.split() == ["False", "False"]
+
+
+# --- arms that share a design, are rigid, or come from a file --------------------------------
+
+
+def test_who_owns_which_design():
+    data = minimal(4)
+    data["arms"][1]["rigid"] = True
+    data["arms"][3]["design"] = "arm1"
+    scene = scene_from_dict(data)
+    assert scene.owners == (0, None, 2, 0)
+    assert scene.cell_counts == {0: 2400, 2: 2400}
+    assert [arm.rigid for arm in scene.arms] == [False, True, False, False]  # not inherited
+
+
+@pytest.mark.parametrize(
+    ("arm", "reason"),
+    [
+        ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
+        ({"design": "arm1", "density": 1.0}, "arms.1.density (arm2) = 1.0: expected None as arm1"),
+        ({"design": "arm1", "rigid": True}, "only one of design, rigid and sid, found design and"),
+        ({"design": "arm3"}, 'an earlier arm with a design of its own: "arm1"'),
+    ],
+)
+def test_contradictions_of_an_arm(arm, reason):
+    data = minimal()
+    data["arms"][1] |= arm
+    assert reason in message_of(data)
+
+
+def test_something_must_be_designed():
+    data = minimal()
+    for arm in data["arms"]:
+        arm["rigid"] = True
+    assert "at least one arm with a design" in message_of(data)
+
+
+def test_own_material():
+    data = minimal()
+    data["arms"][0] |= {"young_modulus": 210e9}
+    data["arms"][1] |= {"density": 7800.0}
+    scene = scene_from_dict(data)
+    first, second = scene.material_of(0), scene.material_of(1)
+    assert (first.young_modulus, first.density) == (210e9, 2700.0)
+    assert (second.young_modulus, second.density) == (210e9, 7800.0)  # inherited, and its own
+    assert scene.material.young_modulus == 70e9
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"objective": {"kind": "eigenfrequency", "attached": "none"}},
+        {"objective": {"attached": "none"}, "constraints": {"first_frequency": 10.0}},
+    ],
+)
+def test_nothing_attached_needs_solid_ends(tables):
+    assert "arms.0.passive (arm1) = 0.0 (default): expected more than 0" in message_of(
+        minimal(**tables)
+    )
+    data = minimal(**tables)
+    data["arms"][0]["passive"] = 0.02
+    scene_from_dict(data)
+
+
+def test_length_of_a_body_from_a_file(tmp_path):
+    from dolfinopt.body import rigid_bar
+    from dolfinopt.sid import write_sid
+    from dolfinopt.standard_input import to_sid
+
+    write_sid(tmp_path / "bar.sid", to_sid(rigid_bar(0.8, 0.05, 0.01, 2700.0)))
+    data = minimal()
+    data["arms"][1]["sid"] = "bar.sid"
+    scene = scene_from_dict(data, str(tmp_path / "scene.toml"))
+    assert scene.arms[1].length == pytest.approx(0.8, rel=1e-12)
+    assert scene.owners == (0, None) and scene.arms[1].sid == str(tmp_path / "bar.sid")
+    assert scene_from_dict(scene.to_dict()) == scene
+    data["arms"][0] = {"name": "arm1", "sid": "bar.sid"}  # needs no geometry at all
+    data["arms"][1] = dict(ARM, name="arm2")
+    first = scene_from_dict(data, str(tmp_path / "scene.toml")).arms[0]
+    assert first.height == first.thickness == pytest.approx(0.04)

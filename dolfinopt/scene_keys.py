@@ -1,0 +1,821 @@
+"""Everything a user can ask for: the tables of a scene, validated once, frozen.
+
+A key is a field; its description carries the unit in brackets, "[-]" where there is none.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from dolfinopt.spelling import shown
+
+# What this version offers; a new method is added here and nowhere else in this file.
+Law = Literal["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
+Path2D = Literal["arc", "line", "points", "joints"]
+TimeLaw = Literal["quintic", "septic"]
+Base = Literal["cart", "fixed"]
+ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
+Integrator = Literal["radau", "generalized-alpha"]
+ObjectiveKind = Literal["esl", "compliance", "deviation", "static", "eigenfrequency"]
+GradientKind = Literal["esl", "exact"]
+Projection = Literal[False, "heaviside", "robust"]
+Attached = Literal["rigid-body", "point-mass", "none"]
+WorstBy = Literal["compliance", "deviation"]
+CellShape = Literal["quadrilateral", "triangle"]
+
+MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
+CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
+Frequency = Annotated[float, Field(ge=0)]  # Hz
+Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
+MAX_ITERATIONS = 1_000_000
+MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation
+
+# Keys that name a file, as (table, key); a scene holds their absolute paths.
+MESH_FILES = (".geo", ".msh", ".step", ".stp")
+FILE_KEYS = (("motion", "file"), ("arms", "mesh"), ("arms", "sid"))
+
+Loc = tuple[Any, ...]  # path of a key in the scene's data, e.g. ("arms", 0, "length")
+
+
+class Refusal(ValueError):
+    """Reject a value for a reason that needs more than one key or a sentence of its own.
+
+    `keys` are paths below the refusing model; the first one is reported, all are involved.
+    """
+
+    def __init__(self, reason: str, *keys: Loc):
+        super().__init__(reason)
+        self.reason = reason
+        self.keys = keys
+
+
+class Table(BaseModel):
+    """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _check_type(cls, value: Any, info: ValidationInfo) -> Any:
+        """Turn a TOML array into a tuple; keep 1, 1.0 and true apart where choices are listed."""
+        annotation = without_none(cls.model_fields[str(info.field_name)].annotation)
+        if get_origin(annotation) is tuple and isinstance(value, list):
+            return tuple(tuple(item) if isinstance(item, list) else item for item in value)
+        # Literal compares with ==, for which True, 1 and 1.0 are the same.
+        kinds = map(type, get_args(annotation))
+        if get_origin(annotation) is Literal and value is not None and type(value) not in kinds:
+            raise ValueError
+        return value
+
+
+def without_none(annotation: Any) -> Any:
+    """Return T for an annotation `T | None`, which stands for a key that may be left out."""
+    kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+    union = get_origin(annotation) in (Union, UnionType)  # of a Literal it is the former
+    return kinds[0] if union and len(kinds) == 1 else annotation
+
+
+def check_arm_name(name: str) -> str:
+    """Return `name` if it can be a file name and the key of an array in a .npz file."""
+    if not re.fullmatch(r"[A-Za-z0-9_](?:[A-Za-z0-9_ -]{0,62}[A-Za-z0-9_-])?", name):
+        raise Refusal(
+            "expected 1 to 64 letters, digits, _, - or spaces, first neither - nor space, "
+            "last no space"
+        )
+    if name.isdigit():  # "arms.1.length" would be ambiguous
+        raise Refusal("expected at least one character that is not a digit")
+    return name
+
+
+def check_scene_name(name: str) -> str:
+    """Return `name` if it can be printed on one line."""
+    if not name.strip() or len(name) > 200 or not name.isprintable():
+        raise Refusal("expected 1 to 200 printable characters on one line")
+    return name
+
+
+class Material(Table):
+    """The solid material, linear elastic and isotropic, in plane stress."""
+
+    young_modulus: float = Field(gt=0, description="Young's modulus of the solid material [Pa]")
+    poisson_ratio: float = Field(gt=-1, lt=0.5, description="Poisson's ratio [-]")
+    density: float = Field(gt=0, description="mass density of the solid material [kg/m3]")
+
+
+class Interpolation(Table):
+    """How stiffness and mass follow from the design variable x of a cell."""
+
+    law: Law = Field(
+        default="two-material", description="interpolation law of stiffness and mass [-]"
+    )
+    penalty: float = Field(
+        default=3.0, ge=1, description='exponent p of x in the stiffness; q of "ramp" [-]'
+    )
+    floor: float = Field(
+        default=1e-6,
+        gt=0,
+        lt=1,
+        description="stiffness and mass of void relative to solid; its square but for "
+        '"two-material" [-]',
+    )
+
+
+class Arm(Table):
+    """One flexible arm; a key left out in a scene is taken from the arm before."""
+
+    name: Annotated[str, AfterValidator(check_arm_name)] = Field(
+        description="unique name, used in files and messages [-]"
+    )
+    length: float = Field(gt=0, description="from joint axis to joint axis, or to the end [m]")
+    height: float = Field(gt=0, description="height in the plane of motion [m]")
+    thickness: float = Field(gt=0, description="thickness normal to the plane of motion [m]")
+    cells: tuple[CellCount, CellCount] | None = Field(
+        default=(200, 12), description="number of cells along and across a rectangular arm [-]"
+    )
+    mesh: str | None = Field(
+        default=None, description="geometry or mesh (.geo, .msh, .step) in place of cells [-]"
+    )
+    mesh_size: float | None = Field(
+        default=None, gt=0, description="of the cells of a .geo or .step file [m]"
+    )
+    cell_shape: CellShape | None = Field(
+        default=None, description="of the cells of a .geo or .step file [-]"
+    )
+    passive: float = Field(
+        default=0.0,
+        ge=0,
+        description="solid material kept around both interfaces; 0 leaves it to a mesh file [m]",
+    )
+    symmetric: bool = Field(
+        default=False, description="design symmetric about the arm's axis y = 0 [-]"
+    )
+    design: str | None = Field(
+        default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
+    )
+    rigid: bool = Field(
+        default=False, description="a solid bar that does not bend and is not optimised [-]"
+    )
+    sid: str | None = Field(
+        default=None, description="standard input data file (SID) in place of a geometry [-]"
+    )
+    young_modulus: float | None = Field(
+        default=None, gt=0, description="instead of material.young_modulus [Pa]"
+    )
+    poisson_ratio: float | None = Field(
+        default=None, gt=-1, lt=0.5, description="instead of material.poisson_ratio [-]"
+    )
+    density: float | None = Field(
+        default=None, gt=0, description="instead of material.density [kg/m3]"
+    )
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Arm:
+        stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
+        if self.rigid:
+            stated.append("rigid")
+        if len(stated) > 1:
+            raise Refusal(
+                f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
+                *((key,) for key in stated),
+            )
+        return self
+
+    @property
+    def own(self) -> bool:
+        """Whether the arm has a design of its own."""
+        return self.flexible and self.design is None
+
+    @property
+    def flexible(self) -> bool:
+        """Whether the arm is meshed and reduced here, alone or with the arm it shares with."""
+        return not self.rigid and self.sid is None
+
+    @model_validator(mode="after")
+    def _check_ends(self) -> Arm:
+        if 2.0 * self.passive >= self.length:
+            raise Refusal(
+                f"expected less than half of length = {self.length} [m]", ("passive",), ("length",)
+            )
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _mesh_or_cells(cls, data: Any) -> Any:
+        """Let a mesh take the place of the default of `cells`."""
+        if not isinstance(data, dict):
+            return data
+        if data.get("mesh") is not None:
+            return {"cells": None} | data
+        return {key: value for key, value in data.items() if (key, value) != ("cells", None)}
+
+    @model_validator(mode="after")
+    def _check_mesh(self) -> Arm:
+        if self.mesh is None:
+            for key in ("mesh_size", "cell_shape"):
+                if getattr(self, key) is not None:
+                    raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
+            return self
+        if self.cells is not None:
+            raise Refusal(
+                "expected either cells (a rectangular arm) or mesh (a file), not both",
+                ("mesh",),
+                ("cells",),
+            )
+        kind = Path(self.mesh).suffix.lower()
+        if kind not in MESH_FILES:
+            raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
+        for key in ("mesh_size", "cell_shape"):
+            if kind == ".msh" and getattr(self, key) is not None:
+                raise Refusal(
+                    "expected only with .geo or .step: a .msh file has its cells", (key,), ("mesh",)
+                )
+        return self
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells; of a mesh file an estimate, 0 where there is nothing to go by."""
+        if self.cells is not None:
+            return self.cells[0] * self.cells[1]
+        if self.mesh_size is None:
+            return 0
+        squares = self.length * self.height / self.mesh_size**2
+        return round(2.0 * squares if self.cell_shape == "triangle" else squares)
+
+    @property
+    def passive_columns(self) -> int:
+        """Count the columns of cells at each end with centroids nearer to it than `passive`.
+
+        0 for a mesh file, whose solid cells are known when it is read.
+        """
+        if self.cells is None:
+            return 0
+        # The expression of meshes/arm.geo, so that rounding cannot tell the two apart.
+        return math.ceil(self.passive / self.length * self.cells[0] - 0.5)
+
+    @property
+    def passive_share(self) -> float:
+        """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
+        return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
+
+    @property
+    def n_reducible(self) -> int | None:
+        """Count the dofs a reduction can keep: interior nodes, and 3 of the outboard interface.
+
+        None for a mesh file.
+        """
+        if self.cells is None:
+            return None
+        n_along, n_across = self.cells
+        return 2 * (n_along - 1) * (n_across + 1) + 3
+
+
+class Motion(Table):
+    """The prescribed motion of the end-effector and the mechanism that follows it."""
+
+    path: Path2D = Field(
+        default="arc",
+        description="of the end-effector: arc, line or table of points; or a table of joint "
+        "coordinates [-]",
+    )
+    radius: float = Field(
+        default=1.0, gt=0, description="radius of the semicircle about the origin, of an arc [m]"
+    )
+    flattening: float = Field(
+        default=1.0, ge=0, le=1, description="factor of an arc's y; 0 is the straight line [-]"
+    )
+    start: tuple[float, float] = Field(default=(-1.0, 0.0), description="where a line begins [m]")
+    end: tuple[float, float] = Field(default=(1.0, 0.0), description="where a line ends [m]")
+    file: str | None = Field(
+        default=None,
+        description="table (CSV) of points or joints, from the scene's folder or the working "
+        "directory [-]",
+    )
+    law: TimeLaw = Field(
+        default="quintic", description="time law along the path; not of a table with times [-]"
+    )
+    duration: float = Field(default=1.9, gt=0, description="time from start to end of the path [s]")
+    horizon: float = Field(
+        default=3.0, gt=0, description="simulated time; at rest after duration [s]"
+    )
+    base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
+    base_position: float = Field(
+        default=0.0, description="x of the shoulder joint on a fixed base [m]"
+    )
+    cart_follow: float = Field(
+        default=0.5,
+        description="position of the cart over the desired x of the end-effector; with one arm, a "
+        "fixed base or a table of joints there is no choice [-]",
+    )
+    joint_height: float = Field(default=-0.5, description="y of the shoulder joint [m]")
+    elbow: Literal[-1, 1] = Field(
+        default=-1,
+        description="sign of the elbow angle beta; with one arm, of its cosine with +x [-]",
+    )
+    gravity: tuple[float, float] = Field(
+        default=(0.0, 0.0), description="gravitational acceleration in x and y [m/s2]"
+    )
+
+    @model_validator(mode="after")
+    def _check_path(self) -> Motion:
+        tabulated = self.path in ("points", "joints")
+        if tabulated and self.file is None:
+            raise Refusal(
+                f'expected the path of a table (CSV) with motion.path = "{self.path}"',
+                ("file",),
+                ("path",),
+            )
+        if self.path == "line" and self.start == self.end:
+            raise Refusal("expected another point than motion.start", ("end",), ("start",))
+        self._refuse_idle(self.path == "arc", "path", "radius", "flattening")
+        self._refuse_idle(self.path == "line", "path", "start", "end")
+        self._refuse_idle(tabulated, "path", "file")
+        self._refuse_idle(self.path != "joints", "path", "cart_follow", "elbow")
+        self._refuse_idle(self.base == "cart", "base", "cart_follow")
+        self._refuse_idle(self.base == "fixed", "base", "base_position")
+        return self
+
+    def _refuse_idle(self, used: bool, choice: str, *keys: str) -> None:
+        """Raise unless `keys` have their defaults or are `used` with this value of `choice`."""
+        for key in keys:
+            default = type(self).model_fields[key].default
+            if not used and getattr(self, key) != default:
+                found = f"motion.{choice} = {shown(getattr(self, choice))}"
+                raise Refusal(
+                    f"expected none with {found}, which does not use it"
+                    if default is None
+                    else f"expected {shown(default)}, the default, with {found}, which does not "
+                    "use it",
+                    (key,),
+                    (choice,),
+                )
+
+
+class Payload(Table):
+    """What the end-effector carries."""
+
+    mass: float = Field(default=6.0, ge=0, description="point mass at the end-effector [kg]")
+    inertia: float = Field(
+        default=0.0, ge=0, description="moment of inertia about its centre [kg m2]"
+    )
+
+
+class Damping(Table):
+    """Structural damping D = stiffness_proportional * K."""
+
+    stiffness_proportional: float = Field(
+        default=2e-4, ge=0, description="factor of the stiffness matrix in D [s]"
+    )
+
+
+class Reduction(Table):
+    """Model reduction of every arm."""
+
+    method: ReductionMethod = Field(
+        default="craig-bampton", description="how the basis is made [-]"
+    )
+    coordinates: int = Field(default=4, ge=1, description="elastic coordinates q of each arm [-]")
+    shifts: tuple[Frequency, ...] = Field(
+        default=(0.0,), description='where "krylov" matches moments [Hz]'
+    )
+    band: tuple[Frequency, Frequency] = Field(
+        default=(0.0, 50.0), description='from where to where "balanced" weights responses [Hz]'
+    )
+
+    @field_validator("shifts")
+    @classmethod
+    def _check_shifts(cls, shifts: tuple[float, ...]) -> tuple[float, ...]:
+        if not shifts or len(set(shifts)) < len(shifts):
+            raise Refusal("expected at least one number >= 0, none of them twice")
+        return shifts
+
+    @field_validator("band")
+    @classmethod
+    def _check_band(cls, band: tuple[float, float]) -> tuple[float, float]:
+        if band[0] >= band[1]:
+            raise Refusal("expected the lower of the two frequencies first")
+        return band
+
+    @model_validator(mode="after")
+    def _check_coordinates(self) -> Reduction:
+        if self.method == "craig-bampton" and self.coordinates < 3:
+            raise Refusal(
+                'expected an integer >= 3 with reduction.method = "craig-bampton" '
+                "(its constraint modes)",
+                ("coordinates",),
+                ("method",),
+            )
+        if self.method == "krylov" and self.coordinates < 3 * len(self.shifts):
+            raise Refusal(
+                f'expected an integer >= {3 * len(self.shifts)} with reduction.method = "krylov" '
+                "(the interface loads at each of reduction.shifts)",
+                ("coordinates",),
+                ("method",),
+                ("shifts",),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_idle(self) -> Reduction:
+        for key, method in (("shifts", "krylov"), ("band", "balanced")):
+            default = type(self).model_fields[key].default
+            if self.method != method and getattr(self, key) != default:
+                raise Refusal(
+                    f"expected {shown(default)}, the default, with reduction.method = "
+                    f"{shown(self.method)}, which does not use it",
+                    (key,),
+                    ("method",),
+                )
+        return self
+
+
+class Simulation(Table):
+    """Time integration of the elastic coordinates and its output."""
+
+    tolerance: float = Field(
+        default=1e-4,
+        gt=0,
+        le=0.1,
+        description="relative error allowed in the elastic coordinates [-]",
+    )
+    integrator: Integrator = Field(default="radau", description="time integration method [-]")
+    rho_inf: float = Field(
+        default=0.8, ge=0, le=1, description="spectral radius at infinity of generalised-alpha [-]"
+    )
+    stages: int = Field(default=3, ge=2, le=5, description="stages of a Radau IIA step [-]")
+    sample: float = Field(default=1e-3, gt=0, description="interval of the output instants [s]")
+
+
+class Objective(Table):
+    """What is minimised."""
+
+    kind: ObjectiveKind = Field(
+        default="esl",
+        description="compliance of load cases or over the horizon, deviation, static "
+        "compliance, or first eigenfrequency [-]",
+    )
+    load_cases: int = Field(
+        default=30,
+        ge=1,
+        description="equal intervals of the horizon; each gives its worst instant [-]",
+    )
+    worst: WorstBy = Field(
+        default="compliance", description="what makes an instant the worst of its interval [-]"
+    )
+    gradient: GradientKind = Field(default="esl", description="with the loads frozen, or exact [-]")
+    exponent: float = Field(
+        default=20.0,
+        ge=2,
+        le=200,
+        description="p of p-means: deviation over time, squared periods over modes [-]",
+    )
+    loads: tuple[Load, ...] = Field(
+        default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="static load cases (F_x N, F_y N, moment N m) at each arm's outboard "
+        "interface [-]",
+    )
+    attached: Attached = Field(
+        default="rigid-body", description="what an arm carries while it vibrates [-]"
+    )
+    elbow_angle: float | None = Field(
+        default=None,
+        description="of every joint behind an arm while it vibrates; default: mid-path [rad]",
+    )
+    modes: int = Field(
+        default=3, ge=1, le=50, description="lowest modes in the p-mean of the eigenfrequency [-]"
+    )
+    follow: bool = Field(
+        default=False,
+        description="follow the initial design's first mode by MAC instead of the p-mean [-]",
+    )
+
+    @field_validator("loads")
+    @classmethod
+    def _check_loads(cls, loads: tuple[Load, ...]) -> tuple[Load, ...]:
+        if not loads or not all(any(load) for load in loads):
+            raise Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
+        return loads
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the objective needs the motion."""
+        return self.kind in ("esl", "compliance", "deviation")
+
+
+class Constraints(Table):
+    """What a design must keep besides its volume, arm by arm."""
+
+    first_frequency: float | None = Field(
+        default=None,
+        gt=0,
+        description="least first frequency of every arm with what it carries "
+        "(objective.attached) [Hz]",
+    )
+    tip_deflection: float | None = Field(
+        default=None,
+        gt=0,
+        description="largest static deflection of every arm's outboard interface under "
+        "objective.loads [m]",
+    )
+
+
+class Design(Table):
+    """Design variables x of all cells, their limits and their filter."""
+
+    volume_fraction: float = Field(
+        default=0.5, gt=0, le=1, description="volume limit of each arm [-]"
+    )
+    shared_volume: bool = Field(
+        default=False, description="one volume limit for all arms together [-]"
+    )
+    initial: float = Field(default=0.5, gt=0, le=1, description="x of every cell at the start [-]")
+    minimum: float = Field(default=1e-3, gt=0, lt=1, description="lower bound of x [-]")
+    filter_radius: float = Field(
+        default=0.0075, ge=0, description="radius of the equivalent cone filter; 0 is no filter [m]"
+    )
+    projection: Projection = Field(
+        default=False,
+        description="after the filter: none, Heaviside, or eroded, nominal and dilated designs "
+        "at once [-]",
+    )
+    sharpness: float = Field(
+        default=128.0, ge=1, le=1e4, description="beta of the projection in the end [-]"
+    )
+    continuation: int = Field(
+        default=25, ge=1, description="iterations until the projection's beta doubles [-]"
+    )
+    erosion: float = Field(
+        default=0.1,
+        gt=0,
+        lt=0.5,
+        description="distance of the robust thresholds from one half [-]",
+    )
+
+    @model_validator(mode="after")
+    def _check_minimum(self) -> Design:
+        if self.minimum >= self.initial:
+            raise Refusal(
+                f"expected less than initial = {self.initial} [-]", ("minimum",), ("initial",)
+            )
+        if self.minimum > self.volume_fraction:
+            raise Refusal(
+                f"expected at most volume_fraction = {self.volume_fraction} [-]",
+                ("minimum",),
+                ("volume_fraction",),
+            )
+        return self
+
+
+class Optimizer(Table):
+    """When the optimiser stops and how far it moves at once."""
+
+    max_iterations: int = Field(
+        default=400, ge=0, le=MAX_ITERATIONS, description="design iterations [-]"
+    )
+    move: float = Field(
+        default=0.2, gt=0, le=1, description="largest step of x in one iteration [-]"
+    )
+    tolerance: float = Field(
+        default=1e-3, ge=0, description="converged when the largest change of x is below it [-]"
+    )
+
+
+class Scene(Table):
+    """A complete, valid scene. Two scenes are equal if all their keys are; `source` is no key."""
+
+    name: Annotated[str, AfterValidator(check_scene_name)] = Field(
+        description="title of the scene; by default the file's name without extension [-]"
+    )
+    material: Material = Field(description="the solid material")
+    interpolation: Interpolation = Field(default=Interpolation(), description="material law")
+    arms: tuple[Arm, ...] = Field(description="arms from the cart outwards")
+    motion: Motion = Field(default=Motion(), description="prescribed motion")
+    payload: Payload = Field(default=Payload(), description="load of the end-effector")
+    damping: Damping = Field(default=Damping(), description="structural damping")
+    reduction: Reduction = Field(default=Reduction(), description="model reduction")
+    simulation: Simulation = Field(default=Simulation(), description="time integration")
+    objective: Objective = Field(default=Objective(), description="what is minimised")
+    constraints: Constraints = Field(default=Constraints(), description="limits besides the volume")
+    design: Design = Field(default=Design(), description="design variables")
+    optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
+
+    _source: str = PrivateAttr("<scene>")
+
+    @property
+    def source(self) -> str:
+        """Return the path of the scene's file as messages show it."""
+        return self._source
+
+    @property
+    def owners(self) -> tuple[int | None, ...]:
+        """For every arm the index of the arm that has its design; None where there is none."""
+        index = {arm.name: i for i, arm in enumerate(self.arms)}
+        return tuple(
+            (index[arm.design] if arm.design is not None else i) if arm.flexible else None
+            for i, arm in enumerate(self.arms)
+        )
+
+    @property
+    def cell_counts(self) -> dict[int, int]:
+        """Number of cells of every arm with a design of its own, by the arm's index."""
+        return {i: self.arms[i].n_cells for i, owner in enumerate(self.owners) if owner == i}
+
+    def material_of(self, index: int) -> Material:
+        """Return the material of arm number `index`: its own values, or else the scene's."""
+        arm = self.arms[index]
+        own = {key: getattr(arm, key) for key in Material.model_fields}
+        given = {key: value for key, value in own.items() if value is not None}
+        return self.material.model_copy(update=given)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all resolved values as JSON-able data, from which `scene_from_dict` restores."""
+        return self.model_dump(mode="json")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scene):
+            return NotImplemented
+        return self.to_dict() == other.to_dict()
+
+    def __hash__(self) -> int:
+        return hash(tuple(getattr(self, key) for key in type(self).model_fields))
+
+    @field_validator("arms")
+    @classmethod
+    def _check_any(cls, arms: tuple[Arm, ...]) -> tuple[Arm, ...]:
+        # Not by min_length: pydantic would also count arms that are there but invalid as absent.
+        if not arms:
+            raise ValueError
+        return arms
+
+    @model_validator(mode="after")
+    def _check_arm_names(self) -> Scene:
+        seen: set[str] = set()
+        for i, arm in enumerate(self.arms):
+            if arm.name.casefold() in seen:  # some file systems do not tell capitals apart
+                raise Refusal("expected a name that no other arm has", ("arms", i, "name"))
+            seen.add(arm.name.casefold())
+        return self
+
+    @model_validator(mode="after")
+    def _check_sharing(self) -> Scene:
+        names = [arm.name for arm in self.arms]
+        for i, arm in enumerate(self.arms):
+            if arm.design is None:
+                continue
+            before = [name for name, a in zip(names[:i], self.arms[:i], strict=True) if a.own]
+            if arm.design not in before:
+                allowed = " | ".join(map(shown, before)) or "no arm before it has one"
+                raise Refusal(
+                    f"expected the name of an earlier arm with a design of its own: {allowed}",
+                    ("arms", i, "design"),
+                )
+            j = names.index(arm.design)
+            for key in Arm.model_fields:
+                if key not in ("name", "design") and getattr(arm, key) != getattr(
+                    self.arms[j], key
+                ):
+                    raise Refusal(
+                        f"expected {shown(getattr(self.arms[j], key))} as {arm.design} has, whose "
+                        "design it shares",
+                        ("arms", i, key),
+                        ("arms", i, "design"),
+                    )
+        if not self.cell_counts:
+            raise Refusal(
+                "expected at least one arm with a design: none is flexible", ("arms", 0, "rigid")
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_attached(self) -> Scene:
+        vibrates = self.objective.kind == "eigenfrequency" or self.constraints.first_frequency
+        if not vibrates or self.objective.attached != "none":
+            return self
+        for i in self.cell_counts:
+            if self.arms[i].passive == 0.0:
+                raise Refusal(
+                    'expected more than 0 with objective.attached = "none": without a mass at its '
+                    "end the optimiser would cut an arm off",
+                    ("arms", i, "passive"),
+                    ("objective", "attached"),
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_joints(self) -> Scene:
+        motion = self.motion
+        if len(self.arms) > 1 or motion.path == "joints":
+            return self
+        if motion.base == "fixed":
+            raise Refusal(
+                f'expected "cart" with one arm and motion.path = "{motion.path}": a single joint '
+                'follows no path; prescribe its angle with motion.path = "joints"',
+                ("motion", "base"),
+                ("motion", "path"),
+            )
+        if motion.cart_follow != Motion.model_fields["cart_follow"].default:
+            raise Refusal(
+                "expected 0.5, the default, with one arm: its angle and the path leave the cart "
+                "no choice",
+                ("motion", "cart_follow"),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_coordinates(self) -> Scene:
+        for i, arm in enumerate(self.arms):
+            if not arm.flexible:
+                continue
+            if arm.n_reducible is not None and self.reduction.coordinates > arm.n_reducible:
+                raise Refusal(
+                    f"expected at most {arm.n_reducible}, the degrees of freedom of "
+                    f'arm "{arm.name}" with cells = {list(arm.cells or ())}',
+                    ("reduction", "coordinates"),
+                    ("arms", i, "cells"),
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_resonances(self) -> Scene:
+        if self.reduction.method == "balanced" and not self.damping.stiffness_proportional:
+            raise Refusal(
+                'expected a number > 0 with reduction.method = "balanced": the Gramian of '
+                "undamped resonances is infinite",
+                ("damping", "stiffness_proportional"),
+                ("reduction", "method"),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_adjoint(self) -> Scene:
+        if self.objective.gradient == "exact" and self.reduction.method == "balanced":
+            raise Refusal(
+                'expected "craig-bampton", "modal" or "krylov" with objective.gradient = "exact": '
+                "the Gramian's basis has no adjoint",
+                ("reduction", "method"),
+                ("objective", "gradient"),
+            )
+        if self.objective.gradient == "exact" and self.simulation.integrator != "radau":
+            raise Refusal(
+                'expected "radau" with objective.gradient = "exact": only its trajectory has an '
+                "adjoint",
+                ("simulation", "integrator"),
+                ("objective", "gradient"),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_sampling(self) -> Scene:
+        horizon, sample = self.motion.horizon, self.simulation.sample
+        n_samples = horizon / sample * (1.0 + 1e-9)  # 3 s in steps of 1e-3 s are 3000 of them
+        keys = ("simulation", "sample"), ("motion", "horizon")
+        if not 1.0 <= n_samples <= MAX_SAMPLES:
+            raise Refusal(
+                f"expected between {horizon / MAX_SAMPLES} and motion.horizon = {horizon} [s]",
+                *keys,
+            )
+        if self.objective.load_cases > n_samples:
+            raise Refusal(
+                f"expected at most {int(n_samples)}, so that each of the equal intervals of "
+                f"motion.horizon = {horizon} [s] holds a sample (simulation.sample = {sample} [s])",
+                ("objective", "load_cases"),
+                *keys,
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_volume(self) -> Scene:
+        limit = self.design.volume_fraction
+        flexible = {i: arm for i, arm in enumerate(self.arms) if arm.flexible}
+        shares = {i: arm.passive_share for i, arm in flexible.items()}
+        if self.design.shared_volume:
+            volumes = {i: a.length * a.height * a.thickness for i, a in flexible.items()}
+            together = sum(shares[i] * volumes[i] for i in shares) / sum(volumes.values())
+            shares = dict.fromkeys(shares, together)
+        for i, share in shares.items():
+            if share + (1.0 - share) * self.design.minimum > limit:
+                raise Refusal(
+                    f"expected so little that volume_fraction = {limit} can be met: with "
+                    f"design.minimum = {self.design.minimum} between them the solid ends of "
+                    f"share {share:.4g} exceed it; shorten passive or raise the volume",
+                    ("arms", i, "passive"),
+                    ("arms", i, "length"),
+                    ("arms", i, "cells"),
+                    ("design", "volume_fraction"),
+                    ("design", "minimum"),
+                )
+        return self
