@@ -189,10 +189,13 @@ def gradient(
     from dolfinopt.evaluation import gradient as slopes
     from dolfinopt.files import write_gradient
     from dolfinopt.ledger import Ledger
+    from dolfinopt.taylor import check_exact
 
     if out.is_dir():
         raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
     loaded = _load(world, scene, (*overrides, f'objective.gradient="{kind}"'))
+    if check:
+        check_exact(loaded)
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, out.parent)
@@ -201,7 +204,8 @@ def gradient(
     write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
         unit = UNITS[loaded.objective.kind]
-        click.echo(f"objective {evaluation.objective:.6g} {unit}; {kind} gradient in {out}")
+        name = kind if loaded.objective.simulated else "exact"
+        click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
     if check:
         _check_gradient(world, loaded, share, arms, x_phys, ledger)
 
@@ -267,6 +271,85 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     return to_sid(body, moments, comment=title), modal_element(body, moments, nodes, thickness)
 
 
+# -- study -----------------------------------------------------------------------------------
+
+
+class _Listing(click.Command):
+    """A command whose --designs takes all words up to the next option."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put --designs before every one of them."""
+        spread: list[str] = []
+        listing = False
+        for word in args:
+            if word == "--designs":
+                listing = True
+                continue
+            listing = listing and not word.startswith("-")
+            spread += ["--designs", word] if listing else [word]
+        return super().parse_args(ctx, spread)
+
+
+@commands.command(cls=_Listing)
+@scene_argument
+@click.argument(
+    "topic",
+    required=False,
+    type=click.Choice(["payload", "flattening", "coordinates", "objective", "reduction"]),
+)
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=VALUES",
+    help="a scene value and start:stop:count or a,b,c; two make a grid",
+)
+@click.option(
+    "--designs",
+    multiple=True,
+    metavar="FILE ...",
+    type=click.Path(path_type=Path),
+    help="design.npz files; default: the initial and the optimised design",
+)
+@click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
+@out_option("tables, pictures and cases; default: results/SCENE-study")
+@set_option
+@plots_option
+@click.pass_obj
+def study(
+    world: MPI.Comm,
+    scene: Path,
+    topic: Any,
+    vary: tuple[str, ...],
+    designs: tuple[Path, ...],
+    reoptimize: bool,
+    out: Path | None,
+    overrides: tuple[str, ...],
+    plots: bool,
+) -> None:
+    """Vary what SCENE rests on: tables and curves of what its designs then do.
+
+    Without TOPIC whatever --vary names. What is computed is kept in DIR/cases and taken from
+    there the next time; a study that was interrupted goes on.
+    """
+    from dolfinopt.study import study as run
+    from dolfinopt.study import write_study
+
+    loaded = _load(world, scene, overrides)
+    folder = out or Path("results") / f"{scene.stem}-study"
+    done = run(loaded, topic, vary, designs, folder, world, reoptimize=reoptimize)
+    if world.rank == 0:
+        write_study(done, folder)
+        if plots:
+            from dolfinopt.study_plots import draw_study
+
+            draw_study(done, folder)
+        click.echo(done.markdown())
+        click.echo(f"{done.computed} cases computed; tables and pictures in {folder}")
+    if done.failures:
+        more = f" (and {len(done.failures) - 1} more)" if len(done.failures) > 1 else ""
+        raise ConvergenceError(f"{done.failures[0]}{more}")
+
+
 @commands.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.pass_obj
@@ -309,10 +392,11 @@ def _check_gradient(
             remainders = "".join(f"{r:12.2e}" for r in row.remainders)
             slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
             click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
-        click.echo(
-            f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
-            f"{test.ratio:.3f} times as long"
-        )
+        if scene.objective.simulated:
+            click.echo(
+                f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
+                f"{test.ratio:.3f} times as long"
+            )
     if not test.passed:
         raise ConvergenceError(
             f"the remainders fall at a rate below {PASSES}: the gradient is not exact here; a "

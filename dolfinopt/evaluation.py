@@ -124,11 +124,11 @@ def evaluate(
     constraints: list[float] = []
     frequencies: tuple[float, ...] = ()
     if kind == "eigenfrequency" or scene.constraints.first_frequency is not None:
-        periods, frequencies = _vibration(scene, share, arms)
+        periods, longest, frequencies = _vibration(scene, share, arms)
         if kind == "eigenfrequency":
             value = float(periods.sum())
         if scene.constraints.first_frequency is not None:
-            constraints += list(periods * scene.constraints.first_frequency**2 - 1.0)
+            constraints += list(longest * scene.constraints.first_frequency**2 - 1.0)
     if scene.constraints.tip_deflection is not None:
         tips = _deflections(scene, share, arms)
         constraints += list(tips / scene.constraints.tip_deflection - 1.0)
@@ -171,7 +171,7 @@ def gradient(
         response = {k: static_response(arm.elastic, _loads(scene)) for k, arm in arms.items()}
         return {k: uses[k] * static_gradient(arm, response[k]) for k, arm in arms.items()}
     if scene.objective.kind == "eigenfrequency":
-        rows = _period_rows(scene, share, arms)
+        rows = _period_rows(scene, share, arms, scene.objective.follow)
         return {k: np.sum([row[k] for row in rows], axis=0) for k in arms}
     if scene.objective.gradient == "esl":
         A = on_root(share.world, moments)
@@ -190,7 +190,7 @@ def constraint_gradients(
     """
     limits, rows = scene.constraints, []
     if limits.first_frequency is not None:
-        for row in _period_rows(scene, share, arms):
+        for row in _period_rows(scene, share, arms, follow=False):
             rows.append({k: limits.first_frequency**2 * values for k, values in row.items()})
     if limits.tip_deflection is not None:
         for owner in scene.cell_counts:
@@ -326,30 +326,37 @@ def _modes(arms: Mapping[int, Arm], chain: Chain) -> dict[int, LoadedModes]:
 
 def _vibration(
     scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
-) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return squared periods (s2) and first frequencies (Hz) of all flexible arms (collective)."""
+) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
+    """Return what all flexible arms' vibrations are judged by (collective).
+
+    The objective's squared periods, those of the lowest modes whichever one it follows (s2), and
+    the first frequencies (Hz).
+    """
     modes = _modes(arms, _chain(scene, share, arms))
     options = scene.objective
     mine = {
-        place: (squared_period(one, options.exponent, options.follow)[0], one.frequency)
+        place: (
+            squared_period(one, options.exponent, options.follow)[0],
+            squared_period(one, options.exponent, False)[0],
+            one.frequency,
+        )
         for place, one in modes.items()
     }
-    values = _everywhere(share, mine).values()
-    return np.array([period for period, _ in values]), tuple(f for _, f in values)
+    periods, longest, frequencies = zip(*_everywhere(share, mine).values(), strict=True)
+    return np.array(periods), np.array(longest), frequencies
 
 
 def _period_rows(
-    scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm], follow: bool
 ) -> list[dict[int, np.ndarray]]:
     """Return every flexible arm's gradient of its squared period (collective).
 
     What an arm carries depends on the designs outboard of it.
     """
     chain = _chain(scene, share, arms)
-    options = scene.objective
     modes = _modes(arms, chain)
     slopes = {
-        place: period_gradient(arms[owner], modes[place], options.exponent, options.follow)
+        place: period_gradient(arms[owner], modes[place], scene.objective.exponent, follow)
         for owner in arms
         for place in arms[owner].places
     }

@@ -35,6 +35,11 @@ WORST_CASE = 20.0
 # Sharpness of the projection from which on the move limit falls with its square root.
 GENTLE = 4.0
 
+# Relative violation of a constraint from which on it is reported: an active one is met to less.
+EXCESS = 1e-3
+# Grayness above which a projection has not done its work.
+GREY = 0.02
+
 Report = Callable[[HistoryRow], None]
 
 
@@ -243,6 +248,7 @@ class _Run:
         self.history: list[HistoryRow] = []
         self.iteration = 0
         self.change = 0.0
+        self.grayness = 0.0  # of the nominal design; known on the root
         self.finished = ""
         self.sharpness = 1.0  # the projection's beta; grows to design.sharpness
         # Held during a step: a threshold that followed x would be one more way to stay grey.
@@ -281,14 +287,23 @@ class _Run:
             history=self.history,
             iterations=self.iteration,
             converged=converged,
-            stop_reason=(
-                f"largest change {self.change:.3g} <= {self.scene.optimizer.tolerance:g}"
-                if converged
-                else f"{self.iteration} iterations (optimizer.max_iterations)"
-            ),
+            stop_reason=self._stop_reason(evaluation),
             ledger=self.ledger,
             counts=counts,
         )
+
+    def _stop_reason(self, evaluation: Evaluation) -> str:
+        """Say in words why the iterations ended, and whether a constraint is not met."""
+        if self.finished == "converged":
+            reason = f"largest change {self.change:.3g} <= {self.scene.optimizer.tolerance:g}"
+        else:
+            reason = f"{self.iteration} iterations (optimizer.max_iterations)"
+        excess = max(evaluation.constraints, default=0.0)
+        if excess > EXCESS:
+            reason += f"; a constraint is exceeded by {100.0 * excess:.3g} %"
+        if self.scene.design.projection and self.grayness > GREY:
+            reason += f"; the projected design is still grey ({self.grayness:.2g})"
+        return reason
 
     def _finished(self, limit: int) -> bool:
         """Decide whether to stop; the same on all ranks."""
@@ -403,6 +418,8 @@ class _Run:
     def _assess(self, designs: Sequence[_Evaluated]) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate what the iterations left out: motions not simulated, and the crisp design."""
         x_phys, evaluation, crisp = designs[-1].x_phys, designs[-1].evaluation, None
+        # A followed mode is known by those before it: the initial and the crisp design's are not.
+        starts = {k: arm.starts for k, arm in self.arms.items()}
         if not self.scene.objective.simulated:
             initial = {k: arm.uniform(self.scene.design.initial) for k, arm in self.arms.items()}
             _, trajectory = self._evaluate_one(initial, simulated=True)
@@ -412,6 +429,8 @@ class _Run:
             cut = {k: np.where(x > 0.5, 1.0, 0.0) for k, x in x_phys.items()}
             crisp, _ = self._evaluate_one(cut, simulated=True)
         if crisp is not None or not self.scene.objective.simulated:
+            for k, arm in self.arms.items():
+                arm.starts = starts[k]
             evaluation, self.trajectory = self._evaluate_one(x_phys, simulated=True)
         return evaluation, crisp
 
@@ -425,11 +444,12 @@ class _Run:
         total, volume, grey = sum_over_arms(self.share, parts)
         if self.share.world.rank != 0:
             return
+        self.grayness = float(grey / total)
         row = HistoryRow(
             iteration=self.iteration,
             objective=_worst([one.evaluation.objective for one in designs]),
             max_deviation=nominal.evaluation.max_deviation,
-            grayness=float(grey / total),
+            grayness=self.grayness,
             volume_fraction=float(volume / total),
             change=self.change,
             seconds=self.earlier + time.perf_counter() - self.begun,
@@ -489,4 +509,5 @@ class _Run:
         self.sharpness = memory.sharpness
         self.thresholds = dict(memory.thresholds)
         self.change = memory.history[-1].change
+        self.grayness = memory.history[-1].grayness
         self.earlier = memory.history[-1].seconds

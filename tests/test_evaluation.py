@@ -276,6 +276,44 @@ def value_close(a: float, b: float) -> bool:
     return abs(a - b) <= 1e-9 * abs(a)
 
 
+# -- projections -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["heaviside", "robust"])
+@pytest.mark.parametrize("objective_kind", ["static", "eigenfrequency"])
+def test_gradient_by_the_variables_through_a_projection(kind: str, objective_kind: str) -> None:
+    """Symmetry, filter, projection and solid ends: remainders of every design x stands for."""
+    built = build(
+        f"objective.kind={objective_kind}",
+        f"design.projection={kind}",
+        "design.filter_radius=0.05",
+        "arms.passive=0.1",
+        "arms.symmetric=true",
+        cells=(24, 4),
+    )
+    x, d = built.fields(wave), built.fields(uneven)
+    several = {"heaviside": 1, "robust": 3}[kind]
+
+    def realised(h: float, variant: int):
+        return {k: a.realise(x[k] + h * d[k], 4.0, 0.45)[variant] for k, a in built.arms.items()}
+
+    values = []
+    for variant in range(several):
+
+        def value(h: float, variant: int = variant) -> float:
+            x_phys = {k: one.x_phys for k, one in realised(h, variant).items()}
+            return built.evaluate(x_phys)[0].objective
+
+        values.append(value(0.0))
+        slopes, here = built.gradient(), realised(0.0, variant)
+        by_x = {k: arm.chain(slopes[k], here[k]) for k, arm in built.arms.items()}
+        rate = rates(value, built.dot(by_x, d), (1e-3, 2.5e-4))
+        assert rate == pytest.approx(2.0, abs=0.1)
+    if kind == "robust" and objective_kind == "static":
+        eroded, dilated, nominal = values
+        assert dilated < nominal < eroded  # the more material, the stiffer
+
+
 # -- load cases ------------------------------------------------------------------------------
 
 
@@ -301,6 +339,49 @@ def test_load_cases_are_the_worst_instants(worst: str) -> None:
         for j in range(7)
     ]
     assert evaluation.compliance == pytest.approx(sum(most), rel=1e-12)
+
+
+# -- constraints -----------------------------------------------------------------------------
+
+
+def test_constraints_say_how_far_a_bound_is_exceeded() -> None:
+    """T^2 f^2 - 1 arm by arm and u / bound - 1; p-means are no more than k^(1/p) too careful."""
+    built = build(
+        "objective.kind=static",
+        "constraints.first_frequency=4.0",
+        "constraints.tip_deflection=1e-4",
+    )
+    evaluation, _ = built.evaluate(built.fields(wave))
+    periods, tips = np.array(evaluation.constraints[:2]), np.array(evaluation.constraints[2:])
+    least = (4.0 / np.array(evaluation.loaded_frequencies)) ** 2
+    assert (1.0 + periods >= least).all()
+    assert (1.0 + periods <= least * 3.0 ** (1.0 / 20.0)).all()
+    for k, arm in built.arms.items():
+        S = arm.elastic.constraint_modes().stiffness
+        largest = max(np.hypot(*np.linalg.solve(S, load)[:2]) for load in np.eye(3)[1:])
+        assert largest / 1e-4 <= 1.0 + tips[k] <= 2.0 ** (1.0 / 20.0) * largest / 1e-4
+
+
+def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None:
+    """An arm set on a mode that is not the lowest: the objective follows it, the bound does not."""
+    built = build(
+        "objective.kind=eigenfrequency", "objective.follow=true", "constraints.first_frequency=1.0"
+    )
+    x = built.fields(wave)
+    first, _ = built.evaluate(x)
+    for arm in built.arms.values():  # the second mode of both arms was the lowest once
+        arm.starts = [start[:, ::-1] for start in arm.starts]
+        arm.set_design(np.ones(arm.mesh.num_cells))
+    second, _ = built.evaluate(x)
+    assert second.objective < 0.5 * first.objective
+    np.testing.assert_allclose(second.constraints, first.constraints, rtol=1e-9)
+    d = built.fields(uneven)
+    for j, row in enumerate(constraint_gradients(built.scene, built.share, built.arms)):
+
+        def value(h: float, j: int = j) -> float:
+            return built.evaluate({k: x[k] + h * d[k] for k in x})[0].constraints[j]
+
+        assert rates(value, built.dot(row, d), (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1)
 
 
 # -- what is left out ------------------------------------------------------------------------

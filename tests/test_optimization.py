@@ -28,6 +28,9 @@ def small(*overrides, iterations=6):
     return scene("arms.cells=[40,4]", f"optimizer.max_iterations={iterations}", *overrides)
 
 
+QUICK = ["motion.horizon=2.0", "simulation.tolerance=1e-3"]
+
+
 def command(*arguments, ranks=0):
     line = [sys.executable, "-m", "dolfinopt", *map(str, arguments)]
     return ["mpirun", "-n", str(ranks), *line] if ranks else line
@@ -102,6 +105,61 @@ def test_three_coordinates_need_no_eigenproblem():
         assert result.ledger.counts.factorisations == 2 * len(result.arms)
 
 
+# -- constraints and projections -------------------------------------------------------------
+
+
+def test_constraints_keep_their_bounds():
+    """Bounds that the free optimum breaks hold in the end, and cost compliance."""
+    # Loose ones, only to be told the values: they change the free design by rounding.
+    loose = ["constraints.first_frequency=0.1", "constraints.tip_deflection=1.0"]
+    free = do.optimize(small(*QUICK, *loose, iterations=40))
+    assert free.evaluation.loaded_frequencies[0] < 5.2 < free.evaluation.loaded_frequencies[1]
+    assert max(free.evaluation.constraints[2:]) > 6e-5 - 1.0
+    for bound in ("constraints.first_frequency=5.215", "constraints.tip_deflection=5.2e-5"):
+        kept = do.optimize(small(*QUICK, bound, iterations=40))
+        # MMA approaches an active bound to a fraction of its last change.
+        assert max(kept.evaluation.constraints) == pytest.approx(0.0, abs=1e-3)
+        assert kept.evaluation.compliance > free.evaluation.compliance * 1.002
+        if WORLD.rank == 0:
+            assert kept.history[-1].volume_fraction == pytest.approx(0.5, abs=1e-3)
+        if "frequency" in bound:
+            assert kept.evaluation.loaded_frequencies[0] == pytest.approx(5.215, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "overrides"),
+    [
+        ("heaviside", ["arms.cells=[60,8]", "design.filter_radius=0.025"]),
+        ("robust", ["arms.cells=[40,6]", "design.filter_radius=0.0375"]),
+    ],
+)
+def test_projection_ends_crisp(kind, overrides):
+    """From all grey, with a filter of one and a half cells, to no grey: cut it is the same design.
+
+    Volume limits hold, and the designs are as good as without a projection, or better.
+    """
+    statics = ["objective.kind=static", *overrides]
+    projected = ["design.continuation=15", f"design.projection={kind}"]
+    result = do.optimize(small(*statics, *projected, iterations=150))
+    grey = do.optimize(small(*statics, iterations=30))
+    if WORLD.rank == 0:
+        last = result.history[-1]
+        assert last.grayness < 0.02 < 0.1 < grey.history[-1].grayness
+        assert last.volume_fraction == pytest.approx(0.5, abs=1e-3)
+        assert result.evaluation.max_deviation < grey.evaluation.max_deviation
+    assert result.crisp.objective == pytest.approx(result.evaluation.objective, rel=0.02)
+    assert result.evaluation.objective < grey.evaluation.objective
+
+
+def test_bounds_out_of_reach_are_told():
+    """No design of half the material is so stiff: the run says so."""
+    result = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1e-6"))
+    assert max(result.evaluation.constraints) > 10.0
+    assert "a constraint is exceeded by" in result.stop_reason
+    kept = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1.0"))
+    assert "exceeded" not in kept.stop_reason
+
+
 # -- resume ----------------------------------------------------------------------------------
 
 
@@ -125,6 +183,70 @@ def test_resume_gives_the_same_bits(shared_tmp_path, monkeypatch):
         assert rows == [replace(row, seconds=0.0) for row in whole.history]
         if WORLD.rank == 0:
             np.testing.assert_array_equal(resumed.initial_deviation, whole.initial_deviation)
+
+
+# Sharper in every iteration, but not so sharp that arms fall apart, which are slow to simulate.
+GENTLE = ["design.continuation=2", "design.sharpness=4.0", "design.filter_radius=0.05"]
+ROBUST = "design.projection=robust"
+SMALLEST = ["motion.horizon=1.9", "simulation.tolerance=1e-2", "arms.cells=[24,3]"]
+# One line an option of which the next iteration remembers something.
+REMEMBERED = [
+    ["reduction.method=modal"],
+    ["reduction.method=modal", "arms.arm2.design=arm1"],
+    ["reduction.method=krylov", "reduction.coordinates=3"],
+    ["reduction.method=balanced", "reduction.coordinates=3"],
+    ["objective.kind=static"],
+    ["objective.kind=deviation"],
+    ["objective.kind=eigenfrequency"],
+    ["objective.kind=eigenfrequency", "objective.follow=true", *GENTLE, ROBUST],
+    ["objective.kind=eigenfrequency", "objective.follow=true", "arms.arm2.design=arm1"],
+    ["objective.kind=eigenfrequency", "arms.arm1.rigid=true"],
+    ["constraints.first_frequency=5.0", "constraints.tip_deflection=6e-5"],
+    [*GENTLE, "design.projection=heaviside"],
+    [*GENTLE, ROBUST],
+]
+OPTIONS = pytest.mark.parametrize("overrides", REMEMBERED, ids=" ".join)
+
+
+@OPTIONS
+def test_every_option_resumes_in_the_same_bits(overrides, shared_tmp_path):
+    """Eigenvectors of every arm and place, the projection's sharpness, all are remembered."""
+    settings = [*SMALLEST, *overrides]
+    whole = do.optimize(small(*settings, iterations=3))
+    do.optimize(small(*settings, iterations=1), shared_tmp_path)
+    resumed = do.optimize(small(*settings, iterations=3), shared_tmp_path, resume=True)
+    for k in whole.x_phys:
+        np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
+    rows = [replace(row, seconds=0.0) for row in resumed.history]
+    assert str(rows) == str([replace(row, seconds=0.0) for row in whole.history])  # nan == nan
+    assert str(resumed.evaluation) == str(whole.evaluation)
+    if WORLD.rank == 0:
+        np.testing.assert_array_equal(resumed.initial_deviation, whole.initial_deviation)
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
+@OPTIONS
+def test_every_option_gives_the_same_bits_on_any_number_of_ranks(overrides):
+    settings = [*SMALLEST, *overrides]
+    together = do.optimize(small(*settings, iterations=2))
+    alone = do.optimize(small(*settings, iterations=2), world=MPI.COMM_SELF)
+    for k in together.x_phys:
+        np.testing.assert_array_equal(together.x_phys[k], alone.x_phys[k])
+    assert str(together.evaluation) == str(alone.evaluation)
+
+
+def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
+    """Modal reduction and loaded modes: all rows, those of the outboard interface included."""
+    settings = small("reduction.method=modal", "objective.kind=eigenfrequency", iterations=2)
+    result = do.optimize(settings, shared_tmp_path)
+    for arm in result.arms.values():  # what a third iteration would set out from
+        assert [len(start) for start in arm.starts] == [arm.elastic.num_dofs] * 2
+    memory = checkpoint.load(shared_tmp_path, settings, result.share, result.arms)
+    for k, arm in result.arms.items():
+        empty, loaded = memory.modes[k]  # the objective needs no reduced model
+        assert empty.shape[1] == 0 and loaded.shape == (arm.elastic.num_dofs, 3)
+        assert np.abs(loaded[-3:]).max() > 0.0
+        assert list(memory.cells[k].shape) == [arm.mesh.num_cells, 5]
 
 
 @pytest.mark.serial

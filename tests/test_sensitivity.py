@@ -275,6 +275,50 @@ def test_gradient_is_one(overrides: list[str]) -> None:
     assert_passed(taylor(scene(*overrides), wave))
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["objective.kind=static"],
+        ["objective.kind=static", "reduction.method=balanced"],
+        ["objective.kind=eigenfrequency"],
+        ["objective.kind=eigenfrequency", "simulation.integrator=generalized-alpha"],
+        ["objective.kind=eigenfrequency", "arms.arm1.rigid=true"],
+        ["objective.kind=static", "arms.arm2.design=arm1"],
+    ],
+    ids=" ".join,
+)
+def test_gradient_of_objectives_without_a_motion(overrides: list[str]) -> None:
+    """Nothing moves, nothing is frozen, and neither basis nor integrator matters."""
+    test = taylor(scene(*overrides), wave)
+    assert_passed(test)
+    assert all(row.slope != 0.0 for row in test.rows)  # the boxes are on designed arms
+    assert np.isnan([test.angle, test.ratio, *(row.slope_frozen for row in test.rows)]).all()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["reduction.method=balanced"], 'reduction.method = "balanced": .* has no adjoint'),
+        (["simulation.integrator=generalized-alpha"], 'integrator = "generalized-alpha": .*radau'),
+    ],
+)
+def test_nothing_to_check(overrides: list[str], expected: str) -> None:
+    """Where there is no exact gradient, one line says so and what to choose."""
+    with pytest.raises(InputError, match=expected) as caught:
+        taylor(scene(*overrides))
+    assert "\n" not in str(caught.value) and str(SCENE) in str(caught.value)
+
+
+def test_frozen_deviation_stands_beside_the_exact_one() -> None:
+    """Static loads tell most of a heavy payload's deviation, but not its sign everywhere."""
+    test = taylor(scene("objective.kind=deviation"), wave)
+    assert_passed(test)
+    assert 0.1 < test.angle < 45.0 and 0.5 < test.ratio < 1.0
+    slopes = {row.direction: (row.slope, row.slope_frozen) for row in test.rows}
+    exact, frozen = slopes["tip of the last arm"]
+    assert exact > 0.0 > frozen
+
+
 def random_scene(seed: int) -> Scene:
     """Return a scene whose every part that the gradient passes through is drawn anew."""
     rng = np.random.default_rng(seed)
