@@ -153,7 +153,7 @@ def _live(board: Board) -> Iterator[None]:
             line = lines[news.rank]
             progress.update(
                 line,
-                description="  at rest" if news.last else f"  {news.label}: {news.text}",
+                description=f"  {news.label}: {news.text}",
                 total=news.total or None,
                 completed=news.done,
                 visible=not news.last,

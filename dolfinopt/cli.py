@@ -331,8 +331,8 @@ def study(
     Without TOPIC whatever --vary names. What is computed is kept in DIR/cases and taken from
     there the next time; a study that was interrupted goes on.
     """
+    from dolfinopt.findings import write_study
     from dolfinopt.study import study as run
-    from dolfinopt.study import write_study
 
     loaded = _load(world, scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-study"

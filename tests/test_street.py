@@ -56,6 +56,7 @@ STREET = (
     "progress",
     "board",
     "cases",
+    "findings",
     "study",
     "plots",
     "study_plots",
