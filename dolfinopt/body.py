@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -119,6 +119,30 @@ def rigid_bar(length: float, height: float, thickness: float, density: float) ->
         D=square,
         outboard=np.zeros((3, 0)),
         outboard_point=np.array([length, 0.0]),
+    )
+
+
+def scaled(body: FloatingBody, mass: float, stiffness: float, damping: float) -> FloatingBody:
+    """Return the body of a denser, stiffer material: all its integrals are linear in them.
+
+    Args:
+        body: reduced; its basis is that of the other material, too.
+        mass, stiffness: factors.
+        damping: beta in D = beta K of the result, s.
+    """
+    K = stiffness * body.K
+    return replace(
+        body,
+        mass=mass * body.mass,
+        moment=mass * body.moment,
+        inertia=mass * body.inertia,
+        C=mass * body.C,
+        j=mass * body.j,
+        r=mass * body.r,
+        M=mass * body.M,
+        G=mass * body.G,
+        K=K,
+        D=damping * K,
     )
 
 

@@ -35,7 +35,7 @@ class Memory:
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
         multipliers: MMA's, on all ranks.
-        solution: from which this design's simulation set out, or None; the root's counts.
+        solutions: from which this design's simulations set out; the root's count.
         history: rows so far.
         initial_deviation: (n, 2) m of the initial design.
         finished: reason, or "" while running.
@@ -47,7 +47,7 @@ class Memory:
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
     multipliers: np.ndarray
-    solution: Solution | None
+    solutions: tuple[Solution, ...]
     history: list[HistoryRow]
     initial_deviation: np.ndarray
     finished: str
@@ -89,9 +89,9 @@ def save(
         "finished": np.array(memory.finished),
         "sharpness": memory.sharpness,
     }
-    if memory.solution is not None:
+    for k, solution in enumerate(memory.solutions):
         for field in (*SOLUTION, "error"):
-            arrays[f"solution/{field}"] = getattr(memory.solution, field)
+            arrays[f"solution{k}/{field}"] = getattr(solution, field)
     for key, by_arm in columns.items():
         for k, value in by_arm.items():
             arrays[f"arm{k}/{key}"] = value
@@ -126,17 +126,18 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
         for j in range(len(arm.starts)):
             interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
             modes[k].append(np.vstack([interior[rows], outboard if last else outboard[:0]]))
-    solution = None
-    if "solution/error" in arrays:
-        parts = {field: arrays[f"solution/{field}"] for field in SOLUTION}
-        solution = Solution(**parts, error=float(arrays["solution/error"]), iterations=0)
+    solutions: list[Solution] = []
+    while f"solution{len(solutions)}/error" in arrays:
+        of = f"solution{len(solutions)}"
+        parts = {field: arrays[f"{of}/{field}"] for field in SOLUTION}
+        solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
     history = [HistoryRow(int(row[0]), *map(float, row[1:])) for row in arrays["history"]]
     return Memory(
         iteration=int(arrays["iteration"]),
         cells=cells,
         modes=modes,
         multipliers=arrays["multipliers"],
-        solution=solution,
+        solutions=tuple(solutions),
         history=history,
         initial_deviation=arrays["initial_deviation"],
         finished=str(arrays["finished"]),

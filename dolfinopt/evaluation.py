@@ -7,15 +7,16 @@ eigenfrequency no simulation.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from dolfinopt.arm import chain_of, fixed_body
-from dolfinopt.body import first_frequency
+from dolfinopt.body import FloatingBody, first_frequency
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
+from dolfinopt.mechanism import BodySlopes
 from dolfinopt.motion import rigid_motion
 from dolfinopt.objective import (
     body_slopes_of,
@@ -24,7 +25,8 @@ from dolfinopt.objective import (
     worst_instants,
 )
 from dolfinopt.parallel import ArmShare, gather_arms, on_root
-from dolfinopt.scene import Scene
+from dolfinopt.scenarios import bodies_in, combined, factors, slopes_back
+from dolfinopt.scene import Scene, pose_scenarios
 from dolfinopt.sensitivity import (
     deflection_gradient,
     esl_gradient,
@@ -55,17 +57,21 @@ class Motion:
     """What the simulated motion does to one design.
 
     Attributes:
+        objective: of the motion, nan where it is another; N m, N m s or m.
         compliance: sum of the load cases' compliance, N m.
         max_deviation, max_deviation_time: m, s.
         first_frequencies: of every arm, clamped-free, Hz; inf of a rigid one.
         error: estimated relative error of the elastic coordinates.
+        scenarios: the same of every scenario.
     """
 
+    objective: float = np.nan
     compliance: float = np.nan
     max_deviation: float = np.nan
     max_deviation_time: float = np.nan
     first_frequencies: tuple[float, ...] = ()
     error: float = np.nan
+    scenarios: tuple[Motion, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -73,12 +79,11 @@ class Evaluation(Motion):
     """What one design does; the same on all ranks. What the scene did not ask for is nan.
 
     Attributes:
-        objective: see `evaluate`; N m, N m s, m or s2.
+        objective: see `evaluate`; of all scenarios, if there are any; N m, N m s, m or s2.
         constraints: (k,) of the scene's [constraints], relative, kept where <= 0.
         loaded_frequencies: of every flexible arm with what it carries, Hz; empty unless asked for.
     """
 
-    objective: float = np.nan
     constraints: tuple[float, ...] = ()
     loaded_frequencies: tuple[float, ...] = ()
 
@@ -89,7 +94,7 @@ def evaluate(
     arms: Mapping[int, Arm],
     x_phys: Cells,
     ledger: Ledger,
-    start: Solution | None = None,
+    start: Sequence[Solution] = (),
     *,
     simulated: bool = True,
 ) -> tuple[Evaluation, Trajectory | None]:
@@ -104,7 +109,7 @@ def evaluate(
         arms: this rank's.
         x_phys: their physical densities (n_cells,).
         ledger: of this rank.
-        start: solution of a nearby design; read on the root only.
+        start: `Trajectory.solutions` of a nearby design; read on the root only.
         simulated: False leaves out the motion where the objective does not need it.
 
     Returns:
@@ -116,9 +121,10 @@ def evaluate(
     for index, arm in arms.items():
         arm.set_design(x_phys[index])
     kind = scene.objective.kind
-    value, motion, trajectory = np.nan, Motion(), None
+    motion, trajectory = Motion(), None
     if simulated or scene.objective.simulated:
-        value, motion, trajectory = _moved(scene, share, arms, x_phys, ledger, start)
+        motion, trajectory = _moved(scene, share, arms, x_phys, ledger, start)
+    value = motion.objective
     if kind == "static":
         value = _static_compliance(scene, share, arms)
     constraints: list[float] = []
@@ -133,8 +139,7 @@ def evaluate(
         tips = _deflections(scene, share, arms)
         constraints += list(tips / scene.constraints.tip_deflection - 1.0)
     evaluation = Evaluation(
-        **vars(motion),
-        objective=value,
+        **vars(replace(motion, objective=value)),
         constraints=tuple(map(float, constraints)),
         loaded_frequencies=frequencies,
     )
@@ -159,12 +164,12 @@ def gradient(
 
     def moments() -> dict[int, np.ndarray]:
         assert trajectory is not None
-        return _by_owner(scene, frozen_moments(trajectory, scene))
+        return _by_owner(scene, _frozen_moments(trajectory))
 
-    def slopes() -> dict[int, object]:
+    def slopes() -> dict[int, BodySlopes]:
         assert trajectory is not None
         with ledger.phase("adjoint"):
-            return _by_owner(scene, body_slopes_of(trajectory, scene))
+            return _by_owner(scene, _body_slopes(trajectory))
 
     if scene.objective.kind == "static":
         uses = _uses(scene)
@@ -212,31 +217,87 @@ def _moved(
     arms: Mapping[int, Arm],
     x_phys: Cells,
     ledger: Ledger,
-    start: Solution | None,
-) -> tuple[float, Motion, Trajectory | None]:
-    """Reduce and simulate; return the objective, nan where it is none of the motion."""
+    start: Sequence[Solution],
+) -> tuple[Motion, Trajectory | None]:
+    """Reduce and simulate."""
     mine = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
     owned = gather_arms(share, mine)
     kept: list[Trajectory] = []
 
-    def run() -> tuple[float, Motion]:
-        bodies = chain_of(scene, owned)
-        trajectory = simulate(scene, bodies, ledger, start)
+    def run() -> Motion:
+        trajectory = _simulate(scene, owned, ledger, start)
         kept.append(trajectory)
         with ledger.phase("objective"):
-            worst = worst_instants(trajectory, scene.objective.load_cases)
-            distance, when = trajectory.max_deviation
-            value = objective(trajectory, scene) if scene.objective.simulated else np.nan
-            return value, Motion(
-                compliance=float(trajectory.compliance[worst].sum()),
-                max_deviation=distance,
-                max_deviation_time=when,
-                first_frequencies=tuple(first_frequency(body) for body in bodies),
-                error=trajectory.solution.error,
-            )
+            motion = _figures(trajectory)
+            if not trajectory.scenarios:
+                return motion
+            others = tuple(_figures(one) for one in trajectory.scenarios)
+            value, _ = combined(scene, [one.objective for one in others])
+            return replace(motion, objective=value, scenarios=others)
 
-    value, motion = on_root(share.world, run)
-    return value, motion, kept[0] if kept else None
+    motion = on_root(share.world, run)
+    return motion, kept[0] if kept else None
+
+
+def _simulate(
+    scene: Scene, owned: Mapping[int, FloatingBody], ledger: Ledger, start: Sequence[Solution]
+) -> Trajectory:
+    """Simulate the scene, and all its scenarios."""
+    scenes = pose_scenarios(scene)
+    starts = [*start, *[None] * (1 + len(scenes))]
+    others = tuple(
+        simulate(other, bodies_in(scene, other, owned), ledger, starts[k])
+        for k, other in enumerate(scenes, 1)
+    )
+    own = simulate(scene, chain_of(scene, owned), ledger, starts[0])
+    return replace(own, scenarios=others)
+
+
+def _figures(trajectory: Trajectory) -> Motion:
+    scene = trajectory.scene
+    worst = worst_instants(trajectory, scene.objective.load_cases)
+    distance, when = trajectory.max_deviation
+    return Motion(
+        objective=objective(trajectory, scene) if scene.objective.simulated else np.nan,
+        compliance=float(trajectory.compliance[worst].sum()),
+        max_deviation=distance,
+        max_deviation_time=when,
+        first_frequencies=tuple(map(first_frequency, trajectory.mechanism.bodies)),
+        error=trajectory.solution.error,
+    )
+
+
+def _frozen_moments(trajectory: Trajectory) -> list[np.ndarray]:
+    """Return `frozen_moments` of every body, of all scenarios together where there are any."""
+    scene, others = trajectory.scene, trajectory.scenarios
+    if not others:
+        return frozen_moments(trajectory, scene)
+    _, weights = combined(scene, [objective(one, one.scene) for one in others])
+    total: list[np.ndarray] = []
+    for weight, one in zip(weights, others, strict=True):
+        parts = [
+            # Of its stiffness; rigid arms and bodies from files have no slopes.
+            weight * factors(scene, one.scene, index).stiffness * part
+            for index, part in enumerate(frozen_moments(one, one.scene))
+        ]
+        total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
+    return total
+
+
+def _body_slopes(trajectory: Trajectory) -> list[BodySlopes]:
+    """Return `body_slopes_of` every body, of all scenarios together where there are any."""
+    scene, others = trajectory.scene, trajectory.scenarios
+    if not others:
+        return body_slopes_of(trajectory, scene)
+    _, weights = combined(scene, [objective(one, one.scene) for one in others])
+    total: list[BodySlopes] = []
+    for weight, one in zip(weights, others, strict=True):
+        parts = [
+            slopes_back(slopes, factors(scene, one.scene, index), weight)
+            for index, slopes in enumerate(body_slopes_of(one, one.scene))
+        ]
+        total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
+    return total
 
 
 def _by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:

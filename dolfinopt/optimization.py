@@ -19,6 +19,7 @@ from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Counts, Ledger
 from dolfinopt.mma import MMAState, initial_state, mma_step
 from dolfinopt.parallel import ArmShare, on_root, share_arms, sum_over_arms
+from dolfinopt.scenarios import worst_of
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
 
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
 # writing (some ms) stays below a percent of the run.
 CHECKPOINT_INTERVAL = 2.0  # s
 
-# Exponent of the smooth largest of the eroded, nominal and dilated design's objectives: 6 % above
-# the largest when all three are equal.
-WORST_CASE = 20.0
 # Sharpness of the projection from which on the move limit falls with its square root.
 GENTLE = 4.0
 
@@ -205,22 +203,6 @@ class _Evaluated:
         return {k: one.x_phys for k, one in self.realised.items()}
 
 
-def _worst(values: Sequence[float]) -> float:
-    """Return (sum f^p)^(1/p): the largest of several positive values, smooth; one is itself."""
-    largest = max(values)
-    if len(values) == 1 or largest == 0.0:
-        return largest
-    return largest * sum((f / largest) ** WORST_CASE for f in values) ** (1.0 / WORST_CASE)
-
-
-def _worst_weights(values: Sequence[float]) -> list[float]:
-    """Return the slopes of `_worst`."""
-    worst = _worst(values)
-    if len(values) == 1 or worst == 0.0:
-        return [1.0] * len(values)
-    return [(f / worst) ** (WORST_CASE - 1.0) for f in values]
-
-
 class _Run:
     """One optimisation under way."""
 
@@ -239,9 +221,9 @@ class _Run:
         self.variables = _Variables(scene, share, arms)
         self.x = np.maximum(np.full(self.variables.size, scene.design.initial), self.variables.xmin)
         self.state = initial_state(self.x)
-        self.solution: Solution | None = None
+        self.solutions: tuple[Solution, ...] = ()
         # Where the current design's evaluation set out: kept, so that it can be repeated.
-        self.start: Solution | None = None
+        self.start: tuple[Solution, ...] = ()
         self.modes: dict[int, list[np.ndarray]] = {}
         self.trajectory: Trajectory | None = None
         self.initial_deviation = np.empty((0, 2))
@@ -344,7 +326,7 @@ class _Run:
 
     def _evaluate(self) -> list[_Evaluated]:
         """Evaluate the design that x stands for, or all of them; the nominal one last."""
-        self.start = self.solution
+        self.start = self.solutions
         self.modes = {k: arm.starts for k, arm in self.arms.items()}
         parts = self.variables.split(self.x)
         realised = {
@@ -357,7 +339,7 @@ class _Run:
             mine = {k: one[variant] for k, one in realised.items()}
             evaluation, trajectory = self._evaluate_one({k: r.x_phys for k, r in mine.items()})
             if trajectory is not None:
-                self.solution = trajectory.solution
+                self.solutions = trajectory.solutions
             self.trajectory = trajectory
             # One factorisation at hand at a time: with several designs the gradient is taken now.
             slopes = self._slopes(mine) if several else None
@@ -375,7 +357,7 @@ class _Run:
             self.arms,
             x_phys,
             self.ledger,
-            self.solution,
+            self.solutions,
             simulated=simulated,
         )
 
@@ -390,7 +372,7 @@ class _Run:
     def _update(self, designs: Sequence[_Evaluated]) -> None:
         """Make one MMA step."""
         slopes = [one.slopes or self._slopes(one.realised) for one in designs]
-        weights = _worst_weights([one.evaluation.objective for one in designs])
+        _, weights = worst_of([one.evaluation.objective for one in designs])
         nominal = designs[-1]
         constraints = [value for one in designs for value in one.evaluation.constraints]
         with self.ledger.phase("mma"):
@@ -447,7 +429,7 @@ class _Run:
         self.grayness = float(grey / total)
         row = HistoryRow(
             iteration=self.iteration,
-            objective=_worst([one.evaluation.objective for one in designs]),
+            objective=worst_of([one.evaluation.objective for one in designs])[0],
             max_deviation=nominal.evaluation.max_deviation,
             grayness=self.grayness,
             volume_fraction=float(volume / total),
@@ -481,7 +463,7 @@ class _Run:
             cells=self.variables.split(np.column_stack(columns)),
             modes=self.modes,
             multipliers=state.multipliers,
-            solution=self.start,
+            solutions=self.start,
             history=self.history,
             initial_deviation=self.initial_deviation,
             finished=self.finished,
@@ -500,7 +482,7 @@ class _Run:
             upp=columns[:, 4].copy(),
             multipliers=memory.multipliers,
         )
-        self.solution = memory.solution
+        self.solutions = memory.solutions
         for k, arm in self.arms.items():
             arm.starts = memory.modes[k]
         self.history = memory.history if self.share.world.rank == 0 else []

@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,7 @@ __all__ = [
     "WorstBy",
     "describe_keys",
     "load_scene",
+    "pose_scenarios",
     "resolve_file",
     "scene_from_dict",
 ]
@@ -126,7 +128,21 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
         message = first_problem(error, tree, inherited, source, changes)
         raise InputError(message) from None
     scene._source = source
+    pose_scenarios(scene)
     return scene
+
+
+@lru_cache(maxsize=16)
+def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
+    """Return the scene as each of its scenarios changes it.
+
+    Raises:
+        InputError: a change names no key, or a value that it cannot have.
+    """
+    if not scene.scenarios:
+        return ()
+    plain = scene.to_dict() | {"scenarios": []}
+    return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
 
 
 def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -> None:

@@ -35,6 +35,7 @@ ObjectiveKind = Literal["esl", "compliance", "deviation", "static", "eigenfreque
 GradientKind = Literal["esl", "exact"]
 Projection = Literal[False, "heaviside", "robust"]
 Attached = Literal["rigid-body", "point-mass", "none"]
+Combination = Literal["sum", "worst"]
 WorstBy = Literal["compliance", "deviation"]
 CellShape = Literal["quadrilateral", "triangle"]
 
@@ -483,6 +484,9 @@ class Objective(Table):
         le=200,
         description="p of p-means: deviation over time, squared periods over modes [-]",
     )
+    scenarios: Combination = Field(
+        default="sum", description="of the scenarios: weighted sum, or smooth worst case [-]"
+    )
     loads: tuple[Load, ...] = Field(
         default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         description="static load cases (F_x N, F_y N, moment N m) at each arm's outboard "
@@ -580,6 +584,29 @@ class Design(Table):
         return self
 
 
+class Scenario(Table):
+    """Another use of the same design, which the objective counts in."""
+
+    changes: tuple[str, ...] = Field(
+        description='what differs, as "key=value" of motion, payload, damping or material [-]'
+    )
+    weight: float = Field(default=1.0, gt=0, description="of its objective [-]")
+
+    @field_validator("changes")
+    @classmethod
+    def _check_changes(cls, changes: tuple[str, ...]) -> tuple[str, ...]:
+        for change in changes:
+            key = change.partition("=")[0].strip()
+            table = key.partition(".")[0]
+            if table not in ("motion", "payload", "damping", "material"):
+                raise Refusal(
+                    f"expected keys of motion, payload, damping or material, found {shown(key)}"
+                )
+            if key == "material.poisson_ratio":
+                raise Refusal("expected no material.poisson_ratio: it changes the arms' basis")
+        return changes
+
+
 class Optimizer(Table):
     """When the optimiser stops and how far it moves at once."""
 
@@ -612,6 +639,9 @@ class Scene(Table):
     constraints: Constraints = Field(default=Constraints(), description="limits besides the volume")
     design: Design = Field(default=Design(), description="design variables")
     optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
+    scenarios: tuple[Scenario, ...] = Field(
+        default=(), description="uses that the objective combines; none: the scene itself"
+    )
 
     _source: str = PrivateAttr("<scene>")
 
@@ -757,6 +787,17 @@ class Scene(Table):
                 "undamped resonances is infinite",
                 ("damping", "stiffness_proportional"),
                 ("reduction", "method"),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_scenarios(self) -> Scene:
+        if self.scenarios and not self.objective.simulated:
+            raise Refusal(
+                'expected "esl", "compliance" or "deviation" with [[scenarios]]: the others know '
+                "no motion",
+                ("objective", "kind"),
+                ("scenarios", 0, "changes"),
             )
         return self
 

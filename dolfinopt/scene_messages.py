@@ -83,7 +83,7 @@ def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
     """Translate one of pydantic's errors."""
     raw: Loc = item["loc"]
     # Below a key there are only the elements of its value, which messages show as a whole.
-    loc = raw[: 3 if raw[:1] == ("arms",) else 2]
+    loc = raw[: 3 if raw[:1] in (("arms",), ("scenarios",)) else 2]
     if item["type"] in ("extra_forbidden", "invalid_key"):
         model = model_at(loc[:-1])
         fields = model.model_fields if model else {}
@@ -146,7 +146,8 @@ def _element_model(annotation: Any) -> type[Table] | None:
 def field_at(loc: Loc) -> FieldInfo:
     """Return the field at `loc`; an element of `arms` counts as a field of its own."""
     if isinstance(loc[-1], int):
-        return FieldInfo(annotation=Arm, description="one arm")
+        one = _element_model(Scene.model_fields[loc[0]].annotation)
+        return FieldInfo(annotation=one, description=f"one of {loc[0]}")
     model = model_at(loc[:-1])
     assert model is not None, loc
     return model.model_fields[loc[-1]]
@@ -171,7 +172,9 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
     if origin is Literal:
         return " | ".join(shown(value) for value in args)
     if origin is tuple and _element_model(annotation):
-        return "an array of tables [[arms]], at least one"
+        if _element_model(annotation) is Arm:
+            return "an array of tables [[arms]], at least one"
+        return "an array of tables"
     if origin is tuple:
         rows = get_origin(args[0]) is tuple
         inner = "arrays of three numbers" if rows else _allowed_type(args[0], plural="s")

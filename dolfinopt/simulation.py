@@ -25,12 +25,19 @@ class Trajectory:
         scene: its scene.
         solution: the integrator's.
         t: (n,) sample instants, s.
+        scenarios: the same design under the scene's scenarios.
     """
 
     problem: ElasticProblem
     scene: Scene
     solution: Solution
     t: np.ndarray
+    scenarios: tuple[Trajectory, ...] = ()
+
+    @property
+    def solutions(self) -> tuple[Solution, ...]:
+        """Its own and the scenarios'."""
+        return (self.solution, *(one.solution for one in self.scenarios))
 
     @property
     def mechanism(self) -> Mechanism:

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arm import Arm
-from dolfinopt.evaluation import Evaluation
+from dolfinopt.evaluation import Evaluation, Motion
 from dolfinopt.files import versions
 from dolfinopt.ledger import Counts, Ledger
 from dolfinopt.parallel import ArmShare, gather_arms
@@ -73,6 +73,10 @@ def summarise(
             zip(_flexible_names(scene), evaluation.loaded_frequencies, strict=False)
         ),
         "constraints": list(evaluation.constraints),
+        "scenarios": [
+            {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
+            for one, motion in zip(scene.scenarios, evaluation.scenarios, strict=True)
+        ],
         **({} if crisp is None else {"crisp": _figures(crisp)}),
         "simulation_error_estimate": evaluation.error,
         "iterations": iterations,
@@ -97,7 +101,7 @@ def _flexible_names(scene: Scene) -> list[str]:
     return [arm.name for arm in scene.arms if arm.flexible]
 
 
-def _figures(evaluation: Evaluation) -> dict[str, float]:
+def _figures(evaluation: Motion) -> dict[str, float]:
     return {
         "objective": evaluation.objective,
         "compliance": evaluation.compliance,

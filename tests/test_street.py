@@ -44,6 +44,7 @@ STREET = (
     "integrators",
     "simulation",
     "objective",
+    "scenarios",
     "sensitivity",
     "evaluation",
     "taylor",

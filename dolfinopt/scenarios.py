@@ -1,0 +1,107 @@
+"""One design under several scenarios: other payloads, paths, damping, other batches of material.
+
+They all share the reduced bodies: a denser or stiffer material scales their integrals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.arm import fixed_body
+from dolfinopt.body import FloatingBody, scaled
+from dolfinopt.mechanism import BodySlopes
+from dolfinopt.scene import Scene
+
+# Exponent of the smooth largest of several objectives: 6 % above the largest of three equal ones.
+WORST_CASE = 20.0
+
+
+@dataclass(frozen=True)
+class Factors:
+    """What a scenario's material makes of one arm's body.
+
+    Attributes:
+        mass, stiffness: relative to the scene's.
+        damping: beta in D = beta K, s.
+    """
+
+    mass: float
+    stiffness: float
+    damping: float
+
+
+def factors(scene: Scene, other: Scene, index: int) -> Factors:
+    """Return what makes the body of arm `index` in `scene` that of the same design in `other`."""
+    here, there = scene.material_of(index), other.material_of(index)
+    return Factors(
+        there.density / here.density,
+        there.young_modulus / here.young_modulus,
+        other.damping.stiffness_proportional,
+    )
+
+
+def bodies_in(scene: Scene, other: Scene, owned: Mapping[int, FloatingBody]) -> list[FloatingBody]:
+    """Return the bodies from the cart outwards in scenario `other` of `scene`.
+
+    Args:
+        scene: in which the bodies were reduced.
+        other: one of its scenarios.
+        owned: bodies of the arms with a design of their own.
+    """
+    bodies = []
+    for index, owner in enumerate(scene.owners):
+        if owner is None:
+            bodies.append(fixed_body(other, index))
+        else:
+            f = factors(scene, other, owner)
+            bodies.append(scaled(owned[owner], f.mass, f.stiffness, f.damping))
+    return bodies
+
+
+def slopes_back(slopes: BodySlopes, f: Factors, weight: float) -> BodySlopes:
+    """Return weighted slopes by the scene's body from those by the scenario's, see `scaled`.
+
+    Those of D join K's.
+    """
+    m = weight * f.mass
+    return BodySlopes(
+        mass=m * slopes.mass,
+        moment=m * slopes.moment,
+        inertia=m * slopes.inertia,
+        C=m * slopes.C,
+        j=m * slopes.j,
+        r=m * slopes.r,
+        M=m * slopes.M,
+        G=m * slopes.G,
+        K=weight * f.stiffness * (slopes.K + f.damping * slopes.D),
+        D=np.zeros_like(slopes.D),
+        outboard=weight * slopes.outboard,
+    )
+
+
+def worst_of(values: Sequence[float]) -> tuple[float, list[float]]:
+    """Return (sum f^p)^(1/p) of positive values and its slopes; a single value is itself.
+
+    The largest, made smooth: Kreisselmeier and Steinhauser's function of the logarithms.
+    Source: Kreisselmeier & Steinhauser (1979), doi:10.1016/S1474-6670(17)65584-8.
+    """
+    largest = max(values)
+    if len(values) == 1 or largest == 0.0:
+        return largest, [1.0] * len(values)
+    worst = largest * sum((f / largest) ** WORST_CASE for f in values) ** (1.0 / WORST_CASE)
+    return worst, [(f / worst) ** (WORST_CASE - 1.0) for f in values]
+
+
+def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
+    """Return the objective of all scenarios from their own, and its slopes.
+
+    "sum": sum w f. "worst": the smooth largest of w f.
+    """
+    weights = [one.weight for one in scene.scenarios]
+    if scene.objective.scenarios == "sum":
+        return sum(w * f for w, f in zip(weights, values, strict=True)), weights
+    worst, slopes = worst_of([w * f for w, f in zip(weights, values, strict=True)])
+    return worst, [s * w for s, w in zip(slopes, weights, strict=True)]
