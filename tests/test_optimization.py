@@ -204,6 +204,7 @@ REMEMBERED = [
     ["constraints.first_frequency=5.0", "constraints.tip_deflection=6e-5"],
     [*GENTLE, "design.projection=heaviside"],
     [*GENTLE, ROBUST],
+    ["scenarios=[{changes=['payload.mass=3']}, {changes=['motion.flattening=0.5']}]"],
 ]
 OPTIONS = pytest.mark.parametrize("overrides", REMEMBERED, ids=" ".join)
 

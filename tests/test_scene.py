@@ -24,6 +24,7 @@ from dolfinopt.scene import (
     Scene,
     describe_keys,
     load_scene,
+    pose_scenarios,
     resolve_file,
     scene_from_dict,
 )
@@ -142,6 +143,9 @@ def test_demo_states_every_other_key():
         "design",
         "rigid",
         "sid",
+        "scenarios",
+        "changes",
+        "weight",
     }
 
 
@@ -530,6 +534,7 @@ BAD_VALUES = [
     ("objective.elbow_angle", "bent", '"bent"', "a number"),
     ("objective.modes", 0, "0", "an integer >= 1 and <= 50"),
     ("objective.follow", 1, "1", "true or false"),
+    ("objective.scenarios", "mean", '"mean"', '"sum" | "worst"'),
     ("constraints.first_frequency", 0.0, "0.0", "a number > 0"),
     ("constraints.tip_deflection", -1e-3, "-0.001", "a number > 0"),
     ("objective.exponent", 1.0, "1.0", "a number >= 2"),
@@ -624,6 +629,7 @@ def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
 
 def test_every_key_refuses_something():
     refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
+    refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
     assert {info.key for info in describe_keys()} <= refused
 
 
@@ -1041,7 +1047,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 74
+    assert len({info.key for info in keys}) == len(keys) == 77
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info
@@ -1056,6 +1062,7 @@ def test_described_defaults():
         "name",  # of the file
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
+        "scenarios.changes",  # of every scenario there is
     }
 
 
@@ -1063,6 +1070,50 @@ def test_import_needs_no_mpi_nor_numpy():
     code = "import sys, dolfinopt.scene; print('numpy' in sys.modules, 'mpi4py' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.split() == ["False", "False"]
+
+
+# --- scenarios -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scenario", "message"),
+    [
+        ({"changes": 5}, "scenarios.0.changes = 5: expected an array of strings"),
+        ({"changes": [], "weight": 0}, "scenarios.0.weight = 0: expected a number > 0"),
+        ({"weight": 1.0}, "missing key scenarios.0.changes"),
+        ({"changes": [], "wait": 1.0}, "unknown key scenarios.0.wait; did you mean scenarios.0.w"),
+        ({"changes": ["arms.length=2"]}, "expected keys of motion, payload, damping or material"),
+        ({"changes": ["material.poisson_ratio=0.2"]}, "expected no material.poisson_ratio"),
+        ({"changes": ["payload.mas=2"]}, "with --set payload.mas=2: unknown key payload.mas"),
+        ({"changes": ["payload.mass=-2"]}, "payload.mass = -2: expected a number >= 0"),
+        (5, "expected a table with the keys changes, weight"),
+    ],
+)
+def test_bad_scenario(scenario, message):
+    assert message in message_of(minimal(scenarios=[scenario]))
+
+
+def test_scenarios_change_what_they_name():
+    scene = scene_from_dict(
+        minimal(
+            scenarios=[
+                {"changes": ["payload.mass=4", "motion.flattening=0.5"]},
+                {"changes": ["material.density=2800"], "weight": 0.5},
+            ]
+        )
+    )
+    first, second = pose_scenarios(scene)
+    assert (first.payload.mass, first.motion.flattening) == (4.0, 0.5)
+    assert (second.payload.mass, second.material.density) == (6.0, 2800.0)
+    assert first.scenarios == second.scenarios == ()
+    assert scene_from_dict(scene.to_dict()) == scene
+
+
+def test_scenarios_need_a_motion():
+    scenarios = [{"changes": ["payload.mass=4"]}]
+    for kind in ("static", "eigenfrequency"):
+        message = message_of(minimal(scenarios=scenarios, objective={"kind": kind}))
+        assert '"esl", "compliance" or "deviation" with [[scenarios]]' in message
 
 
 # --- arms that share a design, are rigid, or come from a file --------------------------------
