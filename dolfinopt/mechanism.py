@@ -8,7 +8,7 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -212,140 +212,257 @@ def _body_force(body: FloatingBody, frame: _Frame) -> np.ndarray:
     return body.mass * frame.a + (1j * frame.wd - w * w) * frame.s + 2j * w * frame.sd + frame.sdd
 
 
+@dataclass(frozen=True)
+class _BodyTangent:
+    """One body's elastic rows, differentiated; arrays over n instants, S columns are kept.
+
+    rows' = K q' + D qd' + M (qdd' - w^2 q') + G (wd q' + 2 w qd') + left (right y') with
+    y = [q, qd, qdd] of all bodies.
+
+    Attributes:
+        body: its constants.
+        rows, columns: its place among all rows and among the kept columns.
+        kept: its coordinates that have a column.
+        w, wd: of its frame.
+        left: (n, q, r).
+        right: (n, r, 3 S).
+    """
+
+    body: FloatingBody
+    rows: slice
+    columns: slice
+    kept: np.ndarray
+    w: np.ndarray
+    wd: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Derivative of the elastic rows with respect to S coordinates and their rates, n instants.
+
+    An arm feels those inboard of it through the four numbers (a_x, a_y, w, wd) of its frame, and
+    those outboard of it through force and moment: block diagonal plus a rank of seven an arm.
+
+    Attributes:
+        bodies: from the cart outwards.
+        kept: (S,) coordinates that have columns, ascending.
+    """
+
+    bodies: tuple[_BodyTangent, ...]
+    kept: np.ndarray
+
+    def window(self, first: int, last: int) -> Tangent:
+        """Return the instants first..last - 1."""
+        part = slice(first, last)
+        cut = [
+            replace(b, w=b.w[part], wd=b.wd[part], left=b.left[part], right=b.right[part])
+            for b in self.bodies
+        ]
+        return replace(self, bodies=tuple(cut))
+
+    def dense(self) -> np.ndarray:
+        """Return the kept coordinates' rows (n, S, 3 S), columns ordered q, qd, qdd."""
+        size = len(self.kept)
+        jacobian = np.empty((len(self.bodies[0].w), size, 3 * size))
+        for part in self.bodies:
+            rows = jacobian[:, part.columns]
+            rows[:] = part.left[:, part.kept] @ part.right
+            w, wd = part.w[:, None, None], part.wd[:, None, None]
+            own = np.ix_(part.kept, part.kept)
+            K, D, M, G = (x[own] for x in _matrices(part.body))
+            columns = _columns(part.columns, size)
+            rows[:, :, columns[0]] += K - w * w * M + wd * G
+            rows[:, :, columns[1]] += D + 2.0 * w * G
+            rows[:, :, columns[2]] += M
+        return jacobian
+
+    def times(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        """Return the change of all rows (n, N) by one of the kept coordinates, each (n, S)."""
+        change = np.concatenate([q, qd, qdd], axis=1)[:, :, None]
+        out = []
+        for part in self.bodies:
+            K, D, M, G = (x[:, part.kept].T for x in _matrices(part.body))
+            w, wd = part.w[:, None], part.wd[:, None]
+            e, ed, edd = q[:, part.columns], qd[:, part.columns], qdd[:, part.columns]
+            far = (part.left @ (part.right @ change))[:, :, 0]
+            near = e @ K + ed @ D + (edd - w * w * e) @ M + (wd * e + 2.0 * w * ed) @ G
+            out.append(far + near)
+        return np.concatenate(out, axis=1)
+
+    def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the slopes of sum_n rows_n . (all rows)_n by kept q, qd, qdd, each (n, S)."""
+        size = len(self.kept)
+        slopes = np.zeros((len(rows), 3 * size))
+        for part in self.bodies:
+            y = rows[:, part.rows]
+            slopes += ((y[:, None] @ part.left) @ part.right)[:, 0]
+        by_q, by_v, by_a = slopes[:, :size], slopes[:, size : 2 * size], slopes[:, 2 * size :]
+        for part in self.bodies:
+            y = rows[:, part.rows]
+            K, D, M, G = (y @ x[:, part.kept] for x in _matrices(part.body))
+            w, wd = part.w[:, None], part.wd[:, None]
+            by_q[:, part.columns] += K - w * w * M + wd * G
+            by_v[:, part.columns] += D + 2.0 * w * G
+            by_a[:, part.columns] += M
+        return by_q, by_v, by_a
+
+
+def _matrices(body: FloatingBody) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return body.K, body.D, body.M, body.G
+
+
 def tangent(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
-    """Return the derivative of the elastic rows with respect to [q, qd, qdd].
-
-    Exact, by differentiating both passes of `inverse_dynamics`. An arm feels those inboard of
-    it through the four numbers (a_x, a_y, w, wd) of its frame, and those outboard of it through
-    force and moment, so that the passes carry few rows however many coordinates there are.
+    """Return the derivative of the elastic rows with respect to [q, qd, qdd], see `linearise`.
 
     Returns:
         (n, N, 3 N), columns ordered q, qd, qdd.
     """
+    return linearise(mechanism, motion, q, qd, qdd).dense()
+
+
+def linearise(
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    keep: np.ndarray | None = None,
+) -> Tangent:
+    """Return the derivative of the elastic rows with respect to q, qd, qdd.
+
+    Exact, by differentiating both passes of `inverse_dynamics`.
+
+    Args:
+        mechanism, motion, q, qd, qdd: as for `inverse_dynamics`.
+        keep: ascending coordinates by which to differentiate; all by default.
+    """
+    keep = np.arange(mechanism.coordinates) if keep is None else keep
     shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
-    count, size = q.shape
-    jacobian = np.zeros((count, size, 3 * size))
-    a_v = np.zeros((count, 3 * size), dtype=complex)  # derivatives of the frame's motion
-    w_v = np.zeros((count, 3 * size))
-    wd_v = np.zeros((count, 3 * size))
-    bodies = list(zip(mechanism.slices, shapes, frames, strict=True))
-    motions = []
-    for part, shape, frame in bodies:
-        motions.append((a_v, w_v, wd_v))
-        a_v, w_v, wd_v = _next_motion(shape, frame, part, size, (a_v, w_v, wd_v))
-    force = mechanism.payload_mass * tip[0]
-    force_v = mechanism.payload_mass * a_v
-    moment_v = mechanism.payload_inertia * wd_v
-    for k in reversed(range(len(bodies))):
-        part, shape, frame = bodies[k]
-        e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
-        columns = _columns(part, size)
+    ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
+    places = [slice(a, b) for a, b in pairwise(ends)]
+    kept = [keep[p] - part.start for p, part in zip(places, mechanism.slices, strict=True)]
+    motions = [_prescribed(len(q), 3 * len(keep))]
+    for shape, frame, place, chosen in zip(shapes, frames, places, kept, strict=True):
+        columns = _columns(place, len(keep))
+        motions.append(_next_motion(shape, frame, columns, chosen, motions[-1]))
+    tip_v, _, turn_v = motions[-1]
+    force, force_v = mechanism.payload_mass * tip[0], mechanism.payload_mass * tip_v
+    moment_v = mechanism.payload_inertia * turn_v
+    bodies: list[_BodyTangent] = []
+    for k in reversed(range(len(shapes))):
+        part, shape, frame, chosen = mechanism.slices[k], shapes[k], frames[k], kept[k]
+        rates = (q[:, part], qd[:, part], qdd[:, part])
+        columns = _columns(places[k], len(keep))
         force = frame.swing * force
         force_v = frame.swing[:, None] * force_v
-        force_v[:, columns[0]] += 1j * force[:, None] * shape.turn
-        rows = jacobian[:, part]
-        _body_rows(rows, shape, frame, motions[k], columns, ed)
-        rows += (
-            shape.B.real[:, None] * force_v.real[:, None, :]
-            + shape.B.imag[:, None] * force_v.imag[:, None, :]
-            + shape.turn[:, None] * moment_v[:, None, :]
-        )
+        force_v[:, columns[0]] += 1j * force[:, None] * shape.turn[chosen]
+        left, right = _felt(shape, frame, motions[k], rates[1], (force_v, moment_v), k > 0)
+        own = (shape.body, part, places[k], chosen, frame.w, frame.wd)
+        bodies.insert(0, _BodyTangent(*own, left, right))
         if k == 0:
             break
         moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
-        moment_v[:, columns[0]] += (np.conj(shape.B) * force[:, None]).imag
-        force_b, moment_b = _body_load(shape, frame, motions[k], columns, e, ed, edd)
+        moment_v[:, columns[0]] += (np.conj(shape.B[chosen]) * force[:, None]).imag
+        force_b, moment_b = _body_load(shape, frame, motions[k], columns, chosen, rates)
         force_v, moment_v = force_v + force_b, moment_v + moment_b
         force = force + _body_force(shape.body, frame)
-    return jacobian
+    return Tangent(tuple(bodies), keep)
 
 
-def _columns(part: slice, size: int) -> tuple[slice, slice, slice]:
+_FrameSlopes = tuple[np.ndarray, np.ndarray, np.ndarray]  # of (a, w, wd), each (n, 3 S)
+_Columns = tuple[slice, slice, slice]
+
+
+def _prescribed(count: int, width: int) -> _FrameSlopes:
+    """Return the derivatives of a frame's motion that is prescribed."""
+    zero = np.zeros((count, width))
+    return zero.astype(complex), zero, zero
+
+
+def _felt(
+    shape: _Shapes,
+    frame: _Frame,
+    motion: _FrameSlopes,
+    ed: np.ndarray,
+    load: tuple[np.ndarray, np.ndarray],
+    moves: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
+    force_v, moment_v = load
+    by = [shape.B.real, shape.B.imag, shape.turn]
+    felt = [force_v.real, force_v.imag, moment_v]
+    if moves:
+        a_v, w_v, wd_v = motion
+        by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ shape.body.G)
+        by += [shape.C.real, shape.C.imag, by_w, frame.rG]
+        felt += [a_v.real, a_v.imag, w_v, wd_v]
+    left = np.empty((*ed.shape, len(by)))
+    for i, column in enumerate(by):
+        left[:, :, i] = column
+    return left, np.stack(felt, axis=1)
+
+
+def _columns(part: slice, size: int) -> _Columns:
     """Return a body's columns in [q, qd, qdd]."""
     a, b = part.start, part.stop
     return slice(a, b), slice(size + a, size + b), slice(2 * size + a, 2 * size + b)
 
 
 def _next_motion(
-    shape: _Shapes,
-    frame: _Frame,
-    part: slice,
-    size: int,
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives (n, 3 N) of the next frame's (a, w, wd)."""
+    shape: _Shapes, frame: _Frame, columns: _Columns, chosen: np.ndarray, motion: _FrameSlopes
+) -> _FrameSlopes:
+    """Return the derivatives of the next frame's (a, w, wd)."""
     a_v, w_v, wd_v = motion
-    cq, cv, ca = _columns(part, size)
+    cq, cv, ca = columns
+    B, turn = shape.B[chosen], shape.turn[chosen]
     w, wd = frame.w[:, None], frame.wd[:, None]
     d, dd = frame.d[:, None], frame.dd[:, None]
     inner = a_v + 1j * d * wd_v + (2j * dd - 2.0 * w * d) * w_v
-    inner[:, cq] += (1j * wd - w * w) * shape.B
-    inner[:, cv] += 2j * w * shape.B
-    inner[:, ca] += shape.B
+    inner[:, cq] += (1j * wd - w * w) * B
+    inner[:, cv] += 2j * w * B
+    inner[:, ca] += B
     next_a = frame.a + (1j * frame.wd - frame.w**2) * frame.d + 2j * frame.w * frame.dd + frame.ddd
-    inner[:, cq] -= 1j * next_a[:, None] * shape.turn
+    inner[:, cq] -= 1j * next_a[:, None] * turn
     out = np.conj(frame.swing)[:, None] * inner
     w_v, wd_v = w_v.copy(), wd_v.copy()
-    w_v[:, cv] += shape.turn
-    wd_v[:, ca] += shape.turn
+    w_v[:, cv] += turn
+    wd_v[:, ca] += turn
     return out, w_v, wd_v
-
-
-def _body_rows(
-    rows: np.ndarray,
-    shape: _Shapes,
-    frame: _Frame,
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
-    columns: tuple[slice, slice, slice],
-    ed: np.ndarray,
-) -> None:
-    """Add one body's own elastic rows (n, q, 3 N), nothing outboard."""
-    body = shape.body
-    a_v, w_v, wd_v = motion
-    w, wd = frame.w[:, None, None], frame.wd[:, None, None]
-    rows[:, :, columns[0]] += body.K - w * w * body.M + wd * body.G
-    rows[:, :, columns[1]] += body.D + 2.0 * w * body.G
-    rows[:, :, columns[2]] += body.M
-    by_w = -2.0 * frame.w[:, None] * frame.jM - 2.0 * (ed @ body.G)
-    rows += (
-        shape.C.real[:, None] * a_v.real[:, None, :]
-        + shape.C.imag[:, None] * a_v.imag[:, None, :]
-        + by_w[:, :, None] * w_v[:, None, :]
-        + frame.rG[:, :, None] * wd_v[:, None, :]
-    )
 
 
 def _body_load(
     shape: _Shapes,
     frame: _Frame,
-    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
-    columns: tuple[slice, slice, slice],
-    e: np.ndarray,
-    ed: np.ndarray,
-    edd: np.ndarray,
+    motion: _FrameSlopes,
+    columns: _Columns,
+    chosen: np.ndarray,
+    rates: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives (n, 3 N) of one body's own force F and moment T."""
-    body = shape.body
+    """Return the derivatives (n, 3 S) of one body's own force F and moment T."""
+    body, C = shape.body, shape.C[chosen]
+    e, ed, edd = rates
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
     w, wd = frame.w[:, None], frame.wd[:, None]
     s, sd = frame.s[:, None], frame.sd[:, None]
     force = body.mass * a_v + 1j * s * wd_v + (2j * sd - 2.0 * w * s) * w_v
-    force[:, cq] += (1j * wd - w * w) * shape.C
-    force[:, cv] += 2j * w * shape.C
-    force[:, ca] += shape.C
+    force[:, cq] += (1j * wd - w * w) * C
+    force[:, cv] += 2j * w * C
+    force[:, ca] += C
     spin = 2.0 * np.einsum("nk,nk->n", frame.jM, ed)[:, None]
     moment = (np.conj(s) * a_v).imag + _inertia(body, frame, e)[:, None] * wd_v + spin * w_v
     moment[:, cq] += (
-        (np.conj(shape.C) * frame.a[:, None]).imag
-        + 2.0 * wd * frame.jM
-        + 2.0 * w * (ed @ body.M)
-        + edd @ body.G  # (G q) . qdd = qdd' G q
+        (np.conj(C) * frame.a[:, None]).imag
+        + 2.0 * wd * frame.jM[:, chosen]
+        + 2.0 * w * (ed @ body.M[:, chosen])
+        + edd @ body.G[:, chosen]  # (G q) . qdd = qdd' G q
     )
-    moment[:, cv] += 2.0 * w * frame.jM
-    moment[:, ca] += frame.rG
+    moment[:, cv] += 2.0 * w * frame.jM[:, chosen]
+    moment[:, ca] += frame.rG[:, chosen]
     return force, moment
 
 

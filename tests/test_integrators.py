@@ -6,12 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from bodies import Chain, assert_close, beam, derivative
+from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
 from scipy.integrate import solve_ivp
 
 from dolfinopt.body import FloatingBody
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.integrators import generalized_alpha, radau
+from dolfinopt.integrators import factors, generalized_alpha, radau
+from dolfinopt.integrators.adjoint import trajectory_slopes
+from dolfinopt.integrators.collocation import Stages, at_stages, rows_at, stages_of, starts
+from dolfinopt.integrators.factors import Factors, factorise
+from dolfinopt.integrators.modes import modes_of
 from dolfinopt.integrators.problem import (
     ElasticProblem,
     Solution,
@@ -454,7 +458,7 @@ def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
         return answer
 
     monkeypatch.setattr(radau, "_newton", spy)
-    monkeypatch.setattr(radau, "MAX_NEWTON", 4)
+    monkeypatch.setattr(radau, "MAX_NEWTON", 2)
     marched = radau.on_grid(problem, edges, 1e-8, 3)
     assert windows[0] == (100, False)
     assert sum(steps for steps, converged in windows if converged) == 100
@@ -502,6 +506,254 @@ def test_nothing_moves_without_loads(integrator: str) -> None:
     solution = solve(integrator, problem, 1e-4)
     assert solution.error == 0.0
     assert not solution.sample(np.linspace(0.0, 1.0, 11)).any()
+
+
+# -- many coordinates ------------------------------------------------------------------------
+
+
+def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
+    """Return a cantilever of many coordinates, frequencies from 1.4 Hz to their squares.
+
+    v_k = 1 - cos(p_k u), w_k = sin(p_k u), p_k = (k - 1/2) pi, u = x / length: the second and first
+    derivatives are orthogonal, the stiffness is diagonal in closed form.
+    """
+    length, count = 0.5, 8 * max(bending, axial)
+    u = (np.arange(count) + 0.5) / count
+    p, r = (np.arange(n) * np.pi + 0.5 * np.pi for n in (bending, axial))
+    modes = np.zeros((count, 2, bending + axial))
+    modes[:, 1, :bending] = 1.0 - np.cos(np.outer(u, p))
+    modes[:, 0, bending:] = np.sin(np.outer(u, r))
+    outboard = np.zeros((3, bending + axial))
+    outboard[0, bending:] = np.sin(r)
+    outboard[1, :bending] = 1.0 - np.cos(p)
+    outboard[2, :bending] = p * np.sin(p) / length
+    K = np.diag(np.concatenate([10.0 / length**3 * p**4, 3e3 / length * r**2]) / 2.0)
+    return Cloud(
+        points=np.column_stack([length * u, np.zeros(count)]),
+        masses=np.full(count, 0.6 / count),
+        modes=modes,
+        K=K,
+        D=damping * K,
+        outboard=outboard,
+        reach=np.array([length, 0.0]),
+    )
+
+
+def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> ElasticProblem:
+    """Return two such arms with a payload, in motion under gravity."""
+    arm = fine_beam(bending, axial, damping)
+    chain = Chain((arm, arm), 1.0, 0.0, (0.0, -9.81), 0.0)
+    return ElasticProblem(chain.mechanism(), reach, ENDS)
+
+
+def some_stages(problem: ElasticProblem, count: int = 5) -> Stages:
+    """Return the stages of a few steps of two lengths, in modal coordinates."""
+    edges = np.concatenate([[0.0], 0.02 * np.cumsum(1.0 + np.arange(count) % 2)])
+    return stages_of(modes_of(problem), radau.radau_iia(3), edges)
+
+
+def some_factors(stages: Stages, slow: np.ndarray) -> Factors:
+    """Return Newton's matrix at a state of rest that is not an equilibrium."""
+    rest = np.zeros((len(stages.h), 3, stages.mechanism.coordinates))
+    return factorise(stages, rest, rest, rest, slow)
+
+
+def dense(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Treat all coordinates as slow: Newton's matrix is exact."""
+    for module in (radau, factors):
+        monkeypatch.setattr(module, "LIMITS", (np.inf,))
+
+
+@pytest.fixture
+def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """Return steps and slow coordinates of every matrix that the test will make."""
+    made: list[tuple[int, int]] = []
+
+    def spy(stages: Stages, *at_and_slow: np.ndarray) -> Factors:
+        made.append((len(stages.h), len(at_and_slow[-1])))
+        return factorise(stages, *at_and_slow)
+
+    for module in ("radau", "factors", "adjoint"):
+        monkeypatch.setattr(f"dolfinopt.integrators.{module}.factorise", spy)
+    return made
+
+
+def test_modes_are_a_change_of_coordinates() -> None:
+    """Rows in z are T' the rows in q at the same motion; every arm's stiffness is the identity."""
+    rng = np.random.default_rng(3)
+    clouds = tuple(random_cloud(rng, size) for size in (3, 5))
+    chain = Chain(clouds, 1.0, 0.1, (0.5, -9.81), 0.0)
+    problem = ElasticProblem(chain.mechanism(), swing, (0.0, 1.0))
+    modes = modes_of(problem)
+    assert_close(modes.problem.mechanism.stiffness(), np.eye(8), 1e-12)
+    assert (np.diff(modes.frequencies[:3]) < 0.0).all()
+    motion = problem.motion(rng.uniform(size=4))
+    z = rng.normal(size=(3, 4, 8))
+    q = [modes.from_modes(x) for x in z]
+    assert_close(modes.to_modes(np.array(q)), z, 1e-12)
+    rows = inverse_dynamics(problem.mechanism, motion, *q)[0]
+    found = inverse_dynamics(modes.problem.mechanism, motion, *z)[0]
+    assert_close(found, modes.slopes_to_modes(rows), 1e-12)
+    assert_close(modes.slopes_from_modes(found), rows, 1e-12)
+
+
+def test_frequencies_of_the_modes() -> None:
+    """One arm on its own: det(K - w^2 M) = 0, M with the payload by the work it does."""
+    arm = beam()
+    chain = Chain((arm,), 0.7, 0.02, (0.0, 0.0), 0.0)
+    modes = modes_of(ElasticProblem(chain.mechanism(), lambda t: reach(t, (0.2, 1.0)), ENDS))
+    payload = np.array([0.7, 0.7, 0.02])  # kg, kg, kg m2
+    M = arm.body().M + arm.outboard.T @ (payload[:, None] * arm.outboard)
+    squares = np.linalg.eigvals(np.linalg.solve(M, arm.K))
+    assert_close(np.sort(modes.frequencies), np.sort(np.sqrt(squares.real)), 1e-12)
+
+
+def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
+    """A step takes the rows' linear part away, and reports the change of q it makes."""
+    problem, _ = two_arms()
+    stages = some_stages(problem)
+    rng = np.random.default_rng(4)
+    state = (rng.normal(scale=0.05, size=6), rng.normal(scale=0.5, size=6))
+    a = rng.normal(size=(5, 3, 6))
+    at = at_stages(stages, state, a)
+    step, shift = factorise(stages, *at, a, np.arange(6)).solve(
+        rows_at(stages, *at, a), np.zeros((2, 6))
+    )
+
+    def rows(t: float) -> np.ndarray:
+        moved = a + t * step
+        return rows_at(stages, *at_stages(stages, state, moved), moved)
+
+    assert_close(derivative(rows), -rows(0.0), 1e-9)  # of differences
+    assert_close(at_stages(stages, state, a + step)[0], at[0] + shift, 1e-12)
+
+
+def test_fast_coordinates_alone_are_oscillators() -> None:
+    """A chain of one arm, fast but for one: their rows' diagonal, step by step."""
+    arm = fine_beam(4, 2)
+    chain = Chain((arm,), 1.0, 0.0, (0.0, 0.0), 0.0)
+
+    def still(t: np.ndarray) -> RigidMotion:
+        rest = np.zeros((len(t), 2))
+        return RigidMotion(rest, rest, rest)
+
+    stages = some_stages(ElasticProblem(chain.mechanism(), still, ENDS))
+    rows = np.random.default_rng(5).normal(size=(5, 3, 6))
+    slow = np.array([5])
+    rows[:, :, slow] = 0.0  # and so they stay: nothing couples slow rows to fast columns
+    fast, _ = some_factors(stages, slow).solve(rows, np.zeros((2, 6)))
+    full, _ = some_factors(stages, np.arange(6)).solve(rows, np.zeros((2, 6)))
+    # At rest the arm's vibrations are not coupled: the diagonal is the whole matrix.
+    assert_close(fast, full, 1e-9)
+
+
+@pytest.mark.parametrize("slow", [[0, 3, 4, 9, 15], list(range(16))])
+def test_transposed_matrix(slow: list[int]) -> None:
+    """by_a . step + by_y . states = multipliers . rows for any rows and slopes."""
+    stages = some_stages(fine_arms())
+    rng = np.random.default_rng(6)
+    matrix = some_factors(stages, np.array(slow))
+    rows, by_a = rng.normal(size=(2, 5, 3, 16))
+    by_y, after = rng.normal(size=(5, 2, 16)), rng.normal(size=(2, 16))
+    zero = np.zeros((2, 16))
+    step, _ = matrix.solve(rows, zero)
+    q, qd = starts(stages, (zero[0], zero[1]), step)
+    states = np.stack([q, qd], axis=1)
+    expected = np.sum(by_a * step) + np.sum(by_y * states[:-1]) + np.sum(after * states[-1])
+    multipliers = matrix.solve_transposed(by_a, by_y, after)
+    # The terms cancel over stiffnesses that lie eight decades apart.
+    assert np.sum(multipliers * rows) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
+def test_fast_coordinates_change_nothing(
+    monkeypatch: pytest.MonkeyPatch, damping: float, tolerance: float
+) -> None:
+    """The same motion and estimate as with the exact matrix."""
+    problem = fine_arms(5, 1, damping)
+    edges = even_steps(problem, 60)
+    found = radau.on_grid(problem, edges, tolerance, 3)
+    dense(monkeypatch)
+    expected = radau.on_grid(problem, edges, tolerance, 3)
+    # Newton's own goal is a millionth of the tolerance.
+    assert distance(problem, found, expected) <= 3e-6 * tolerance + 1e-12
+    assert found.error == pytest.approx(expected.error, rel=0.05)
+    assert found.iterations <= expected.iterations + 10
+
+
+def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]]) -> None:
+    """Blocks of a few slow coordinates of 8, 24, 96; about as many iterations, the same error."""
+    iterations, slow, found = [], [], []
+    for bending, axial in ((3, 1), (9, 3), (36, 12)):
+        matrices.clear()
+        solution = radau.integrate(fine_arms(bending, axial), 1e-4, 3, Ledger())
+        iterations.append(solution.iterations)
+        slow.append(max(size for _, size in matrices))
+        found.append(solution.error)
+        assert len(matrices) <= 8
+    assert max(slow) <= 24
+    assert max(iterations) <= 15  # on two grids; 8 to 11, by which coordinates are just fast
+    assert_close(found, found[:1] * 3, 0.1)  # other steps
+
+
+def test_poor_contraction_makes_the_matrix_denser(
+    monkeypatch: pytest.MonkeyPatch, matrices: list[tuple[int, int]]
+) -> None:
+    """With one slow coordinate where eight are: widened, and solved all the same."""
+    problem = fine_arms()
+    plain = radau.integrate(problem, 1e-6, 3, Ledger())
+    for module in (radau, factors):
+        monkeypatch.setattr(module, "LIMITS", (1e-3, np.inf))
+    matrices.clear()
+    forced = radau.integrate(problem, 1e-6, 3, Ledger())
+    assert {size for _, size in matrices} == {1, 16}
+    assert distance(problem, forced, plain) <= 1e-6
+    assert forced.error == pytest.approx(plain.error, rel=0.3)  # other steps
+
+
+def test_dense_matrices_are_kept_small(
+    monkeypatch: pytest.MonkeyPatch, matrices: list[tuple[int, int]]
+) -> None:
+    """Steps whose blocks take too much memory are solved a few at a time, forth and back."""
+    problem = fine_arms(5, 1)
+    edges = even_steps(problem, 60)
+    t = np.linspace(0.0, 1.0, 21)
+    dense(monkeypatch)
+    whole = radau.on_grid(problem, edges, 1e-8, 3)
+    slopes = trajectory_slopes(problem, whole, t, whole.sample(t))
+    monkeypatch.setattr(factors, "MEMORY_BYTES", 1e6)
+    matrices.clear()
+    parts = radau.on_grid(problem, edges, 1e-8, 3)
+    again = trajectory_slopes(problem, whole, t, whole.sample(t))
+    assert max(count for count, _ in matrices) < 60
+    assert distance(problem, parts, whole) <= 1e-12
+    assert parts.error == pytest.approx(whole.error, rel=1e-9)
+    for a, b in zip(again, slopes, strict=True):
+        # Rounding of stiffnesses that lie eight decades apart.
+        assert_close(a.K, b.K, 1e-9)
+        assert_close(a.M, b.M, 1e-9)
+
+
+@pytest.mark.parametrize("limits", [(20.0, np.inf), (1e-3, np.inf)])
+def test_adjoint_is_exact_with_fast_coordinates(
+    monkeypatch: pytest.MonkeyPatch, matrices: list[tuple[int, int]], limits: tuple[float, ...]
+) -> None:
+    """Corrected until it is; of an undamped chain too, and where the matrix must be widened."""
+    problem = fine_arms(damping=0.0)
+    solution = radau.on_grid(problem, even_steps(problem, 60), 1e-8, 3)
+    t = np.linspace(0.0, 1.0, 31)
+    by_q = solution.sample(t) @ problem.mechanism.stiffness()
+    monkeypatch.setattr(factors, "LIMITS", limits)
+    matrices.clear()
+    found = trajectory_slopes(problem, solution, t, by_q)
+    assert min(size for _, size in matrices) < 16
+    assert (max(size for _, size in matrices) == 16) == (limits[0] < 1.0)
+    dense(monkeypatch)
+    for a, b in zip(found, trajectory_slopes(problem, solution, t, by_q), strict=True):
+        for name in ("C", "M", "G", "K", "outboard"):
+            # Multipliers are corrected to 1e-8, largest component.
+            assert_close(getattr(a, name), getattr(b, name), 1e-8)
 
 
 # -- warm start, counts, sampling ------------------------------------------------------------

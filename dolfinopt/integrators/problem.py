@@ -122,6 +122,8 @@ def static_start(problem: ElasticProblem) -> np.ndarray:
     moved_before = np.inf
     for _ in range(50):
         rows, _ = inverse_dynamics(mechanism, motion, q, rest, rest)
+        if not rows.any():  # mostly at once: nothing loads the arms before they move
+            return q[0]
         slopes = tangent(mechanism, motion, q, rest, rest)[0, :, :size]
         try:
             step = np.linalg.solve(slopes, -rows[0])[None]

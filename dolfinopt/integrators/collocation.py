@@ -1,0 +1,136 @@
+"""Radau IIA on the steps of a horizon: coefficients, stages, and the elastic rows there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from dolfinopt.integrators.modes import Modes
+from dolfinopt.integrators.problem import lagrange_integrals
+from dolfinopt.mechanism import Mechanism, Tangent, inverse_dynamics, linearise
+from dolfinopt.motion import RigidMotion
+
+
+@dataclass(frozen=True)
+class Collocation:
+    """Nodes c (s,) and matrices of an s-stage method: A (s, s) and A A."""
+
+    c: np.ndarray
+    A: np.ndarray
+    A2: np.ndarray
+
+
+@lru_cache
+def radau_iia(stages: int) -> Collocation:
+    """Return the s-stage Radau IIA method: c are the zeros of P_s - P_{s-1} on [0, 1]."""
+    legendre = np.polynomial.legendre.Legendre
+    c = (legendre.basis(stages) - legendre.basis(stages - 1)).roots()
+    c = np.sort(0.5 * (1.0 + c.real))
+    c[-1] = 1.0
+    _, A, _ = lagrange_integrals(c, c)
+    return Collocation(c, A, A @ A)
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The problem at all stages of a run of steps.
+
+    Attributes:
+        mechanism: of the problem, in modal coordinates.
+        frequencies: (N,) of the coordinates, rad/s.
+        method: collocation.
+        h: (n,) steps, s.
+        motion: rigid coordinates at the n s stages.
+    """
+
+    mechanism: Mechanism
+    frequencies: np.ndarray
+    method: Collocation
+    h: np.ndarray
+    motion: RigidMotion
+
+    def window(self, first: int, last: int) -> Stages:
+        """Return the steps first..last - 1."""
+        s = len(self.method.c)
+        part = slice(first * s, last * s)
+        motion = RigidMotion(self.motion.q[part], self.motion.qd[part], self.motion.qdd[part])
+        return replace(self, h=self.h[first:last], motion=motion)
+
+
+def stages_of(modes: Modes, method: Collocation, edges: np.ndarray) -> Stages:
+    """Return all stages of the steps between `edges` (n + 1,)."""
+    h = np.diff(edges)
+    times = (edges[:-1, None] + h[:, None] * method.c).ravel()
+    problem = modes.problem
+    return Stages(problem.mechanism, modes.frequencies, method, h, problem.motion(times))
+
+
+def starts(
+    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n + 1, N) at the beginning of every step and at the end of the last."""
+    method, h = stages.method, stages.h[:, None]
+    gain_v = h * np.einsum("j,njk->nk", method.A[-1], a)
+    qd = np.cumsum(np.concatenate([state[1][None], gain_v]), axis=0)
+    gain_q = h * qd[:-1] + h * h * np.einsum("j,njk->nk", method.A2[-1], a)
+    q = np.cumsum(np.concatenate([state[0][None], gain_q]), axis=0)
+    return q, qd
+
+
+def at_stages(
+    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n, s, N) at all stages."""
+    q, qd = starts(stages, state, a)
+    return stage_values(stages, q[:-1], qd[:-1], a)
+
+
+def stage_values(
+    stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n, s, N) at all stages from those (n, N) at the steps' beginnings."""
+    method, h = stages.method, stages.h[:, None, None]
+    q_s = q[:, None] + method.c[:, None] * h * qd[:, None] + h * h * (method.A2 @ a)
+    return q_s, qd[:, None] + h * (method.A @ a)
+
+
+def rows_at(stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the elastic rows (n, s, N) at all stages."""
+    size = q.shape[2]
+    flat = (x.reshape(-1, size) for x in (q, qd, a))
+    return inverse_dynamics(stages.mechanism, stages.motion, *flat)[0].reshape(q.shape)
+
+
+def tangent_at(
+    stages: Stages,
+    q: np.ndarray,
+    qd: np.ndarray,
+    a: np.ndarray,
+    keep: np.ndarray | None = None,
+) -> Tangent:
+    """Return the rows' derivative at the n s stages by the coordinates `keep`, or all."""
+    q, qd, a = (x.reshape(-1, q.shape[2]) for x in (q, qd, a))
+    return linearise(stages.mechanism, stages.motion, q, qd, a, keep)
+
+
+def pulled_back(
+    stages: Stages, by_q: np.ndarray, by_v: np.ndarray, by_a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return slopes by the steps' accelerations (n, s, S), states at their beginnings (n, 2, S).
+
+    Undoes `stage_values`: from slopes by the stages' q, qd, qdd, each (n, s, S).
+    """
+    method, h = stages.method, stages.h[:, None, None]
+    steps = by_a + h * (method.A.T @ by_v) + h * h * (method.A2.T @ by_q)
+    late = (by_v + method.c[:, None] * h * by_q).sum(axis=1)
+    return steps, np.stack([by_q.sum(axis=1), late], axis=1)
+
+
+def end_gain(stages: Stages, a: np.ndarray) -> np.ndarray:
+    """Return what accelerations (n, s, N, m) add to the state (n, 2 N, m) at the steps' ends."""
+    h = stages.h[:, None, None]
+    by_q = h * h * np.einsum("j,njkm->nkm", stages.method.A2[-1], a)
+    by_v = h * np.einsum("j,njkm->nkm", stages.method.A[-1], a)
+    return np.concatenate([by_q, by_v], axis=1)
