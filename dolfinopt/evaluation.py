@@ -193,18 +193,19 @@ def constraint_gradients(
     Args:
         scene, share, arms: as for `gradient`.
     """
-    limits, rows = scene.constraints, []
+    limits = scene.constraints
+    rows: list[dict[int, np.ndarray]] = []
     if limits.first_frequency is not None:
         for row in _period_rows(scene, share, arms, follow=False):
-            rows.append({k: limits.first_frequency**2 * values for k, values in row.items()})
+            rows.append({k: limits.first_frequency**2 * slope for k, slope in row.items()})
     if limits.tip_deflection is not None:
         for owner in scene.cell_counts:
-            row = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
+            slopes = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
             if owner in arms:
                 response = static_response(arms[owner].elastic, _loads(scene))
-                slope = deflection_gradient(arms[owner], response, scene.objective.exponent)
-                row[owner] = slope / limits.tip_deflection
-            rows.append(row)
+                slopes[owner] = deflection_gradient(arms[owner], response, scene.objective.exponent)
+                slopes[owner] /= limits.tip_deflection
+            rows.append(slopes)
     return rows
 
 

@@ -86,7 +86,7 @@ def _deviation_norm(
     value = largest * mean ** (1.0 / exponent)
     # (distance / largest)^(p - 2) e / largest: no division by a distance of zero for p >= 2.
     slope = mean ** (1.0 / exponent - 1.0) * share * relative ** (exponent - 2.0) / largest
-    return value, slope[:, None] * e
+    return float(value), slope[:, None] * e
 
 
 def body_slopes_of(trajectory: Trajectory, scene: Scene) -> list[BodySlopes]:

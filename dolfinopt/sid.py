@@ -541,7 +541,8 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
 def write_sid_npz(path: Path, data: StandardInputData) -> None:
     """Write `sid_arrays` to a file."""
     with open(path, "wb") as stream:
-        np.savez(stream, **sid_arrays(data))
+        arrays: dict[str, Any] = dict(sid_arrays(data))
+        np.savez(stream, **arrays)
 
 
 def read_sid_npz(path: Path) -> StandardInputData:

@@ -198,7 +198,7 @@ def test_second_run_computes_nothing(plan, done, monkeypatch):
     forbid(monkeypatch)
     again = run_cases([*plan, *plan], folder, WORLD, shown=False)
     assert again.computed == 0
-    assert again.by_case == outcomes.by_case
+    assert repr(again.by_case) == repr(outcomes.by_case)  # nan is not equal to nan
 
 
 def test_comparison(plan, done):
