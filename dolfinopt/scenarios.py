@@ -15,7 +15,8 @@ from dolfinopt.body import FloatingBody, scaled
 from dolfinopt.mechanism import BodySlopes
 from dolfinopt.scene import Scene
 
-# Exponent of the smooth largest of several objectives: 6 % above the largest of three equal ones.
+# Exponent of the smooth largest of several objectives, unless one is given: 6 % above the largest
+# of three equal ones.
 WORST_CASE = 20.0
 
 
@@ -82,7 +83,9 @@ def slopes_back(slopes: BodySlopes, f: Factors, weight: float) -> BodySlopes:
     )
 
 
-def worst_of(values: Sequence[float]) -> tuple[float, list[float]]:
+def worst_of(
+    values: Sequence[float], exponent: float = WORST_CASE
+) -> tuple[float, list[float]]:
     """Return (sum f^p)^(1/p) of positive values and its slopes; a single value is itself.
 
     The largest, made smooth: Kreisselmeier and Steinhauser's function of the logarithms.
@@ -91,17 +94,18 @@ def worst_of(values: Sequence[float]) -> tuple[float, list[float]]:
     largest = max(values)
     if len(values) == 1 or largest == 0.0:
         return largest, [1.0] * len(values)
-    worst = largest * sum((f / largest) ** WORST_CASE for f in values) ** (1.0 / WORST_CASE)
-    return worst, [(f / worst) ** (WORST_CASE - 1.0) for f in values]
+    worst = largest * sum((f / largest) ** exponent for f in values) ** (1.0 / exponent)
+    return worst, [(f / worst) ** (exponent - 1.0) for f in values]
 
 
 def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
     """Return the objective of all scenarios from their own, and its slopes.
 
-    "sum": sum w f. "worst": the smooth largest of w f.
+    "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`.
     """
     weights = [one.weight for one in scene.scenarios]
     if scene.objective.scenarios == "sum":
         return sum(w * f for w, f in zip(weights, values, strict=True)), weights
-    worst, slopes = worst_of([w * f for w, f in zip(weights, values, strict=True)])
+    scaled_values = [w * f for w, f in zip(weights, values, strict=True)]
+    worst, slopes = worst_of(scaled_values, scene.objective.exponent)
     return worst, [s * w for s, w in zip(slopes, weights, strict=True)]

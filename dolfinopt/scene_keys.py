@@ -482,7 +482,8 @@ class Objective(Table):
         default=20.0,
         ge=2,
         le=200,
-        description="p of p-means: deviation over time, squared periods over modes [-]",
+        description="p of p-means: deviation over time, squared periods over modes, worst "
+        "scenario [-]",
     )
     scenarios: Combination = Field(
         default="sum", description="of the scenarios: weighted sum, or smooth worst case [-]"
