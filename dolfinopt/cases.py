@@ -57,6 +57,7 @@ SCENARIO = (
     "objective",
     "constraints",
     "optimizer",
+    "scenarios",
 )
 
 

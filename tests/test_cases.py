@@ -66,6 +66,7 @@ def test_name_is_no_part_of_the_key():
         "constraints.first_frequency=1.0",
         "design.initial=0.4",
         "optimizer.max_iterations=4",
+        "scenarios=[{changes=['payload.mass=4']}]",
     ],
 )
 def test_every_value_is_part_of_the_key(change):
