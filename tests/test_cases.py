@@ -77,7 +77,7 @@ def test_every_table_is_tried_above():
     tried = set(scene_content(scene()))
     assert tried == {
         "material", "interpolation", "arms", "motion", "payload", "damping", "reduction",
-        "simulation", "objective", "constraints", "design", "optimizer",
+        "simulation", "objective", "constraints", "design", "optimizer", "scenarios",
     }  # fmt: skip
 
 
