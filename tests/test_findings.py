@@ -7,6 +7,8 @@ import numpy as np
 
 from dolfinopt.findings import Line, LineFigure, Panel, Study, Table, write_study
 
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
 
 def test_table():
     table = Table("", "Title.", ("a|b [m]", "n", "x"), (("one|two", 3, 1.23456), ("", 4, np.nan)))

@@ -8,6 +8,8 @@ import pytest
 from dolfinopt.cli import commands
 from dolfinopt.scene import describe_keys
 
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 

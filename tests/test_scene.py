@@ -29,6 +29,8 @@ from dolfinopt.scene import (
     scene_from_dict,
 )
 
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
 TWO_ARM = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 MATERIAL = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}  # Pa, -, kg/m3
 ARM = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}  # m

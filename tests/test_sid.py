@@ -21,6 +21,8 @@ from dolfinopt.sid import (
     write_sid_npz,
 )
 
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
 MATRICES = ("mdCM", "J", "Ct", "Cr", "Me", "Gr", "Ge", "Oe", "ksigma", "Ke", "De")
 PARTS = ("origin", "phi", "psi", "AP", "sigma")
 

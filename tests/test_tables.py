@@ -12,6 +12,8 @@ from bodies import assert_close, derivative
 from dolfinopt.errors import InputError
 from dolfinopt.tables import Curve, Table, curve_by_chord, curve_in_time, read_table
 
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
 ROWS = np.array([[0.0, 0.0], [0.3, 0.4], [1.1, 0.3], [1.0, -0.2], [1.6, -0.3]])
 TIMES = np.array([0.0, 0.3, 0.8, 1.1, 1.9])  # s
 
