@@ -4,6 +4,7 @@ import csv
 import io
 
 import numpy as np
+import pytest
 
 from dolfinopt.findings import Line, LineFigure, Panel, Study, Table, write_study
 
