@@ -62,10 +62,12 @@ step() {
   exit 1
 }
 
+# missing_packages STAMP: tests read the report in a browser (96 MB, a quarter of a minute).
 missing_packages() {
   # libopenblas0-pthread: else the reference BLAS is linked and factorisations take three times longer.
   local wanted="python3-dolfinx python3-petsc4py python3-slepc4py python3-mpi4py python3-scipy
     python3-gmsh python3-venv libegl1 libgl1-mesa-dri libxrender1 libopenblas0-pthread"
+  [ "$1" != ready-dev ] || wanted+=" chromium-headless-shell"
   local installed package
   installed=$(dpkg-query -W -f '${db:Status-Abbrev}${Package}\n' 2>/dev/null)
   for package in $wanted; do
@@ -73,9 +75,10 @@ missing_packages() {
   done
 }
 
+# install_packages STAMP
 install_packages() {
   local packages sudo=()
-  mapfile -t packages < <(missing_packages)
+  mapfile -t packages < <(missing_packages "$1")
   [ ${#packages[@]} -gt 0 ] || return
   [ "$(id -u)" = 0 ] || sudo=(sudo)
   if ! command -v apt-get >/dev/null; then
@@ -99,7 +102,7 @@ set_up() {
   local stamp=$1 project=$2 version
   is_ready "$stamp" && return # another call did it while this one waited for the lock
   mkdir -p "$venv" || exit 1
-  install_packages
+  install_packages "$stamp"
 
   # A finished environment is brought up to date in place, since others may be running in it; one
   # that was never finished or belongs to another Python is made anew.
@@ -185,7 +188,8 @@ run_tests() {
   check "ruff format" "$python" -m ruff format --check .
   check "mypy" "$python" -m mypy
   check "pytest" "$python" -m pytest "$@"
-  check "pytest, $ranks ranks" /usr/bin/mpirun -n "$ranks" "$python" -m pytest "$@"
+  # What takes long need not take it twice; a -m among the arguments wins.
+  check "pytest, $ranks ranks" /usr/bin/mpirun -n "$ranks" "$python" -m pytest -m "not slow" "$@"
   printf '== summary\n%s' "$summary"
   if [ ${#failed[@]} -gt 0 ]; then
     printf 'FAILED:%s\n' "$(printf ' %s;' "${failed[@]}")"

@@ -108,6 +108,7 @@ def test_three_coordinates_need_no_eigenproblem():
 # -- constraints and projections -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_constraints_keep_their_bounds():
     """Bounds that the free optimum breaks hold in the end, and cost compliance."""
     # Loose ones, only to be told the values: they change the free design by rounding.
@@ -126,6 +127,7 @@ def test_constraints_keep_their_bounds():
             assert kept.evaluation.loaded_frequencies[0] == pytest.approx(5.215, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "overrides"),
     [

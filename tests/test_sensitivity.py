@@ -354,6 +354,7 @@ def random_scene(seed: int) -> Scene:
         return drawn
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_gradient_is_one_in_random_scenes(seed: int) -> None:
     """Payload, path, geometry, mesh, reduction, filter, damping, floor and objective drawn."""
