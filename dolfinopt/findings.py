@@ -126,7 +126,63 @@ class TornadoFigure:
     panels: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...]
 
 
-Figure = LineFigure | DesignFigure | MatrixFigure | TornadoFigure
+@dataclass(frozen=True)
+class Histogram:
+    """How values (n,) of one design scatter, and the nominal one."""
+
+    title: str
+    x_label: str
+    values: np.ndarray
+    nominal: float
+
+
+@dataclass(frozen=True)
+class HistogramFigure:
+    """Histograms in rows, with the share of the values below."""
+
+    name: str
+    title: str
+    rows: tuple[tuple[Histogram, ...], ...]
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Groups of bars: a label, and value, lower and upper end (n, 3) of each."""
+
+    title: str
+    y_label: str
+    groups: tuple[tuple[str, np.ndarray], ...]
+
+
+@dataclass(frozen=True)
+class BarFigure:
+    """Panels of bars in rows; `labels` (n,) below all of them."""
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    rows: tuple[tuple[Bars, ...], ...]
+
+
+@dataclass(frozen=True)
+class ScatterFigure:
+    """Points: every row's values (n,) by every column's."""
+
+    name: str
+    title: str
+    columns: tuple[tuple[str, np.ndarray], ...]
+    rows: tuple[tuple[str, np.ndarray], ...]
+
+
+Figure = (
+    LineFigure
+    | DesignFigure
+    | MatrixFigure
+    | TornadoFigure
+    | HistogramFigure
+    | BarFigure
+    | ScatterFigure
+)
 
 
 @dataclass(frozen=True)
@@ -139,6 +195,7 @@ class Study:
         figures: to draw.
         failures: one line each.
         computed: cases that were not there before.
+        data: tables too long to be read, for CSV files alone.
     """
 
     name: str
@@ -146,6 +203,7 @@ class Study:
     figures: tuple[Figure, ...]
     failures: tuple[str, ...]
     computed: int
+    data: tuple[Table, ...] = ()
 
     def markdown(self) -> str:
         """Return all tables."""
@@ -156,7 +214,7 @@ def write_study(study: Study, folder: Path) -> None:
     """Write all tables as CSV and Markdown, and the curves as CSV (root only)."""
     from dolfinopt.files import write_text
 
-    for table in study.tables:
+    for table in (*study.tables, *study.data):
         write_text(folder / f"{joined(study.name, table.name)}.csv", table.csv())
     for figure in study.figures:
         if isinstance(figure, LineFigure):

@@ -83,9 +83,7 @@ def slopes_back(slopes: BodySlopes, f: Factors, weight: float) -> BodySlopes:
     )
 
 
-def worst_of(
-    values: Sequence[float], exponent: float = WORST_CASE
-) -> tuple[float, list[float]]:
+def worst_of(values: Sequence[float], exponent: float = WORST_CASE) -> tuple[float, list[float]]:
     """Return (sum f^p)^(1/p) of positive values and its slopes; a single value is itself.
 
     The largest, made smooth: Kreisselmeier and Steinhauser's function of the logarithms.

@@ -336,12 +336,12 @@ class _Objectives(_Plan):
         moved = [o for o in good if o.case.scene.objective.simulated and o.case != self.initial]
         others = [o for o in good if o not in moved]
         panels = [
-            *_deviation_panels("initial, static, eigenfrequency", others),
-            *_deviation_panels(MOTION, moved),
+            *deviation_panels("initial, static, eigenfrequency", others),
+            *deviation_panels(MOTION, moved),
         ]
         figures: list[Figure] = [
             LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
-            _designs("designs", "Designs by objective", good),
+            design_figure("designs", "Designs by objective", good),
         ]
         return [table], figures
 
@@ -364,7 +364,7 @@ def _end(outcome: Outcome) -> str:
     return "" if outcome.case.action != "optimize" else outcome.stop_reason
 
 
-def _deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel, ...]]:
+def deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel, ...]]:
     """Return the deviation over time; designs of another magnitude get a panel of their own."""
     rows: list[tuple[Panel, ...]] = []
     for group in _magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
@@ -376,7 +376,7 @@ def _deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel,
     return rows
 
 
-def _designs(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
+def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
     return DesignFigure(
         name,
         title,
@@ -407,7 +407,7 @@ def reduced(scene: Scene, method: str, coordinates: int) -> Scene:
     return changed(scene, f"reduction.method={method}", f"{COORDINATES}={coordinates}", *settings)
 
 
-def _reference(scene: Scene) -> Scene:
+def reference_scene(scene: Scene) -> Scene:
     """Return the scene with so many coordinates that more make no difference."""
     most = [arm.n_reducible for arm in scene.arms if arm.n_reducible is not None]
     return reduced(scene, REFERENCE_METHOD, min([REFERENCE, *most]))
@@ -500,7 +500,7 @@ class _Coordinates(_Plan):
                 outcome = outcomes[self.case(label, design, scene)]
                 if not outcome.failure:
                     found.append(replace(outcome, case=Case(scene, label=_called(scene))))
-        panels = _deviation_panels(label, found)
+        panels = deviation_panels(label, found)
         title = "Deviation of the end-effector"
         return [LineFigure("deviation", title, tuple(panels))] if panels else []
 
@@ -512,7 +512,9 @@ QUANTITIES: tuple[tuple[str, _Take], ...] = (
 )
 
 
-def _given(scene: Scene, designs: Sequence[Path]) -> tuple[tuple[str, Case | Path | None], ...]:
+def given_designs(
+    scene: Scene, designs: Sequence[Path]
+) -> tuple[tuple[str, Case | Path | None], ...]:
     """Return label and design of the files, or else of the initial and the optimised design."""
     _check_designs(scene, designs)
     if designs:
@@ -529,7 +531,7 @@ def _coordinates_plan(
     scene: Scene, name: str, designs: Sequence[Path], counts: Sequence[int] | None
 ) -> _Coordinates:
     scenes = _reductions(scene, counts, SWEPT)
-    return _Coordinates(name, _given(scene, designs), tuple(scenes))
+    return _Coordinates(name, given_designs(scene, designs), tuple(scenes))
 
 
 @dataclass(frozen=True)
@@ -566,9 +568,9 @@ class _Reductions(_Plan):
         own = [a for a, _ in pairs if not a.failure]
         title = f"Designs optimised with every reduction, simulated with {_called(self.reference)}"
         moved = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
-        if panels := _deviation_panels("", moved):
+        if panels := deviation_panels("", moved):
             figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
-            figures.append(_designs("designs", title, moved))
+            figures.append(design_figure("designs", title, moved))
         if own:
             figures.append(_convergence(own))
         return tables, figures
@@ -665,7 +667,7 @@ def _reduction_plan(scene: Scene, counts: Sequence[int] | None) -> _Plan:
     return _Reductions(
         "reduction",
         tuple(_reductions(scene, counts, OPTIMISED)),
-        _reference(scene),
+        reference_scene(scene),
         _coordinates_plan(scene, "reduction", (), None),
         tuple(_reductions(scene, None, COMPARED)),
     )
@@ -818,7 +820,7 @@ class _Sweep(_Plan):
         )
         designs = [outcomes[self.optimum(p)] for p in self.points]
         good = [outcome for outcome in designs if not outcome.failure]
-        pictures = [_designs(joined(self.prefix, "designs"), "Designs by scenario", good)]
+        pictures = [design_figure(joined(self.prefix, "designs"), "Designs by scenario", good)]
         return tables, [figure, *(p for p in pictures if good)]
 
 
@@ -900,7 +902,7 @@ def _sweep_plan(
             f"--vary {resized[0].text}: no given design fits arms of several sizes; "
             + ("leave out --designs" if reoptimize else "add --reoptimize to optimise one for each")
         )
-    given = (("initial design", None),) if resized else _given(scene, designs)
+    given = (("initial design", None),) if resized else given_designs(scene, designs)
 
     def sweep(keys: Sequence[Vary], prefix: str) -> _Sweep:
         points = []

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt import findings
 from dolfinopt.files import designed, gather_views, read_design, write_atomically
 from dolfinopt.findings import (
+    BarFigure,
     DesignFigure,
+    HistogramFigure,
     LineFigure,
     MatrixFigure,
     Panel,
+    ScatterFigure,
     Study,
     TornadoFigure,
     joined,
@@ -33,6 +37,7 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#0
 DASHES = ("-", "--", ":", "-.")
 MARKERS = "osD^vPX"
 FEW = 40  # points a line that get markers
+NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
 
 
@@ -41,16 +46,25 @@ def draw_study(study: Study, folder: Path) -> list[Path]:
     paths = []
     for figure in study.figures:
         name = joined(study.name, figure.name)
-        if isinstance(figure, LineFigure):
-            drawn = line_figure(figure)
-        elif isinstance(figure, MatrixFigure):
-            drawn = matrix_figure(figure)
-        elif isinstance(figure, TornadoFigure):
-            drawn = tornado_figure(figure)
-        else:
-            drawn = design_figure(figure)
-        paths.append(_save(drawn, folder / f"{name}.png"))
+        paths.append(save(draw(figure), folder / f"{name}.png"))
     return paths
+
+
+def draw(figure: findings.Figure) -> Figure:
+    """Return a study's figure, drawn."""
+    if isinstance(figure, LineFigure):
+        return line_figure(figure)
+    if isinstance(figure, MatrixFigure):
+        return matrix_figure(figure)
+    if isinstance(figure, TornadoFigure):
+        return tornado_figure(figure)
+    if isinstance(figure, HistogramFigure):
+        return histogram_figure(figure)
+    if isinstance(figure, BarFigure):
+        return bar_figure(figure)
+    if isinstance(figure, ScatterFigure):
+        return scatter_figure(figure)
+    return design_figure(figure)
 
 
 def line_figure(figure: LineFigure) -> Figure:
@@ -76,6 +90,25 @@ def line_figure(figure: LineFigure) -> Figure:
             fontsize=9,
         )
     drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12, parse_math=False)
+    return drawn
+
+
+def column_figure(figure: LineFigure) -> Figure:
+    """Return the panels below each other, each with its legend below: legible on a phone."""
+    panels = [panel for row in figure.rows for panel in row]
+    looks = _looks(figure)
+    heights = [3.0 + 0.21 * len(panel.lines) for panel in panels]
+    drawn = _figure(NARROW, sum(heights), dpi=160)
+    parts = np.atleast_1d(np.array(drawn.subfigures(len(panels), 1, height_ratios=heights)))
+    for part, panel in zip(parts.ravel(), panels, strict=True):
+        axes = part.subplots()
+        _draw_panel(axes, panel, looks)
+        part.legend(
+            *axes.get_legend_handles_labels(),
+            loc="outside lower left",
+            frameon=False,
+            fontsize=9,
+        )
     return drawn
 
 
@@ -121,7 +154,7 @@ def _draw_panel(axes: Axes, panel: Panel, looks: dict[str, dict[str, Any]]) -> N
         axes.set_ylim(bottom=0.0)
     if len(x) and (x % 1 == 0).all():
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if len(x) > FEW:
+    if any(len(line.x) > FEW for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
     axes.set_xlabel(panel.x_label, parse_math=False)
     axes.set_ylabel(panel.y_label, parse_math=False)
@@ -232,20 +265,94 @@ def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
     return designed(gather_views(scene, share, arms, read_design(path, share, arms)))
 
 
+# -- random values ---------------------------------------------------------------------------
+
+
+def histogram_figure(figure: HistogramFigure) -> Figure:
+    """Return histograms, the share of the samples below as a curve, and the nominal values."""
+    rows, columns = len(figure.rows), max(map(len, figure.rows))
+    drawn = _figure(5.2 * columns, 3.2 * rows + 0.5)
+    grid = drawn.subplots(rows, columns, squeeze=False)
+    for i, (row, panels) in enumerate(zip(grid, figure.rows, strict=True)):
+        for axes, panel in zip(row, panels):
+            colour = PALETTE[i % len(PALETTE)]
+            axes.hist(panel.values, bins="fd", color=colour, alpha=0.55)
+            axes.axvline(panel.nominal, color="black", linestyle="--", linewidth=1.2)
+            axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
+            axes.set_xlabel(panel.x_label, parse_math=False)
+            axes.set_ylabel("samples [-]")
+            share = axes.twinx()
+            ordered = np.sort(panel.values)
+            share.step(ordered, np.arange(1, len(ordered) + 1) / len(ordered), where="post",
+                       color=GREY, linewidth=1.4)  # fmt: skip
+            share.set_ylim(0.0, 1.0)
+            share.set_ylabel("share of samples below [-]", color=GREY)
+    drawn.suptitle(f"{figure.title}; dashed: nominal", x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+def bar_figure(figure: BarFigure) -> Figure:
+    """Return groups of bars with their intervals."""
+    rows, columns = len(figure.rows), max(map(len, figure.rows))
+    place = np.arange(len(figure.labels))
+    drawn = _figure((1.5 + 1.1 * max(3, len(place))) * columns + 0.6, 3.2 * rows + 0.8)
+    grid = drawn.subplots(rows, columns, squeeze=False, sharey=True)
+    for row, panels in zip(grid, figure.rows, strict=True):
+        for axes, panel in zip(row, panels):
+            width = 0.8 / len(panel.groups)
+            for k, (label, bars) in enumerate(panel.groups):
+                value, low, high = bars.T
+                x = place + (k - 0.5 * (len(panel.groups) - 1)) * width
+                ends = np.maximum([value - low, high - value], 0.0)
+                axes.bar(x, value, 0.9 * width, yerr=ends, capsize=3, label=label,
+                         color=PALETTE[k % len(PALETTE)], alpha=0.8)  # fmt: skip
+            # A key in two lines takes half the width.
+            names = [label.replace(".", ".\n", 1) for label in figure.labels]
+            axes.set_xticks(place, names, fontsize=8, parse_math=False)
+            axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
+            axes.set_ylabel(panel.y_label)
+            axes.grid(True, axis="y", alpha=0.3)
+    grid[0, 0].legend(frameon=False, fontsize=9)
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+def scatter_figure(figure: ScatterFigure) -> Figure:
+    """Return points, a row a quantity and a column an input."""
+    from matplotlib.ticker import EngFormatter
+
+    rows, columns = len(figure.rows), len(figure.columns)
+    drawn = _figure(3.2 * columns + 0.8, 2.5 * rows + 0.5)
+    grid = drawn.subplots(rows, columns, squeeze=False, sharex="col", sharey="row")
+    for i, (row, (y_label, y)) in enumerate(zip(grid, figure.rows, strict=True)):
+        for axes, (x_label, x) in zip(row, figure.columns):
+            axes.plot(x, y, ".", color=PALETTE[i // 2 % len(PALETTE)], alpha=0.35, markersize=3)
+            axes.grid(True, alpha=0.3)
+            if np.abs(x).max() >= 1e4:  # 70 G rather than a power of ten in a corner
+                axes.xaxis.set_major_formatter(EngFormatter())
+            if axes is row[0]:
+                axes.set_ylabel(y_label.replace(": ", "\n", 1), fontsize=9, parse_math=False)
+            if i == rows - 1:
+                axes.set_xlabel(x_label, fontsize=9, parse_math=False)
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
 # -- files -----------------------------------------------------------------------------------
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(width: float, height: float, dpi: int = 110) -> Figure:
     """Return an empty figure, inches, that no global state knows of."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=110)
+    figure = Figure(figsize=(width, height), dpi=dpi)
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     FigureCanvasAgg(figure)
     return figure
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG; return its path."""
     write_atomically(path, lambda stream: figure.savefig(stream, format="png"))
     return path
