@@ -1,4 +1,4 @@
-"""The parametric meshes that come with the package, wherever it is installed."""
+"""What comes with the package wherever it is installed: meshes, the paper's scene, its page."""
 
 from pathlib import Path
 
@@ -9,3 +9,16 @@ def mesh_folder() -> Path:
     In a source tree it is a link to the folder `meshes` next to the package.
     """
     return Path(__file__).parent / "meshes"
+
+
+def paper_scene() -> Path:
+    """Return the paper's two-arm manipulator.
+
+    In a source tree it is a link to `demos/two_arm.toml`.
+    """
+    return Path(__file__).parent / "scenes" / "two_arm.toml"
+
+
+def page_folder() -> Path:
+    """Return the folder of the templates that make report.html."""
+    return Path(__file__).parent / "pages"

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dolfinopt.findings import Line, LineFigure, MatrixFigure, Panel, TornadoFigure
-from dolfinopt.study_plots import line_figure, matrix_figure, tornado_figure
+from dolfinopt.study_plots import column_figure, line_figure, matrix_figure, tornado_figure
 
 
 def test_line_figure():
@@ -33,6 +33,25 @@ def test_legend_names_every_curve():
     drawn = line_figure(LineFigure("", "", (panels,)))
     texts = [text.get_text() for text in drawn.axes[1].get_legend().get_texts()]
     assert texts == ["a", "b"]
+
+
+def test_column_of_panels():
+    """Below each other, one look a curve, every legend below its panel; sweeps keep a margin."""
+    t, x = np.linspace(0.0, 3.0, 200), np.linspace(0.0, 1.0, 9)
+    rows = (
+        (Panel("", "t [s]", "y [mm]", (Line("a", t, t), Line("b", t, t))),),
+        (Panel("", "s [-]", "y [mm]", tuple(Line(name, x, x) for name in "bcdef")),),
+    )
+    drawn = column_figure(LineFigure("", "", rows))
+    drawn.canvas.draw()
+    first, second = (part.axes[0] for part in drawn.subfigs)
+    assert first.get_position().y0 > 0.0 and len(drawn.axes) == 2
+    assert first.lines[1].get_color() == second.lines[0].get_color()
+    assert first.get_xlim() == (0.0, 3.0) and second.get_xlim()[0] < 0.0
+    for part, names in zip(drawn.subfigs, ("ab", "bcdef"), strict=True):
+        (legend,) = part.legends
+        assert [text.get_text() for text in legend.get_texts()] == list(names)
+        assert legend.get_window_extent().y1 < part.axes[0].get_window_extent().y0
 
 
 def test_matrix_and_tornado_figures():
