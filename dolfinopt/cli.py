@@ -311,6 +311,25 @@ class _Listing(click.Command):
     help="design.npz files; default: the initial and the optimised design",
 )
 @click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
+@click.option(
+    "--random",
+    multiple=True,
+    metavar="KEY=LAW",
+    help="a scene value's distribution: normal:MEAN:DEVIATION, uniform:LOW:HIGH, "
+    "triangular:LOW:MODE:HIGH or lognormal:MEDIAN:SIGMA; several are independent",
+)
+@click.option("--samples", type=int, help="of the random values; default: 1000")
+@click.option("--seed", type=int, help="of the samples; default: 1")
+@click.option(
+    "--sampler",
+    type=click.Choice(["sobol", "latin-hypercube"]),
+    help="how they fill the space; default: sobol",
+)
+@click.option(
+    "--indices",
+    type=click.Choice(["polynomial", "saltelli"]),
+    help="Sobol' indices of a polynomial fitted to the samples (default), or of more simulations",
+)
 @out_option("tables, pictures and cases; default: results/SCENE-study")
 @set_option
 @plots_option
@@ -322,21 +341,34 @@ def study(
     vary: tuple[str, ...],
     designs: tuple[Path, ...],
     reoptimize: bool,
+    random: tuple[str, ...],
+    samples: int | None,
+    seed: int | None,
+    sampler: Any,
+    indices: Any,
     out: Path | None,
     overrides: tuple[str, ...],
     plots: bool,
 ) -> None:
     """Vary what SCENE rests on: tables and curves of what its designs then do.
 
-    Without TOPIC whatever --vary names. What is computed is kept in DIR/cases and taken from
-    there the next time; a study that was interrupted goes on.
+    Without TOPIC whatever --vary names, or --random scatters. What is computed is kept in DIR and
+    taken from there the next time; a study that was interrupted goes on.
     """
     from dolfinopt.findings import write_study
     from dolfinopt.study import study as run
 
+    options = {"samples": samples, "seed": seed, "sampler": sampler, "indices": indices}
+    given = {name: value for name, value in options.items() if value is not None}
+    _check_random(bool(random), bool(topic or vary or reoptimize), given)
     loaded = _load(world, scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-study"
-    done = run(loaded, topic, vary, designs, folder, world, reoptimize=reoptimize)
+    if random:
+        from dolfinopt.random_study import Plan, study_random
+
+        done = study_random(loaded, random, designs, folder, world, Plan(**given))
+    else:
+        done = run(loaded, topic, vary, designs, folder, world, reoptimize=reoptimize)
     if world.rank == 0:
         write_study(done, folder)
         if plots:
@@ -348,6 +380,76 @@ def study(
     if done.failures:
         more = f" (and {len(done.failures) - 1} more)" if len(done.failures) > 1 else ""
         raise ConvergenceError(f"{done.failures[0]}{more}")
+
+
+def _check_random(random: bool, others: bool, options: Mapping[str, Any]) -> None:
+    """Raise InputError unless the options of a study go together."""
+    if random and others:
+        raise InputError("--random: a study of its own, without topic, --vary and --reoptimize")
+    if options and not random:
+        raise InputError(f"--{next(iter(options))}: expected only with --random")
+
+
+@commands.command()
+@out_option("figures, report.html and cases; default: results/paper")
+@click.option("--check", is_flag=True, help="end with status 1 where a main finding fails")
+@click.option("--coarse", is_flag=True, help="100 x 6 cells and 60 iterations: a minute")
+@set_option
+@plots_option
+@click.pass_obj
+def reproduce(
+    world: MPI.Comm,
+    out: Path | None,
+    check: bool,
+    coarse: bool,
+    overrides: tuple[str, ...],
+    plots: bool,
+) -> None:
+    """Recreate figures 3 to 15 of the paper, and a page that compares the findings.
+
+    What is computed is kept in DIR/cases and taken from there the next time; a call that was
+    interrupted goes on.
+    """
+    from dolfinopt.claims import broken
+    from dolfinopt.paper import Plan, load_paper
+    from dolfinopt.paper import reproduce as run
+    from dolfinopt.parallel import on_root
+    from dolfinopt.report import write_reproduction
+
+    folder = out or Path("results") / "paper"
+    done = run(Plan(on_root(world, load_paper, coarse, overrides)), folder, world)
+    if world.rank == 0:
+        write_reproduction(done, folder, plots=plots)
+        for finding in done.findings:
+            click.echo(f"{finding.name} (paper: {finding.paper}). {finding.sentence}")
+        page = " and report.html" if plots else ""
+        click.echo(f"{done.outcomes.computed} cases computed; figures{page} in {folder}")
+    failures = [f"{o.case.label}: {o.failure}" for o in done.outcomes.failures]
+    wrong = [*failures, *(broken(done.findings) if check else ())]
+    if wrong:
+        raise ConvergenceError("; ".join(wrong))
+
+
+@commands.command()
+@out_option("diagrams and bench.md; default: results/bench")
+@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
+@click.pass_obj
+def bench(world: MPI.Comm, out: Path | None, quick: bool) -> None:
+    """Measure run time against error: integrators, meshes, reductions, iterations, other programs.
+
+    What is measured is kept in DIR; a call that was interrupted goes on.
+    """
+    if world.size > 1:
+        raise InputError("bench: starts its ranks itself; call it without mpirun")
+    from dolfinopt.bench import QUICKLY, Plan
+    from dolfinopt.bench import bench as run
+    from dolfinopt.paper import load_paper
+
+    folder = out or Path("results") / "bench"
+    _prepare(world, folder)
+    scene = load_paper(False, QUICKLY if quick else ())
+    summary = run(Plan(scene, quick), folder, lambda text: click.echo(text, err=True))
+    click.echo(f"diagrams in {folder}, summary in {summary}")
 
 
 @commands.command()
@@ -507,7 +609,9 @@ def _draw(
 
 
 def _conclude(summary: Mapping[str, Any], folder: Path) -> None:
-    """Print the run's figures in one line."""
+    """Print the run's warnings, and its figures in one line."""
+    for warning in summary["warnings"]:
+        click.echo(f"dolfinopt: warning: {warning}", err=True)
     click.echo(
         f"{summary['name']}: {summary['iterations']} iterations ({summary['stop_reason']}), "
         f"compliance {summary['compliance']:.4g} N m, "

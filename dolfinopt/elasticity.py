@@ -19,10 +19,19 @@ from petsc4py import PETSc
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt import compat
-from dolfinopt.errors import InputError
+from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import ArmMesh
 from dolfinopt.parallel import direct_solver
+
+# Imbalance of constraint modes up to which they are taken as they are: S is then right to 1e-5.
+# Connected designs have 1e-13 to 1e-9, checkerboards in a void of 1e-6 1e-5, of 1e-9 1e-2.
+BALANCED = 1e-3
+# Change of S by a step of refinement up to which it is believed.
+STEADY = 1e-3
+# Of void to solid where solids float. Rounding of the element matrices holds them, too, which no
+# refinement notices: S is off by up to 3e-8 in a void of 1e-6, 3e-5 of 1e-9, 6e-4 of 1e-10.
+LOWEST_CONTRAST = 5e-11
 
 
 @dataclass(frozen=True)
@@ -181,11 +190,15 @@ class ConstraintModes:
         interior: (num_interior, 3) owned interior rows.
         field: (n_nodes, 2, 3) nodal field.
         stiffness: (3, 3) S, force and moment at the interface by its displacement.
+        coupling: (num_interior, 3) K_Ib.
+        corner: (3, 3) K_bb.
     """
 
     interior: np.ndarray
     field: np.ndarray
     stiffness: np.ndarray
+    coupling: np.ndarray
+    corner: np.ndarray
 
 
 class ElasticArm:
@@ -405,7 +418,11 @@ class ElasticArm:
         return self._ksp
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve K_II U = right for (num_interior, k) owned rows."""
+        """Solve K_II U = right for (num_interior, k) owned rows.
+
+        Raises:
+            ConvergenceError: K_II is singular but for rounding.
+        """
         b, x = self.factorise().getOperators()[0].createVecs()
         out = np.empty_like(right)
         with self.ledger.phase("solves"):
@@ -413,6 +430,11 @@ class ElasticArm:
                 b.array = right[:, k]
                 self.solve_vector(b, x)
                 out[:, k] = x.array_r
+        if self.factorise().getConvergedReason() < 0:  # the same on all ranks
+            raise ConvergenceError(
+                f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is lost "
+                "in the rounding of solid; raise interpolation.floor or design.minimum"
+            )
         return out
 
     def solve_vector(self, right: PETSc.Vec, solution: PETSc.Vec) -> None:
@@ -424,13 +446,58 @@ class ElasticArm:
         """Return the static fields of unit displacements of the outboard interface; once a design.
 
         Psi = [-K_II^-1 K_Ib; I],  S = Psi' K Psi: three solves with the factor at hand.
+
+        Raises:
+            ConvergenceError: the contrast between solid and void is too large for this design.
         """
         if self._constraint_modes is None:
-            coupling, _ = self.restrict(self.stiffness_times(self.rigid))
-            interior = self.solve(-coupling)
-            field = self.expand(interior, np.eye(3))
-            self._constraint_modes = ConstraintModes(interior, field, self.energy_matrix(field))
+            coupling, corner = self.restrict(self.stiffness_times(self.rigid))
+            modes = self._energies(self.solve(-coupling), coupling, corner)
+            if not self._imbalance(modes) <= BALANCED:  # not a number included
+                modes = self._refined(modes)
+            self._constraint_modes = modes
         return self._constraint_modes
+
+    def _energies(
+        self, interior: np.ndarray, coupling: np.ndarray, corner: np.ndarray
+    ) -> ConstraintModes:
+        field = self.expand(interior, np.eye(3))
+        return ConstraintModes(interior, field, self.energy_matrix(field), coupling, corner)
+
+    def _imbalance(self, modes: ConstraintModes) -> float:
+        """Return how far K_bb + K_bI Psi is from S, relative; inf where S is no stiffness.
+
+        Equal in exact arithmetic; off by the equilibrium's error to first order, S by its square.
+        """
+        lower = self.comm.allreduce(modes.coupling.T @ modes.interior)
+        return _relative_change(modes.stiffness, modes.corner + lower)
+
+    def _refined(self, modes: ConstraintModes) -> ConstraintModes:
+        """Return constraint modes after one step of iterative refinement, if it changes little.
+
+        Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below
+        the rounding of their own. The residual is summed cell by cell without rigid motion, which
+        knows them better than the assembled matrix.
+
+        Raises:
+            ConvergenceError: the void's stiffness is lost in the rounding of the solid's.
+        """
+        values = self._on_cells(modes.field)
+        forces = (self.operators.stiffness @ values) * self._young[:, None, None]
+        residual = np.zeros_like(modes.field)
+        np.add.at(residual, self.operators.cells, forces.reshape(*self.operators.cells.shape, 2, 3))
+        better = modes.interior - self.solve(self.restrict(residual)[0])
+        refined = self._energies(better, modes.coupling, modes.corner)
+        low = -self.comm.allreduce(-self._young.min(initial=np.inf), op=MPI.MAX)
+        high = self.comm.allreduce(self._young.max(initial=0.0), op=MPI.MAX)
+        change = _relative_change(refined.stiffness, modes.stiffness)
+        if low < LOWEST_CONTRAST * high or not change <= STEADY:
+            raise ConvergenceError(
+                f"arm {self.mesh.name!r}: solid parts of the design float in a void "
+                f"{low / high:.1g} times as stiff, lost in their rounding; raise "
+                "interpolation.floor or design.minimum, or connect the design to both interfaces"
+            )
+        return refined
 
     # -- cells -------------------------------------------------------------------------------
 
@@ -472,6 +539,15 @@ class ElasticArm:
         values = field[cells]
         values -= values.mean(axis=1, keepdims=True)
         return values.reshape(len(cells), 2 * cells.shape[1], field.shape[2])
+
+
+def _relative_change(stiffness: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest relative difference of two stiffnesses (3, 3), in any direction."""
+    try:
+        inverse = np.linalg.inv(np.linalg.cholesky(stiffness))
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(np.linalg.norm(inverse @ (other - stiffness) @ inverse.T, 2))
 
 
 def _cell_products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:

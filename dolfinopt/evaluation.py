@@ -14,6 +14,7 @@ import numpy as np
 
 from dolfinopt.arm import chain_of, fixed_body
 from dolfinopt.body import FloatingBody, first_frequency
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
 from dolfinopt.mechanism import BodySlopes
@@ -35,7 +36,7 @@ from dolfinopt.sensitivity import (
     rigid_gradient,
     static_gradient,
 )
-from dolfinopt.simulation import Trajectory, simulate
+from dolfinopt.simulation import Trajectory, simulate_batch
 from dolfinopt.statics import static_response
 from dolfinopt.vibration import (
     Chain,
@@ -62,6 +63,8 @@ class Motion:
         max_deviation, max_deviation_time: m, s.
         first_frequencies: of every arm, clamped-free, Hz; inf of a rigid one.
         error: estimated relative error of the elastic coordinates.
+        deflections, turns: largest outboard deflection of every arm over its length, and rotation
+            in rad.
         scenarios: the same of every scenario.
     """
 
@@ -71,6 +74,8 @@ class Motion:
     max_deviation_time: float = np.nan
     first_frequencies: tuple[float, ...] = ()
     error: float = np.nan
+    deflections: tuple[float, ...] = ()
+    turns: tuple[float, ...] = ()
     scenarios: tuple[Motion, ...] = ()
 
 
@@ -245,13 +250,13 @@ def _simulate(
 ) -> Trajectory:
     """Simulate the scene, and all its scenarios."""
     scenes = pose_scenarios(scene)
-    starts = [*start, *[None] * (1 + len(scenes))]
-    others = tuple(
-        simulate(other, bodies_in(scene, other, owned), ledger, starts[k])
-        for k, other in enumerate(scenes, 1)
-    )
-    own = simulate(scene, chain_of(scene, owned), ledger, starts[0])
-    return replace(own, scenarios=others)
+    bodies = [chain_of(scene, owned), *(bodies_in(scene, other, owned) for other in scenes)]
+    found = simulate_batch([scene, *scenes], bodies, ledger, start)
+    for one in found:
+        if isinstance(one, ConvergenceError):
+            raise one
+    own, *others = (one for one in found if isinstance(one, Trajectory))
+    return replace(own, scenarios=tuple(others))
 
 
 def _figures(trajectory: Trajectory) -> Motion:
@@ -265,6 +270,8 @@ def _figures(trajectory: Trajectory) -> Motion:
         max_deviation_time=when,
         first_frequencies=tuple(map(first_frequency, trajectory.mechanism.bodies)),
         error=trajectory.solution.error,
+        deflections=tuple(map(float, trajectory.deflections)),
+        turns=tuple(map(float, trajectory.turns)),
     )
 
 

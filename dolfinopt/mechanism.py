@@ -16,10 +16,31 @@ import numpy as np
 from dolfinopt.body import FloatingBody
 from dolfinopt.motion import RigidMotion
 
+# One number, or one at each of the n instants that a function is given.
+PerInstant = float | np.ndarray
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What multiplies a body's integrals, its stiffness and its damping."""
+
+    mass: PerInstant = 1.0
+    stiffness: PerInstant = 1.0
+    damping: PerInstant = 1.0
+
+    def __getitem__(self, part: slice) -> Scale:
+        """Return it at some of the instants."""
+        return Scale(*(_at(x, part) for x in (self.mass, self.stiffness, self.damping)))
+
+
+UNSCALED = Scale()
+
 
 @dataclass(frozen=True)
 class Mechanism:
     """A cart on a horizontal rail that carries a chain of arms and a payload.
+
+    Payload, gravity and scales may differ from instant to instant: several mechanisms in one.
 
     Attributes:
         bodies: from the cart outwards.
@@ -27,13 +48,15 @@ class Mechanism:
         payload_inertia: its rotary inertia, kg m2.
         gravity: (g_x, g_y), m/s2.
         joint_height: y of the first joint, m.
+        scales: of every body's elastic rows, forces and moments, or none.
     """
 
     bodies: tuple[FloatingBody, ...]
-    payload_mass: float
-    payload_inertia: float
-    gravity: tuple[float, float]
+    payload_mass: PerInstant
+    payload_inertia: PerInstant
+    gravity: tuple[PerInstant, PerInstant]
     joint_height: float
+    scales: tuple[Scale, ...] = ()
 
     @property
     def slices(self) -> tuple[slice, ...]:
@@ -46,12 +69,25 @@ class Mechanism:
         """Number N of elastic coordinates of all bodies."""
         return sum(body.coordinates for body in self.bodies)
 
+    def scale(self, k: int) -> Scale:
+        """Return that of a body."""
+        return self.scales[k] if self.scales else UNSCALED
+
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
         K = np.zeros((self.coordinates, self.coordinates))
         for part, body in zip(self.slices, self.bodies, strict=True):
             K[part, part] = body.K
         return K
+
+
+def _at(x: PerInstant, part: slice) -> PerInstant:
+    return x[part] if isinstance(x, np.ndarray) else x
+
+
+def _column(x: PerInstant) -> PerInstant:
+    """Return what multiplies (n, m) arrays instant by instant."""
+    return x[:, None] if isinstance(x, np.ndarray) else x
 
 
 @dataclass(frozen=True)
@@ -108,7 +144,7 @@ def _outward(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> tuple[list[_Shapes], list[_Frame], tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Pass out along the chain; return shapes, frames and (a, w, wd) of the payload's frame."""
-    gravity = complex(*mechanism.gravity)
+    gravity = mechanism.gravity[0] + 1j * mechanism.gravity[1]
     joints, joints_d, joints_dd = motion.q[:, 1:], motion.qd[:, 1:], motion.qdd[:, 1:]
     a = np.exp(-1j * joints[:, 0]) * (motion.qdd[:, 0] - gravity)
     w, wd = joints_d[:, 0], joints_dd[:, 0]
@@ -172,30 +208,33 @@ def inverse_dynamics(
     bodies = list(zip(mechanism.slices, shapes, frames, strict=True))
     for k in reversed(range(len(bodies))):
         part, shape, frame = bodies[k]
-        body, w = shape.body, frame.w[:, None]
+        body, w, scale = shape.body, frame.w[:, None], mechanism.scale(k)
         e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
         force = frame.swing * force  # of everything outboard, in this frame
-        rows[:, part] = (
+        inertial = (
             np.outer(frame.a.real, shape.C.real)
             + np.outer(frame.a.imag, shape.C.imag)
             + frame.rG * frame.wd[:, None]
             - w * w * frame.jM
             - 2.0 * w * (ed @ body.G)
             + edd @ body.M
-            + e @ body.K
-            + ed @ body.D
+        )
+        rows[:, part] = (
+            _column(scale.mass) * inertial
+            + _column(scale.stiffness) * (e @ body.K)
+            + _column(scale.damping) * (ed @ body.D)
             + np.outer(force.real, shape.B.real)
             + np.outer(force.imag, shape.B.imag)
             + np.outer(moment, shape.turn)
         )
-        moment = (
-            moment
-            + (np.conj(frame.d) * force + np.conj(frame.s) * frame.a).imag
+        own = (
+            (np.conj(frame.s) * frame.a).imag
             + _inertia(body, frame, e) * frame.wd
             + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, ed)
             + np.einsum("nk,nk->n", frame.rG, edd)
         )
-        force = force + _body_force(body, frame)
+        moment = moment + (np.conj(frame.d) * force).imag + scale.mass * own
+        force = force + scale.mass * _body_force(body, frame)
         drives[:, k + 1] = moment
     drives[:, 0] = (np.exp(1j * motion.q[:, 1]) * force).real
     return rows, drives
@@ -224,6 +263,7 @@ class _BodyTangent:
         rows, columns: its place among all rows and among the kept columns.
         kept: its coordinates that have a column.
         w, wd: of its frame.
+        scale: of its constants; not of left and right.
         left: (n, q, r).
         right: (n, r, 3 S).
     """
@@ -234,8 +274,29 @@ class _BodyTangent:
     kept: np.ndarray
     w: np.ndarray
     wd: np.ndarray
+    scale: Scale
     left: np.ndarray
     right: np.ndarray
+
+    def at(self, part: slice) -> _BodyTangent:
+        """Return it at some of the instants."""
+        names = ("w", "wd", "scale", "left", "right")
+        return replace(self, **{name: getattr(self, name)[part] for name in names})
+
+    def factors(self, times: int = 1) -> tuple[PerInstant, ...]:
+        """Return what K and M, by q; D and G, by qd; M, by qdd, are multiplied by, as columns.
+
+        (k, m_q, g_q, d, g_v, m): of K and M and G by q, of D and G by qd, of M by qdd.
+
+        Args:
+            times: how often every instant is repeated.
+        """
+        w, wd = np.repeat(self.w, times)[:, None], np.repeat(self.wd, times)[:, None]
+        m, k, d = (
+            _column(np.repeat(x, times) if isinstance(x, np.ndarray) else x)
+            for x in (self.scale.mass, self.scale.stiffness, self.scale.damping)
+        )
+        return k, -m * w * w, m * wd, d, 2.0 * m * w, m
 
 
 @dataclass(frozen=True)
@@ -255,12 +316,7 @@ class Tangent:
 
     def window(self, first: int, last: int) -> Tangent:
         """Return the instants first..last - 1."""
-        part = slice(first, last)
-        cut = [
-            replace(b, w=b.w[part], wd=b.wd[part], left=b.left[part], right=b.right[part])
-            for b in self.bodies
-        ]
-        return replace(self, bodies=tuple(cut))
+        return replace(self, bodies=tuple(b.at(slice(first, last)) for b in self.bodies))
 
     def dense(self) -> np.ndarray:
         """Return the kept coordinates' rows (n, S, 3 S), columns ordered q, qd, qdd."""
@@ -269,25 +325,39 @@ class Tangent:
         for part in self.bodies:
             rows = jacobian[:, part.columns]
             rows[:] = part.left[:, part.kept] @ part.right
-            w, wd = part.w[:, None, None], part.wd[:, None, None]
+            k, m_q, g_q, d, g_v, m = (
+                x[:, None] if isinstance(x, np.ndarray) else x for x in part.factors()
+            )
             own = np.ix_(part.kept, part.kept)
             K, D, M, G = (x[own] for x in _matrices(part.body))
             columns = _columns(part.columns, size)
-            rows[:, :, columns[0]] += K - w * w * M + wd * G
-            rows[:, :, columns[1]] += D + 2.0 * w * G
-            rows[:, :, columns[2]] += M
+            rows[:, :, columns[0]] += k * K + m_q * M + g_q * G
+            rows[:, :, columns[1]] += d * D + g_v * G
+            rows[:, :, columns[2]] += m * M
         return jacobian
 
-    def times(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Return the change of all rows (n, N) by one of the kept coordinates, each (n, S)."""
-        change = np.concatenate([q, qd, qdd], axis=1)[:, :, None]
+    def times(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of W wanted rows (m, W) by one of the kept coordinates, each (m, S).
+
+        With m a multiple of the n instants, each of them stands for as many rows in turn.
+
+        Args:
+            q, qd, qdd: (m, S).
+            wanted: (W,) ascending.
+        """
+        count = len(self.bodies[0].w)
+        times = len(q) // count
+        change = np.concatenate([q, qd, qdd], axis=1).reshape(count, times, -1).swapaxes(1, 2)
         out = []
         for part in self.bodies:
-            K, D, M, G = (x[:, part.kept].T for x in _matrices(part.body))
-            w, wd = part.w[:, None], part.wd[:, None]
+            own = wanted[(wanted >= part.rows.start) & (wanted < part.rows.stop)] - part.rows.start
+            K, D, M, G = (x[np.ix_(own, part.kept)].T for x in _matrices(part.body))
+            k, m_q, g_q, d, g_v, m = part.factors(times)
             e, ed, edd = q[:, part.columns], qd[:, part.columns], qdd[:, part.columns]
-            far = (part.left @ (part.right @ change))[:, :, 0]
-            near = e @ K + ed @ D + (edd - w * w * e) @ M + (wd * e + 2.0 * w * ed) @ G
+            far = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
+            near = (k * e) @ K + (d * ed) @ D + (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
             out.append(far + near)
         return np.concatenate(out, axis=1)
 
@@ -302,10 +372,10 @@ class Tangent:
         for part in self.bodies:
             y = rows[:, part.rows]
             K, D, M, G = (y @ x[:, part.kept] for x in _matrices(part.body))
-            w, wd = part.w[:, None], part.wd[:, None]
-            by_q[:, part.columns] += K - w * w * M + wd * G
-            by_v[:, part.columns] += D + 2.0 * w * G
-            by_a[:, part.columns] += M
+            k, m_q, g_q, d, g_v, m = part.factors()
+            by_q[:, part.columns] += k * K + m_q * M + g_q * G
+            by_v[:, part.columns] += d * D + g_v * G
+            by_a[:, part.columns] += m * M
         return by_q, by_v, by_a
 
 
@@ -350,8 +420,8 @@ def linearise(
         columns = _columns(place, len(keep))
         motions.append(_next_motion(shape, frame, columns, chosen, motions[-1]))
     tip_v, _, turn_v = motions[-1]
-    force, force_v = mechanism.payload_mass * tip[0], mechanism.payload_mass * tip_v
-    moment_v = mechanism.payload_inertia * turn_v
+    force, force_v = mechanism.payload_mass * tip[0], _column(mechanism.payload_mass) * tip_v
+    moment_v = _column(mechanism.payload_inertia) * turn_v
     bodies: list[_BodyTangent] = []
     for k in reversed(range(len(shapes))):
         part, shape, frame, chosen = mechanism.slices[k], shapes[k], frames[k], kept[k]
@@ -360,16 +430,19 @@ def linearise(
         force = frame.swing * force
         force_v = frame.swing[:, None] * force_v
         force_v[:, columns[0]] += 1j * force[:, None] * shape.turn[chosen]
-        left, right = _felt(shape, frame, motions[k], rates[1], (force_v, moment_v), k > 0)
-        own = (shape.body, part, places[k], chosen, frame.w, frame.wd)
+        scale = mechanism.scale(k)
+        load = (force_v, moment_v)
+        left, right = _felt(shape, frame, motions[k], rates[1], load, scale.mass, k > 0)
+        own = (shape.body, part, places[k], chosen, frame.w, frame.wd, scale)
         bodies.insert(0, _BodyTangent(*own, left, right))
         if k == 0:
             break
         moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
         moment_v[:, columns[0]] += (np.conj(shape.B[chosen]) * force[:, None]).imag
         force_b, moment_b = _body_load(shape, frame, motions[k], columns, chosen, rates)
-        force_v, moment_v = force_v + force_b, moment_v + moment_b
-        force = force + _body_force(shape.body, frame)
+        mass = _column(scale.mass)
+        force_v, moment_v = force_v + mass * force_b, moment_v + mass * moment_b
+        force = force + scale.mass * _body_force(shape.body, frame)
     return Tangent(tuple(bodies), keep)
 
 
@@ -389,6 +462,7 @@ def _felt(
     motion: _FrameSlopes,
     ed: np.ndarray,
     load: tuple[np.ndarray, np.ndarray],
+    mass: PerInstant,
     moves: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
@@ -399,7 +473,7 @@ def _felt(
         a_v, w_v, wd_v = motion
         by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ shape.body.G)
         by += [shape.C.real, shape.C.imag, by_w, frame.rG]
-        felt += [a_v.real, a_v.imag, w_v, wd_v]
+        felt += [_column(mass) * x for x in (a_v.real, a_v.imag, w_v, wd_v)]
     left = np.empty((*ed.shape, len(by)))
     for i, column in enumerate(by):
         left[:, :, i] = column

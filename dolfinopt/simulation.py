@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from dolfinopt.body import FloatingBody
-from dolfinopt.integrators import generalized_alpha, radau
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.integrators import batch, generalized_alpha, radau
 from dolfinopt.integrators.problem import ElasticProblem, Solution
 from dolfinopt.ledger import Ledger
 from dolfinopt.mechanism import Mechanism, compliance, deviation, inverse_dynamics
@@ -65,6 +67,21 @@ class Trajectory:
         return compliance(self.mechanism.bodies, self.mechanism.slices, self.q_e)
 
     @cached_property
+    def deflections(self) -> np.ndarray:
+        """Largest outboard deflection of every arm in its own frame, over its length (arms,)."""
+        largest = []
+        for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
+            u = self.q_e[:, part] @ body.outboard[:2].T
+            largest.append(np.hypot(u[:, 0], u[:, 1]).max() / np.hypot(*body.outboard_point))
+        return np.array(largest)
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
+        parts = zip(self.mechanism.slices, self.mechanism.bodies, strict=True)
+        return np.array([np.abs(self.q_e[:, s] @ body.outboard[2]).max() for s, body in parts])
+
+    @cached_property
     def joint_forces(self) -> np.ndarray:
         """Drive forces of cart (N) and joints (N m), (n, 1 + arms).
 
@@ -111,7 +128,7 @@ def simulate(
     Raises:
         ConvergenceError: the integrator gave up; the message says what to try.
     """
-    motion, options = scene.motion, scene.simulation
+    options = scene.simulation
     problem = ElasticProblem(
         build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), breakpoints(scene)
     )
@@ -123,6 +140,73 @@ def simulate(
                 problem, options.tolerance, options.rho_inf, ledger
             )
     ledger.counts.simulations += 1
-    count = round(motion.horizon / options.sample)
-    t = np.arange(count + 1) * options.sample
-    return Trajectory(problem, scene, solution, t[t <= motion.horizon * (1 + 1e-12)])
+    return _trajectory(problem, scene, solution)
+
+
+def simulate_batch(
+    scenes: Sequence[Scene],
+    bodies: Sequence[list[FloatingBody]],
+    ledger: Ledger,
+    starts: Sequence[Solution | None] = (),
+) -> list[Trajectory | ConvergenceError]:
+    """Integrate the same design in many scenes at once, each to its `simulation.tolerance`.
+
+    Scenes may differ in payload, motion, gravity, damping and, by the factors of `body.scaled`, in
+    material; whatever else differs is simulated by itself. The common steps are those of the scene
+    that needs most, so that a trajectory depends on the other scenes within the tolerance, not on
+    their order.
+
+    Args:
+        scenes: any number of them.
+        bodies: of each, from the cart outwards.
+        ledger: counts the simulations.
+        starts: solution of a nearby design for each, or None.
+
+    Returns:
+        In the scenes' order; of one that fails its error, see `simulate`.
+    """
+    starts = [*starts, *[None] * (len(scenes) - len(starts))]
+    problems = _problems(scenes, bodies)
+    found: list[Trajectory | ConvergenceError | None] = [None] * len(scenes)
+    groups: dict[tuple[float, int], list[int]] = {}
+    for i, (scene, own) in enumerate(zip(scenes, bodies, strict=True)):
+        options = scene.simulation
+        if len(scenes) > 1 and options.integrator == "radau":
+            groups.setdefault((options.tolerance, options.stages), []).append(i)
+            continue
+        try:
+            found[i] = simulate(scene, own, ledger, starts[i])
+        except ConvergenceError as error:
+            found[i] = error
+    for (tolerance, stages), group in groups.items():
+        with ledger.phase("simulation"):
+            solutions = batch.integrate(
+                [problems[i] for i in group], tolerance, stages, ledger, [starts[i] for i in group]
+            )
+        for i, one in zip(group, solutions, strict=True):
+            if isinstance(one, ConvergenceError):
+                found[i] = one
+                continue
+            found[i] = _trajectory(problems[i], scenes[i], one)
+            ledger.counts.simulations += 1
+    return [one for one in found if one is not None]
+
+
+def _problems(
+    scenes: Sequence[Scene], bodies: Sequence[list[FloatingBody]]
+) -> list[ElasticProblem]:
+    """Return what moves in every scene; scenes of one motion share it."""
+    motions: dict[object, Callable[[np.ndarray], RigidMotion]] = {}
+    problems = []
+    for scene, own in zip(scenes, bodies, strict=True):
+        key = (scene.motion, tuple((arm.name, arm.length) for arm in scene.arms))
+        motion = motions.setdefault(key, partial(rigid_motion, scene=scene))
+        problems.append(ElasticProblem(build_mechanism(scene, own), motion, breakpoints(scene)))
+    return problems
+
+
+def _trajectory(problem: ElasticProblem, scene: Scene, solution: Solution) -> Trajectory:
+    """Return a solution with its sample instants."""
+    horizon, sample = scene.motion.horizon, scene.simulation.sample
+    t = np.arange(round(horizon / sample) + 1) * sample
+    return Trajectory(problem, scene, solution, t[t <= horizon * (1 + 1e-12)])

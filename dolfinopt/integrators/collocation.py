@@ -43,6 +43,7 @@ class Stages:
         method: collocation.
         h: (n,) steps, s.
         motion: rigid coordinates at the n s stages.
+        runs: equal parts of the steps, each a problem of its own.
     """
 
     mechanism: Mechanism
@@ -50,6 +51,12 @@ class Stages:
     method: Collocation
     h: np.ndarray
     motion: RigidMotion
+    runs: int = 1
+
+    @property
+    def length(self) -> int:
+        """Number of steps in a run."""
+        return len(self.h) // self.runs
 
     def window(self, first: int, last: int) -> Stages:
         """Return the steps first..last - 1."""
@@ -71,20 +78,37 @@ def starts(
     stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return q, qd (n + 1, N) at the beginning of every step and at the end of the last."""
-    method, h = stages.method, stages.h[:, None]
-    gain_v = h * np.einsum("j,njk->nk", method.A[-1], a)
-    qd = np.cumsum(np.concatenate([state[1][None], gain_v]), axis=0)
-    gain_q = h * qd[:-1] + h * h * np.einsum("j,njk->nk", method.A2[-1], a)
-    q = np.cumsum(np.concatenate([state[0][None], gain_q]), axis=0)
+    q, qd = _ends(stages, state, a)
+    return q[0], qd[0]
+
+
+def beginnings(
+    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (n, N) at the beginning of every step; of one run, or of each (runs, N)."""
+    q, qd = (x[:, :-1].reshape(-1, a.shape[2]) for x in _ends(stages, state, a))
     return q, qd
+
+
+def _ends(
+    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q, qd (runs, 1 + steps, N) at both ends of all steps."""
+    method, h = stages.method, stages.h[:, None]
+    shape = (stages.runs, stages.length, a.shape[2])
+    q_0, v_0 = (x.reshape(stages.runs, 1, -1) for x in state)
+    gain_v = (h * np.einsum("j,njk->nk", method.A[-1], a)).reshape(shape)
+    qd = np.cumsum(np.concatenate([v_0, gain_v], axis=1), axis=1)
+    late = h * h * np.einsum("j,njk->nk", method.A2[-1], a)
+    gain_q = stages.h.reshape(stages.runs, -1, 1) * qd[:, :-1] + late.reshape(shape)
+    return np.cumsum(np.concatenate([q_0, gain_q], axis=1), axis=1), qd
 
 
 def at_stages(
     stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return q, qd (n, s, N) at all stages."""
-    q, qd = starts(stages, state, a)
-    return stage_values(stages, q[:-1], qd[:-1], a)
+    return stage_values(stages, *beginnings(stages, state, a), a)
 
 
 def stage_values(

@@ -101,14 +101,15 @@ class Factors:
 
         Args:
             rows: (n, s, N).
-            before: (2, N) change of q, qd at the beginning of the first step.
+            before: (2, N) change of q, qd at the beginning of the first step of every run.
         """
         step, shift = np.empty_like(rows), np.empty_like(rows)
         slow = self._solve_slow(rows[:, :, self.slow], before[:, self.slow])
         step[:, :, self.slow], shift[:, :, self.slow] = slow[0], slow[1]
         if len(self.fast):
-            flat = (x.reshape(-1, len(self.slow)) for x in (slow[1], slow[2], slow[0]))
-            left = (rows + self.tangent.times(*flat).reshape(rows.shape))[:, :, self.fast]
+            a, q, qd = (x.reshape(-1, len(self.slow)) for x in slow)
+            felt = self.tangent.times(q, qd, a, self.fast)
+            left = rows[:, :, self.fast] + felt.reshape(*rows.shape[:2], -1)
             step[:, :, self.fast], shift[:, :, self.fast] = self._solve_fast(
                 left, before[:, self.fast]
             )
@@ -121,8 +122,8 @@ class Factors:
         count, s, size = rows.shape
         forced = -(self.inverse @ rows.reshape(count, s * size, 1)).reshape(rows.shape)
         y = np.empty((count, 2 * size))
-        y[0] = before.ravel()
         y[1:] = end_gain(self.stages, forced[..., None])[:-1, :, 0]
+        y[:: self.stages.length] = before.ravel()
         y = _carried(self.band, y)
         answer = self.answer.reshape(count, s * size, -1)
         step = forced + (answer @ y[:, :, None]).reshape(rows.shape)
@@ -133,8 +134,8 @@ class Factors:
         forced = -_diagonal(self.fast_inverse, rows)
         count, _, size = rows.shape
         y = np.empty((count, 2, size))
-        y[0] = before
         y[1:] = end_gain(self.stages, forced[..., None])[:-1].reshape(-1, 2, size)
+        y[:: self.stages.length] = before
         # Coordinate by coordinate, one after the other.
         y = _carried(self.fast_band, _in_turn(y))
         y = y.reshape(size, count, 2).transpose(1, 2, 0)
@@ -185,12 +186,16 @@ class Factors:
         return -_diagonal(turned, by_a + _end_slopes(self.stages, p.reshape(len(p), -1)))
 
 
-def _band(transfer: np.ndarray) -> np.ndarray:
-    """Return the matrix of y_n+1 - T_n y_n, transfer T (n, m, m), as BLAS wants its lower bands."""
+def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
+    """Return the matrix of y_n+1 - T_n y_n, transfer T (n, m, m), as BLAS wants its lower bands.
+
+    The end of a run of `length` steps is not the beginning of the next.
+    """
     count, m, _ = transfer.shape
     bands = np.zeros((count, m, 2 * m))  # of column j: rows j to j + 2 m - 1
     i, j = np.indices((m, m))
-    bands[:-1, j, m + i - j] = -transfer[:-1]
+    bands[:, j, m + i - j] = -transfer
+    bands[length - 1 :: length] = 0.0
     return bands.reshape(count * m, 2 * m).T
 
 
@@ -251,8 +256,13 @@ def factorise(
     transfer = end_gain(stages, answer) + np.eye(2 * slow_size)
     diagonal = np.arange(slow_size)
     transfer[:, diagonal, slow_size + diagonal] += stages.h[:, None]
-    held = (inverse, answer, transfer, _band(transfer))
-    return Factors(stages, tangent, slow, fast, *held, *_fast(stages, fast))
+    dense = (inverse, answer, transfer, band_of(transfer, stages.length))
+    bodies = stages.mechanism.bodies
+    k = np.concatenate([np.diag(body.K) for body in bodies])[fast]
+    d = np.concatenate([np.diag(body.D) for body in bodies])[fast]
+    m = k / stages.frequencies[fast] ** 2  # with what the arm carries
+    single = diagonal_factors(stages, k[None], d[None], m[None])
+    return Factors(stages, tangent, slow, fast, *dense, *single)
 
 
 def _blocks(stages: Stages, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -275,37 +285,36 @@ def _blocks(stages: Stages, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return block.reshape(count, s * size, -1), beginning.reshape(count, s * size, -1)
 
 
-def _fast(
-    stages: Stages, fast: np.ndarray
+def diagonal_factors(
+    stages: Stages, k: np.ndarray, d: np.ndarray, m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return inverse, loads, transfer and its band of the fast coordinates, one by one.
 
     The rows m a + d qd + k q of all stages, m + h A d + h^2 A^2 k, are diagonal in the
-    eigenvectors of A: no matrix is inverted. m = k / w^2 holds what the arm carries.
+    eigenvectors of A: no matrix is inverted.
+
+    Args:
+        stages: n steps.
+        k, d, m: (1, F), or (n, F) of every step.
     """
     method, h = stages.method, stages.h[:, None]
-    bodies = stages.mechanism.bodies
-    k = np.concatenate([np.diag(body.K) for body in bodies])[fast]
-    d = np.concatenate([np.diag(body.D) for body in bodies])[fast]
-    m = k / stages.frequencies[fast] ** 2
     values, X = np.linalg.eig(method.A)
     s, count = len(values), len(h)
     ha = h * values[:, None, None]  # (s, n, 1)
     parts = (X[:, None] * np.linalg.inv(X).T).reshape(s * s, s)
     each = 1.0 / (m + ha * (d + ha * k))
-    inverse = (parts @ each.reshape(s, -1)).real.reshape(s, s, count, len(fast))
-    loads = np.empty((2, count, s, len(fast)))
-    loads[0] = k
-    loads[1] = d + h[:, :, None] * method.c[:, None] * k
-    transfer = np.empty((count, 2, 2, len(fast)))
+    inverse = (parts @ each.reshape(s, -1)).real.reshape(s, s, count, -1)
+    loads = np.empty((2, count, s, k.shape[1]))
+    loads[0] = k[:, None]
+    loads[1] = d[:, None] + h[:, :, None] * method.c[:, None] * k[:, None]
+    transfer = np.empty((count, 2, 2, k.shape[1]))
     for i in range(2):
         answer = -_diagonal(inverse, loads[i])[..., None]
         transfer[:, :, i] = end_gain(stages, answer)[:, :, 0].reshape(count, 2, -1)
         transfer[:, i, i] += 1.0
     transfer[:, 0, 1] += h
-    chain = transfer.transpose(3, 0, 1, 2).copy()
-    chain[:, -1] = 0.0  # one coordinate's end is not the next one's beginning
-    return inverse, loads, transfer, _band(chain.reshape(-1, 2, 2))
+    chain = transfer.transpose(3, 0, 1, 2)
+    return inverse, loads, transfer, band_of(chain.reshape(-1, 2, 2), stages.length)
 
 
 def solve_once(

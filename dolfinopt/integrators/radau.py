@@ -100,7 +100,7 @@ def integrate(
             converges, or the tolerance is beyond rounding.
     """
     modes = modes_of(problem)
-    edges = _next_edges(modes.problem, start, tolerance, stages)
+    edges = next_edges(modes.problem, start, tolerance, stages)
     iterations = failures = 0
     before, rough = np.inf, start is None
     for _ in range(MAX_GRIDS):
@@ -118,7 +118,7 @@ def integrate(
             if 0.9 * before < start.error < ROUNDING:
                 break
             before = start.error
-            edges = _next_edges(modes.problem, start, tolerance, stages)
+            edges = next_edges(modes.problem, start, tolerance, stages)
         elif not rough:
             ledger.counts.newton_iterations += iterations
             return replace(start, iterations=iterations)
@@ -170,7 +170,7 @@ def _on_grid(
 # -- grids -----------------------------------------------------------------------------------
 
 
-def _next_edges(
+def next_edges(
     problem: ElasticProblem, start: Solution | None, tolerance: float, stages: int
 ) -> np.ndarray:
     """Return steps that should meet the tolerance, from the estimated error of `start`.

@@ -30,21 +30,21 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
         start: `Basis.start` of a nearby design, or None.
     """
     normal = options.coordinates - 3
-    coupling, _ = arm.restrict(arm.stiffness_times(arm.rigid))
-    interior = arm.solve(-coupling)
+    static = arm.constraint_modes()
     modes = np.empty((arm.num_interior, 0))
     if normal > 0:
         K, M = arm.interior_stiffness(), arm.interior_mass()
         _, modes = lowest_eigenpairs(arm, K, M, arm.solve_vector, normal, start)
     outboard = np.hstack([np.eye(3), np.zeros((3, normal))])
-    V = arm.expand(np.hstack([interior, modes]), outboard)
+    V = arm.expand(np.hstack([static.interior, modes]), outboard)
     MV = arm.mass_times(V)
     sign = np.ones(options.coordinates)
     sign[3:] = orient(arm, V[:, :, 3:], MV[:, :, 3:])
     # Constraint and normal modes are K-orthogonal, normal modes among themselves, too.
-    energy = arm.energy_matrix(V)
-    stiffness = np.diag(np.diag(energy))
-    stiffness[:3, :3] = energy[:3, :3]
+    stiffness = np.zeros((options.coordinates, options.coordinates))
+    stiffness[:3, :3] = static.stiffness
+    if normal > 0:
+        stiffness[3:, 3:] = np.diag(np.diag(arm.energy_matrix(V[:, :, 3:])))
     return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[3:])
 
 

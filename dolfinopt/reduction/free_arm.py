@@ -24,9 +24,9 @@ class FreeArm:
 
     def __init__(self, arm: ElasticArm):
         self.arm = arm
-        self.coupling, self.corner = arm.restrict(arm.stiffness_times(arm.rigid))
-        self.psi = arm.solve(-self.coupling)
-        self.schur_inverse = np.linalg.inv(arm.energy_matrix(arm.expand(self.psi, np.eye(3))))
+        modes = arm.constraint_modes()
+        self.coupling, self.corner, self.psi = modes.coupling, modes.corner, modes.interior
+        self.schur_inverse = np.linalg.inv(modes.stiffness)
 
     def solve(self, right: Rows) -> np.ndarray:
         """Return (T'KT)^-1 right as a nodal field (n_nodes, 2, k); no solve for zero rows."""
