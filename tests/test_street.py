@@ -66,6 +66,7 @@ STREET = (
     "random_study",
     "plots",
     "study_plots",
+    "bench",
     "claims",
     "paper",
     "report",

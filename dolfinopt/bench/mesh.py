@@ -1,0 +1,299 @@
+"""Error of one arm's discretisation against CPU seconds and degrees of freedom, by element."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.bench.common import Diagram, Plan, Row, Tell, curves, timed
+from dolfinopt.body import FloatingBody, first_frequency, floating_body
+from dolfinopt.compat import cell_coordinates, local_cell_counts
+from dolfinopt.elasticity import ElasticArm, ElementOperators, element_operators
+from dolfinopt.findings import Panel
+from dolfinopt.ledger import Ledger
+from dolfinopt.mesh import ArmMesh
+from dolfinopt.reduction import METHODS, Options
+from dolfinopt.scene import Scene
+from dolfinopt.simulation import simulate
+from dolfinopt.study import changed
+
+CELLS = (50, 3), (100, 6), (200, 12), (400, 24), (800, 48), (1600, 96)
+QUICK = (50, 3), (100, 6), (200, 12)
+# Of third degree, one order above the elements that are judged.
+REFERENCE, QUICK_REFERENCE = (800, 48), (200, 12)
+MOST_DOFS = 700_000  # of an element that is judged: more takes minutes and gigabytes
+COORDINATES = 12  # Craig-Bampton: the first frequency is then right to 1e-6 of the mesh's
+GOALS = 1e-2, 1e-3, 1e-4
+TOLERANCE, STAGES = 1e-6, 5
+
+
+def diagram() -> Diagram:
+    """Return the diagram of the finite elements."""
+    return Diagram(
+        "mesh",
+        "Finite elements: error against time and degrees of freedom",
+        (
+            "element",
+            "cells",
+            "degrees of freedom",
+            "seconds [s]",
+            "set-up [s]",
+            "error of tip compliance [-]",
+            "error of first frequency [-]",
+            "error of maximal deviation [-]",
+        ),
+        _measure,
+        _panels,
+        _notes,
+    )
+
+
+# -- elements --------------------------------------------------------------------------------
+
+
+def grid_arm(
+    length: float, height: float, cells: tuple[int, int], triangles: bool = False
+) -> ArmMesh:
+    """Mesh a rectangular arm by DOLFINx's own grid, on this rank alone.
+
+    Args:
+        length, height: m.
+        cells: along and across; each is cut into two `triangles` if asked for.
+    """
+    from dolfinx import mesh as meshes
+
+    corners = [np.array([0.0, -0.5 * height]), np.array([length, 0.5 * height])]
+    kind = meshes.CellType.triangle if triangles else meshes.CellType.quadrilateral
+    mesh = meshes.create_rectangle(MPI.COMM_SELF, corners, list(cells), kind)
+    mesh.topology.create_connectivity(1, 2)
+    count, _ = local_cell_counts(mesh)
+
+    def at(x: float) -> Any:
+        return meshes.locate_entities_boundary(mesh, 1, lambda p: np.isclose(p[0], x))
+
+    return ArmMesh(
+        name="arm",
+        comm=MPI.COMM_SELF,
+        mesh=mesh,
+        centroid=cell_coordinates(mesh, count)[:, :, :2].mean(axis=1),
+        area=np.full(count, length * height / count),
+        passive=np.zeros(count, dtype=bool),
+        inboard_facets=at(0.0),
+        outboard_facets=at(length),
+        outboard_point=np.array([length, 0.0]),
+    )
+
+
+def incompatible_operators(
+    mesh: ArmMesh, thickness: float, poisson_ratio: float
+) -> ElementOperators:
+    """Return bilinear quadrilaterals with Wilson's incompatible modes, condensed: QM6.
+
+    1 - xi^2 and 1 - eta^2 in both components let an element bend without shear; their gradients
+    are those at its centre, which keeps the patch test on any quadrilateral. Source: Taylor,
+    Beresford & Wilson (1976), doi:10.1002/nme.1620100602.
+
+    Args:
+        mesh: of quadrilaterals.
+        thickness: m.
+        poisson_ratio: of plane stress.
+    """
+    plain = element_operators(mesh, thickness, poisson_ratio)
+    corners = plain.points[plain.cells]  # tensor-product order
+    nu = poisson_ratio
+    law = np.array([[1.0, nu, 0.0], [nu, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - nu)]]) / (1.0 - nu**2)
+    centre = _jacobian(corners, 0.0, 0.0)
+    at_centre, size = np.linalg.inv(centre), np.linalg.det(centre)
+    total = np.zeros((len(corners), 12, 12))
+    gauss = 1.0 / np.sqrt(3.0)
+    for xi in (-gauss, gauss):
+        for eta in (-gauss, gauss):
+            jacobian = _jacobian(corners, xi, eta)
+            weight = np.linalg.det(jacobian)
+            nodal = _slopes(xi, eta) @ np.linalg.inv(jacobian)
+            inner = np.diag([-2.0 * xi, -2.0 * eta]) @ at_centre * (size / weight)[:, None, None]
+            B = _strains(np.concatenate([nodal, inner], axis=1))
+            total += np.abs(weight)[:, None, None] * (B.transpose(0, 2, 1) @ law @ B)
+    coupling = total[:, 8:, :8]
+    inside = coupling.transpose(0, 2, 1) @ np.linalg.solve(total[:, 8:, 8:], coupling)
+    return replace(plain, stiffness=thickness * (total[:, :8, :8] - inside))
+
+
+def _slopes(xi: float, eta: float) -> np.ndarray:
+    """Return the derivatives (4, 2) of the bilinear shape functions on [-1, 1]^2."""
+    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    a, b = signs.T
+    return 0.25 * np.stack([a * (1.0 + b * eta), b * (1.0 + a * xi)], axis=1)
+
+
+def _jacobian(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
+    """Return dX_i/dxi_k (n, 2, 2)."""
+    return np.einsum("eni,nk->eik", corners, _slopes(xi, eta))
+
+
+def _strains(gradients: np.ndarray) -> np.ndarray:
+    """Return B (n, 3, 2m): strains xx, yy, 2 xy by displacements, from gradients (n, m, 2)."""
+    count, m, _ = gradients.shape
+    B = np.zeros((count, 3, 2 * m))
+    B[:, 0, 0::2] = B[:, 2, 1::2] = gradients[:, :, 0]
+    B[:, 1, 1::2] = B[:, 2, 0::2] = gradients[:, :, 1]
+    return B
+
+
+Operators = Callable[[ArmMesh, float, float], ElementOperators]
+
+
+@dataclass(frozen=True)
+class Element:
+    """A finite element: its name, its shape, its matrices."""
+
+    name: str
+    triangles: bool
+    operators: Operators
+
+
+def _degree(degree: int) -> Operators:
+    return lambda mesh, t, nu: element_operators(mesh, t, nu, degree)
+
+
+ELEMENTS = (
+    Element("Q1", False, _degree(1)),
+    Element("QM6, incompatible modes", False, incompatible_operators),
+    Element("Q2", False, _degree(2)),
+    Element("P1 triangles", True, _degree(1)),
+    Element("P2 triangles", True, _degree(2)),
+)
+FINER = Element("Q3", False, _degree(3))
+
+
+# -- measuring -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a discretised solid arm does.
+
+    Attributes:
+        compliance: deflection of the tip by a unit force across, m/N.
+        frequency: first, clamped-free, Hz.
+        deviation: maximal, of a mechanism of such arms, m.
+        dofs: degrees of freedom.
+        seconds, setup: CPU time of a design and of what is done once a run.
+    """
+
+    compliance: float
+    frequency: float
+    deviation: float
+    dofs: int
+    seconds: float
+    setup: float
+
+
+def respond(scene: Scene, element: Element, cells: tuple[int, int], repeats: int = 1) -> Response:
+    """Discretise the scene's first arm, solid, reduce it, and move a mechanism of such arms."""
+    arm, solid = scene.arms[0], scene.material_of(0)
+
+    def set_up() -> ElasticArm:
+        mesh = grid_arm(arm.length, arm.height, cells, element.triangles)
+        operators = element.operators(mesh, arm.thickness, solid.poisson_ratio)
+        return ElasticArm(mesh, operators, Ledger())
+
+    setup, elastic = timed(set_up, 1)
+    ones = np.ones(elastic.mesh.num_cells)
+    damping = scene.damping.stiffness_proportional
+
+    def reduce() -> FloatingBody:
+        elastic.set_design(solid.young_modulus * ones, solid.density * ones)
+        basis = METHODS["craig-bampton"].reduce(elastic, Options(COORDINATES), None)
+        return floating_body(elastic, basis, damping)
+
+    seconds = np.inf
+    for _ in range(repeats + 1):  # the first one analyses the matrix for the whole run
+        elastic.set_design(0.5 * solid.young_modulus * ones, 0.5 * solid.density * ones)
+        now, body = timed(reduce, 1)
+        seconds = min(seconds, now)
+    flexibility = np.linalg.inv(elastic.constraint_modes().stiffness)
+    moved = simulate(scene, [body] * len(scene.arms), Ledger())
+    return Response(
+        float(flexibility[1, 1]),
+        first_frequency(body),
+        moved.max_deviation[0],
+        elastic.num_dofs,
+        seconds,
+        setup,
+    )
+
+
+def _measure(plan: Plan, tell: Tell) -> list[Row]:
+    scene = changed(
+        plan.scene,
+        f"simulation.tolerance={TOLERANCE}",
+        f"simulation.stages={STAGES}",
+        f"reduction.coordinates={COORDINATES}",
+    )
+    best = QUICK_REFERENCE if plan.quick else REFERENCE
+    tell("reference")
+    right = respond(scene, FINER, best)
+    rows: list[Row] = []
+    half = (best[0] // 2, best[1] // 2)
+    cases = [(one, cells) for one in ELEMENTS for cells in (QUICK if plan.quick else CELLS)]
+    for element, cells in [*cases, (FINER, half)]:
+        nodes = (4 if element.name.endswith("2") or "P2" in element.name else 1) * np.prod(cells)
+        if 2 * nodes > MOST_DOFS:
+            continue
+        tell(f"{element.name}, {cells[0]} x {cells[1]}")
+        found = respond(scene, element, cells, plan.repeats)
+        rows.append(
+            (
+                element.name if element is not FINER else "Q3 (check of the reference)",
+                f"{cells[0]} x {cells[1]}",
+                found.dofs,
+                found.seconds,
+                found.setup,
+                abs(found.compliance / right.compliance - 1.0),
+                abs(found.frequency / right.frequency - 1.0),
+                abs(found.deviation / right.deviation - 1.0),
+            )
+        )
+    return rows
+
+
+# -- presented -------------------------------------------------------------------------------
+
+
+def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
+    panels = [
+        Panel(f"error of {what}", "CPU time of a design [s]", f"error of {what} [-]",
+              curves(rows, 0, 3, column))
+        for what, column in (("tip compliance", 5), ("first frequency", 6),
+                             ("maximal deviation", 7))
+    ]  # fmt: skip
+    dofs = Panel("by degrees of freedom", "degrees of freedom [-]", "error of tip compliance [-]",
+                 curves(rows, 0, 2, 5))  # fmt: skip
+    return (*panels, dofs)
+
+
+def _notes(rows: Sequence[Row]) -> list[str]:
+    notes = [
+        "Errors against Q3 on 800 x 48 cells (200 x 12 in a quick bench), one order above the "
+        "elements that are judged; its own error shows in Q3 on half as many cells either way. "
+        "Solid arms; a clamped end is singular, which limits every order on a uniform grid.",
+        "Seconds of one design: assembly, factorisation, Craig-Bampton basis of "
+        f"{COORDINATES} coordinates, inertia integrals.",
+    ]
+    judged = [row for row in rows if not str(row[0]).startswith("Q3")]
+    for goal in GOALS:
+        met = [row for row in judged if max(float(e) for e in row[5:8]) <= goal]
+        if met:
+            best = min(met, key=lambda row: float(row[3]))
+            notes.append(
+                f"All three to {100 * goal:g} %: cheapest is {best[0]}, {best[1]} cells, "
+                f"{best[2]} degrees of freedom, {float(best[3]):.3g} s."
+            )
+        else:
+            notes.append(f"All three to {100 * goal:g} %: none of these meshes.")
+    return notes

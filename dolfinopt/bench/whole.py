@@ -1,0 +1,115 @@
+"""CPU seconds of a whole design iteration against the number of elements, by phase."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dolfinopt.bench.common import Diagram, Plan, Row, Tell, fitted_exponent
+from dolfinopt.bench.worker import Iteration
+from dolfinopt.findings import Line, Panel
+from dolfinopt.scene import Scene
+from dolfinopt.study import changed
+
+CELLS = (200, 12), (400, 24), (800, 48), (1600, 96)
+QUICK = (100, 6), (200, 12), (400, 24)
+PARTS = "bodies", "simulation", "gradient", "filter", "mma"
+LARGE = 4e4  # elements per arm up to which the exponent is fitted
+
+
+def diagram() -> Diagram:
+    """Return the diagram of whole design iterations."""
+    return Diagram(
+        "whole",
+        "A design iteration: time against elements",
+        (
+            "ranks",
+            "elements per arm",
+            "iteration [s]",
+            *(f"{part} [s]" for part in PARTS),
+            "peak memory [MB]",
+        ),
+        _measure,
+        _panels,
+        _notes,
+    )
+
+
+def _measure(plan: Plan, tell: Tell) -> list[Row]:
+    rows: list[Row] = []
+    for ranks in (1, 2):
+        if ranks > 1 and _mpirun() is None:
+            continue
+        for along, across in QUICK if plan.quick else CELLS:
+            tell(f"{along} x {across} cells, {ranks} rank{'s' if ranks > 1 else ''}")
+            iterations = 4 if plan.quick or along > 800 else 10
+            words = f"arms.cells=[{along},{across}]", f"optimizer.max_iterations={iterations}"
+            done = run_worker(changed(plan.scene, *words), ranks)
+            parts = (getattr(done, part) for part in PARTS)
+            rows.append((ranks, along * across, done.total, *parts, done.memory))
+    return rows
+
+
+def run_worker(scene: Scene, ranks: int) -> Iteration:
+    """Iterate in processes of their own, so that the peak memory is theirs."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.json"
+        path.write_text(json.dumps(scene.to_dict()), encoding="utf-8")
+        command = [sys.executable, "-m", "dolfinopt.bench.worker", str(path)]
+        if ranks > 1:
+            command = [str(_mpirun()), "-n", str(ranks), *command]
+        # os.environ is as Python found it: without what MPI added for this process alone.
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)}: {done.stderr[-2000:]}")
+    return Iteration(**json.loads(done.stdout.strip().splitlines()[-1]))
+
+
+def _mpirun() -> str | None:
+    return shutil.which("mpirun") or shutil.which("mpiexec")
+
+
+def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
+    def line(label: str, ranks: int, column: int) -> Line:
+        here = [row for row in rows if row[0] == ranks]
+        x, y = (np.array([float(row[k]) for row in here]) for k in (1, column))
+        return Line(label, x, y)
+
+    several = [int(ranks) for ranks in dict.fromkeys(row[0] for row in rows)]
+    names = {1: "1 rank", 2: "2 ranks"}
+    whole = tuple(line(names[ranks], ranks, 2) for ranks in several)
+    parts = tuple(line(part, 1, 3 + k) for k, part in enumerate(PARTS))
+    memory = tuple(line(names[ranks], ranks, 8) for ranks in several)
+    x = "elements per arm [-]"
+    return (
+        Panel("a design iteration", x, "CPU time [s]", whole),
+        Panel("its parts, 1 rank", x, "CPU time [s]", parts),
+        Panel("memory", x, "peak memory of all ranks [MB]", memory),
+    )
+
+
+def _notes(rows: Sequence[Row]) -> list[str]:
+    notes = [
+        "CPU seconds of the first rank, waiting for others included; parts are its own. Bodies: "
+        "assembly, factorisation, basis and inertia integrals.",
+    ]
+    for ranks in dict.fromkeys(row[0] for row in rows):
+        here = [(float(row[1]), float(row[2])) for row in rows if row[0] == ranks]
+        small = [point for point in here if point[0] <= LARGE]
+        notes.append(
+            f"{ranks} rank{'s' if ranks != 1 else ''}: time grows with elements to the power "
+            f"{fitted_exponent(*zip(*small, strict=True)):.2f} up to {LARGE:g} elements an arm, "
+            f"{fitted_exponent(*zip(*here, strict=True)):.2f} over all."
+        )
+    if not any(row[0] == 2 for row in rows):
+        notes.append("No mpirun or mpiexec was found: two ranks are left out.")
+    return notes

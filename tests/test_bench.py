@@ -1,0 +1,223 @@
+"""Work-precision diagrams: what they measure is right, kept, drawn and told."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_matrix
+
+from dolfinopt.bench import Plan, bench, common, diagrams
+from dolfinopt.bench import mesh as meshes
+from dolfinopt.bench import time as times
+from dolfinopt.bench.common import Diagram, curves, fitted_exponent
+from dolfinopt.bench.statics import StaticArm, dolfinx_iteration, pymoto_iteration
+from dolfinopt.elasticity import element_operators
+from dolfinopt.errors import InputError
+from dolfinopt.findings import Panel
+from dolfinopt.integrators import generalized_alpha, radau
+from dolfinopt.integrators.modes import modes_of
+from dolfinopt.integrators.problem import ElasticProblem, even_steps
+from dolfinopt.ledger import Ledger
+from dolfinopt.mechanism import inverse_dynamics
+from dolfinopt.motion import breakpoints, rigid_motion
+from dolfinopt.paper import load_paper
+from dolfinopt.simulation import build_mechanism
+from dolfinopt.study import changed
+
+pytestmark = pytest.mark.serial  # a bench runs on one rank and starts others itself
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """The paper's motion with coarse uniform arms."""
+    scene = load_paper(overrides=("arms.cells=[20,2]",))
+    arms = common.arms_of(scene)
+    x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    mechanism = build_mechanism(scene, common.bodies_of(scene, arms, x_phys))
+    return ElasticProblem(mechanism, partial(rigid_motion, scene=scene), breakpoints(scene))
+
+
+# -- elements --------------------------------------------------------------------------------
+
+
+def test_incompatible_modes_pass_the_patch_test():
+    """Skewed cells under constant strain: nodal forces are those of bilinear cells."""
+    grid = meshes.grid_arm(1.0, 0.5, (3, 2))
+    x = grid.mesh.geometry.x
+    inside = (x[:, 0] > 0.1) & (x[:, 0] < 0.9) & (np.abs(x[:, 1]) < 0.1)
+    x[inside, :2] += [0.08, -0.06]
+    plain = element_operators(grid, 0.01, 0.3)
+    better = meshes.incompatible_operators(grid, 0.01, 0.3)
+    linear = plain.points @ np.array([[0.3, -0.2], [0.7, 0.4]])
+    u = linear[plain.cells].reshape(len(plain.cells), 8, 1)
+
+    def assembled(stiffness):
+        rows = (2 * plain.cells[:, :, None] + np.arange(2)).ravel()
+        forces = (stiffness @ u).ravel()
+        size = 2 * len(plain.points)
+        return csr_matrix((forces, (rows, np.zeros_like(rows))), shape=(size, 1)).toarray()[:, 0]
+
+    free = np.abs(plain.points[:, 0] - 0.5) < 0.45
+    free &= np.abs(plain.points[:, 1]) < 0.2
+    assert free.sum() == 2  # the two that were moved
+    force, other = assembled(better.stiffness), assembled(plain.stiffness)
+    # Rounding of element matrices of size 0.01.
+    assert np.abs(force.reshape(-1, 2)[free]).max() < 1e-15
+    np.testing.assert_allclose(force, other, atol=1e-15)
+    stretched = np.linalg.eigvalsh(better.stiffness)
+    assert (stretched[:, :3] < 1e-15).all() and (stretched[:, 3] > 1e-5).all()
+
+
+def test_elements_that_do_not_lock():
+    """A slender solid arm of few cells against beam theory: E I and Cowper's shear."""
+    scene = changed(load_paper(), "simulation.tolerance=1e-2")
+    E, nu, h, t = 70e9, 0.33, 0.06, 0.01
+    shear = (12 + 11 * nu) / (10 * (1 + nu)) * 2 * (1 + nu) / (E * h * t)
+    # The rigid end leaves no shear at a free one, but its moment is free: a cantilever.
+    right = 1.0 / (3 * E * t * h**3 / 12) + shear
+    error = {
+        e.name: meshes.respond(scene, e, (50, 3)).compliance / right - 1.0 for e in meshes.ELEMENTS
+    }
+    # A clamped end does not let the section warp: 0.1 % of the compliance.
+    assert all(abs(error[n]) < 3e-3 for n in ("QM6, incompatible modes", "Q2", "P2 triangles"))
+    assert error["Q1"] < -0.03 and error["P1 triangles"] < -0.2  # they lock
+
+
+# -- motion ----------------------------------------------------------------------------------
+
+
+def test_accelerations_solve_the_rows(problem):
+    size = problem.mechanism.coordinates
+    rng = np.random.default_rng(1)
+    q, qd = 1e-3 * rng.normal(size=size), 1e-2 * rng.normal(size=size)
+    qdd = times.accelerations(problem, 0.7, q, qd)
+    motion = problem.motion(np.array([0.7]))
+    rows = inverse_dynamics(problem.mechanism, motion, q[None], qd[None], qdd[None])[0]
+    at_rest = inverse_dynamics(problem.mechanism, motion, q[None], qd[None], 0 * qdd[None])[0]
+    assert np.abs(rows).max() < 1e-11 * np.abs(at_rest).max()
+
+
+def test_jacobian_is_the_slope_of_accelerations(problem):
+    problem = modes_of(problem).problem
+    size = problem.mechanism.coordinates
+    rng = np.random.default_rng(2)
+    y, d = 1e-3 * rng.normal(size=2 * size), rng.normal(size=2 * size)
+    exact = times.jacobian(problem, 0.7, y) @ d
+
+    def rate(step):
+        q, qd = np.split(y + step * d, 2)
+        return np.concatenate([qd, times.accelerations(problem, 0.7, q, qd)])
+
+    central = (rate(1e-5) - rate(-1e-5)) / 2e-5
+    np.testing.assert_allclose(central, exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
+
+
+def test_scipy_and_radau_agree(problem):
+    """Two independent paths through the same rows; the errors fall with the tolerance."""
+    judge = times.judge(problem, 1e-7)
+    modes = modes_of(problem)
+    found = times.scipy_motion(modes.problem, "Radau", 1e-4, judge.t, (0.1, 10.0))
+    assert max(judge.errors(modes.from_modes(found))) < 3e-2
+    ours = [
+        radau.integrate(problem, tolerance, 3, Ledger()).sample(judge.t)
+        for tolerance in (1e-3, 1e-5)
+    ]
+    errors = [judge.errors(q)[0] for q in ours]
+    assert errors[0] < 1e-3 and errors[1] < 1e-5  # the tolerances
+
+
+def test_newmark_is_of_second_order(problem):
+    judge = times.judge(problem, 1e-7)
+    errors = [
+        judge.errors(
+            generalized_alpha.on_grid(problem, even_steps(problem, n), 1e-8, 1.0).sample(judge.t)
+        )[0]
+        for n in (750, 1500)
+    ]
+    assert fitted_exponent([750, 1500], errors) == pytest.approx(-2.0, abs=0.4)
+
+
+def test_fastest_interpolates():
+    rows = [("d", 4, "Radau, 3 stages", "", s, e, e) for s, e in ((1.0, 1e-3), (100.0, 1e-5))]
+    assert times.fastest(rows, "Radau")[1] == pytest.approx(10.0)
+    assert times.fastest(rows, "SciPy") is None
+
+
+# -- peers -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [dolfinx_iteration, pymoto_iteration])
+def test_static_iterations(make):
+    """Compliance of a slender uniform arm by beam theory; its slope by differences."""
+    iterate = make(StaticArm(1.0, 0.06, 0.01, (100, 12), 70e9, 0.33))
+    if iterate is None:
+        pytest.skip("not installed")
+    x = np.full(1200, 0.5)
+    compliance, slope = iterate(x)
+    # Q1 cells twice as long as high are up to 3 % too stiff; the floor adds 1e-5.
+    beam = 1.0 / (3 * 70e9 * 0.5**3 * 0.01 * 0.06**3 / 12)
+    assert compliance == pytest.approx(beam, rel=0.04)
+    d = np.random.default_rng(3).normal(size=1200)
+    central = (iterate(x + 1e-4 * d)[0] - iterate(x - 1e-4 * d)[0]) / 2e-4
+    assert slope @ d == pytest.approx(central, rel=1e-4)
+
+
+# -- the bench -------------------------------------------------------------------------------
+
+
+def _toy(measure):
+    return Diagram(
+        "toy",
+        "A toy",
+        ("method", "seconds [s]", "error [-]"),
+        measure,
+        lambda rows: (Panel("toy", "time [s]", "error [-]", curves(rows, 0, 1, 2)),),
+        lambda rows: [f"{len(rows)} points"],
+    )
+
+
+def test_bench_writes_and_goes_on(tmp_path):
+    """An ended bench does not measure again what it has, unless the plan differs."""
+    calls = []
+
+    def measure(plan, tell):
+        tell("now")
+        calls.append(plan.quick)
+        return [("a", np.float64(1.0), 1e-2), ("a", 10.0, 1e-4), ("b", 1.0, float("nan"))]
+
+    scene, told = load_paper(), []
+    for quick in (True, True, False):
+        bench(Plan(scene, quick), tmp_path, told.append, (_toy(measure),))
+    assert calls == [True, False] and told == ["toy: now"] * 2
+    assert {p.name for p in tmp_path.iterdir()} == {"toy.json", "toy.csv", "toy.png", "bench.md"}
+    assert (tmp_path / "toy.csv").read_text().splitlines()[1] == "a,1,0.01"
+    text = (tmp_path / "bench.md").read_text()
+    assert "- 3 points" in text and "toy.png" in text
+
+
+def test_cut_off_file_is_measured_anew(tmp_path):
+    (tmp_path / "toy.json").write_text('{"stamp": [')
+    bench(Plan(load_paper(), True), tmp_path, print, (_toy(lambda *_: [("a", 1.0, 1.0)]),))
+    assert "a,1,1" in (tmp_path / "toy.csv").read_text()
+
+
+def test_curves_leave_out_what_a_logarithm_cannot_show():
+    lines = curves([("a", 1.0, 2.0), ("a", 2.0, 0.0), ("b", 1.0, float("nan"))], 0, 1, 2)
+    assert [(one.label, list(one.y)) for one in lines] == [("a", [2.0])]
+
+
+def test_every_diagram_labels_its_axes_with_units():
+    assert [one.name for one in diagrams()] == ["time", "peers", "whole", "mesh", "reduction"]
+    for one in diagrams():
+        for panel in one.panels([(1,) * len(one.columns)]):
+            assert panel.x_label.endswith("]") and panel.y_label.endswith("]")
+
+
+def test_bench_refuses_ranks():
+    from dolfinopt.cli import commands
+
+    class Two:
+        size, rank = 2, 0
+
+    with pytest.raises(InputError, match="without mpirun"):
+        commands.main(["bench"], standalone_mode=False, obj=Two())
