@@ -260,10 +260,10 @@ def test_scenarios_are_left_out(folder, given):
 def test_failures_end_with_status_1(folder, given, monkeypatch):
     from dolfinopt import sampling
 
-    def failing(*_):
-        raise ConvergenceError("no luck")
+    def failing(scenes, *_):
+        return [ConvergenceError("no luck")] * len(scenes)
 
-    monkeypatch.setattr(sampling, "simulate", failing)
+    monkeypatch.setattr(sampling, "simulate_batch", failing)
     with pytest.raises(ConvergenceError, match=r"solid, sample 0 \(\): no luck \(and 10 more\)"):
         run(SCENE, "--random", MASS, "--samples", 10, "--designs", given, *SETTINGS,
             "--out", folder / "f")  # fmt: skip

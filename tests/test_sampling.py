@@ -157,18 +157,19 @@ def _full(folder):
 
 @pytest.mark.serial
 def test_failures_are_told_and_tried_again(tmp_path, monkeypatch):
-    honest = sampling.simulate
+    honest = sampling.simulate_batch
 
-    def failing(scene, *others):
-        if scene.payload.mass > 6.25:
-            raise ConvergenceError("too heavy")
-        return honest(scene, *others)
+    def failing(scenes, *others):
+        return [
+            ConvergenceError("too heavy") if scene.payload.mass > 6.25 else one
+            for scene, one in zip(scenes, honest(scenes, *others), strict=True)
+        ]
 
     samples = payloads(CHUNK - 1)
     heavy = np.flatnonzero(samples.values[:, 0] > 6.25) + 1
     assert 0 < len(heavy) < CHUNK - 1
     with monkeypatch.context() as patch:
-        patch.setattr(sampling, "simulate", failing)
+        patch.setattr(sampling, "simulate_batch", failing)
         [found], _ = respond(samples, INITIAL, tmp_path, SELF, shown=False)
     assert list(found.failures) == list(heavy)
     assert set(found.failures.values()) == {"too heavy"}
