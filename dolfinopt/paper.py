@@ -58,8 +58,8 @@ SHOWN = (
 METHODS = (CRAIG_BAMPTON, MODAL)
 OPTIMISED = (4, 48)  # coordinates
 SWEPT = (4, 6, 8, 12, 16, 24, 48, 100)
-PAYLOADS, MASSES = (4.0, 6.0, 8.0), tuple(np.linspace(4.0, 8.0, 9).tolist())
-PATHS, FLATTENINGS = (0.0, 0.25, 0.5, 0.75, 1.0), tuple(np.linspace(0.0, 1.0, 9).tolist())
+PAYLOADS, MASSES = (4.0, 6.0, 8.0), tuple(4.0 + 0.5 * k for k in range(9))
+PATHS, FLATTENINGS = (0.0, 0.25, 0.5, 0.75, 1.0), tuple(0.125 * k for k in range(9))
 INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
 SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")

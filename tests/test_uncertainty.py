@@ -271,7 +271,8 @@ def test_saltelli_on_ishigami(sampler):
 def test_saltelli_intervals_are_repeatable():
     points = draw([ANGLE] * 3, saltelli_points(256, 3, "sobol", 1))
     values = ishigami(points)
-    assert saltelli_indices(values, 3, 5) == saltelli_indices(values, 3, 5)
+    again = saltelli_indices(values, 3, 5)
+    assert repr(saltelli_indices(values, 3, 5)) == repr(again)  # one of its numbers is nan
     # A mean far from zero does not spoil the estimates.
     for one, other in zip(
         saltelli_indices(values, 3, 5).first, saltelli_indices(values + 1e6, 3, 5).first
