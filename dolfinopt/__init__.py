@@ -24,6 +24,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm, build_arms
+    from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.evaluation import Evaluation, evaluate, gradient
     from dolfinopt.files import gather_views
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Arm": "arm",
     "build_arms": "arm",
+    "choose_coordinates": "coordinates",
     "ConvergenceError": "errors",
     "InputError": "errors",
     "Evaluation": "evaluation",

@@ -52,6 +52,7 @@ class Arm:
         mesh: see `ArmMesh`.
         elastic: stiffness and mass of the current design.
         solid: the arm's solid material.
+        coordinates: number q that `reduce` keeps; None until `take`, where the scene says "auto".
         basis: of the current design; None before `reduce`.
         start: (owned rows, k) eigenvectors from which the next `reduce` sets out, or None.
         loaded_starts: the same for every `loaded_modes`, by the place in the chain.
@@ -71,9 +72,11 @@ class Arm:
             operators = element_operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
             self.elastic = ElasticArm(self.mesh, operators, ledger)
             self.filter = HelmholtzFilter(self.mesh, scene.design.filter_radius)
-        if scene.reduction.coordinates > self.elastic.num_dofs:  # of a mesh file known only now
+        self.coordinates = scene.reduction.count or None
+        # Of a mesh file known only now.
+        if self.coordinates is not None and self.coordinates > self.elastic.num_dofs:
             raise InputError(
-                f"{scene.source}: reduction.coordinates = {scene.reduction.coordinates}: expected "
+                f"{scene.source}: reduction.coordinates = {self.coordinates}: expected "
                 f"at most {self.elastic.num_dofs}, the degrees of freedom of arm {arm.name!r}"
             )
         self.ledger = ledger
@@ -180,6 +183,12 @@ class Arm:
             self._body = floating_body(self.elastic, self.basis, damping)
         return self._body
 
+    def take(self, coordinates: int) -> None:
+        """Reduce to so many coordinates from now on."""
+        if coordinates != self.coordinates:
+            self.basis = self._body = self.start = None
+        self.coordinates = coordinates
+
     def under(self, scene: scenes.Scene) -> Arm:
         """Return this arm in a scene that differs in what it does, not in what it is.
 
@@ -197,6 +206,8 @@ class Arm:
         same_basis = old.reduction == new.reduction and (
             old.damping == new.damping or new.reduction.method != "balanced"
         )
+        if old.reduction != new.reduction:
+            other.coordinates = scene.reduction.count or None
         if not same_basis or self.basis is None:
             other.basis = other._body = other.start = None
         elif old.damping != new.damping:
@@ -235,10 +246,23 @@ class Arm:
 
     @property
     def reduction_options(self) -> Options:
-        """What the scene tells the reduction method."""
+        """What the reduction method is told.
+
+        Raises:
+            InputError: the number of coordinates is "auto", and nobody has chosen one.
+        """
+        if self.coordinates is None:
+            raise InputError(
+                f'{self.scene.source}: reduction.coordinates = "auto": expected a number here, or '
+                "choose_coordinates() before the first evaluation"
+            )
+        return self.options(self.coordinates)
+
+    def options(self, coordinates: int) -> Options:
+        """Return what the scene tells the reduction method, with so many coordinates."""
         options = self.scene.reduction
         damping = self.scene.damping.stiffness_proportional
-        return Options(options.coordinates, options.shifts, options.band, damping)
+        return Options(coordinates, options.shifts, options.band, damping)
 
     @property
     def material(self) -> Interpolated:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.coordinates import Choice
 from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
 from dolfinopt.integrators.problem import Solution
@@ -41,6 +42,7 @@ class Memory:
         finished: reason, or "" while running.
         sharpness: the projection's beta.
         thresholds: per arm its eta.
+        choice: of the coordinates, where the scene leaves it to "auto".
     """
 
     iteration: int
@@ -53,6 +55,7 @@ class Memory:
     finished: str
     sharpness: float
     thresholds: Mapping[int, float]
+    choice: Choice | None = None
 
 
 def _scene_text(scene: Scene) -> str:
@@ -89,6 +92,9 @@ def save(
         "finished": np.array(memory.finished),
         "sharpness": memory.sharpness,
     }
+    if memory.choice is not None:
+        arrays["coordinates"] = memory.choice.coordinates
+        arrays["tried"] = np.array(memory.choice.tried)
     for k, solution in enumerate(memory.solutions):
         for field in (*SOLUTION, "error"):
             arrays[f"solution{k}/{field}"] = getattr(solution, field)
@@ -132,6 +138,11 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
         parts = {field: arrays[f"{of}/{field}"] for field in SOLUTION}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
     history = [HistoryRow(int(row[0]), *map(float, row[1:])) for row in arrays["history"]]
+    choice = None
+    if "coordinates" in arrays:
+        tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
+        count = int(arrays["coordinates"])
+        choice = Choice(count, dict(tried)[count], tried)
     return Memory(
         iteration=int(arrays["iteration"]),
         cells=cells,
@@ -143,6 +154,7 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
         finished=str(arrays["finished"]),
         sharpness=float(arrays["sharpness"]),
         thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in arms},
+        choice=choice,
     )
 
 

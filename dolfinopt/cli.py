@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arm import Arm
+    from dolfinopt.coordinates import Choice
     from dolfinopt.files import ArmView, HistoryRow
     from dolfinopt.optimization import Result
     from dolfinopt.parallel import ArmShare
@@ -146,6 +147,7 @@ def simulate(
     plots: bool,
 ) -> None:
     """Simulate SCENE with a given design and report compliance and deviation."""
+    from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.evaluation import evaluate
     from dolfinopt.ledger import Ledger
     from dolfinopt.results import Simulated, write_simulation
@@ -155,8 +157,9 @@ def simulate(
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, folder)
+    choice = choose_coordinates(loaded, share, arms, x_phys, ledger)
     evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
-    simulated = Simulated(loaded, share, arms, x_phys, evaluation, trajectory, ledger)
+    simulated = Simulated(loaded, share, arms, x_phys, evaluation, trajectory, ledger, choice)
     written = write_simulation(folder, simulated, time.perf_counter() - BEGUN)
     if written is None or trajectory is None:
         return
@@ -185,6 +188,7 @@ def gradient(
     overrides: tuple[str, ...],
 ) -> None:
     """Write the objective's gradient with respect to the physical densities to FILE."""
+    from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.evaluation import evaluate
     from dolfinopt.evaluation import gradient as slopes
     from dolfinopt.files import write_gradient
@@ -199,6 +203,8 @@ def gradient(
     ledger = Ledger()
     share, arms, x_phys = _design(world, loaded, design, ledger)
     _prepare(world, out.parent)
+    if loaded.objective.simulated:
+        _tell(world, choose_coordinates(loaded, share, arms, x_phys, ledger))
     evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger, simulated=False)
     by_cell = slopes(loaded, share, arms, trajectory, ledger)
     write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
@@ -229,6 +235,7 @@ def export(
     world: MPI.Comm, scene: Path, design: Path | None, out: Path, overrides: tuple[str, ...]
 ) -> None:
     """Write the reduced arms of SCENE for other multibody codes: SID, .npz of it, MBDyn's .fem."""
+    from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.files import write_arrays, write_text
     from dolfinopt.ledger import Ledger
     from dolfinopt.mbdyn import fem_text
@@ -238,6 +245,7 @@ def export(
     loaded = _load(world, scene, overrides)
     share, arms, x_phys = _design(world, loaded, design, Ledger())
     _prepare(world, out)
+    _tell(world, choose_coordinates(loaded, share, arms, x_phys, Ledger()))
     exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(share, exported)
     if world.rank != 0:
@@ -432,7 +440,7 @@ def reproduce(
 
 @commands.command()
 @out_option("diagrams and bench.md; default: results/bench")
-@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
+@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: about two minutes")
 @click.pass_obj
 def bench(world: MPI.Comm, out: Path | None, quick: bool) -> None:
     """Measure run time against error: integrators, meshes, reductions, iterations, other programs.
@@ -441,15 +449,19 @@ def bench(world: MPI.Comm, out: Path | None, quick: bool) -> None:
     """
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    from dolfinopt.bench import QUICKLY, Plan
+    from dolfinopt.bench import QUICKLY, Plan, diagrams
     from dolfinopt.bench import bench as run
+    from dolfinopt.bench.progress import live_diagrams
     from dolfinopt.paper import load_paper
 
+    begun = time.perf_counter()
     folder = out or Path("results") / "bench"
     _prepare(world, folder)
     scene = load_paper(False, QUICKLY if quick else ())
-    summary = run(Plan(scene, quick), folder, lambda text: click.echo(text, err=True))
-    click.echo(f"diagrams in {folder}, summary in {summary}")
+    with live_diagrams(len(diagrams())) as (tell, done):
+        summary = run(Plan(scene, quick), folder, tell, done=done)
+    seconds = time.perf_counter() - begun
+    click.echo(f"diagrams in {folder}, summary in {summary}; {seconds:.0f} s")
 
 
 @commands.command()
@@ -536,9 +548,14 @@ def _prepare(world: MPI.Comm, folder: Path) -> None:
 
 
 def _scene_of(folder: Path) -> Scene:
+    """Return the scene of a run, with the coordinates that "auto" came to."""
     path = folder / "summary.json"
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))["scene"]
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        data = summary["scene"]
+        if data["reduction"]["coordinates"] == "auto":
+            data["reduction"]["coordinates"] = summary["reduction"]["coordinates"]
+            del data["reduction"]["tolerance"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}); name the folder of a finished "
@@ -612,6 +629,9 @@ def _conclude(summary: Mapping[str, Any], folder: Path) -> None:
     """Print the run's warnings, and its figures in one line."""
     for warning in summary["warnings"]:
         click.echo(f"dolfinopt: warning: {warning}", err=True)
+    found = summary["reduction"]
+    if found["error_estimate"] is not None:
+        click.echo(_chosen(found["coordinates"], found["error_estimate"]))
     click.echo(
         f"{summary['name']}: {summary['iterations']} iterations ({summary['stop_reason']}), "
         f"compliance {summary['compliance']:.4g} N m, "
@@ -619,6 +639,18 @@ def _conclude(summary: Mapping[str, Any], folder: Path) -> None:
         f"at {summary['max_deviation_time']:.3f} s, "
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
+    )
+
+
+def _tell(world: MPI.Comm, choice: Choice | None) -> None:
+    if choice is not None and world.rank == 0:
+        click.echo(_chosen(choice.coordinates, choice.error))
+
+
+def _chosen(coordinates: int, error: float) -> str:
+    return (
+        f'reduction.coordinates = "auto": {coordinates} coordinates an arm, estimated error '
+        f"{error:.2g}"
     )
 
 

@@ -506,6 +506,7 @@ class ElasticArm:
 
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
+        self.ledger.counts.energy_fields += left.shape[2]
         return _cell_products(self.operators.stiffness, self._on_cells(left), self._on_cells(right))
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -513,6 +514,7 @@ class ElasticArm:
 
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
+        self.ledger.counts.energy_fields += left.shape[2]
         cells, mass = self.operators.cells, self.operators.mass
         shape = (*cells.shape, -1)  # both components and all columns alike
         return _cell_products(mass, left[cells].reshape(shape), right[cells].reshape(shape))

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Cells = Mapping[int, np.ndarray]
+NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
 
 @dataclass(frozen=True)
@@ -125,11 +126,58 @@ def evaluate(
     """
     for index, arm in arms.items():
         arm.set_design(x_phys[index])
-    kind = scene.objective.kind
     motion, trajectory = Motion(), None
     if simulated or scene.objective.simulated:
-        motion, trajectory = _moved(scene, share, arms, x_phys, ledger, start)
-    value = motion.objective
+        owned = _reduced(share, arms, x_phys)
+        [(moved, trajectory)] = _moved([scene], share, owned, ledger, [start])
+        if isinstance(moved, ConvergenceError):
+            raise moved
+        motion = moved
+    return _judged(scene, share, arms, motion), trajectory
+
+
+def evaluate_batch(
+    scenes: Sequence[Scene],
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x_phys: Cells,
+    ledger: Ledger,
+) -> list[tuple[Evaluation, Trajectory | None] | ConvergenceError]:
+    """Evaluate one design in many scenes, whose motions are simulated in one batch (collective).
+
+    Args:
+        scenes: of one reduction, in which the arms are the same, see `Arm.under`; or, if nothing
+            but their motion is asked for, scaled, see `scenarios.factors`.
+        share: which ranks do which arm.
+        arms: this rank's, in the first scene.
+        x_phys: their physical densities (n_cells,).
+        ledger: of this rank.
+
+    Returns:
+        What `evaluate` does of every scene, or the error that it would raise.
+    """
+    try:
+        owned = _reduced(share, arms, x_phys)
+    except ConvergenceError as error:
+        return [error] * len(scenes)
+    found: list[tuple[Evaluation, Trajectory | None] | ConvergenceError] = []
+    moved = _moved(scenes, share, owned, ledger, [()] * len(scenes))
+    for scene, (motion, trajectory) in zip(scenes, moved, strict=True):
+        try:
+            if isinstance(motion, ConvergenceError):
+                raise motion
+            under = arms
+            if not scene.objective.simulated or any(vars(scene.constraints).values()):
+                under = {k: arm.under(scene) for k, arm in arms.items()}
+            found.append((_judged(scene, share, under, motion), trajectory))
+        except ConvergenceError as error:
+            found.append(error)
+    return found
+
+
+def _judged(scene: Scene, share: ArmShare, arms: Mapping[int, Arm], motion: Motion) -> Evaluation:
+    """Add what the scene asks for beside the motion (collective)."""
+    kind, value = scene.objective.kind, motion.objective
     if kind == "static":
         value = _static_compliance(scene, share, arms)
     constraints: list[float] = []
@@ -143,12 +191,11 @@ def evaluate(
     if scene.constraints.tip_deflection is not None:
         tips = _deflections(scene, share, arms)
         constraints += list(tips / scene.constraints.tip_deflection - 1.0)
-    evaluation = Evaluation(
+    return Evaluation(
         **vars(replace(motion, objective=value)),
         constraints=tuple(map(float, constraints)),
         loaded_frequencies=frequencies,
     )
-    return evaluation, trajectory
 
 
 def gradient(
@@ -173,6 +220,7 @@ def gradient(
 
     def slopes() -> dict[int, BodySlopes]:
         assert trajectory is not None
+        ledger.counts.adjoints += max(1, len(trajectory.scenarios))
         with ledger.phase("adjoint"):
             return _by_owner(scene, _body_slopes(trajectory))
 
@@ -217,46 +265,78 @@ def constraint_gradients(
 # -- the motion ------------------------------------------------------------------------------
 
 
+def _reduced(share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells) -> Mapping[int, FloatingBody]:
+    """Return the bodies of the arms with a design of their own, on the root (collective)."""
+    return gather_arms(share, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
+
+
 def _moved(
-    scene: Scene,
+    scenes: Sequence[Scene],
     share: ArmShare,
-    arms: Mapping[int, Arm],
-    x_phys: Cells,
+    owned: Mapping[int, FloatingBody],
     ledger: Ledger,
-    start: Sequence[Solution],
-) -> tuple[Motion, Trajectory | None]:
-    """Reduce and simulate."""
-    mine = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
-    owned = gather_arms(share, mine)
-    kept: list[Trajectory] = []
+    starts: Sequence[Sequence[Solution]],
+) -> list[tuple[Motion | ConvergenceError, Trajectory | None]]:
+    """Simulate the scenes and their scenarios in one batch (collective).
 
-    def run() -> Motion:
-        trajectory = _simulate(scene, owned, ledger, start)
-        kept.append(trajectory)
+    Args:
+        scenes: the bodies are those of the first one.
+        share, owned, ledger: as elsewhere.
+        starts: of every scene, see `evaluate`.
+
+    Returns:
+        What became of every scene, on all ranks, and on the root its trajectory.
+    """
+    kept: list[Trajectory | ConvergenceError] = []
+
+    def run() -> list[Motion | ConvergenceError]:
+        kept.extend(_simulate(scenes, owned, ledger, starts))
         with ledger.phase("objective"):
-            motion = _figures(trajectory)
-            if not trajectory.scenarios:
-                return motion
-            others = tuple(_figures(one) for one in trajectory.scenarios)
-            value, _ = combined(scene, [one.objective for one in others])
-            return replace(motion, objective=value, scenarios=others)
+            return [one if isinstance(one, ConvergenceError) else _motion(one) for one in kept]
 
-    motion = on_root(share.world, run)
-    return motion, kept[0] if kept else None
+    motions = on_root(share.world, run)
+    trajectories = [one if isinstance(one, Trajectory) else None for one in kept]
+    return list(zip(motions, trajectories or [None] * len(motions), strict=True))
 
 
 def _simulate(
-    scene: Scene, owned: Mapping[int, FloatingBody], ledger: Ledger, start: Sequence[Solution]
-) -> Trajectory:
-    """Simulate the scene, and all its scenarios."""
-    scenes = pose_scenarios(scene)
-    bodies = [chain_of(scene, owned), *(bodies_in(scene, other, owned) for other in scenes)]
-    found = simulate_batch([scene, *scenes], bodies, ledger, start)
-    for one in found:
-        if isinstance(one, ConvergenceError):
-            raise one
-    own, *others = (one for one in found if isinstance(one, Trajectory))
-    return replace(own, scenarios=tuple(others))
+    scenes: Sequence[Scene],
+    owned: Mapping[int, FloatingBody],
+    ledger: Ledger,
+    starts: Sequence[Sequence[Solution]],
+) -> list[Trajectory | ConvergenceError]:
+    """Simulate scenes, with all their scenarios."""
+    posed: list[Scene] = []
+    begun: list[Solution | None] = []
+    sizes = []
+    for scene, start in zip(scenes, starts, strict=True):
+        group = [scene, *pose_scenarios(scene)]
+        posed += group
+        begun += [*start, *[None] * (len(group) - len(start))]
+        sizes.append(len(group))
+    nominal = chain_of(scenes[0], owned)
+    bodies = [nominal, *(bodies_in(scenes[0], other, owned) for other in posed[1:])]
+    every = simulate_batch(posed, bodies, ledger, begun)
+    found: list[Trajectory | ConvergenceError] = []
+    for size in sizes:
+        parts, every = every[:size], every[size:]
+        failed = [one for one in parts if isinstance(one, ConvergenceError)]
+        if failed:
+            found.append(failed[0])
+            continue
+        own, *rest = (one for one in parts if isinstance(one, Trajectory))
+        found.append(replace(own, scenarios=tuple(rest)))
+    return found
+
+
+def _motion(trajectory: Trajectory) -> Motion:
+    """Return what the motion does, of all scenarios together where there are any."""
+    motion = _figures(trajectory)
+    if not trajectory.scenarios:
+        return motion
+    others = tuple(_figures(one) for one in trajectory.scenarios)
+    value, _ = combined(trajectory.scene, [one.objective for one in others])
+    return replace(motion, objective=value, scenarios=others)
 
 
 def _figures(trajectory: Trajectory) -> Motion:
@@ -434,7 +514,12 @@ def _period_rows(
     for place, matrix in by_carried.items():
         zero = [np.zeros((3, 3))] * len(scene.arms)
         by_body = _by_owner(scene, chain.body_slopes([*zero[:place], matrix, *zero[place + 1 :]]))
-        row = {k: rigid_gradient(arm, by_body[k]) for k, arm in arms.items()}
+        row = {
+            k: np.zeros(arm.mesh.num_cells)  # it is not outboard of this place
+            if by_body[k] == NOTHING
+            else rigid_gradient(arm, by_body[k])
+            for k, arm in arms.items()
+        }
         owner = scene.owners[place]
         if owner in row:
             row[owner] = row[owner] + slopes[place].cells

@@ -10,14 +10,28 @@ from dataclasses import dataclass, field, fields
 
 @dataclass
 class Counts:
-    """How often the costly steps ran, over all arms."""
+    """How often the costly steps ran, over all arms.
+
+    Attributes:
+        assemblies: of a stiffness or a mass matrix.
+        factorisations, solves: of and with the stiffness of an arm's interior.
+        eigenproblems: of an arm.
+        reductions: of an arm to a basis.
+        simulations: of a motion.
+        newton_iterations: of the simulations.
+        adjoints: backward integrations of a motion.
+        energy_fields: whose energy was taken cell by cell, for gradients.
+    """
 
     assemblies: int = 0
     factorisations: int = 0
     solves: int = 0
     eigenproblems: int = 0
+    reductions: int = 0
     simulations: int = 0
     newton_iterations: int = 0
+    adjoints: int = 0
+    energy_fields: int = 0
 
     def __add__(self, other: Counts) -> Counts:
         return Counts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))

@@ -32,15 +32,9 @@ from dolfinopt.claims import (
 )
 from dolfinopt.data import paper_scene
 from dolfinopt.findings import Cell, Figure, Line, LineFigure, MatrixFigure, Panel, Table
+from dolfinopt.plans import design_figure, deviation_panels
 from dolfinopt.scene import Scene, load_scene
-from dolfinopt.study import (
-    OBJECTIVES,
-    changed,
-    design_figure,
-    deviation_panels,
-    reduced,
-    reference_scene,
-)
+from dolfinopt.variants import OBJECTIVES, changed, reduced, reference_scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -371,7 +365,7 @@ def _reduced(plan: Plan, outcomes: Outcomes, case: Case) -> Reduced:
     best = finest if finest in outcomes.by_case else plan.reductions[0]
     return Reduced(
         case.scene.reduction.method,
-        case.scene.reduction.coordinates,
+        case.scene.reduction.count,
         own.compliance,
         again.compliance,
         again.max_deviation,
@@ -397,7 +391,7 @@ def _resolved(
     return Resolved(
         label,
         method,
-        tuple(o.case.scene.reduction.coordinates for o in found),
+        tuple(o.case.scene.reduction.count for o in found),
         tuple(o.compliance for o in found),
         tuple(o.max_deviation for o in found),
         tuple(_distance(o, finest) for o in found),

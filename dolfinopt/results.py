@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.coordinates import Choice
 from dolfinopt.evaluation import Evaluation
 from dolfinopt.files import (
     ArmView,
@@ -34,7 +35,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Simulated:
-    """One design in one scene, simulated; the trajectory is the root's, None elsewhere."""
+    """One design in one scene, simulated; the trajectory is the root's, None elsewhere.
+
+    `choice` is what `reduction.coordinates = "auto"` came to.
+    """
 
     scene: Scene
     share: ArmShare
@@ -43,6 +47,7 @@ class Simulated:
     evaluation: Evaluation
     trajectory: Trajectory | None
     ledger: Ledger
+    choice: Choice | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,9 @@ def write_simulation(
     """
     s = simulated
     views = gather_views(s.scene, s.share, s.arms, s.x_phys)
-    summary = summarise(s.scene, s.share, s.arms, s.x_phys, s.evaluation, s.ledger, wall=wall)
+    summary = summarise(
+        s.scene, s.share, s.arms, s.x_phys, s.evaluation, s.ledger, wall=wall, choice=s.choice
+    )
     return _write(folder, views, s.trajectory, None, summary, paraview)
 
 
@@ -93,6 +100,7 @@ def write_result(
         wall=wall,
         counts=result.counts,
         crisp=result.crisp,
+        choice=result.choice,
         iterations=result.iterations,
         converged=result.converged,
         stop_reason=result.stop_reason,

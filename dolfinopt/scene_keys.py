@@ -41,6 +41,7 @@ CellShape = Literal["quadrilateral", "triangle"]
 
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
+Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
 Frequency = Annotated[float, Field(ge=0)]  # Hz
 Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
 MAX_ITERATIONS = 1_000_000
@@ -389,7 +390,18 @@ class Reduction(Table):
     method: ReductionMethod = Field(
         default="craig-bampton", description="how the basis is made [-]"
     )
-    coordinates: int = Field(default=4, ge=1, description="elastic coordinates q of each arm [-]")
+    coordinates: Coordinates = Field(
+        default=4,
+        description='elastic coordinates q of each arm; "auto": the fewest that meet '
+        "reduction.tolerance [-]",
+    )
+    tolerance: float = Field(
+        default=1e-3,
+        ge=1e-6,
+        le=0.5,
+        description='with "auto": relative error that too few coordinates may make, energy norm '
+        "[-]",
+    )
     shifts: tuple[Frequency, ...] = Field(
         default=(0.0,), description='where "krylov" matches moments [Hz]'
     )
@@ -413,22 +425,32 @@ class Reduction(Table):
 
     @model_validator(mode="after")
     def _check_coordinates(self) -> Reduction:
-        if self.method == "craig-bampton" and self.coordinates < 3:
+        if self.coordinates == "auto" or self.count >= self.fewest:
+            return self
+        if self.method == "craig-bampton":
             raise Refusal(
                 'expected an integer >= 3 with reduction.method = "craig-bampton" '
                 "(its constraint modes)",
                 ("coordinates",),
                 ("method",),
             )
-        if self.method == "krylov" and self.coordinates < 3 * len(self.shifts):
-            raise Refusal(
-                f'expected an integer >= {3 * len(self.shifts)} with reduction.method = "krylov" '
-                "(the interface loads at each of reduction.shifts)",
-                ("coordinates",),
-                ("method",),
-                ("shifts",),
-            )
-        return self
+        raise Refusal(
+            f'expected an integer >= {self.fewest} with reduction.method = "krylov" '
+            "(the interface loads at each of reduction.shifts)",
+            ("coordinates",),
+            ("method",),
+            ("shifts",),
+        )
+
+    @property
+    def count(self) -> int:
+        """The stated number of coordinates; 0 with "auto"."""
+        return 0 if self.coordinates == "auto" else self.coordinates
+
+    @property
+    def fewest(self) -> int:
+        """The least number of coordinates that the method can have."""
+        return {"craig-bampton": 3, "krylov": 3 * len(self.shifts)}.get(self.method, 1)
 
     @model_validator(mode="after")
     def _check_idle(self) -> Reduction:
@@ -441,6 +463,14 @@ class Reduction(Table):
                     (key,),
                     ("method",),
                 )
+        default = type(self).model_fields["tolerance"].default
+        if self.coordinates != "auto" and self.tolerance != default:
+            raise Refusal(
+                f"expected {shown(default)}, the default, with reduction.coordinates = "
+                f'{self.coordinates}: only "auto" uses it',
+                ("tolerance",),
+                ("coordinates",),
+            )
         return self
 
 
@@ -771,7 +801,7 @@ class Scene(Table):
         for i, arm in enumerate(self.arms):
             if not arm.flexible:
                 continue
-            if arm.n_reducible is not None and self.reduction.coordinates > arm.n_reducible:
+            if arm.n_reducible is not None and self.reduction.count > arm.n_reducible:
                 raise Refusal(
                     f"expected at most {arm.n_reducible}, the degrees of freedom of "
                     f'arm "{arm.name}" with cells = {list(arm.cells or ())}',

@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
@@ -169,6 +170,8 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
     if origin is Annotated:
         rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
         return _allowed_type(args[0], rules, plural)
+    if origin in (Union, UnionType):
+        return " | ".join(_allowed_type(one, metadata) for one in args)
     if origin is Literal:
         return " | ".join(shown(value) for value in args)
     if origin is tuple and _element_model(annotation):

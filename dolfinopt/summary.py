@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arm import Arm
+from dolfinopt.coordinates import Choice
 from dolfinopt.evaluation import Evaluation, Motion
 from dolfinopt.files import versions
 from dolfinopt.ledger import Counts, Ledger
@@ -35,6 +36,7 @@ def summarise(
     wall: float,
     counts: Counts | None = None,
     crisp: Evaluation | None = None,
+    choice: Choice | None = None,
     iterations: int = 0,
     converged: bool = True,
     stop_reason: str = "simulated",
@@ -47,6 +49,7 @@ def summarise(
         wall: seconds since the command began, s.
         counts: this rank's, where not all of the ledger's belong to the run.
         crisp: evaluation of the design cut at one half.
+        choice: what `reduction.coordinates = "auto"` came to.
         iterations, converged, stop_reason: of the optimisation.
     """
     volumes = gather_arms(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
@@ -85,7 +88,8 @@ def summarise(
         ],
         **({} if crisp is None else {"crisp": _figures(crisp)}),
         "simulation_error_estimate": evaluation.error,
-        "warnings": _warnings(scene, evaluation),
+        "reduction": _reduction(scene, choice),
+        "warnings": [*_warnings(scene, evaluation), *_too_few(scene, choice)],
         "iterations": iterations,
         "converged": converged,
         "stop_reason": stop_reason,
@@ -114,6 +118,39 @@ def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
                     "off; stiffen the arm or slow the motion"
                 )
     return found
+
+
+def _reduction(scene: Scene, choice: Choice | None) -> dict[str, Any]:
+    """Return the number of coordinates and, where it was chosen, by which errors.
+
+    For a given number there is no estimate: it would cost a simulation with more coordinates.
+    """
+    if choice is None:
+        return {"coordinates": scene.reduction.coordinates, "error_estimate": None, "tried": []}
+    return {
+        "coordinates": choice.coordinates,
+        "error_estimate": _finite(choice.error),
+        "tried": [
+            {"coordinates": count, "error_estimate": _finite(error)}
+            for count, error in choice.tried
+        ],
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def _too_few(scene: Scene, choice: Choice | None) -> list[str]:
+    """Return a sentence where the final design would need more coordinates than were chosen."""
+    if choice is None or choice.error <= scene.reduction.tolerance:
+        return []
+    return [
+        f"with the {choice.coordinates} coordinates that were chosen for the initial design the "
+        f"final one has an estimated error of {choice.error:.2g}, above reduction.tolerance = "
+        f"{scene.reduction.tolerance:g}; optimise with reduction.coordinates = "
+        f"{2 * choice.coordinates}, or a smaller tolerance"
+    ]
 
 
 def _volume(scene: Scene, index: int, arm: Arm) -> float:

@@ -89,22 +89,6 @@ def test_passive_cells_stay_solid():
         assert (result.x_phys[k][arm.mesh.passive] == 1.0).all()
 
 
-def test_load_cases_cost_nothing():
-    """The work of an iteration does not depend on the number of load cases."""
-    few = do.optimize(small("objective.load_cases=3", iterations=2))
-    many = do.optimize(small("objective.load_cases=300", iterations=2))
-    assert replace(few.ledger.counts, newton_iterations=0) == replace(
-        many.ledger.counts, newton_iterations=0
-    )
-
-
-def test_three_coordinates_need_no_eigenproblem():
-    result = do.optimize(small("reduction.coordinates=3", iterations=1))
-    assert result.ledger.counts.eigenproblems == 0
-    if result.arms:
-        assert result.ledger.counts.factorisations == 2 * len(result.arms)
-
-
 # -- constraints and projections -------------------------------------------------------------
 
 

@@ -245,6 +245,7 @@ def test_integer_stands_for_a_number():
         ("reduction.coordinates", 3),
         ("reduction.coordinates", 5177),  # 2 * 199 * 13 + 3
         ("reduction", {"method": "modal", "coordinates": 1}),
+        ("reduction", {"coordinates": "auto", "tolerance": 1e-6}),
         ("design", {"minimum": 0.3, "volume_fraction": 0.3}),
     ],
 )
@@ -499,7 +500,10 @@ BAD_VALUES = [
     ("payload.inertia", -1, "-1", "a number >= 0"),
     ("damping.stiffness_proportional", -2e-4, "-0.0002", "a number >= 0"),
     ("reduction.method", "guyan", '"guyan"', '"craig-bampton" | "modal" | "krylov" | "balanced"'),
-    ("reduction.coordinates", 0, "0", "an integer >= 1"),
+    ("reduction.coordinates", 0, "0", 'an integer >= 1 | "auto"'),
+    ("reduction.coordinates", "all", '"all"', 'an integer >= 1 | "auto"'),
+    ("reduction.tolerance", 0.0, "0.0", "a number >= 1e-06 and <= 0.5"),
+    ("reduction.tolerance", 1e-2, "0.01", "0.001, the default, with reduction.coordinates = 4"),
     ("reduction.coordinates", 2, "2", 'an integer >= 3 with reduction.method = "craig-bampton"'),
     ("reduction.coordinates", 4.0, "4.0", "an integer >= 1"),
     ("reduction.coordinates", True, "true", "an integer >= 1"),
@@ -815,7 +819,12 @@ def test_scene_that_is_no_table(data, found):
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
         ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
         ("radius", "radius", "motion.radius", "name, material"),
-        ("tolerance", "tolerance", "simulation.tolerance or optimizer.tolerance", "name, mat"),
+        (
+            "tolerance",
+            "tolerance",
+            "reduction.tolerance or simulation.tolerance or optimizer.tolerance",
+            "name, mat",
+        ),
         ("volum_fraction", "volum_fraction", "design.volume_fraction", "name, material"),
         ("arms.0.blocks", "arms.0.blocks (arm1)", None, "name, length, height, thickness, cells"),
         ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
@@ -1049,7 +1058,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 77
+    assert len({info.key for info in keys}) == len(keys) == 78
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info

@@ -12,7 +12,6 @@ from remainders import SCENE, build, rates, tip, uneven, wave
 import dolfinopt as do
 from dolfinopt.arm import Arm
 from dolfinopt.evaluation import constraint_gradients
-from dolfinopt.ledger import Counts
 from dolfinopt.statics import StaticResponse, static_response
 
 YOUNG, LENGTH, HEIGHT, THICKNESS = 70e9, 1.0, 0.06, 0.01  # of the scene
@@ -205,18 +204,3 @@ def test_gradients_are_ones(overrides: list[str], direction) -> None:
             continue
         rate = rates(lambda h, j=j: at(h).constraints[j], along)
         assert rate == pytest.approx(2.0, abs=0.1)
-
-
-# -- cost ------------------------------------------------------------------------------------
-
-
-def test_neither_mass_nor_motion() -> None:
-    """One assembly, one factor and three solves an arm and design, gradients included."""
-    built = build("objective.kind=static", "constraints.tip_deflection=1e-6", LOADS)
-    for design in (wave, uneven):
-        x = {k: np.clip(field, 0.1, 0.9) for k, field in built.fields(design).items()}
-        built.evaluate(x)
-        built.gradient()
-        constraint_gradients(built.scene, built.share, built.arms)
-    arms = 2 * len(built.arms)
-    assert built.ledger.counts == Counts(assemblies=arms, factorisations=arms, solves=3 * arms)

@@ -415,8 +415,6 @@ def test_gradients_are_ones(overrides: list[str]) -> None:
             return built.evaluate({k: x[k] + h * d[k] for k in x})[0].objective
 
         assert rates(value, slope, (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1), direction
-    assert built.ledger.counts.simulations == 0
-    assert built.ledger.counts.newton_iterations == 0
 
 
 def test_the_outboard_arm_weighs_on_the_inboard_one() -> None:

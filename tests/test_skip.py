@@ -1,0 +1,297 @@
+"""What a scene does not need is not done: the list, scene by scene, read from summary.json.
+
+Counters tell how often the costly things were done, see `ledger.Counts`; those of an optimisation
+are its iterations'. What they cannot tell, imports and files, is looked at itself. That a part of
+the program does nothing twice is tested where that part is: stiffness, mass and factors in
+test_elasticity, bases in test_reduction, scenarios of one design in test_scenarios and test_cases,
+the exact gradient's factors in test_sensitivity, time steps that start warm in test_integrators and
+test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from remainders import build, wave
+
+from dolfinopt import results
+from dolfinopt.cli import commands
+
+SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
+WORLD = MPI.COMM_WORLD
+# Coarse in space and time: what is counted depends on neither.
+QUICK = (
+    "arms.cells=[12,2]",
+    "motion.horizon=2.0",
+    "simulation.sample=0.01",
+    "simulation.tolerance=1e-2",
+)
+ITERATIONS = 2
+ARMS, DESIGNS = 2, ITERATIONS + 1  # the last design is evaluated, but has no gradient
+
+Counts = dict[str, int]
+Run = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Run a command on the small scene with overrides; return its folder. Once for each."""
+    path = tmp_path_factory.mktemp("skip") if WORLD.rank == 0 else None
+    root = WORLD.bcast(path, root=0)
+    made: list[Path] = []
+
+    @cache
+    def once(command: str, *overrides: str, design: Path | None = None) -> Path:
+        made.append(root / str(len(made)))
+        line = [command, str(SCENE), "--no-plots", "--out", str(made[-1])]
+        line += ["--design", str(design)] if design else []
+        for override in (*QUICK, f"optimizer.max_iterations={ITERATIONS}", *overrides):
+            line += ["--set", override]
+        commands.main(line, standalone_mode=False, obj=WORLD)
+        WORLD.barrier()
+        return made[-1]
+
+    return once
+
+
+def counts(folder: Path) -> Counts:
+    """Return the counters of a run."""
+    return json.loads((folder / "summary.json").read_text())["counts"]
+
+
+# -- scene by scene --------------------------------------------------------------------------
+
+EACH = ARMS * DESIGNS  # once for every design of every arm
+ONCE = {"assemblies": 2 * EACH, "factorisations": EACH, "reductions": EACH}  # stiffness and mass
+STILL = {"simulations": 0, "newton_iterations": 0, "adjoints": 0, "reductions": 0}
+ONE_ARM = {key: value // ARMS for key, value in ONCE.items()}
+SHARED, RIGID = "arms.arm2.design=arm1", "arms.arm1.rigid=true"
+EXACT = "objective.gradient=exact"
+
+CASES: dict[tuple[str, ...], Counts] = {
+    # Nothing twice for one design: a factor an arm and design; frozen loads need no adjoint.
+    (): {**ONCE, "eigenproblems": EACH, "simulations": DESIGNS, "adjoints": 0},
+    ("objective.kind=deviation",): {"simulations": DESIGNS, "adjoints": 0},
+    # With everything a scene may ask for the factor is the same; the last design needs no gradient.
+    (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1e-4"): {
+        **ONCE,
+        "eigenproblems": 2 * EACH,  # of the basis, and with what the arm carries
+        "simulations": DESIGNS,
+        "adjoints": ITERATIONS,
+    },
+    # q = 3: no eigenproblem, three solves for the constraint modes, three more for their adjoints.
+    ("reduction.coordinates=3",): {**ONCE, "eigenproblems": 0, "solves": 3 * EACH},
+    ("reduction.coordinates=3", EXACT): {
+        **ONCE,
+        "eigenproblems": 0,
+        "solves": 3 * EACH + 3 * ARMS * ITERATIONS,
+    },
+    ("reduction.method=krylov",): {**ONCE, "eigenproblems": 0, "solves": 4 * EACH},
+    # Static: no simulation, no basis, no mass matrix, whatever the damping, payload and motion.
+    ("objective.kind=static",): {
+        **STILL,
+        "assemblies": EACH,
+        "factorisations": EACH,
+        "solves": 3 * EACH,
+        "eigenproblems": 0,
+    },
+    ("objective.kind=static", "constraints.tip_deflection=1e-6", EXACT): {
+        **STILL,
+        "assemblies": EACH,
+        "factorisations": EACH,
+        "solves": 3 * EACH,
+        "eigenproblems": 0,
+    },
+    # Eigenfrequency: mass, but no simulation and no basis. Three modes of every arm have elastic
+    # and kinetic energy, and only the outer arm is carried, as two fields (mass and inertia).
+    ("objective.kind=eigenfrequency",): {
+        **STILL,
+        "assemblies": 2 * EACH,
+        "factorisations": EACH,
+        "eigenproblems": EACH,
+        "energy_fields": (2 * 3 * ARMS + 2) * ITERATIONS,
+    },
+    # Bounded as well as maximised: the same modes.
+    ("objective.kind=eigenfrequency", "constraints.first_frequency=1.0"): {
+        **STILL,
+        "factorisations": EACH,
+        "eigenproblems": EACH,
+    },
+    # A shared design: all that concerns one arm alone once.
+    (SHARED,): {**ONE_ARM, "eigenproblems": DESIGNS, "simulations": DESIGNS},
+    (SHARED, EXACT): {**ONE_ARM, "eigenproblems": DESIGNS, "adjoints": ITERATIONS},
+    (SHARED, "objective.kind=static"): {**STILL, "assemblies": DESIGNS, "solves": 3 * DESIGNS},
+    (SHARED, "objective.kind=eigenfrequency"): {
+        **STILL,
+        "assemblies": 2 * DESIGNS,
+        "factorisations": DESIGNS,
+        "eigenproblems": EACH,  # the two arms carry different things
+    },
+    # A rigid arm has nothing to assemble.
+    (RIGID,): {**ONE_ARM, "eigenproblems": DESIGNS, "simulations": DESIGNS},
+}
+
+
+@pytest.mark.parametrize("overrides", CASES, ids=" ".join)
+def test_only_what_the_scene_needs(run: Run, overrides: tuple[str, ...]) -> None:
+    found = counts(run("optimize", *overrides))
+    expected = CASES[overrides]
+    assert {key: found[key] for key in expected} == expected
+
+
+def test_a_first_design_alone_needs_no_gradient(run: Run) -> None:
+    found = counts(run("optimize", EXACT, "optimizer.max_iterations=0"))
+    assert found["adjoints"] == found["energy_fields"] == 0
+    assert found["factorisations"] == ARMS and found["simulations"] == 1
+
+
+@pytest.mark.parametrize("overrides", [[SHARED], [RIGID]], ids=" ".join)
+def test_one_mesh_and_one_filter(overrides: list[str]) -> None:
+    """Mesh and filter belong to an `Arm`, of which there is one."""
+    built = build(*overrides)
+    assert WORLD.allreduce(len(built.arms)) == 1
+
+
+@pytest.mark.parametrize("kind", ["static", "eigenfrequency"])
+def test_nothing_moves_unless_asked(kind: str) -> None:
+    """No simulation and no reduced model without `simulated`; with it the same objective."""
+    built = build(f"objective.kind={kind}")
+    x = built.fields(wave)
+    still, trajectory = built.evaluate(x)
+    assert trajectory is None and np.isnan([still.max_deviation, still.compliance]).all()
+    assert still.first_frequencies == ()
+    assert all(arm.basis is None for arm in built.arms.values())
+    moved, trajectory = built.evaluate(x, simulated=True)
+    assert (trajectory is None) == (WORLD.rank != 0)
+    assert moved.objective == still.objective and moved.max_deviation > 0.0
+
+
+# -- load cases ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gradient", ["esl", "exact"])
+def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
+    """From as many load cases as coordinates on their number changes no count.
+
+    Without normal modes, whose search for other designs takes other numbers of solves; Newton's
+    iterations depend on the design, too.
+    """
+    kept = ("reduction.coordinates=3", f"objective.gradient={gradient}")
+    few, many = (
+        counts(run("optimize", *kept, f"objective.load_cases={cases}")) for cases in (3, 200)
+    )
+    del few["newton_iterations"], many["newton_iterations"]
+    assert few == many
+    if gradient == "esl":
+        assert few["energy_fields"] == 3 * ARMS * ITERATIONS
+
+
+# -- warm starts -----------------------------------------------------------------------------
+
+
+@cache
+def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
+    """Return what the second design takes in an optimisation, and by itself.
+
+    The optimiser's step is small, 0.02, and the tolerance the usual one: at 1e-2 as many steps as
+    the motion needs to look smooth are enough from cold, too.
+    """
+    small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=1e-4")
+    first = counts(run("optimize", *small, "optimizer.max_iterations=0"))
+    folder = run("optimize", *small, "optimizer.max_iterations=1")
+    both = counts(folder)
+    cold = counts(run("simulate", *small, design=folder / "design.npz"))
+    return {key: both[key] - first[key] for key in both}, cold
+
+
+def test_a_trajectory_starts_from_the_last_designs(run: Run) -> None:
+    """5 iterations of Newton against 10."""
+    warm, cold = warm_and_cold(run)
+    assert warm["simulations"] == cold["simulations"] == 1
+    assert 0 < warm["newton_iterations"] < cold["newton_iterations"]
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [(), ("reduction.method=modal", "arms.cells=[50,4]"), ("reduction.coordinates=6",)],
+    ids=" ".join,
+)
+def test_modes_start_from_the_last_designs(run: Run, overrides: tuple[str, ...]) -> None:
+    """22 solves against 26, 42 against 48, 39 against 46; see `reduction.basis._searches`."""
+    warm, cold = warm_and_cold(run, *overrides)
+    assert warm["factorisations"] == cold["factorisations"] == ARMS
+    assert 3 * ARMS < warm["solves"] < cold["solves"]
+
+
+# -- what is not asked for -------------------------------------------------------------------
+
+# Prints which of the modules it is told are there in the end, whatever the command does.
+LOADED = """
+import sys
+names, sys.argv[1:] = sys.argv[1].split(), sys.argv[2:]
+try:
+    {}
+except SystemExit:
+    pass
+print([name for name in names if name in sys.modules])
+"""
+MAIN = "from dolfinopt.cli import main; main()"
+DRAW = {"pyvista", "vtkmodules", "matplotlib", "PIL"}
+SOLVE = {"dolfinx", "ufl", "slepc4py", "scipy", "gmsh"}
+
+
+def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
+    """Return which modules a process of its own has imported at its end."""
+    line = [sys.executable, "-c", LOADED.format(code), " ".join(names), *map(str, arguments)]
+    # os.environ is as it was before this process began MPI.
+    done = subprocess.run(line, capture_output=True, text=True, env=dict(os.environ), timeout=60)
+    assert done.returncode == 0, done.stderr
+    return set(ast.literal_eval(done.stdout.splitlines()[-1]))
+
+
+@pytest.mark.serial
+def test_the_package_imports_nothing() -> None:
+    assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
+
+
+@pytest.mark.serial
+def test_help_needs_no_solver() -> None:
+    assert loaded(DRAW | SOLVE | {"click"}, MAIN, "optimize", "--help") == {"click"}
+
+
+@pytest.mark.serial
+def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
+    """Nor anything of other commands: statistics, studies, exports."""
+    others = {"scipy.stats", "dolfinopt.plots", "dolfinopt.study", "dolfinopt.mbdyn"}
+    line = ["optimize", SCENE, "--no-plots", "--out", tmp_path / "out"]
+    for override in (*QUICK, "optimizer.max_iterations=1"):
+        line += ["--set", override]
+    assert loaded(DRAW | others | {"dolfinx"}, MAIN, *line) == {"dolfinx"}
+
+
+def test_nothing_is_drawn_exported_or_gathered_unless_asked(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Designs are gathered when they are written, once, not in every iteration."""
+    gathered = []
+    gather_views = results.gather_views
+
+    def spy(*arguments: object) -> object:
+        gathered.append(arguments)
+        return gather_views(*arguments)
+
+    monkeypatch.setattr(results, "gather_views", spy)
+    folder = run("optimize", "optimizer.max_iterations=3")
+    assert len(gathered) == 1
+    kinds = {path.suffix for path in folder.iterdir()}
+    assert kinds == {".json", ".npz", ".csv", ".xdmf"}
