@@ -7,45 +7,77 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 
-from dolfinopt.bench import mesh, peers, reduction, time, whole
-from dolfinopt.bench.common import Diagram, Plan, Tell, measured, write_diagram
+from dolfinopt.bench import mesh, peers, reduction, time, tolerance, whole
+from dolfinopt.bench.common import Diagram, Goal, Plan, Tell, measured, write_diagram
 from dolfinopt.files import write_text
+from dolfinopt.findings import Table
 
 QUICKLY = ("arms.cells=[100,6]",)
 
-__all__ = ["QUICKLY", "Diagram", "Plan", "bench", "diagrams"]
+__all__ = ["QUICKLY", "Diagram", "Goal", "Plan", "bench", "diagrams"]
 
 
 def diagrams() -> tuple[Diagram, ...]:
     """Return all diagrams, the main one first."""
-    return tuple(module.diagram() for module in (time, peers, whole, mesh, reduction))
+    return tuple(module.diagram() for module in (time, peers, whole, mesh, reduction, tolerance))
 
 
-def bench(plan: Plan, folder: Path, tell: Tell, chosen: tuple[Diagram, ...] = ()) -> Path:
+def bench(
+    plan: Plan,
+    folder: Path,
+    tell: Tell,
+    chosen: tuple[Diagram, ...] = (),
+    done: Tell | None = None,
+) -> Path:
     """Measure what is not measured yet, draw everything; return the path of the summary.
 
     A diagram's rows are kept in FOLDER/<name>.json as soon as they are there: a bench that was
-    ended goes on from the diagram it was at.
+    ended goes on from the diagram it was at. The summary grows with every diagram.
 
     Args:
         plan: what is measured on.
         folder: for <name>.json, .csv, .png and bench.md.
         tell: takes a line whenever something else is measured.
         chosen: diagrams; all of them by default.
+        done: takes a line when a diagram is finished.
     """
-    parts = []
-    for diagram in chosen or diagrams():
+    parts: list[str] = []
+    goals: list[Goal] = []
+    asked = chosen or diagrams()
+    path = folder / "bench.md"
+    for diagram in asked:
+        begun = perf_counter()
         rows = measured(diagram, plan, folder, partial(_told, tell, diagram.name))
         parts.append(write_diagram(diagram, rows, folder))
-    path = folder / "bench.md"
-    how = "`dolfinopt bench --quick`" if plan.quick else "`dolfinopt bench`"
-    head = (
-        f"# Run time against error\n\nMeasured by {how}: CPU seconds of this process, the least of "
-        "the repeats, one thread.\n"
-    )
-    write_text(path, "\n".join([head, *parts]))
+        goals += diagram.goals(rows)
+        rest = [one.name for one in asked[len(parts) :]]
+        write_text(path, "\n".join([_head(plan, rest), _goal_table(goals, plan), *parts]))
+        if done is not None:
+            done(f"{diagram.name}: {diagram.title}, {perf_counter() - begun:.0f} s")
     return path
+
+
+def _head(plan: Plan, rest: list[str]) -> str:
+    how = "`dolfinopt bench --quick`" if plan.quick else "`dolfinopt bench`"
+    text = (
+        f"# Run time against error\n\nMeasured by {how}: CPU seconds of this process, the least of "
+        "the repeats, one thread, unless a table says otherwise.\n"
+    )
+    return text + (f"\nNot finished: {', '.join(rest)} are missing.\n" if rest else "")
+
+
+def _goal_table(goals: list[Goal], plan: Plan) -> str:
+    if not goals:
+        return ""
+    quick = (
+        "A quick bench is coarser than what some goals are about: the table is partial.\n\n"
+        if plan.quick
+        else ""
+    )
+    table = Table("goals", "", ("goal", "measured", "met"), tuple(goal.cells() for goal in goals))
+    return f"## Goals\n\n{quick}{table.markdown().strip()}\n"
 
 
 def _told(tell: Tell, name: str, text: str) -> None:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import json
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from dolfinopt import __version__
 from dolfinopt.arm import Arm, build_arms, chain_of
 from dolfinopt.body import FloatingBody
 from dolfinopt.files import write_text
@@ -23,8 +26,11 @@ from dolfinopt.ledger import Ledger
 from dolfinopt.optimization import optimize
 from dolfinopt.parallel import share_arms
 from dolfinopt.scene import Scene
-from dolfinopt.study import changed
 from dolfinopt.study_plots import line_figure, save
+from dolfinopt.variants import changed
+
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
 
 T = TypeVar("T")
 Row = tuple[Cell, ...]
@@ -51,6 +57,38 @@ class Plan:
 
 
 @dataclass(frozen=True)
+class Goal:
+    """What was wanted, and what was measured.
+
+    Attributes:
+        what: of a figure, with its unit.
+        limit: of that figure.
+        measured: the figure; nan where this bench did not measure it, or not well enough.
+        least: whether the figure should be at least the limit, not at most.
+        remark: on the figure.
+    """
+
+    what: str
+    limit: float
+    measured: float
+    least: bool = False
+    remark: str = ""
+
+    def cells(self) -> Row:
+        """Return goal, measured, met."""
+        wanted = f"{self.what}: at {'least' if self.least else 'most'} {self.limit:g}"
+        remark = f" ({self.remark})" if self.remark else ""
+        if math.isnan(self.measured):
+            return wanted, f"not measured{remark}", ""
+        met = self.measured >= self.limit if self.least else self.measured <= self.limit
+        return wanted, f"{self.measured:.3g}{remark}", "yes" if met else "no"
+
+
+def _no_goals(rows: Sequence[Row]) -> list[Goal]:
+    return []
+
+
+@dataclass(frozen=True)
 class Diagram:
     """One work-precision diagram.
 
@@ -59,8 +97,11 @@ class Diagram:
         title: a sentence.
         columns: of the rows, with units.
         measure: the rows; `tell` takes what is being measured.
-        panels: the curves of the rows, one row of axes.
+        panels: the curves of the rows, logarithmic.
         notes: sentences about the rows.
+        abreast: panels beside each other, before a new row begins.
+        goals: what was wanted of the rows.
+        uses: packages whose versions, or absence, change the rows.
     """
 
     name: str
@@ -69,15 +110,23 @@ class Diagram:
     measure: Callable[[Plan, Tell], list[Row]]
     panels: Callable[[Sequence[Row]], tuple[Panel, ...]]
     notes: Callable[[Sequence[Row]], list[str]]
+    abreast: int = 4
+    goals: Callable[[Sequence[Row]], list[Goal]] = _no_goals
+    uses: tuple[str, ...] = ()
 
 
 # -- files -----------------------------------------------------------------------------------
 
 
 def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> list[Row]:
-    """Return the rows of a diagram from FOLDER/<name>.json, or measure and keep them there."""
+    """Return the rows of a diagram from FOLDER/<name>.json, or measure and keep them there.
+
+    Rows that another source of this package, or other versions of what they use, left there are
+    measured anew: they must not stand beside those of today's.
+    """
     path = folder / f"{diagram.name}.json"
-    asked = [__version__, plan.quick, diagram.columns, plan.scene.to_dict()]
+    versions = [_version(package) for package in diagram.uses]
+    asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
     stamp = json.loads(json.dumps(asked))  # tuples become lists, as in the file
     try:
         kept = json.loads(path.read_text(encoding="utf-8"))
@@ -90,6 +139,22 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> list[Row
     return rows
 
 
+@cache
+def source(folder: Path = Path(__file__).parents[1]) -> str:
+    """Return a digest of this package's Python files, as they are when first asked for."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
 def _plain(cell: Cell) -> Cell:
     return cell.item() if isinstance(cell, np.generic) else cell
 
@@ -100,15 +165,30 @@ def write_diagram(diagram: Diagram, rows: Sequence[Row], folder: Path) -> str:
     write_text(folder / f"{diagram.name}.csv", table.csv())
     panels = diagram.panels(rows)
     if panels:
-        figure = line_figure(LineFigure(diagram.name, diagram.title, (panels,)))
+        width = diagram.abreast
+        lines = tuple(panels[k : k + width] for k in range(0, len(panels), width))
+        figure = line_figure(LineFigure(diagram.name, diagram.title, lines))
         for axes in figure.axes:
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.autoscale()
+            for axis in (axes.xaxis, axes.yaxis):
+                _readable(axis)
         save(figure, folder / f"{diagram.name}.png")
     notes = "\n".join(f"- {note}" for note in diagram.notes(rows))
     picture = f"![{diagram.title}]({diagram.name}.png)\n\n" if panels else ""
     return f"## {diagram.title}\n\n{picture}{notes}\n\n{table.markdown().strip()}\n"
+
+
+def _readable(axis: Axis) -> None:
+    """Label 1, 2, 5, 10 ... in full on a short logarithmic axis, powers of ten alone on a long."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = sorted(axis.get_view_interval())
+    if high < 100.0 * low:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def curves(rows: Iterable[Row], label: int, x: int, y: int) -> tuple[Line, ...]:
@@ -124,19 +204,33 @@ def curves(rows: Iterable[Row], label: int, x: int, y: int) -> tuple[Line, ...]:
 # -- measuring -------------------------------------------------------------------------------
 
 
+def tidy() -> None:
+    """Free matrices and factors that nothing refers to: PETSc keeps them until it is told."""
+    gc.collect()
+    if hasattr(PETSc, "garbage_cleanup"):  # from 3.18 on
+        PETSc.garbage_cleanup(MPI.COMM_SELF)
+
+
 def timed(action: Callable[[], T], repeats: int) -> tuple[float, T]:
     """Return the fewest CPU seconds of `repeats` calls, and what the last one returned.
 
     CPU time of this process, so that others on the machine are left out; the least, since
     whatever disturbs a call makes it longer. No garbage of earlier ones is collected meanwhile.
     """
-    best = math.inf
+    best, _, value = clocked(action, repeats)
+    return best, value
+
+
+def clocked(action: Callable[[], T], repeats: int) -> tuple[float, float, T]:
+    """Return what `timed` does, with the least seconds of the clock on the wall in the middle."""
+    best = wall = math.inf
     for _ in range(repeats):
         gc.collect()
-        begun = time.process_time()
+        begun, since = time.process_time(), time.perf_counter()
         value = action()
         best = min(best, time.process_time() - begun)
-    return best, value
+        wall = min(wall, time.perf_counter() - since)
+    return best, wall, value
 
 
 def fitted_exponent(x: Sequence[float], y: Sequence[float]) -> float:

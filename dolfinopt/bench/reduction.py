@@ -15,13 +15,14 @@ from dolfinopt.ledger import Ledger
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import simulate
-from dolfinopt.study import changed, reduced
+from dolfinopt.variants import changed, reduced
 
 COUNTS = 3, 4, 5, 6, 8, 12, 16, 24, 32, 48
 # More coordinates than any method that is judged has, and of the kind that converges surely.
 REFERENCE = 100
-QUICK_COUNTS, QUICK_REFERENCE = (3, 4, 6, 12, 24), 48
-# Time steps leave this much: far less than the reduction does.
+QUICK_COUNTS, QUICK_REFERENCE = (3, 4, 6, 12), 32
+# Of every motion here. The steps come out alike, so that what they leave cancels in the
+# differences: methods were seen to agree to 1e-10.
 TOLERANCE, STAGES = 1e-7, 5
 
 
@@ -41,6 +42,7 @@ def diagram() -> Diagram:
         _measure,
         _panels,
         _notes,
+        abreast=3,
     )
 
 
@@ -113,13 +115,21 @@ def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
 
 def _notes(rows: Sequence[Row]) -> list[str]:
     notes = [
-        f"Errors against Craig-Bampton with {REFERENCE} coordinates per arm ({QUICK_REFERENCE} in "
-        f"a quick bench), every motion simulated to {TOLERANCE:g}: the largest compliance of both "
-        "arms, and the deviation, largest error in time over the largest value.",
+        f"Reference: Craig-Bampton with {REFERENCE} coordinates per arm ({QUICK_REFERENCE} in a "
+        f"quick bench), more than any method has here; every motion simulated to {TOLERANCE:g}. "
+        "Errors of the largest compliance of both arms, and of the deviation, largest in time "
+        "over the largest value.",
         "Seconds of both arms from cold: assembly, factorisation, basis, inertia integrals.",
     ]
     for design in dict.fromkeys(row[0] for row in rows):
-        for goal in (1e-2, 1e-3, 1e-4):
+        others = [row for row in rows if row[0] == design and row[1] != "craig-bampton"]
+        if others:
+            near = min(others, key=lambda row: float(row[5]))
+            notes.append(
+                f"{design}: an independent basis, {near[1]} with {near[2]} coordinates, agrees "
+                f"with the reference to {float(near[5]):.1e} of the deviation."
+            )
+        for goal in (1e-2, 1e-3, 1e-4, 1e-6):
             met = [row for row in rows if row[0] == design and float(row[5]) <= goal]
             if met:
                 best = min(met, key=lambda row: float(row[3]))

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from dolfinopt.bench.common import (
     Diagram,
+    Goal,
     Plan,
     Row,
     Tell,
@@ -34,16 +35,20 @@ from dolfinopt.ledger import Ledger
 from dolfinopt.mechanism import deviation, inverse_dynamics, tangent
 from dolfinopt.motion import breakpoints, rigid_motion
 from dolfinopt.simulation import build_mechanism
-from dolfinopt.study import reduced
+from dolfinopt.variants import reduced
 
 # One stage more than the methods that are judged: of order 11, theirs is 9 at most.
 REFERENCE_STAGES, REFERENCE_TOLERANCE = 6, 1e-8
 SAMPLES = 3001
 TOLERANCES = 1e-2, 1e-3, 1e-4, 1e-5, 1e-6
 QUICK_TOLERANCES, QUICK_REFERENCE = TOLERANCES[:3], 1e-6
-# CPU seconds after which a method's finer settings are left out, in a quick bench and a full one.
-PATIENCE = 1.0, 120.0
+# CPU seconds that the next finer setting may take, by guess, in a quick bench and a full one.
+PATIENCE = 1.0, 20.0
+SHORT = 0.3  # what takes less is timed several times
 GOAL = 1e-4
+USUAL = "Radau, 3 stages", f"tolerance {GOAL:g}"  # a simulation as scenes have it by default
+LIMITS = (4, 0.03), (48, 0.3)  # seconds that it should take at most, by coordinates per arm
+FASTER = 50.0  # times as fast as SciPy
 MANY, QUICK_MANY = 48, 12  # coordinates per arm, beside the scene's usual 4
 
 
@@ -64,6 +69,8 @@ def diagram() -> Diagram:
         _measure,
         _panels,
         _notes,
+        abreast=2,
+        goals=_goals,
     )
 
 
@@ -201,7 +208,7 @@ def _ours(judge: Judge, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solve
             f"Radau, {stages} stages",
             [(f"tolerance {tol:g}", partial(collocated, stages, tol)) for tol in tolerances],
         )
-    counts = [250 * 3**k for k in range(3)] if plan.quick else [500 * 4**k for k in range(5)]
+    counts = [250 * 3**k for k in range(3)] if plan.quick else [500 * 2**k for k in range(5)]
     for name, rho_inf in (
         ("generalised-alpha, 0.5", 0.5),
         ("generalised-alpha, 0.8", 0.8),
@@ -258,7 +265,7 @@ def _timed_all(
             seconds, q = timed(solver, 1)
         except ConvergenceError:
             continue  # no point of the curve
-        if seconds < 1.0 and plan.repeats > 1:
+        if seconds < SHORT and plan.repeats > 1:
             seconds = min(seconds, timed(solver, plan.repeats - 1)[0])
         yield setting, seconds, *reference.errors(q)
         if 2.0 * seconds > patience:
@@ -272,7 +279,7 @@ def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
     kinds = dict.fromkeys((row[0], row[1]) for row in rows)
     return tuple(
         Panel(
-            f"{design}, q = {q}",
+            f"{design}, {q} coordinates per arm",
             "CPU time [s]",
             "error of elastic coordinates [-]",
             curves((row for row in rows if row[:2] == (design, q)), 2, 4, 5),
@@ -283,11 +290,15 @@ def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
 
 def _notes(rows: Sequence[Row]) -> list[str]:
     notes = [
-        f"Errors against Radau with {REFERENCE_STAGES} stages, one more than any method here; "
-        "of the elastic coordinates in the energy norm, largest in time over the largest value.",
+        f"Reference: Radau with {REFERENCE_STAGES} stages, order {2 * REFERENCE_STAGES - 1}, to "
+        f"{REFERENCE_TOLERANCE:g} ({QUICK_REFERENCE:g} in a quick bench); the methods have at most "
+        f"{REFERENCE_STAGES - 1} stages and order {2 * REFERENCE_STAGES - 3}. Errors of the "
+        "elastic coordinates in the energy norm, largest in time over the largest value.",
         "Radau from cold, its error estimate and refinements included; the other methods on "
         "given steps or tolerances, without an estimate of the global error. SciPy solves the "
-        "same rows, with their exact Jacobian, in the arms' own vibrations, between breakpoints.",
+        "same rows, with their exact Jacobian, in the arms' own vibrations, between breakpoints. A "
+        f"method's finer settings are left out where the next one would take over "
+        f"{PATIENCE[1]:g} s ({PATIENCE[0]:g} s in a quick bench).",
         "Newmark is the trapezoidal rule, beta = 1/4 and gamma = 1/2: generalised-alpha with "
         "rho_inf = 1, whose rows are taken at midpoints.",
     ]
@@ -297,28 +308,71 @@ def _notes(rows: Sequence[Row]) -> list[str]:
         if ours is None:
             continue
         note = f"{design}, q = {q}: to {GOAL:g} {ours[0]} takes {ours[1]:.3g} s"
-        if theirs is not None:
+        if theirs is None:
+            note += ", no SciPy method that was tried gets there"
+        else:
             ratio = theirs[1] / ours[1]
             note += f", {theirs[0]} {theirs[1]:.3g} s: {ratio:.0f} times as long"
         notes.append(f"{note}.")
     return notes
 
 
-def fastest(rows: Sequence[Row], start: str) -> tuple[str, float] | None:
-    """Return which method named `start...` first meets `GOAL`, and its seconds.
+def _goals(rows: Sequence[Row]) -> list[Goal]:
+    """Return the goals of a usual simulation, by the slower and the less superior design."""
+    seconds, ratios = [], []
+    for q, limit in LIMITS:
+        usual = [row for row in rows if row[1] == q and row[2:4] == USUAL]
+        times = [float(row[4]) for row in usual]
+        shown = "; ".join(
+            f"{row[0]} {float(row[4]):.3g}, error {float(row[5]):.1e}" for row in usual
+        )
+        what = f"simulation to {GOAL:g}, {q} coordinates per arm, from cold [s]"
+        seconds.append(Goal(what, limit, max(times, default=np.nan), remark=shown))
+        faster = [superiority(rows, row) for row in usual]
+        shown = "; ".join(
+            f"{row[0]} {ratio:.0f}{'' if sure else ' or more: SciPy stopped short of that error'}"
+            for row, (ratio, sure) in zip(usual, faster, strict=True)
+        )
+        what = (
+            f"the same, times as fast as solve_ivp at the same error, {q} coordinates per arm [-]"
+        )
+        least = min((ratio for ratio, _ in faster), default=np.nan)
+        if least < FASTER and not all(sure for _, sure in faster):
+            least = np.nan  # a bound that is too low tells nothing
+        ratios.append(Goal(what, FASTER, least, least=True, remark=shown))
+    return [*seconds, *ratios]
+
+
+def superiority(rows: Sequence[Row], ours: Row) -> tuple[float, bool]:
+    """Return how many times as long SciPy takes to the error of `ours`; or a bound, and False.
+
+    A method that did not get there takes longer than its finest setting did.
+    """
+    error, seconds = float(ours[5]), float(ours[4])
+    theirs = [row for row in rows if row[:2] == ours[:2] and str(row[2]).startswith("SciPy")]
+    there = fastest(theirs, "SciPy", error)
+    best, sure = (np.nan, False) if there is None else (there[1], True)
+    for line in curves(theirs, 2, 4, 5):
+        if line.y.min() > error and not line.x[-1] >= best:
+            best, sure = float(line.x[-1]), False
+    return best / seconds, sure
+
+
+def fastest(rows: Sequence[Row], start: str, goal: float = GOAL) -> tuple[str, float] | None:
+    """Return which method named `start...` first meets the error `goal`, and its seconds.
 
     Interpolated along its curve, log over log; None where no curve reaches it.
     """
     best: tuple[str, float] | None = None
     for line in curves((row for row in rows if str(row[2]).startswith(start)), 2, 4, 5):
         error, seconds = np.minimum.accumulate(line.y), line.x
-        below = np.flatnonzero(error <= GOAL)
+        below = np.flatnonzero(error <= goal)
         if not len(below):
             continue
         k = int(below[0])
         at = float(seconds[k])
         if k > 0 and error[k] < error[k - 1]:
-            share = np.log(error[k - 1] / GOAL) / np.log(error[k - 1] / error[k])
+            share = np.log(error[k - 1] / goal) / np.log(error[k - 1] / error[k])
             at = float(seconds[k - 1] * (seconds[k] / seconds[k - 1]) ** share)
         if best is None or at < best[1]:
             best = line.label, at

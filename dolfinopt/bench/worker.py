@@ -29,11 +29,17 @@ class Iteration:
     """CPU seconds of one design iteration on the root.
 
     Attributes:
+        iterations: that were done.
+        wall: median of the iterations by the clock on the wall, s.
+        elapsed: from the first to the last moment of `optimize`, by that clock, s.
         total: median of the iterations.
-        bodies, simulation, gradient, filter, mma: parts of it.
+        bodies, simulation, gradient, filter, mma: parts of it, means.
         memory: peak of all ranks together, MB.
     """
 
+    iterations: int
+    wall: float
+    elapsed: float
     total: float
     bodies: float
     simulation: float
@@ -52,10 +58,12 @@ def iterate(scene: Scene, world: MPI.Comm) -> Iteration:
         cpu.append(time.process_time())
         wall.append(time.perf_counter())
 
+    begun = time.perf_counter()
     result = optimize(scene, world=world, report=report)
+    elapsed = time.perf_counter() - begun
     memory = world.allreduce(_peak())
     if world.rank > 0:
-        return Iteration(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, memory)
+        return Iteration(result.iterations, *(0.0,) * 8, memory)
     total = float(np.median(np.diff(cpu)))
     # Phases are kept in wall-clock seconds: others on the machine lengthen them all alike.
     share = (cpu[-1] - cpu[0]) / (wall[-1] - wall[0]) / (result.iterations + 1)
@@ -64,6 +72,9 @@ def iterate(scene: Scene, world: MPI.Comm) -> Iteration:
         return share * sum(result.ledger.seconds.get(phase, 0.0) for phase in phases)
 
     return Iteration(
+        iterations=result.iterations,
+        wall=float(np.median(np.diff(wall))),
+        elapsed=elapsed,
         total=total,
         bodies=seconds(*BODIES),
         simulation=seconds("simulation"),
