@@ -5,6 +5,10 @@ a path or a date. Its results are the usual files in DIR/cases/<key>/; the summa
 tells that the case is done. Every case runs on one rank alone, so that its bits do not depend on
 how many there are. Ranks take cases by locking their folders: a lock ends with its process, and
 several runs may work on the same DIR.
+
+All that a run asks of one design with one reduction is simulated at once. Such a batch shares its
+steps, which each of its cases depends on within the tolerance: they are kept under the key of case
+and company, and one that is missing is computed with all the others.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
@@ -34,10 +38,12 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arm import Arm
+    from dolfinopt.evaluation import Evaluation
     from dolfinopt.files import HistoryRow
     from dolfinopt.ledger import Ledger
     from dolfinopt.parallel import ArmShare
     from dolfinopt.results import Simulated
+    from dolfinopt.simulation import Trajectory
 
 Action = Literal["optimize", "simulate", "compare"]
 
@@ -59,6 +65,12 @@ SCENARIO = (
     "optimizer",
     "scenarios",
 )
+
+
+# These values of material and arms do no more to the reduced arms than scale their integrals, where
+# the basis does not depend on them: Krylov's shifts and the Gramian's band are frequencies.
+SCALING = ("young_modulus", "density", "thickness")
+SCALABLE = ("craig-bampton", "modal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +112,22 @@ class Case:
         kept = {table: value for table, value in content.items() if table not in SCENARIO}
         return _digest([self.action, kept, self.design_key])
 
-    @property
-    def basis_key(self) -> str:
-        """Equal where the same basis and damping can be used again, with equal `arms_key`."""
-        return repr((self.scene.reduction, self.scene.damping))
+    @cached_property
+    def batch_key(self) -> str:
+        """Equal where cases are done at once: simulations of the same arms and basis."""
+        scene, content = self.scene, scene_content(self.scene)
+        if self.action != "simulate" or scene.reduction.coordinates == "auto":  # each its own
+            return self.key
+        free = {*SCENARIO} - {"reduction"}
+        if scene.reduction.method == "balanced":  # the Gramian knows the damping
+            free.remove("damping")
+        kept = {table: value for table, value in content.items() if table not in free}
+        motion_alone = scene.objective.simulated and not any(vars(scene.constraints).values())
+        if motion_alone and scene.reduction.method in SCALABLE:
+            for row in (kept["material"], *kept["arms"]):
+                for key in SCALING:
+                    row.pop(key, None)
+        return _digest([kept, self.design_key])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Case) and self.key == other.key
@@ -246,20 +270,70 @@ def _digest(content: Any) -> str:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """Cases one rank does in one go: an optimisation, or one design in many scenes."""
+class _Batch:
+    """Cases that are done at once, in an order that depends on nothing but what they are."""
 
     cases: tuple[Case, ...]
+
+    @cached_property
+    def names(self) -> dict[Case, str]:
+        """Every case's folder: its key, and where it has company the company's."""
+        if len(self.cases) == 1:
+            return {case: case.key for case in self.cases}
+        company = [case.key for case in self.cases]
+        return {case: _digest([case.key, company]) for case in self.cases}
 
     @property
     def cost(self) -> float:
         """Rough measure of the time it takes; the reduced equations' cost grows with q^2."""
-        steps = [
-            case.scene.optimizer.max_iterations if case.action == "optimize" else 1
-            for case in self.cases
-        ]
-        sizes = [1.0 + (case.scene.reduction.coordinates / 10.0) ** 2 for case in self.cases]
-        return sum(step * size for step, size in zip(steps, sizes, strict=True))
+        first = self.cases[0]
+        steps = first.scene.optimizer.max_iterations if first.action == "optimize" else 1
+        coordinates = first.scene.reduction.coordinates
+        size = 1.0 + ((REFERENCE if coordinates == "auto" else coordinates) / 10.0) ** 2
+        return steps * size * len(self.cases)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What one rank does in one go: an optimisation, or one design in many scenes."""
+
+    batches: tuple[_Batch, ...]
+
+    @property
+    def first(self) -> Case:
+        """All others have its action and its design."""
+        return self.batches[0].cases[0]
+
+    @property
+    def cost(self) -> float:
+        """See `_Batch.cost`."""
+        return sum(batch.cost for batch in self.batches)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the cases of this run are kept.
+
+    Attributes:
+        folder: of all cases.
+        run: what tells this run's failures from those of earlier ones.
+        names: every case's folder in it.
+    """
+
+    folder: Path
+    run: str
+    names: Mapping[Case, str]
+
+    def __getitem__(self, case: Case) -> Path:
+        return self.folder / self.names[case]
+
+    def failure(self, case: Case) -> str:
+        """Return why the case failed in this run, "" if it did not."""
+        return _failure(self[case], self.run)
+
+    def has(self, case: Case) -> bool:
+        """Tell whether the case is done, or has failed in this run."""
+        return (self[case] / SUMMARY).exists() or bool(self.failure(case))
 
 
 def run_cases(
@@ -282,14 +356,18 @@ def run_cases(
     from dolfinopt.parallel import on_root
 
     wanted = _with_dependencies(cases)
-    place = folder / CASES
-    done, run = on_root(world, lambda: ([_is_done(place / c.key) for c in wanted], uuid4().hex))
-    missing = [case for case, there in zip(wanted, done, strict=True) if not there]
+    batches = _batches(wanted)
+    names = {case: name for batch in batches for case, name in batch.names.items()}
+    run = on_root(world, lambda: uuid4().hex)
+    place = _Place(folder / CASES, run, names)
+    done = on_root(world, lambda: [_is_done(place[case]) for case in wanted])
+    missing = {case for case, there in zip(wanted, done, strict=True) if not there}
+    left = [batch for batch in batches if not missing.isdisjoint(batch.cases)]
     with open_board(world, len(missing), shown) as board:
-        _work(_jobs(missing, world.size), place, run, board)
+        _work(_jobs(left, world.size), place, board)
         board.wait_for_all()
     world.barrier()
-    outcomes = {case: _read(case, place, run) for case in wanted}
+    outcomes = {case: _read(case, place) for case in wanted}
     return Outcomes(outcomes, len(missing))
 
 
@@ -303,27 +381,39 @@ def _with_dependencies(cases: Iterable[Case]) -> list[Case]:
     return list(found)
 
 
-def _jobs(cases: Sequence[Case], ranks: int) -> list[_Job]:
-    """Return the jobs, optimisations first, as others wait for them, and longest first."""
+def _batches(cases: Iterable[Case]) -> list[_Batch]:
+    """Return all cases, those that can be done at once together."""
     groups: dict[str, list[Case]] = {}
     for case in cases:
-        name = case.key if case.action == "optimize" else case.arms_key
-        groups.setdefault(name, []).append(case)
+        groups.setdefault(case.batch_key, []).append(case)
+    return [_Batch(tuple(sorted(group, key=lambda case: case.key))) for group in groups.values()]
+
+
+def _jobs(batches: Iterable[_Batch], ranks: int) -> list[_Job]:
+    """Return the jobs, optimisations first, as others wait for them, and longest first.
+
+    Batches of the same arms and design are one job, so that these are built once, unless that
+    leaves a rank without.
+    """
+    groups: dict[str, list[_Batch]] = {}
+    for batch in batches:
+        first = batch.cases[0]
+        name = first.key if first.action == "optimize" else first.arms_key
+        groups.setdefault(name, []).append(batch)
     jobs = []
     for group in groups.values():
-        ordered = sorted(group, key=lambda case: case.basis_key)
         parts = ranks if len(groups) < ranks else 1
-        cuts = np.linspace(0, len(ordered), min(parts, len(ordered)) + 1).astype(int)
-        jobs += [_Job(tuple(ordered[a:b])) for a, b in pairwise(cuts)]
-    return sorted(jobs, key=lambda job: (job.cases[0].action != "optimize", -job.cost))
+        cuts = np.linspace(0, len(group), min(parts, len(group)) + 1).astype(int)
+        jobs += [_Job(tuple(group[a:b])) for a, b in pairwise(cuts)]
+    return sorted(jobs, key=lambda job: (job.first.action != "optimize", -job.cost))
 
 
-def _work(jobs: Sequence[_Job], place: Path, run: str, board: Board) -> None:
+def _work(jobs: Sequence[_Job], place: _Place, board: Board) -> None:
     """Take jobs until none is left; the other ranks do the same."""
     left = list(jobs)
     while left:
         for job in left:
-            if _is_finished(job, place, run) or _do(job, place, run, board):
+            if not _missing(job, place) or _do(job, place, board):
                 left.remove(job)
                 break
         else:
@@ -331,38 +421,33 @@ def _work(jobs: Sequence[_Job], place: Path, run: str, board: Board) -> None:
             time.sleep(IDLE)
 
 
-def _is_finished(job: _Job, place: Path, run: str) -> bool:
-    return all(
-        (place / case.key / SUMMARY).exists() or _failure(place / case.key, run)
-        for case in job.cases
-    )
+def _missing(job: _Job, place: _Place) -> list[Case]:
+    """Return the job's cases that have neither been done nor failed."""
+    return [case for batch in job.batches for case in batch.cases if not place.has(case)]
 
 
-def _do(job: _Job, place: Path, run: str, board: Board) -> bool:
+def _do(job: _Job, place: _Place, board: Board) -> bool:
     """Do a job if it is ready and nobody else is at it; return whether it is done."""
-    given = job.cases[0].design
+    given = job.first.design
     if isinstance(given, Case):
-        if reason := _failure(place / given.key, run):
-            for case in job.cases:
-                _fail(place / case.key, run, f"{given.label or given.key}: {reason}")
+        if reason := place.failure(given):
+            for case in _missing(job, place):
+                _fail(place[case], place.run, f"{given.label or given.key}: {reason}")
                 board.tell(case.label, text="its design is missing", finished=1)
             return True
-        if not (place / given.key / SUMMARY).exists():
+        if not (place[given] / SUMMARY).exists():
             return False
-        given = place / given.key / "design.npz"
-    with _claim(place / job.cases[0].key) as mine:
+        given = place[given] / "design.npz"
+    with _claim(place[job.first]) as mine:
         if not mine:
             return False
-        missing = [
-            case
-            for case in job.cases
-            if not ((place / case.key / SUMMARY).exists() or _failure(place / case.key, run))
-        ]
-        if job.cases[0].action == "optimize":
+        missing = _missing(job, place)
+        if job.first.action == "optimize":
             for case in missing:
-                _optimise(case, place / case.key, run, board)
+                _optimise(case, place[case], place.run, board)
         elif missing:
-            _examine(missing, given, place, run, board)
+            batches = [batch for batch in job.batches if not set(missing).isdisjoint(batch.cases)]
+            _examine(batches, missing, given, place, board)
     return True
 
 
@@ -421,21 +506,31 @@ def _optimise(case: Case, folder: Path, run: str, board: Board) -> None:
 
 
 def _examine(
-    cases: Sequence[Case], design: Path | None, place: Path, run: str, board: Board
+    batches: Sequence[_Batch],
+    missing: Sequence[Case],
+    design: Path | None,
+    place: _Place,
+    board: Board,
 ) -> None:
-    """Simulate or compare one design in many scenes."""
+    """Simulate or compare one design in many scenes; write what is missing."""
     from dolfinopt.results import write_simulation
 
-    board.tell(cases[0].label, text="...")
-    kind = cases[0].action
+    cases = [case for batch in batches for case in batch.cases]
+    board.tell(missing[0].label, text="...")
     scenes = [_unnamed(case) for case in cases]
-    results = simulate_scenarios(scenes, design) if kind == "simulate" else compare(scenes, design)
+    results: Iterator[Simulated | tuple[BasisFigures, ...] | ConvergenceError]
+    if cases[0].action == "simulate":
+        results = simulate_scenarios(scenes, design)
+    else:
+        results = compare(scenes, design)
     begun = time.perf_counter()
-    for case, scene, found in zip(cases, scenes, results):
-        folder, wall = place / case.key, time.perf_counter() - begun
+    for case, scene, found in zip(cases, scenes, results, strict=True):
+        if case not in missing:  # it was needed as company
+            continue
+        folder, wall = place[case], time.perf_counter() - begun
         folder.mkdir(parents=True, exist_ok=True)
         if isinstance(found, ConvergenceError):
-            _fail(folder, run, str(found))
+            _fail(folder, place.run, str(found))
             text = f"failed: {found}"
         elif isinstance(found, tuple):
             _write_comparison(folder, scene, found, wall)
@@ -452,31 +547,50 @@ def simulate_scenarios(
 ) -> Iterator[Simulated | ConvergenceError]:
     """Simulate one design in many scenes, on this rank alone.
 
-    Arms are meshed, assembled and factorised once, and reduced once for every change of
-    `reduction` between neighbours. A scene whose simulation fails yields its error.
+    Arms are meshed, assembled and factorised once; neighbours with the same `reduction` share it
+    and are simulated in one batch, whose time and counts the first of them bears.
 
     Args:
-        scenes: that differ in `SCENARIO` alone.
+        scenes: that differ in `SCENARIO` alone; neighbours also in what `Case.batch_key` allows.
         design: design.npz, or None, the initial one.
+
+    Returns:
+        In the scenes' order; of one that fails its error.
 
     Raises:
         InputError: the design does not fit the arms.
     """
-    from dolfinopt.evaluation import evaluate
+    from dolfinopt.coordinates import choose_coordinates
+    from dolfinopt.evaluation import evaluate_batch
     from dolfinopt.ledger import Ledger
     from dolfinopt.results import Simulated
 
     ledger = Ledger()
     share, arms, x_phys = _posed(scenes[0], design, ledger)
-    for scene in scenes:
-        arms = {k: arm.under(scene) for k, arm in arms.items()}
+    for batch in _neighbours(scenes):
+        arms = {k: arm.under(batch[0]) for k, arm in arms.items()}
+        every: Sequence[tuple[Evaluation, Trajectory | None] | ConvergenceError]
+        choice = None
         try:
-            evaluation, trajectory = evaluate(scene, share, arms, x_phys, ledger)
+            choice = choose_coordinates(batch[0], share, arms, x_phys, ledger)
+            every = evaluate_batch(batch, share, arms, x_phys, ledger)
         except ConvergenceError as error:
-            yield error
+            every = [error]
+        for scene, found in zip(batch, every, strict=True):
+            if isinstance(found, ConvergenceError):
+                yield found
+            else:
+                yield Simulated(scene, share, arms, x_phys, *found, ledger, choice)
+            _clear(ledger)
+
+
+def _neighbours(scenes: Sequence[Scene]) -> Iterator[list[Scene]]:
+    """Yield neighbours with one basis; where it is chosen, "auto", each scene alone."""
+    for reduction, group in groupby(scenes, key=lambda scene: scene.reduction):
+        if reduction.coordinates == "auto":
+            yield from ([scene] for scene in group)
         else:
-            yield Simulated(scene, share, arms, x_phys, evaluation, trajectory, ledger)
-        _clear(ledger)
+            yield list(group)
 
 
 def compare(
@@ -491,10 +605,12 @@ def compare(
     Raises:
         InputError: the design does not fit the arms.
     """
+    from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.ledger import Ledger
     from dolfinopt.reduction import METHODS, Options, basis_errors
 
-    _, arms, x_phys = _posed(scenes[0], design, Ledger())
+    ledger = Ledger()
+    share, arms, x_phys = _posed(scenes[0], design, ledger)
     richer = {}
     for k, arm in arms.items():
         arm.set_design(x_phys[k])
@@ -503,8 +619,9 @@ def compare(
     for scene in scenes:
         figures = []
         try:
-            for k in arms:
-                arm = arms[k] = arms[k].under(scene)
+            arms = {k: arm.under(scene) for k, arm in arms.items()}
+            choose_coordinates(scene, share, arms, x_phys, ledger)
+            for k, arm in arms.items():
                 arm.reduce(x_phys[k])
                 assert arm.basis is not None
                 errors = basis_errors(arm.elastic, arm.basis, richer[k], MODES)
@@ -595,10 +712,10 @@ def _failure(folder: Path, run: str) -> str:
     return str(data["message"]) if data.get("run") == run else ""
 
 
-def _read(case: Case, place: Path, run: str) -> Outcome:
+def _read(case: Case, place: _Place) -> Outcome:
     """Read a case back."""
-    folder = place / case.key
-    if message := _failure(folder, run):
+    folder = place[case]
+    if message := place.failure(case):
         return Outcome(case, folder, failure=message)
     data = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
     seconds = data["seconds"]["total"]

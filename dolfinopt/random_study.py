@@ -24,10 +24,10 @@ from dolfinopt.findings import (
     Study,
     Table,
 )
+from dolfinopt.plans import given_designs
 from dolfinopt.sampling import Responses, Samples, posed, respond
 from dolfinopt.scene import Scene
 from dolfinopt.scene_messages import allowed_words, field_at
-from dolfinopt.study import Vary, changed, given_designs
 from dolfinopt.uncertainty import (
     CONFIDENCE,
     QUANTILES,
@@ -44,6 +44,7 @@ from dolfinopt.uncertainty import (
     statistics,
     unit_points,
 )
+from dolfinopt.variants import Vary, changed
 
 if TYPE_CHECKING:
     from mpi4py import MPI

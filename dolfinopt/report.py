@@ -152,7 +152,7 @@ def _table(table: Table) -> str:
         "<tr>" + "".join(f"<td>{escape(_shown(cell))}</td>" for cell in row) + "</tr>"
         for row in table.rows
     )
-    caption = f"<caption>{escape(table.title)}</caption>"
+    caption = f"<caption><span>{escape(table.title)}</span></caption>"
     content = (
         f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     )

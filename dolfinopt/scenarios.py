@@ -22,7 +22,7 @@ WORST_CASE = 20.0
 
 @dataclass(frozen=True)
 class Factors:
-    """What a scenario's material makes of one arm's body.
+    """What a scenario's material, and thickness, make of one arm's body.
 
     Attributes:
         mass, stiffness: relative to the scene's.
@@ -37,9 +37,10 @@ class Factors:
 def factors(scene: Scene, other: Scene, index: int) -> Factors:
     """Return what makes the body of arm `index` in `scene` that of the same design in `other`."""
     here, there = scene.material_of(index), other.material_of(index)
+    thicker = other.arms[index].thickness / scene.arms[index].thickness  # in plane stress
     return Factors(
-        there.density / here.density,
-        there.young_modulus / here.young_modulus,
+        thicker * there.density / here.density,
+        thicker * there.young_modulus / here.young_modulus,
         other.damping.stiffness_proportional,
     )
 

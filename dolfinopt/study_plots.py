@@ -37,6 +37,7 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#0
 DASHES = ("-", "--", ":", "-.")
 MARKERS = "osD^vPX"
 FEW = 40  # points a line that get markers
+FEW_DECADES = 300.0  # ratio up to which a logarithmic axis names 1, 2 and 5
 NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
 
@@ -81,6 +82,8 @@ def line_figure(figure: LineFigure) -> Figure:
         # Curves of one name look alike: any of them stands for all.
         handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
         names = [label for label in looks if label in handles]
+        if all(names == [panel.title] for panel in panels):  # the title says it
+            continue
         row[len(panels) - 1].legend(
             [handles[name] for name in names],
             names,
@@ -131,25 +134,32 @@ def _look(index: int) -> dict[str, Any]:
         "color": colour,
         "linestyle": DASHES[index // len(PALETTE) % len(DASHES)],
         "marker": MARKERS[index % len(MARKERS)],
-        # Smaller ones on top: curves that coincide can be told apart.
+        # Smaller and thinner ones on top: curves that coincide can be told apart.
         "markersize": max(4.0, 9.0 - 1.5 * index),
+        "linewidth": max(1.2, 2.6 - 0.7 * index),
+        "zorder": 2.0 + 0.01 * index,
     }
 
 
 def _draw_panel(axes: Axes, panel: Panel, looks: dict[str, dict[str, Any]]) -> None:
     """Draw one panel."""
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     for line in panel.lines:
         look = dict(looks[line.label])
+        if len(panel.lines) == 1 or len(line.x) <= FEW:
+            look["linewidth"] = 1.4
         if len(line.x) > FEW:
             look["marker"] = ""
-        axes.plot(line.x, line.y, label=line.label, linewidth=1.4,
-                  markerfacecolor="none", **look)  # fmt: skip
+        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **look)
     values = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
     x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
     if len(values) and spans_decade(values):
         axes.set_yscale("log")
+        if values.max() < FEW_DECADES * values.min():
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(NullFormatter())
     elif len(values) and values.min() >= 0.0 and values.min() < 0.5 * values.max():
         axes.set_ylim(bottom=0.0)
     if len(x) and (x % 1 == 0).all():
@@ -270,6 +280,8 @@ def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
 
 def histogram_figure(figure: HistogramFigure) -> Figure:
     """Return histograms, the share of the samples below as a curve, and the nominal values."""
+    from matplotlib.ticker import MaxNLocator
+
     rows, columns = len(figure.rows), max(map(len, figure.rows))
     drawn = _figure(5.2 * columns, 3.2 * rows + 0.5)
     grid = drawn.subplots(rows, columns, squeeze=False)
@@ -281,6 +293,7 @@ def histogram_figure(figure: HistogramFigure) -> Figure:
             axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
             axes.set_xlabel(panel.x_label, parse_math=False)
             axes.set_ylabel("samples [-]")
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             share = axes.twinx()
             ordered = np.sort(panel.values)
             share.step(ordered, np.arange(1, len(ordered) + 1) / len(ordered), where="post",

@@ -39,7 +39,7 @@ def forbid(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("computed again")
 
-    for module, name in ((optimization, "optimize"), (evaluation, "evaluate")):
+    for module, name in ((optimization, "optimize"), (evaluation, "simulate_batch")):
         monkeypatch.setattr(module, name, refuse)
 
 
@@ -181,8 +181,9 @@ def test_same_as_without_cases(plan, done):
 
 
 def test_ranks_do_not_matter(plan, done, tmp_path):
-    """Done on each rank alone: the same bits as together."""
+    """Done on each rank alone: the same bits as together, in any order."""
     _, together = done
+    plan = plan[::-1]
     alone = run_cases(plan, tmp_path, SELF, shown=False)
     assert alone.computed == together.computed
     for case, outcome in alone.by_case.items():
@@ -214,8 +215,15 @@ def test_comparison(plan, done):
         assert one.compliance[2] > 0.02
 
 
+def assert_close(one, other):
+    """Both are right to `simulation.tolerance` in the coordinates; compliance is their square."""
+    tolerance = scene().simulation.tolerance
+    assert one.compliance == pytest.approx(other.compliance, rel=4.0 * tolerance)
+    assert one.max_deviation == pytest.approx(other.max_deviation, rel=2.0 * tolerance)
+
+
 def test_scenarios_share_what_they_can():
-    """One mesh, factorisation and basis; and the same bits as each scenario by itself."""
+    """One mesh and factorisation, one basis and batch a reduction; results as if alone."""
     scenes = [
         scene(),
         scene("payload.mass=4", "motion.flattening=0.8"),
@@ -227,20 +235,139 @@ def test_scenarios_share_what_they_can():
     for one, found in zip(scenes, simulate_scenarios(scenes, None)):
         counts.append(found.ledger.counts)
         [alone] = simulate_scenarios([one], None)
-        assert found.evaluation == alone.evaluation
+        assert_close(found.evaluation, alone.evaluation)
+        assert found.scene is one and found.trajectory.scene is one
     assert [c.factorisations for c in counts] == [2, 0, 0, 0, 0]
     assert [c.eigenproblems for c in counts] == [2, 0, 0, 2, 2]
-    assert [c.simulations for c in counts] == [1] * 5
+    assert [c.simulations for c in counts] == [3, 0, 0, 1, 1]
+
+
+@pytest.fixture
+def batches(monkeypatch):
+    """How many scenes every call of the simulation took on this rank."""
+    sizes = []
+    whole = evaluation.simulate_batch
+
+    def count(scenes, *args):
+        sizes.append(len(scenes))
+        return whole(scenes, *args)
+
+    monkeypatch.setattr(evaluation, "simulate_batch", count)
+    return sizes
+
+
+def test_sweep_of_nine_is_one_batch(tmp_path, batches):
+    masses = np.linspace(4.0, 8.0, 9)
+    sweep = [Case(scene(f"payload.mass={mass}")) for mass in masses]
+    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
+    assert batches == [9]
+    # The first of the batch bears its account: one arm is factorised once, the other, too.
+    counts = [
+        json.loads((outcomes[case].folder / "summary.json").read_text())["counts"]
+        for case in sorted(sweep, key=lambda case: case.key)
+    ]
+    assert [one["simulations"] for one in counts] == [9] + 8 * [0]
+    assert [one["factorisations"] for one in counts] == [2] + 8 * [0]
+    # In any order the same company, and nothing is computed again.
+    again = run_cases(sweep[::-1], tmp_path, SELF, shown=False)
+    assert again.computed == 0 and batches == [9]
+
+
+@pytest.mark.parametrize(
+    "key", ["material.density", "material.young_modulus", "arms.arm1.thickness"]
+)
+def test_what_scales_the_arms_is_one_batch(tmp_path, batches, key):
+    """Against arms that are assembled and reduced anew."""
+    values = {"density": (2500, 2900), "young_modulus": (60e9, 75e9), "thickness": (0.009, 0.012)}
+    sweep = [Case(scene(f"{key}={value}")) for value in values[key.rpartition(".")[2]]]
+    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
+    assert batches == [2]
+    for case in sweep:
+        [alone] = simulate_scenarios([case.scene], None)
+        assert_close(outcomes[case], alone.evaluation)
+
+
+def test_batches_have_one_basis():
+    """A basis that depends on frequencies, or a frequency that is asked for, is not scaled."""
+    key = Case(scene()).batch_key
+    light = "material.density=2600"
+    assert Case(scene(light, "payload.mass=4")).batch_key == key
+    others = ["reduction.coordinates=5", "material.poisson_ratio=0.3", "design.initial=0.4"]
+    assert key not in {Case(scene(other)).batch_key for other in others}
+    krylov = ("reduction.method=krylov", "reduction.shifts=[30]")
+    for settings in (krylov, ("objective.kind=static",), ("constraints.first_frequency=1",)):
+        one, other = Case(scene(*settings)), Case(scene(*settings, light))
+        assert one.batch_key != other.batch_key
+    damped = "damping.stiffness_proportional=1e-3"
+    assert Case(scene(damped)).batch_key == key
+    gramian = "reduction.method=balanced"
+    assert Case(scene(gramian, damped)).batch_key != Case(scene(gramian)).batch_key
+
+
+def test_chosen_coordinates_are_those_of_each_scene():
+    """Nothing that "auto" came to in one scene is left in the next."""
+    auto = "reduction.coordinates=auto"
+    strict, loose = (scene(auto, f"reduction.tolerance={value}") for value in (0.002, 0.05))
+    first, found = simulate_scenarios([strict, loose], None)
+    [alone] = simulate_scenarios([loose], None)
+    assert found.choice == alone.choice and found.evaluation == alone.evaluation
+    assert first.choice.coordinates > found.choice.coordinates
+    assert Case(strict).batch_key == Case(strict).key
+
+
+def test_company_is_part_of_where_a_case_is_kept(plan, done, tmp_path, batches):
+    """What a case gives does not depend on what was there before, but on what is asked with it."""
+    _, outcomes = done
+    [case, *_] = together = plan[3:6]
+    alone = run_cases([case], tmp_path, SELF, shown=False)
+    assert alone[case].folder.name == case.key != outcomes[case].folder.name
+    assert_close(alone[case], outcomes[case])
+    after = run_cases(together, tmp_path, SELF, shown=False)
+    assert batches == [1, 3] and after.computed == 3
+    for one in together:
+        assert after[one].compliance == outcomes[one].compliance
+
+
+def test_batch_interrupted_while_it_is_written(plan, done, shared_tmp_path, monkeypatch, batches):
+    """Cases that are missing are computed with the company of those that are there."""
+    from dolfinopt import results
+
+    _, outcomes = done
+    together = plan[3:6]
+    written = []
+    whole = results.write_simulation
+
+    class Killed(Exception):
+        pass
+
+    def stop(*args, **kwargs):
+        if written:
+            raise Killed
+        written.append(whole(*args, **kwargs))
+
+    if WORLD.rank == 0:
+        with monkeypatch.context() as patch:
+            patch.setattr(results, "write_simulation", stop)
+            with pytest.raises(Killed):
+                run_cases(together, shared_tmp_path, SELF, shown=False)
+        batches.clear()
+    WORLD.barrier()
+    again = run_cases(together, shared_tmp_path, WORLD, shown=False)
+    assert again.computed == 2 and sum(WORLD.allgather(sum(batches))) == 3
+    for case in together:
+        assert again[case].compliance == outcomes[case].compliance
+        np.testing.assert_array_equal(again[case].deviation(), outcomes[case].deviation())
 
 
 def test_damaged_summary_is_done_anew(plan, done, shared_tmp_path):
     folder, outcomes = done
     case = plan[3]
     if WORLD.rank == 0:
-        shutil.copytree(folder / "cases" / case.key, shared_tmp_path / "cases" / case.key)
-        (shared_tmp_path / "cases" / case.key / "summary.json").write_text('{"seconds": {')
+        shutil.copytree(folder / "cases", shared_tmp_path / "cases")
+        name = outcomes[case].folder.name
+        (shared_tmp_path / "cases" / name / "summary.json").write_text('{"seconds": {')
     WORLD.barrier()
-    again = run_cases([case], shared_tmp_path, WORLD, shown=False)
+    again = run_cases(plan, shared_tmp_path, WORLD, shown=False)
     assert again.computed == 1
     assert again[case].compliance == outcomes[case].compliance
 
@@ -307,15 +434,15 @@ def test_foreign_checkpoint_is_not_used(plan, done, tmp_path):
 
 def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypatch):
     _, outcomes = done
-    whole = evaluation.evaluate
+    whole = evaluation.simulate_batch
 
-    def fail_at_four(scene, *args, **kwargs):
-        if scene.payload.mass == 4.0:
-            raise do.ConvergenceError("no solution at 4 kg")
-        return whole(scene, *args, **kwargs)
+    def fail_at_four(scenes, *args):
+        error = do.ConvergenceError("no solution at 4 kg")
+        found = whole(scenes, *args)
+        return [error if s.payload.mass == 4.0 else one for s, one in zip(scenes, found)]
 
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "evaluate", fail_at_four)
+        patch.setattr(evaluation, "simulate_batch", fail_at_four)
         first = run_cases(plan[3:6], shared_tmp_path, WORLD, shown=False)
     assert [one.failure for one in first.failures] == ["no solution at 4 kg"]
     assert first[plan[4]].failure and np.isnan(first[plan[4]].compliance)
@@ -343,7 +470,7 @@ def test_case_in_other_hands_is_waited_for(plan, done, shared_tmp_path):
     import fcntl
     import threading
 
-    folder, outcomes = done
+    _, outcomes = done
     case = plan[3]
     if WORLD.rank > 0:
         run_cases([case], shared_tmp_path, WORLD, shown=False)
@@ -354,7 +481,7 @@ def test_case_in_other_hands_is_waited_for(plan, done, shared_tmp_path):
     fcntl.flock(lock, fcntl.LOCK_EX)
 
     def finish():
-        data = json.loads((folder / "cases" / case.key / "summary.json").read_text())
+        data = json.loads((outcomes[case].folder / "summary.json").read_text())
         (place / "part").write_text(json.dumps(data | {"compliance": 12345.0}))
         (place / "part").rename(place / "summary.json")
         lock.close()

@@ -16,17 +16,20 @@ import pytest
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt import cases, study
+from dolfinopt import cases, study, topics, variants
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.findings import TornadoFigure
-from dolfinopt.study import parse_vary
+from dolfinopt.variants import parse_vary
 
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "demos" / "two_arm.toml"
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 SMALL = ["arms.cells=[20,3]", "optimizer.max_iterations=3", "simulation.sample=0.01"]
 SETTINGS = [word for value in SMALL for word in ("--set", value)]
+# Of the coordinates, whose square is the compliance. A batch's steps are not those of one scene:
+# both results are right to it.
+TOLERANCE = 1e-4
 # As it was before this process began MPI, which would confuse another mpirun.
 ENVIRONMENT = dict(os.environ)
 
@@ -161,12 +164,11 @@ def test_payload(folder, capsys):
             ("optimised design", result.x_phys),
         ):
             evaluation, _ = do.evaluate(other, result.share, result.arms, x, do.Ledger())
-            # Ten digits are written; the modes' search set out elsewhere.
             assert float(row[f"{label}: compliance [N m]"]) == pytest.approx(
-                evaluation.compliance, rel=1e-8
+                evaluation.compliance, rel=4.0 * TOLERANCE
             )
             assert float(row[f"{label}: maximal deviation [mm]"]) == pytest.approx(
-                1e3 * evaluation.max_deviation, rel=1e-8
+                1e3 * evaluation.max_deviation, rel=2.0 * TOLERANCE
             )
     for name in ("payload.png", "payload.md", "payload_curves.csv"):
         assert (folder / name).is_file()
@@ -197,7 +199,7 @@ def test_cross_evaluation(folder):
         for j, used in enumerate((4, 8)):
             other = scene(f"payload.mass={used}")
             found, _ = do.evaluate(other, design.share, design.arms, design.x_phys, do.Ledger())
-            assert values[i, j] == pytest.approx(found.compliance, rel=1e-8)
+            assert values[i, j] == pytest.approx(found.compliance, rel=4.0 * TOLERANCE)
     # Those made for each scenario stand in the main table, too.
     made_for_it = [row[-2] for row in tables[""].rows]
     np.testing.assert_array_equal(made_for_it, np.diag(values))
@@ -299,29 +301,29 @@ def test_objective(folder):
 
 
 def test_solid_ends_allow_nothing_attached():
-    plan = study._objective_plan(scene("arms.passive=0.05"))
+    plan = topics.objective_plan(scene("arms.passive=0.05"))
     labels = [case.label for case in plan.cases]
     assert "eigenfrequency, nothing attached" in labels and len(labels) == 12
 
 
 def test_exact_gradient_only_where_there_is_one():
-    plan = study._objective_plan(scene("simulation.integrator=generalized-alpha"))
+    plan = topics.objective_plan(scene("simulation.integrator=generalized-alpha"))
     assert not any("exact" in case.label for case in plan.cases)
 
 
 @pytest.mark.slow
 def test_reduction(folder, monkeypatch):
     """Craig-Bampton and Krylov do not depend on q, modal truncation is below and climbs."""
-    monkeypatch.setattr(study, "SWEPT", (4, 8))
-    monkeypatch.setattr(study, "COMPARED", (4,))
-    monkeypatch.setattr(study, "REFERENCE", 8)
+    monkeypatch.setattr(topics, "SWEPT", (4, 8))
+    monkeypatch.setattr(topics, "COMPARED", (4,))
+    monkeypatch.setattr(variants, "REFERENCE", 8)
     monkeypatch.setattr(cases, "REFERENCE", 8)
     run(
         SCENE, "reduction", "--vary", "reduction.coordinates=4", *SETTINGS, "--set",
         "optimizer.max_iterations=1", "--out", folder,
     )  # fmt: skip
     main = {row["method"]: row for row in rows_of(folder / "reduction.csv")}
-    assert list(main) == list(study.METHODS)
+    assert list(main) == list(variants.METHODS)
     own, again = "compliance, own model [N m]", "compliance, craig-bampton 8 [N m]"
     for method, row in main.items():
         off = float(row["own model off by [%]"])
@@ -351,28 +353,28 @@ def test_reduction(folder, monkeypatch):
 
 def test_balanced_where_it_is_possible():
     """Too few directions are not asked of the Gramian; options of one method stay there."""
-    swept = study._reductions(scene(), None, (4, 48))
+    swept = variants.reductions(scene(), None, (4, 48))
     pairs = {(s.reduction.method, s.reduction.coordinates) for s in swept}
     assert ("balanced", 4) in pairs and ("balanced", 48) not in pairs
     base = scene(
         "reduction.method=krylov", "reduction.shifts=[0.0,100.0]", "reduction.coordinates=6"
     )
-    assert study.reduced(base, "krylov", 8).reduction.shifts == (0.0, 100.0)
-    assert study.reduced(base, "modal", 8).reduction.shifts == (0.0,)
+    assert variants.reduced(base, "krylov", 8).reduction.shifts == (0.0, 100.0)
+    assert variants.reduced(base, "modal", 8).reduction.shifts == (0.0,)
 
 
 def test_failures_end_with_status_one(folder, monkeypatch):
     """The table names what failed and holds the rest."""
     from dolfinopt import evaluation
 
-    whole = evaluation.evaluate
+    whole = evaluation.simulate_batch
 
-    def fail_at_seven(scene, *args, **kwargs):
-        if scene.payload.mass == 7.25:
-            raise ConvergenceError("no solution")
-        return whole(scene, *args, **kwargs)
+    def fail_at_seven(scenes, *args):
+        error = ConvergenceError("no solution")
+        found = whole(scenes, *args)
+        return [error if s.payload.mass == 7.25 else one for s, one in zip(scenes, found)]
 
-    monkeypatch.setattr(evaluation, "evaluate", fail_at_seven)
+    monkeypatch.setattr(evaluation, "simulate_batch", fail_at_seven)
     with pytest.raises(ConvergenceError, match=r"mass = 7\.25: no solution \(and 1 more\)"):
         run(SCENE, "payload", "--vary", "payload.mass=4,7.25", *SETTINGS, "--out", folder)
     WORLD.barrier()
