@@ -316,7 +316,9 @@ def _simulate(
         sizes.append(len(group))
     nominal = chain_of(scenes[0], owned)
     bodies = [nominal, *(bodies_in(scenes[0], other, owned) for other in posed[1:])]
-    every = simulate_batch(posed, bodies, ledger, begun)
+    # Slopes are asked of a single evaluation at most.
+    alone = len(scenes) == 1
+    every = simulate_batch(posed, bodies, ledger, begun, differentiated=alone)
     found: list[Trajectory | ConvergenceError] = []
     for size in sizes:
         parts, every = every[:size], every[size:]

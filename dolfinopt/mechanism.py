@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +38,60 @@ UNSCALED = Scale()
 
 
 @dataclass(frozen=True)
+class Shapes:
+    """One body's constants in complex form, and tables that serve all instants in one product.
+
+    Attributes:
+        body: real constants.
+        c: first mass moment, complex.
+        C, B: (q,) complex; B is the outboard deflection.
+        turn: (q,) outboard rotation.
+        reach: outboard reference point, complex.
+        moved: (q, 6) real: x and y of C, of B; turn, 0.
+        pushed: (7, q) real: x and y of C; r; j; x and y of B; turn.
+        K, D: (q, q), or their diagonals (q,) where there is nothing else; no D, None.
+    """
+
+    body: FloatingBody
+    c: complex
+    C: np.ndarray
+    B: np.ndarray
+    turn: np.ndarray
+    reach: complex
+    moved: np.ndarray
+    pushed: np.ndarray
+    K: np.ndarray
+    D: np.ndarray | None
+
+
+def _shapes(body: FloatingBody) -> Shapes:
+    C, (B_x, B_y, turn) = body.C, body.outboard
+    return Shapes(
+        body=body,
+        c=complex(*body.moment),
+        C=C[0] + 1j * C[1],
+        B=B_x + 1j * B_y,
+        turn=turn,
+        reach=complex(*body.outboard_point),
+        moved=np.stack([C[0], C[1], B_x, B_y, turn, np.zeros_like(turn)], axis=1),
+        pushed=np.stack([C[0], C[1], body.r, body.j, B_x, B_y, turn]),
+        K=_alone(body.K),
+        D=_alone(body.D) if body.D.any() else None,
+    )
+
+
+def _alone(A: np.ndarray) -> np.ndarray:
+    """Return the diagonal of a matrix that has nothing else, or the matrix."""
+    diagonal = np.diagonal(A)
+    return diagonal if np.count_nonzero(A) == np.count_nonzero(diagonal) else A
+
+
+def _product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """Return x A (n, q) of a matrix, or of its diagonal."""
+    return x * A if A.ndim == 1 else x @ A
+
+
+@dataclass(frozen=True)
 class Mechanism:
     """A cart on a horizontal rail that carries a chain of arms and a payload.
 
@@ -58,7 +113,7 @@ class Mechanism:
     joint_height: float
     scales: tuple[Scale, ...] = ()
 
-    @property
+    @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Each body's place in the vector of all elastic coordinates."""
         ends = np.cumsum([0, *(body.coordinates for body in self.bodies)])
@@ -68,6 +123,24 @@ class Mechanism:
     def coordinates(self) -> int:
         """Number N of elastic coordinates of all bodies."""
         return sum(body.coordinates for body in self.bodies)
+
+    @cached_property
+    def shapes(self) -> tuple[Shapes, ...]:
+        """Every body's constants as the equations of motion use them."""
+        return tuple(_shapes(body) for body in self.bodies)
+
+    def __getitem__(self, part: slice) -> Mechanism:
+        """Return it at some of the instants."""
+        if not self.scales and not isinstance(self.payload_mass, np.ndarray):
+            return self
+        mass, inertia = (_at(x, part) for x in (self.payload_mass, self.payload_inertia))
+        return replace(
+            self,
+            payload_mass=mass,
+            payload_inertia=inertia,
+            gravity=(_at(self.gravity[0], part), _at(self.gravity[1], part)),
+            scales=tuple(scale[part] for scale in self.scales),
+        )
 
     def scale(self, k: int) -> Scale:
         """Return that of a body."""
@@ -91,29 +164,6 @@ def _column(x: PerInstant) -> PerInstant:
 
 
 @dataclass(frozen=True)
-class _Shapes:
-    """One body's constants in complex form; real ones are read from `body`."""
-
-    body: FloatingBody
-    c: complex
-    C: np.ndarray  # (q,) complex
-    B: np.ndarray  # (q,) complex outboard deflection
-    turn: np.ndarray  # (q,) outboard rotation
-    reach: complex  # outboard reference point
-
-
-def _shapes(body: FloatingBody) -> _Shapes:
-    return _Shapes(
-        body=body,
-        c=complex(*body.moment),
-        C=body.C[0] + 1j * body.C[1],
-        B=body.outboard[0] + 1j * body.outboard[1],
-        turn=body.outboard[2],
-        reach=complex(*body.outboard_point),
-    )
-
-
-@dataclass(frozen=True)
 class _Frame:
     """Motion of one tangent frame and what one body makes of it; arrays over n instants.
 
@@ -122,8 +172,9 @@ class _Frame:
         w, wd: angular velocity and acceleration.
         d, dd, ddd: outboard point from the origin and its relative velocity and acceleration.
         s, sd, sdd: first mass moment c + C q and its relative rates.
-        jM, rG: (n, q) j + M q and r + G q.
         swing: (n,) complex exp(i (theta + joint angle)) from the next frame to this one.
+        shape: of the body.
+        e: (n, q) its coordinates.
     """
 
     a: np.ndarray
@@ -135,48 +186,47 @@ class _Frame:
     s: np.ndarray
     sd: np.ndarray
     sdd: np.ndarray
-    jM: np.ndarray
-    rG: np.ndarray
     swing: np.ndarray
+    shape: Shapes
+    e: np.ndarray
+
+    @cached_property
+    def jM(self) -> np.ndarray:
+        """Return j + M q (n, q)."""
+        return self.shape.body.j + self.e @ self.shape.body.M
+
+    @cached_property
+    def rG(self) -> np.ndarray:
+        """Return r + G q (n, q); G is skew: (G q)' = -q' G."""
+        return self.shape.body.r - self.e @ self.shape.body.G
 
 
 def _outward(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
-) -> tuple[list[_Shapes], list[_Frame], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Pass out along the chain; return shapes, frames and (a, w, wd) of the payload's frame."""
+) -> tuple[list[_Frame], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Pass out along the chain; return frames and (a, w, wd) of the payload's frame."""
     gravity = mechanism.gravity[0] + 1j * mechanism.gravity[1]
-    joints, joints_d, joints_dd = motion.q[:, 1:], motion.qd[:, 1:], motion.qdd[:, 1:]
-    a = np.exp(-1j * joints[:, 0]) * (motion.qdd[:, 0] - gravity)
+    joints_d, joints_dd = motion.qd[:, 1:], motion.qdd[:, 1:]
+    a = np.conj(motion.swings[0]) * (motion.qdd[:, 0] - gravity)
     w, wd = joints_d[:, 0], joints_dd[:, 0]
-    shapes, frames = [], []
+    frames: list[_Frame] = []
     last = len(mechanism.bodies) - 1
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        shape = _shapes(body)
-        e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
-        # Behind the last arm the payload's frame has no joint of its own.
-        beta, beta_d, beta_dd = (
-            (joints[:, k + 1], joints_d[:, k + 1], joints_dd[:, k + 1]) if k < last else (0, 0, 0)
-        )
-        frame = _Frame(
-            a=a,
-            w=w,
-            wd=wd,
-            d=shape.reach + e @ shape.B,
-            dd=ed @ shape.B,
-            ddd=edd @ shape.B,
-            s=shape.c + e @ shape.C,
-            sd=ed @ shape.C,
-            sdd=edd @ shape.C,
-            jM=body.j + e @ body.M,
-            rG=body.r - e @ body.G,  # G is skew: (G q)' = -q' G
-            swing=np.exp(1j * (e @ shape.turn + beta)),
-        )
-        shapes.append(shape)
-        frames.append(frame)
-        a = np.conj(frame.swing) * (a + (1j * wd - w * w) * frame.d + 2j * w * frame.dd + frame.ddd)
-        w = w + ed @ shape.turn + beta_d
-        wd = wd + edd @ shape.turn + beta_dd
-    return shapes, frames, (a, w, wd)
+    for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
+        e = q[:, part]
+        # One real product for C q, B q and the turn: of complex matrices all q would be copied.
+        s, d, turn = (e @ shape.moved).view(complex).T
+        sd, dd, turn_d = (qd[:, part] @ shape.moved).view(complex).T
+        sdd, ddd, turn_dd = (qdd[:, part] @ shape.moved).view(complex).T
+        swing = np.exp(1j * turn.real)
+        if k < last:  # behind the last arm the payload's frame has no joint of its own
+            swing *= motion.swings[k + 1]
+        d = shape.reach + d
+        frames.append(_Frame(a, w, wd, d, dd, ddd, shape.c + s, sd, sdd, swing, shape, e))
+        a = np.conj(swing) * (a + (1j * wd - w * w) * d + 2j * w * dd + ddd)
+        w, wd = w + turn_d.real, wd + turn_dd.real
+        if k < last:
+            w, wd = w + joints_d[:, k + 1], wd + joints_dd[:, k + 1]
+    return frames, (a, w, wd)
 
 
 def inverse_dynamics(
@@ -201,53 +251,86 @@ def inverse_dynamics(
         Elastic rows (n, N), zero when the equations of motion hold, and the forces of cart and
         joints (n, 1 + arms), N and N m, that drive the rigid coordinates.
     """
-    shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
+    rows, (force, drives) = _inward(mechanism, motion, (q, qd, qdd), driven=True)
+    cart = (motion.swings[0] * force).real
+    return rows, np.stack([cart, *drives], axis=1)
+
+
+def elastic_rows(
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> np.ndarray:
+    """Return the elastic rows (n, N) of `inverse_dynamics`, without what only drives need."""
+    return _inward(mechanism, motion, (q, qd, qdd), driven=False)[0]
+
+
+_Rates = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _inward(
+    mechanism: Mechanism, motion: RigidMotion, rates: _Rates, driven: bool
+) -> tuple[np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
+    """Pass back along the chain; return the rows, and force and moments if they are asked for."""
+    frames, tip = _outward(mechanism, motion, *rates)
     force, moment = mechanism.payload_mass * tip[0], mechanism.payload_inertia * tip[2]
-    rows = np.empty_like(q)
-    drives = np.empty_like(motion.q)
-    bodies = list(zip(mechanism.slices, shapes, frames, strict=True))
-    for k in reversed(range(len(bodies))):
-        part, shape, frame = bodies[k]
-        body, w, scale = shape.body, frame.w[:, None], mechanism.scale(k)
-        e, ed, edd = q[:, part], qd[:, part], qdd[:, part]
+    rows = np.empty_like(rates[0])
+    drives: list[np.ndarray] = []
+    for k in reversed(range(len(frames))):
+        part, frame, scale = mechanism.slices[k], frames[k], mechanism.scale(k)
+        own = (rates[0][:, part], rates[1][:, part], rates[2][:, part])
         force = frame.swing * force  # of everything outboard, in this frame
-        inertial = (
-            np.outer(frame.a.real, shape.C.real)
-            + np.outer(frame.a.imag, shape.C.imag)
-            + frame.rG * frame.wd[:, None]
-            - w * w * frame.jM
-            - 2.0 * w * (ed @ body.G)
-            + edd @ body.M
-        )
-        rows[:, part] = (
-            _column(scale.mass) * inertial
-            + _column(scale.stiffness) * (e @ body.K)
-            + _column(scale.damping) * (ed @ body.D)
-            + np.outer(force.real, shape.B.real)
-            + np.outer(force.imag, shape.B.imag)
-            + np.outer(moment, shape.turn)
-        )
-        own = (
-            (np.conj(frame.s) * frame.a).imag
-            + _inertia(body, frame, e) * frame.wd
-            + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, ed)
-            + np.einsum("nk,nk->n", frame.rG, edd)
-        )
-        moment = moment + (np.conj(frame.d) * force).imag + scale.mass * own
-        force = force + scale.mass * _body_force(body, frame)
-        drives[:, k + 1] = moment
-    drives[:, 0] = (np.exp(1j * motion.q[:, 1]) * force).real
-    return rows, drives
+        rows[:, part] = _body_rows(frame, own, (force, moment), scale)
+        if k > 0 or driven:
+            moment = (
+                moment + (np.conj(frame.d) * force).imag + scale.mass * _body_moment(frame, own)
+            )
+            force = force + scale.mass * _body_force(frame)
+            drives.insert(0, moment)
+    return rows, (force, drives)
 
 
-def _inertia(body: FloatingBody, frame: _Frame, e: np.ndarray) -> np.ndarray:
+def _body_rows(
+    frame: _Frame, rates: _Rates, load: tuple[np.ndarray, np.ndarray], scale: Scale
+) -> np.ndarray:
+    """Return one body's elastic rows (n, q) under the load (force, moment) on its outboard end."""
+    e, ed, edd = rates
+    body, shape = frame.shape.body, frame.shape
+    w, wd = frame.w, frame.wd
+    pushes = np.empty((len(e), 7))
+    pushes[:, 0], pushes[:, 1], pushes[:, 2], pushes[:, 3] = frame.a.real, frame.a.imag, wd, -w * w
+    pushes[:, :4] *= _column(scale.mass)
+    pushes[:, 4], pushes[:, 5], pushes[:, 6] = load[0].real, load[0].imag, load[1]
+    w, wd = w[:, None], wd[:, None]
+    inertial = (edd - (w * w) * e) @ body.M
+    inertial -= (wd * e + (2.0 * w) * ed) @ body.G
+    if isinstance(scale.mass, np.ndarray) or scale.mass != 1.0:
+        inertial *= _column(scale.mass)
+    inertial += pushes @ shape.pushed
+    inertial += _column(scale.stiffness) * _product(e, shape.K)
+    if shape.D is not None:
+        inertial += _column(scale.damping) * _product(ed, shape.D)
+    return inertial
+
+
+def _body_moment(frame: _Frame, rates: _Rates) -> np.ndarray:
+    """Return the moment T (n,) of one body's own inertia about its frame's origin, N m."""
+    _, ed, edd = rates
+    return (
+        (np.conj(frame.s) * frame.a).imag
+        + _inertia(frame) * frame.wd
+        + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, ed)
+        + np.einsum("nk,nk->n", frame.rG, edd)
+    )
+
+
+def _inertia(frame: _Frame) -> np.ndarray:
     """Return the deformed body's inertia about its frame's origin (n,), kg m2."""
-    return body.inertia + np.einsum("nk,nk->n", body.j + frame.jM, e)
+    body = frame.shape.body
+    return body.inertia + np.einsum("nk,nk->n", body.j + frame.jM, frame.e)
 
 
-def _body_force(body: FloatingBody, frame: _Frame) -> np.ndarray:
+def _body_force(frame: _Frame) -> np.ndarray:
     """Return the inertia force F (n,) complex, body components, N."""
-    w = frame.w
+    w, body = frame.w, frame.shape.body
     return body.mass * frame.a + (1j * frame.wd - w * w) * frame.s + 2j * w * frame.sd + frame.sdd
 
 
@@ -259,7 +342,7 @@ class _BodyTangent:
     y = [q, qd, qdd] of all bodies.
 
     Attributes:
-        body: its constants.
+        shape: its constants.
         rows, columns: its place among all rows and among the kept columns.
         kept: its coordinates that have a column.
         w, wd: of its frame.
@@ -268,7 +351,7 @@ class _BodyTangent:
         right: (n, r, 3 S).
     """
 
-    body: FloatingBody
+    shape: Shapes
     rows: slice
     columns: slice
     kept: np.ndarray
@@ -277,6 +360,12 @@ class _BodyTangent:
     scale: Scale
     left: np.ndarray
     right: np.ndarray
+
+    @property
+    def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return K, D, M, G (q, q)."""
+        body = self.shape.body
+        return body.K, body.D, body.M, body.G
 
     def at(self, part: slice) -> _BodyTangent:
         """Return it at some of the instants."""
@@ -329,10 +418,12 @@ class Tangent:
                 x[:, None] if isinstance(x, np.ndarray) else x for x in part.factors()
             )
             own = np.ix_(part.kept, part.kept)
-            K, D, M, G = (x[own] for x in _matrices(part.body))
+            K, D, M, G = (x[own] for x in part.matrices)
             columns = _columns(part.columns, size)
             rows[:, :, columns[0]] += k * K + m_q * M + g_q * G
-            rows[:, :, columns[1]] += d * D + g_v * G
+            rows[:, :, columns[1]] += g_v * G
+            if part.shape.D is not None:
+                rows[:, :, columns[1]] += d * D
             rows[:, :, columns[2]] += m * M
         return jacobian
 
@@ -353,12 +444,16 @@ class Tangent:
         out = []
         for part in self.bodies:
             own = wanted[(wanted >= part.rows.start) & (wanted < part.rows.stop)] - part.rows.start
-            K, D, M, G = (x[np.ix_(own, part.kept)].T for x in _matrices(part.body))
+            K, D, M, G = (x[np.ix_(own, part.kept)].T for x in part.matrices)
             k, m_q, g_q, d, g_v, m = part.factors(times)
             e, ed, edd = q[:, part.columns], qd[:, part.columns], qdd[:, part.columns]
-            far = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
-            near = (k * e) @ K + (d * ed) @ D + (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
-            out.append(far + near)
+            felt = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
+            felt += (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
+            if K.any():  # not of the rows of other coordinates that vibrate by themselves
+                felt += (k * e) @ K
+            if D.any():
+                felt += (d * ed) @ D
+            out.append(felt)
         return np.concatenate(out, axis=1)
 
     def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -371,16 +466,15 @@ class Tangent:
         by_q, by_v, by_a = slopes[:, :size], slopes[:, size : 2 * size], slopes[:, 2 * size :]
         for part in self.bodies:
             y = rows[:, part.rows]
-            K, D, M, G = (y @ x[:, part.kept] for x in _matrices(part.body))
+            body = part.shape.body
+            K, M, G = (y @ x[:, part.kept] for x in (body.K, body.M, body.G))
             k, m_q, g_q, d, g_v, m = part.factors()
             by_q[:, part.columns] += k * K + m_q * M + g_q * G
-            by_v[:, part.columns] += d * D + g_v * G
+            by_v[:, part.columns] += g_v * G
+            if part.shape.D is not None:
+                by_v[:, part.columns] += d * (y @ body.D[:, part.kept])
             by_a[:, part.columns] += m * M
         return by_q, by_v, by_a
-
-
-def _matrices(body: FloatingBody) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    return body.K, body.D, body.M, body.G
 
 
 def tangent(
@@ -411,20 +505,21 @@ def linearise(
         keep: ascending coordinates by which to differentiate; all by default.
     """
     keep = np.arange(mechanism.coordinates) if keep is None else keep
-    shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
+    frames, tip = _outward(mechanism, motion, q, qd, qdd)
     ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
     places = [slice(a, b) for a, b in pairwise(ends)]
     kept = [keep[p] - part.start for p, part in zip(places, mechanism.slices, strict=True)]
     motions = [_prescribed(len(q), 3 * len(keep))]
-    for shape, frame, place, chosen in zip(shapes, frames, places, kept, strict=True):
+    for frame, place, chosen in zip(frames, places, kept, strict=True):
         columns = _columns(place, len(keep))
-        motions.append(_next_motion(shape, frame, columns, chosen, motions[-1]))
+        motions.append(_next_motion(frame, columns, chosen, motions[-1]))
     tip_v, _, turn_v = motions[-1]
     force, force_v = mechanism.payload_mass * tip[0], _column(mechanism.payload_mass) * tip_v
     moment_v = _column(mechanism.payload_inertia) * turn_v
     bodies: list[_BodyTangent] = []
-    for k in reversed(range(len(shapes))):
-        part, shape, frame, chosen = mechanism.slices[k], shapes[k], frames[k], kept[k]
+    for k in reversed(range(len(frames))):
+        part, frame, chosen = mechanism.slices[k], frames[k], kept[k]
+        shape = frame.shape
         rates = (q[:, part], qd[:, part], qdd[:, part])
         columns = _columns(places[k], len(keep))
         force = frame.swing * force
@@ -432,17 +527,17 @@ def linearise(
         force_v[:, columns[0]] += 1j * force[:, None] * shape.turn[chosen]
         scale = mechanism.scale(k)
         load = (force_v, moment_v)
-        left, right = _felt(shape, frame, motions[k], rates[1], load, scale.mass, k > 0)
-        own = (shape.body, part, places[k], chosen, frame.w, frame.wd, scale)
+        left, right = _felt(frame, motions[k], rates[1], load, scale.mass, k > 0)
+        own = (shape, part, places[k], chosen, frame.w, frame.wd, scale)
         bodies.insert(0, _BodyTangent(*own, left, right))
         if k == 0:
             break
         moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
         moment_v[:, columns[0]] += (np.conj(shape.B[chosen]) * force[:, None]).imag
-        force_b, moment_b = _body_load(shape, frame, motions[k], columns, chosen, rates)
+        force_b, moment_b = _body_load(frame, motions[k], columns, chosen, rates)
         mass = _column(scale.mass)
         force_v, moment_v = force_v + mass * force_b, moment_v + mass * moment_b
-        force = force + scale.mass * _body_force(shape.body, frame)
+        force = force + scale.mass * _body_force(frame)
     return Tangent(tuple(bodies), keep)
 
 
@@ -457,7 +552,6 @@ def _prescribed(count: int, width: int) -> _FrameSlopes:
 
 
 def _felt(
-    shape: _Shapes,
     frame: _Frame,
     motion: _FrameSlopes,
     ed: np.ndarray,
@@ -467,6 +561,7 @@ def _felt(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
     force_v, moment_v = load
+    shape = frame.shape
     by = [shape.B.real, shape.B.imag, shape.turn]
     felt = [force_v.real, force_v.imag, moment_v]
     if moves:
@@ -487,12 +582,12 @@ def _columns(part: slice, size: int) -> _Columns:
 
 
 def _next_motion(
-    shape: _Shapes, frame: _Frame, columns: _Columns, chosen: np.ndarray, motion: _FrameSlopes
+    frame: _Frame, columns: _Columns, chosen: np.ndarray, motion: _FrameSlopes
 ) -> _FrameSlopes:
     """Return the derivatives of the next frame's (a, w, wd)."""
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
-    B, turn = shape.B[chosen], shape.turn[chosen]
+    B, turn = frame.shape.B[chosen], frame.shape.turn[chosen]
     w, wd = frame.w[:, None], frame.wd[:, None]
     d, dd = frame.d[:, None], frame.dd[:, None]
     inner = a_v + 1j * d * wd_v + (2j * dd - 2.0 * w * d) * w_v
@@ -509,7 +604,6 @@ def _next_motion(
 
 
 def _body_load(
-    shape: _Shapes,
     frame: _Frame,
     motion: _FrameSlopes,
     columns: _Columns,
@@ -517,8 +611,8 @@ def _body_load(
     rates: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (n, 3 S) of one body's own force F and moment T."""
-    body, C = shape.body, shape.C[chosen]
-    e, ed, edd = rates
+    body, C = frame.shape.body, frame.shape.C[chosen]
+    _, ed, edd = rates
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
     w, wd = frame.w[:, None], frame.wd[:, None]
@@ -528,7 +622,7 @@ def _body_load(
     force[:, cv] += 2j * w * C
     force[:, ca] += C
     spin = 2.0 * np.einsum("nk,nk->n", frame.jM, ed)[:, None]
-    moment = (np.conj(s) * a_v).imag + _inertia(body, frame, e)[:, None] * wd_v + spin * w_v
+    moment = (np.conj(s) * a_v).imag + _inertia(frame)[:, None] * wd_v + spin * w_v
     moment[:, cq] += (
         (np.conj(C) * frame.a[:, None]).imag
         + 2.0 * wd * frame.jM[:, chosen]
@@ -544,8 +638,7 @@ def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np
     """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
     place = motion.q[:, 0] + 1j * mechanism.joint_height
     swing = np.ones(len(q), dtype=complex)
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        shape = _shapes(body)
+    for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
         swing = swing * np.exp(1j * motion.q[:, k + 1])
         place = place + swing * (shape.reach + q[:, part] @ shape.B)
         swing = swing * np.exp(1j * (q[:, part] @ shape.turn))
@@ -576,8 +669,7 @@ def end_effector_slopes(
     w = weights[:, 0] + 1j * weights[:, 1]
     swings, levers = [], []
     swing = np.ones(len(q), dtype=complex)
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        shape = _shapes(body)
+    for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
         swing = swing * np.exp(1j * motion.q[:, k + 1])
         swings.append(swing)
         levers.append(swing * (shape.reach + q[:, part] @ shape.B))
@@ -586,7 +678,7 @@ def end_effector_slopes(
     by_outboard: list[np.ndarray] = []
     beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
     for k in reversed(range(len(swings))):
-        part, shape = mechanism.slices[k], _shapes(mechanism.bodies[k])
+        part, shape = mechanism.slices[k], mechanism.shapes[k]
         place = np.conj(swings[k]) * w
         turn = (np.conj(w) * 1j * beyond).real
         by_q[:, part] = (
@@ -656,8 +748,8 @@ def body_slopes(
         mechanism, motion, q, qd, qdd: as for `inverse_dynamics`; n instants.
         multipliers: (n, N).
     """
-    shapes, frames, tip = _outward(mechanism, motion, q, qd, qdd)
-    moves, (tip_p, tip_turn) = _virtual_motion(mechanism, shapes, frames, multipliers)
+    frames, tip = _outward(mechanism, motion, q, qd, qdd)
+    moves, (tip_p, tip_turn) = _virtual_motion(mechanism, frames, multipliers)
     outer = _Outer(
         force=mechanism.payload_mass * tip[0],
         moment=mechanism.payload_inertia * tip[2],
@@ -668,13 +760,13 @@ def body_slopes(
         next_p=tip_p,
     )
     slopes: list[BodySlopes] = []
-    for k in reversed(range(len(shapes))):
+    for k in reversed(range(len(frames))):
         part = mechanism.slices[k]
         rates = (q[:, part], qd[:, part], qdd[:, part])
         virtual = (*moves[k], multipliers[:, part])
-        outboard, outer = _outboard_slopes(shapes[k], frames[k], rates, virtual, outer)
+        outboard, outer = _outboard_slopes(frames[k], rates, virtual, outer)
         slopes.insert(0, _integral_slopes(frames[k], rates, virtual, outboard))
-        outer = _with_body(shapes[k], frames[k], rates, virtual, outer)
+        outer = _with_body(frames[k], rates, virtual, outer)
     return slopes
 
 
@@ -698,24 +790,22 @@ class _Outer:
 
 
 def _virtual_motion(
-    mechanism: Mechanism, shapes: list[_Shapes], frames: list[_Frame], multipliers: np.ndarray
+    mechanism: Mechanism, frames: list[_Frame], multipliers: np.ndarray
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], tuple[np.ndarray, np.ndarray]]:
     """Return every frame's virtual displacement (complex, its components) and turn."""
     p = np.zeros(len(multipliers), dtype=complex)
     turn = np.zeros(len(multipliers))
     moves = []
-    for part, shape, frame in zip(mechanism.slices, shapes, frames, strict=True):
+    for part, frame in zip(mechanism.slices, frames, strict=True):
+        shape = frame.shape
         moves.append((p, turn))
         p = np.conj(frame.swing) * (p + 1j * turn * frame.d + multipliers[:, part] @ shape.B)
         turn = turn + multipliers[:, part] @ shape.turn
     return moves, (p, turn)
 
 
-_Rates = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
 def _outboard_slopes(
-    shape: _Shapes, frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer
+    frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer
 ) -> tuple[np.ndarray, _Outer]:
     """Return the slopes (3, q) of the outboard modes and `outer` brought into this frame."""
     q, qd, qdd = rates
@@ -768,21 +858,19 @@ def _integral_slopes(
     )
 
 
-def _with_body(
-    shape: _Shapes, frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer
-) -> _Outer:
+def _with_body(frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer) -> _Outer:
     """Add one body's own force and slopes to what lies outboard of it."""
-    body = shape.body
-    q, qd, qdd = rates
+    body, shape = frame.shape.body, frame.shape
+    _, qd, qdd = rates
     p, turn, multipliers = virtual
     w = frame.w
     spin = np.einsum("nk,nk->n", frame.jM, qd)
     gyro = -2.0 * w[:, None] * frame.jM - 2.0 * (qd @ body.G)
     return _Outer(
-        force=outer.force + _body_force(body, frame),
+        force=outer.force + _body_force(frame),
         moment=outer.moment
         + (np.conj(frame.s) * frame.a).imag
-        + _inertia(body, frame, q) * frame.wd
+        + _inertia(frame) * frame.wd
         + 2.0 * w * spin
         + np.einsum("nk,nk->n", frame.rG, qdd),
         a=outer.a + body.mass * p + 1j * frame.s * turn + multipliers @ shape.C,
@@ -792,7 +880,7 @@ def _with_body(
         + np.einsum("nk,nk->n", gyro, multipliers),
         wd=outer.wd
         + (np.conj(p) * 1j * frame.s).real
-        + _inertia(body, frame, q) * turn
+        + _inertia(frame) * turn
         + np.einsum("nk,nk->n", frame.rG, multipliers),
         next_a=outer.next_a,
         next_p=outer.next_p,

@@ -487,7 +487,7 @@ class Simulation(Table):
     rho_inf: float = Field(
         default=0.8, ge=0, le=1, description="spectral radius at infinity of generalised-alpha [-]"
     )
-    stages: int = Field(default=3, ge=2, le=5, description="stages of a Radau IIA step [-]")
+    stages: int = Field(default=4, ge=2, le=5, description="stages of a Radau IIA step [-]")
     sample: float = Field(default=1e-3, gt=0, description="interval of the output instants [s]")
 
 

@@ -13,7 +13,8 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import batch, radau
 from dolfinopt.integrators.adjoint import trajectory_slopes
 from dolfinopt.integrators.collocation import beginnings, radau_iia, rows_at, stages_of, starts
-from dolfinopt.integrators.factors import diagonal_factors, factorise
+from dolfinopt.integrators.factors import alone as alone_of
+from dolfinopt.integrators.factors import factorise
 from dolfinopt.integrators.held import held_factors
 from dolfinopt.integrators.modes import modes_of
 from dolfinopt.integrators.problem import ElasticProblem, Solution, even_steps, relative_error
@@ -28,6 +29,7 @@ from dolfinopt.mechanism import (
 from dolfinopt.motion import RigidMotion, quintic
 
 TOLERANCE = 1e-4
+LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
 DAMPING = 1e-3  # s
 
 
@@ -189,18 +191,20 @@ def test_held_matrix_is_exact_where_the_tangent_rests(stages):
     modes, method = modes_of(resting), radau_iia(stages)
     own = stages_of(modes, method, even_steps(resting, 12))
     count = len(own.h)
-    slow, fast = np.arange(6), np.zeros(0, dtype=int)
+    slow = np.arange(6)
     zero = np.zeros((count, stages, 6))
     exact = factorise(own, zero, zero, zero, slow)
     flat = np.zeros((count, 6))
-    held = linearise(own.mechanism, resting.motion(np.zeros(count)), flat, flat, flat)
-    none = diagonal_factors(own, *[np.ones((1, 0))] * 3)
-    found = held_factors(own, held, slow, fast, none)
+    found = held_factors(own, (flat, flat), zero, slow, alone_of(own))
     rows = np.random.default_rng(1).normal(size=zero.shape)
     for mine, theirs in zip(
         found.solve(rows, np.zeros((2, 6))), exact.solve(rows, np.zeros((2, 6))), strict=True
     ):
         np.testing.assert_allclose(mine, theirs, atol=1e-8 * np.abs(theirs).max())
+
+
+def doubled(motion):
+    return RigidMotion(*(np.tile(x, (2, 1)) for x in (motion.q, motion.qd, motion.qdd)))
 
 
 def test_runs_begin_anew():
@@ -211,9 +215,8 @@ def test_runs_begin_anew():
     twice = replace(
         own,
         h=np.tile(own.h, 2),
-        motion=RigidMotion(
-            *(np.tile(x, (2, 1)) for x in (own.motion.q, own.motion.qd, own.motion.qdd))
-        ),
+        motion=doubled(own.motion),
+        middle=doubled(own.middle),
         runs=2,
     )
     rng = np.random.default_rng(2)
@@ -250,9 +253,9 @@ def test_batch_is_each_of_them_alone(alone):
         assert one.error <= TOLERANCE
         assert distance(problem, one, single) <= 2.0 * TOLERANCE
         same = radau.on_grid(problem, one.edges, TOLERANCE, 3)
-        assert distance(problem, one, same) <= 1e-9
-        # The tangent is held: the estimate moves by its contraction, some percent.
-        assert one.error == pytest.approx(same.error, rel=0.2)
+        assert distance(problem, one, same) <= LEFT
+        # Of a single answer: more by what its contraction may leave, up to a quarter.
+        assert 0.9 <= one.error / same.error <= 1.3
 
 
 def test_order_does_not_matter():
@@ -272,7 +275,7 @@ def test_a_start_keeps_its_steps(alone):
     assert second.counts.newton_iterations < first.counts.newton_iterations
     for problem, one, other in zip(problems, cold, warm, strict=True):
         assert np.array_equal(one.edges, other.edges)
-        assert distance(problem, one, other) <= 1e-9
+        assert distance(problem, one, other) <= LEFT
 
 
 def test_one_problem_is_solved_as_ever(alone):
@@ -302,8 +305,9 @@ def test_failure_stays_alone():
     found, _ = solve([good[0], soft, good[1]])
     assert isinstance(found[1], ConvergenceError) and str(found[1]) == str(error.value)
     without, _ = solve(good)
-    for one, other in zip((found[0], found[2]), without, strict=True):
-        assert np.array_equal(one.a, other.a)
+    for problem, one, other in zip(good, (found[0], found[2]), without, strict=True):
+        assert np.array_equal(one.edges, other.edges)
+        assert distance(problem, one, other) <= LEFT  # the matrix is renewed at other times
 
 
 def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
@@ -352,4 +356,4 @@ def test_bodies_without_coordinates(alone):
     assert not alone
     for one, each in zip(found, problems, strict=True):
         same = radau.on_grid(each, one.edges, TOLERANCE, 3)
-        assert distance(each, one, same) <= 1e-9
+        assert distance(each, one, same) <= LEFT

@@ -248,9 +248,9 @@ def batches(monkeypatch):
     sizes = []
     whole = evaluation.simulate_batch
 
-    def count(scenes, *args):
+    def count(scenes, *args, **options):
         sizes.append(len(scenes))
-        return whole(scenes, *args)
+        return whole(scenes, *args, **options)
 
     monkeypatch.setattr(evaluation, "simulate_batch", count)
     return sizes
@@ -436,9 +436,9 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
     _, outcomes = done
     whole = evaluation.simulate_batch
 
-    def fail_at_four(scenes, *args):
+    def fail_at_four(scenes, *args, **options):
         error = do.ConvergenceError("no solution at 4 kg")
-        found = whole(scenes, *args)
+        found = whole(scenes, *args, **options)
         return [error if s.payload.mass == 4.0 else one for s, one in zip(scenes, found)]
 
     with monkeypatch.context() as patch:

@@ -15,6 +15,7 @@ from dolfinopt.integrators import factors, generalized_alpha, radau
 from dolfinopt.integrators.adjoint import trajectory_slopes
 from dolfinopt.integrators.collocation import Stages, at_stages, rows_at, stages_of, starts
 from dolfinopt.integrators.factors import Factors, factorise
+from dolfinopt.integrators.held import held_factors
 from dolfinopt.integrators.modes import modes_of
 from dolfinopt.integrators.problem import (
     ElasticProblem,
@@ -559,7 +560,7 @@ def some_factors(stages: Stages, slow: np.ndarray) -> Factors:
 
 
 def dense(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Treat all coordinates as slow: Newton's matrix is exact."""
+    """Treat all coordinates as slow."""
     for module in (radau, factors):
         monkeypatch.setattr(module, "LIMITS", (np.inf,))
 
@@ -573,8 +574,13 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
         made.append((len(stages.h), len(at_and_slow[-1])))
         return factorise(stages, *at_and_slow)
 
+    def held_spy(stages, begin, a, slow, single):  # type: ignore[no-untyped-def]
+        made.append((len(stages.h), len(slow)))
+        return held_factors(stages, begin, a, slow, single)
+
     for module in ("radau", "factors", "adjoint"):
         monkeypatch.setattr(f"dolfinopt.integrators.{module}.factorise", spy)
+    monkeypatch.setattr("dolfinopt.integrators.radau.held_factors", held_spy)
     return made
 
 
@@ -682,6 +688,22 @@ def test_fast_coordinates_change_nothing(
     assert found.iterations <= expected.iterations + 10
 
 
+@pytest.mark.parametrize("bending", [10.0, 100.0, 1000.0])
+@pytest.mark.parametrize("stages", [3, 4])
+@pytest.mark.parametrize("steps", [8, 12, 20])
+def test_estimate_of_vibrations_that_are_not_resolved(
+    bending: float, stages: int, steps: int
+) -> None:
+    """Undamped arms, steps from a fifth of the slowest period to five of them.
+
+    Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
+    """
+    problem, _ = two_arms(payload=0.0, bending=bending, damping=0.0)
+    fine = radau.on_grid(problem, even_steps(problem, 800), 1e-7, 5)
+    found = radau.on_grid(problem, even_steps(problem, steps), 1e-6, stages)
+    assert 0.6 <= found.error / distance(problem, found, fine) <= 3.0
+
+
 def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]]) -> None:
     """Blocks of a few slow coordinates of 8, 24, 96; about as many iterations, the same error."""
     iterations, slow, found = [], [], []
@@ -691,10 +713,10 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
         iterations.append(solution.iterations)
         slow.append(max(size for _, size in matrices))
         found.append(solution.error)
-        assert len(matrices) <= 8
-    assert max(slow) <= 24
-    assert max(iterations) <= 15  # on two grids; 8 to 11, by which coordinates are just fast
-    assert_close(found, found[:1] * 3, 0.1)  # other steps
+        assert len(matrices) <= 12  # of two grids, most of them with held tangents
+    assert max(slow) <= 32  # of 96
+    assert max(iterations) <= 26  # on two grids; 21 to 24, by which coordinates are just fast
+    assert_close(found, found[:1] * 3, 0.2)  # other steps
 
 
 def test_poor_contraction_makes_the_matrix_denser(
@@ -728,7 +750,8 @@ def test_dense_matrices_are_kept_small(
     again = trajectory_slopes(problem, whole, t, whole.sample(t))
     assert max(count for count, _ in matrices) < 60
     assert distance(problem, parts, whole) <= 1e-12
-    assert parts.error == pytest.approx(whole.error, rel=1e-9)
+    # Of the tangents at the stages here, held ones there, whose answer is corrected once.
+    assert parts.error == pytest.approx(whole.error, rel=0.05)
     for a, b in zip(again, slopes, strict=True):
         # Rounding of stiffnesses that lie eight decades apart.
         assert_close(a.K, b.K, 1e-9)

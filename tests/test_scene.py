@@ -106,7 +106,7 @@ def test_demo_values():
 def test_defaults_of_keys_the_demo_leaves_out():
     simulation = load_scene(TWO_ARM).simulation
     assert simulation.integrator == "radau"
-    assert (simulation.rho_inf, simulation.stages, simulation.sample) == (0.8, 3, 1e-3)
+    assert (simulation.rho_inf, simulation.stages, simulation.sample) == (0.8, 4, 1e-3)
 
 
 def test_demo_states_every_other_key():

@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -25,7 +26,12 @@ from mpi4py import MPI
 from remainders import build, wave
 
 from dolfinopt import results
+from dolfinopt.arm import chain_of
 from dolfinopt.cli import commands
+from dolfinopt.mechanism import inverse_dynamics, linearise
+from dolfinopt.motion import rigid_motion
+from dolfinopt.parallel import gather_arms
+from dolfinopt.simulation import build_mechanism
 
 SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
@@ -196,6 +202,39 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
         assert few["energy_fields"] == 3 * ARMS * ITERATIONS
 
 
+# -- damping ---------------------------------------------------------------------------------
+
+
+class Watched(np.ndarray):
+    """A matrix that counts its products."""
+
+    products = 0
+
+    def __array_ufunc__(self, ufunc, method, *inputs, **options):
+        Watched.products += ufunc in (np.matmul, np.multiply)
+        plain = [x.view(np.ndarray) if isinstance(x, Watched) else x for x in inputs]
+        return getattr(ufunc, method)(*plain, **options)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("damping", [0.0, 2e-4])
+def test_undamped_rows_have_no_damping_terms(damping: float) -> None:
+    built = build(f"damping.stiffness_proportional={damping}")
+    x = built.fields(wave)
+    owned = gather_arms(built.share, {k: a.reduce(x[k]) for k, a in built.arms.items()})
+    bodies = [replace(b, D=b.D.view(Watched)) for b in chain_of(built.scene, owned)]
+    mechanism = build_mechanism(built.scene, bodies)
+    t = np.linspace(0.1, 1.0, 3)
+    motion, q = rigid_motion(t, built.scene), np.full((3, mechanism.coordinates), 1e-6)
+    before = Watched.products
+    inverse_dynamics(mechanism, motion, q, q, q)
+    tangent = linearise(mechanism, motion, q, q, q)
+    tangent.dense()
+    tangent.times(q, q, q, np.arange(mechanism.coordinates))
+    tangent.transposed(q)
+    assert (Watched.products > before) == (damping > 0.0)
+
+
 # -- warm starts -----------------------------------------------------------------------------
 
 
@@ -203,10 +242,10 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
 def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
     """Return what the second design takes in an optimisation, and by itself.
 
-    The optimiser's step is small, 0.02, and the tolerance the usual one: at 1e-2 as many steps as
-    the motion needs to look smooth are enough from cold, too.
+    The optimiser's step is small, 0.02, and the tolerance of the usual size: at 1e-2 as many
+    steps as the motion needs to look smooth are enough from cold, too.
     """
-    small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=1e-4")
+    small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=5e-5")
     first = counts(run("optimize", *small, "optimizer.max_iterations=0"))
     folder = run("optimize", *small, "optimizer.max_iterations=1")
     both = counts(folder)

@@ -369,9 +369,9 @@ def test_failures_end_with_status_one(folder, monkeypatch):
 
     whole = evaluation.simulate_batch
 
-    def fail_at_seven(scenes, *args):
+    def fail_at_seven(scenes, *args, **options):
         error = ConvergenceError("no solution")
-        found = whole(scenes, *args)
+        found = whole(scenes, *args, **options)
         return [error if s.payload.mass == 7.25 else one for s, one in zip(scenes, found)]
 
     monkeypatch.setattr(evaluation, "simulate_batch", fail_at_seven)

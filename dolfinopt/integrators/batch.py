@@ -23,14 +23,16 @@ from dolfinopt.body import FloatingBody
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import radau
 from dolfinopt.integrators.collocation import (
+    Collocation,
     Stages,
     at_stages,
     beginnings,
+    motions,
     radau_iia,
     rows_at,
     stage_values,
 )
-from dolfinopt.integrators.factors import LIMITS, Factors, diagonal_factors
+from dolfinopt.integrators.factors import Factors
 from dolfinopt.integrators.held import held_factors
 from dolfinopt.integrators.modes import REFERENCES, Modes, modes_of
 from dolfinopt.integrators.problem import (
@@ -40,29 +42,32 @@ from dolfinopt.integrators.problem import (
     first_count,
     lagrange_integrals,
 )
+from dolfinopt.integrators.unresolved import unresolved
 from dolfinopt.ledger import Ledger
-from dolfinopt.mechanism import Mechanism, Scale, Tangent, inverse_dynamics, linearise
+from dolfinopt.mechanism import Mechanism, Scale, elastic_rows, linearise
 from dolfinopt.motion import RigidMotion
 
 State = tuple[np.ndarray, np.ndarray]  # q, qd
 
+# Angle w h up to which coordinates are slow: with 40, as for one problem, nine take 145 instead of
+# 110 ms with 4 coordinates an arm, optimised, and 315 instead of 365 ms with 48, initial design.
+LIMIT = 20.0
 # Relative difference of the integrals that rounding makes of a factor.
 SAME = 1e-12
 MAX_NEWTON = 6  # factorisations: what needs more needs damping, and windows
 MAX_GRIDS = 4
 MAX_PILOTS = 3
-# What Newton may leave, as a share of the tolerance.
-GOAL = 1e-7
-PILOT = 1e6  # of the first solution, Newton's goal in its usual ones
+# What Newton may leave, as a share of the tolerance: of values, and of a first, rough solution.
+GOAL, PILOT_GOAL = 1e-3, 0.1
 # Steps grow with the speed of the slowest vibration to this power: lighter payloads vibrate
 # faster, and less. Paper's example, 4 kg against 6 kg: 0.4 initial, 0.6 optimised.
 GROWTH = 0.5
 # Steps times coordinates of a batch: with more, arrays leave the processor's cache.
 MAX_SIZE = 40_000
-CHORD_START = 0.3  # step after which the matrix is renewed
 CHORD_RATE = 0.2  # contraction that keeps a matrix: a new one costs four iterations
-# Contraction of Newton's iteration up to which one answer is a good estimate of the error.
-TRUSTED = 0.1
+# Contraction of Newton's iteration up to which one answer, with what it may leave, estimates the
+# error; beyond it is corrected, which takes an eighth of the time of all.
+TRUSTED = 0.2
 
 
 # -- what is solved --------------------------------------------------------------------------
@@ -96,32 +101,44 @@ class Family:
             scales=tuple(Scale(*one) for one in scales),
         )
 
-    def motion(self, members: np.ndarray, times: Sequence[np.ndarray]) -> RigidMotion:
-        """Return that of some problems at their instants, one problem after the other.
+    def motions(
+        self, members: np.ndarray, method: Collocation, edges: np.ndarray
+    ) -> tuple[RigidMotion, RigidMotion]:
+        """Return `collocation.motions` of some problems, one after the other, on edges (R, n + 1).
 
-        Problems that share motion and instants are asked once.
+        Those that share motion and edges are asked once.
         """
-        known: dict[tuple[int, bytes], RigidMotion] = {}
-        found = []
-        for member, t in zip(members, times, strict=True):
+        known: dict[tuple[int, bytes], tuple[RigidMotion, RigidMotion]] = {}
+        keys = []
+        for member, own in zip(members, edges, strict=True):
             motion = self.problems[member].motion
-            key = (id(motion), t.tobytes())
-            if key not in known:
-                known[key] = motion(t)
-            found.append(known[key])
-        return RigidMotion(
-            *(np.concatenate([getattr(one, name) for one in found]) for name in ("q", "qd", "qdd"))
-        )
+            keys.append((id(motion), own.tobytes()))
+            if keys[-1] not in known:
+                known[keys[-1]] = motions(motion, method, own)
+        inner, middle = zip(*(known[key] for key in keys), strict=True)
+        return _joined(inner), _joined(middle)
+
+    def motion(self, shares: np.ndarray) -> RigidMotion:
+        """Return that of all problems at some shares of their horizons, one after the other.
+
+        Those that share motion and horizon are asked once.
+        """
+        known: dict[tuple[int, float], RigidMotion] = {}
+        keys = []
+        for problem in self.problems:
+            keys.append((id(problem.motion), problem.breakpoints[-1]))
+            if keys[-1] not in known:
+                known[keys[-1]] = problem.motion(shares * problem.breakpoints[-1])
+        return _joined([known[key] for key in keys])
 
     @cached_property
     def diagonal(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stiffness, damping and mass (R, N) of every coordinate alone, the latter averaged."""
         size = self.modes.problem.mechanism.coordinates
         members = np.arange(len(self.problems))
-        times = [np.linspace(0.0, p.breakpoints[-1], REFERENCES) for p in self.problems]
+        motion = self.motion(np.linspace(0.0, 1.0, REFERENCES))
         rest = np.zeros((REFERENCES * len(members), size))
-        mechanism = self.mechanism(members, REFERENCES)
-        slopes = linearise(mechanism, self.motion(members, times), rest, rest, rest).dense()
+        slopes = linearise(self.mechanism(members, REFERENCES), motion, rest, rest, rest).dense()
         own = np.arange(size)
         mass = slopes[:, own, 2 * size + own].reshape(len(members), REFERENCES, size).mean(axis=1)
         parts = self.modes.problem.mechanism.slices
@@ -131,6 +148,12 @@ class Family:
             k[:, part] = self.scales[:, i, 1:2] * np.diag(body.K)
             d[:, part] = self.scales[:, i, 2:] * np.diag(body.D)
         return k, d, mass
+
+
+def _joined(motions: Sequence[RigidMotion]) -> RigidMotion:
+    """Return several motions one after the other."""
+    names = ("q", "qd", "qdd")
+    return RigidMotion(*(np.concatenate([getattr(m, name) for m in motions]) for name in names))
 
 
 def related(problems: Sequence[ElasticProblem]) -> list[np.ndarray | None]:
@@ -228,15 +251,14 @@ class Grid:
         return replace(self, members=self.members[chosen], edges=self.edges[chosen], state=state)
 
     def collocated(self, stages: int) -> Stages:
-        """Return all steps with so many stages, or with one in the middle for none."""
-        method = radau_iia(max(stages, 1))
-        nodes = method.c if stages else np.array([0.5])
+        """Return all steps with so many stages."""
+        method = radau_iia(stages)
         h = np.diff(self.edges, axis=1)
-        times = self.edges[:, :-1, None] + h[:, :, None] * nodes
-        mechanism = self.family.mechanism(self.members, h.shape[1] * len(nodes))
-        motion = self.family.motion(self.members, [t.ravel() for t in times])
+        mechanism = self.family.mechanism(self.members, h.shape[1] * stages)
+        motion, middle = self.family.motions(self.members, method, self.edges)
         frequencies = self.family.modes.frequencies
-        return Stages(mechanism, frequencies, method, h.ravel(), motion, len(self.members))
+        runs = len(self.members)
+        return Stages(mechanism, frequencies, method, h.ravel(), motion, middle, runs)
 
     @cached_property
     def own(self) -> Stages:
@@ -244,16 +266,11 @@ class Grid:
         return self.collocated(self.stages)
 
     @cached_property
-    def middle(self) -> Stages:
-        """The middle of all steps."""
-        return self.collocated(0)
-
-    @cached_property
     def slow(self) -> np.ndarray:
         """Coordinates that are slow in one of the problems, ascending."""
         k, _, m = (x[self.members] for x in self.family.diagonal)
         angles = np.sqrt(k / m) * np.median(np.diff(self.edges, axis=1), axis=1)[:, None]
-        return np.flatnonzero(angles.min(axis=0) <= max(LIMITS[0], angles.min()))
+        return np.flatnonzero(angles.min(axis=0) <= max(LIMIT, angles.min()))
 
     def factors(self, stages: Stages, begin: State, a: np.ndarray) -> Factors:
         """Return Newton's matrix, the tangent taken in the middle of every step.
@@ -263,22 +280,8 @@ class Grid:
             begin: q, qd (n, N) at the steps' beginnings.
             a: (n, s, N).
         """
-        slow = self.slow
-        fast = np.setdiff1d(np.arange(a.shape[2]), slow)
-        steps = self.edges.shape[1] - 1
-        single = diagonal_factors(
-            stages,
-            *(np.repeat(x[self.members][:, fast], steps, axis=0) for x in self.family.diagonal),
-        )
-        return held_factors(stages, self._tangent(stages, begin, a), slow, fast, single)
-
-    def _tangent(self, stages: Stages, begin: State, a: np.ndarray) -> Tangent:
-        value, first, second = lagrange_integrals(stages.method.c, np.array([0.5]))
-        h = stages.h[:, None]
-        q = begin[0] + 0.5 * h * begin[1] + h * h * np.einsum("j,njk->nk", second[0], a)
-        qd = begin[1] + h * np.einsum("j,njk->nk", first[0], a)
-        qdd = np.einsum("j,njk->nk", value[0], a)
-        return linearise(self.middle.mechanism, self.middle.motion, q, qd, qdd, self.slow)
+        k, d, m = (np.repeat(x[self.members], stages.length, axis=0) for x in self.family.diagonal)
+        return held_factors(stages, begin, a, self.slow, (k, d, m))
 
     def energies(self, q: np.ndarray) -> np.ndarray:
         """Return the largest norms (R, arms) of q (n, s, N); the stiffness is one here."""
@@ -315,12 +318,12 @@ def _static_starts(family: Family) -> tuple[np.ndarray, np.ndarray]:
     members = np.arange(len(family.problems))
     size = family.modes.problem.mechanism.coordinates
     mechanism = family.mechanism(members, 1)
-    motion = family.motion(members, [np.zeros(1)] * len(members))
+    motion = family.motion(np.zeros(1))
     q = rest = np.zeros((len(members), size))
     before = np.full(len(members), np.inf)
     done = np.zeros(len(members), dtype=bool)
     for _ in range(50):
-        rows, _ = inverse_dynamics(mechanism, motion, q, rest, rest)
+        rows = elastic_rows(mechanism, motion, q, rest, rest)
         done |= ~rows.any(axis=1)
         if done.all():
             break
@@ -410,7 +413,7 @@ def _chord(grid: Grid, a: np.ndarray, goal: float) -> _Found:
         grown = ~done & ~(norm <= 0.9 * norm_before)
         done |= grown & (moved <= radau.ROUNDING)
         grown &= ~done
-        if grown.any() or (moved > CHORD_START).any():
+        if grown.any():
             fresh = ~np.isfinite(worst) | (worst == 0.0)
             worst[grown & fresh] = np.inf  # damping would be needed
             break
@@ -424,12 +427,13 @@ def _largest(rows: np.ndarray, runs: int) -> np.ndarray:
 def _errors(grid: Grid, a: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return every problem's relative error (R,), see `radau._error`.
 
-    Corrected where the iterations contracted slowly.
+    Corrected where the iterations contracted slowly; else what a correction could add is added.
     """
     stages = grid.own
     finer = radau_iia(grid.stages + 1)
     richer = grid.collocated(grid.stages + 1)
     begin = beginnings(stages, grid.state, a)
+    unseen = _unseen(grid, begin, a)
     a = lagrange_integrals(stages.method.c, finer.c)[0] @ a
     q, qd = stage_values(richer, *begin, a)
     factors = grid.factors(richer, begin, a)
@@ -438,8 +442,18 @@ def _errors(grid: Grid, a: np.ndarray, rate: np.ndarray) -> np.ndarray:
     if rate.max(initial=0.0) > TRUSTED:
         there = at_stages(richer, grid.state, a + step)
         _, more = factors.solve(rows_at(richer, *there, a + step), rest)
-        shift = shift + more
-    return grid.relative(shift, q)
+        return grid.relative(shift + more, q) + unseen
+    return grid.relative(shift, q) / (1.0 - rate) + unseen
+
+
+def _unseen(grid: Grid, begin: State, a: np.ndarray) -> np.ndarray:
+    """Return the relative error (R,) of vibrations that the steps do not resolve."""
+    states = (*stage_values(grid.own, *begin, a), a)
+    single = tuple(x[grid.members] for x in grid.family.diagonal)
+    breakpoints = grid.family.problems[grid.members[0]].breakpoints
+    kinks = np.searchsorted(grid.edges[0], breakpoints)[:-1]
+    blind = unresolved(grid.own, single, states, grid.state[0], kinks)
+    return grid.relative(blind[:, None], states[0])
 
 
 # -- all of it -------------------------------------------------------------------------------
@@ -451,6 +465,7 @@ def integrate(
     stages: int,
     ledger: Ledger,
     starts: Sequence[Solution | None],
+    goal: float = GOAL,
 ) -> list[Solution | ConvergenceError]:
     """Solve every problem as `radau.integrate` does, related ones at once.
 
@@ -460,6 +475,7 @@ def integrate(
         problems: what to solve.
         tolerance, stages, ledger: as there.
         starts: solution of a nearby problem for each, or None.
+        goal: what Newton's method may leave, as a share of the tolerance.
 
     Returns:
         In the same order; a problem that cannot be solved has its error.
@@ -472,7 +488,7 @@ def integrate(
         if len(mine) > 1:
             family = family_of([problems[i] for i in mine], [s for s in scales if s is not None])
             given = [starts[i] for i in mine]
-            solutions = _together(family, tolerance, stages, ledger, given)
+            solutions = _together(family, tolerance, stages, ledger, given, goal)
         else:
             solutions = [None]
         for i, solution in zip(mine, solutions, strict=True):
@@ -514,6 +530,7 @@ def _together(
     stages: int,
     ledger: Ledger,
     starts: Sequence[Solution | None],
+    goal: float,
 ) -> list[Solution | None]:
     """Return the solutions of a family; None where it takes `radau.integrate`.
 
@@ -544,7 +561,9 @@ def _together(
                 members = np.array(group[first : first + most])
                 edges = _common_edges([problems[i] for i in members], steps)
                 grid = Grid(family, members, edges, stages, _resting(rest[members]))
-                for i, solution in zip(members, _on_grid(grid, guesses, tolerance), strict=True):
+                for i, solution in zip(
+                    members, _on_grid(grid, guesses, goal * tolerance), strict=True
+                ):
                     if solution is None:
                         continue
                     ledger.counts.newton_iterations += solution.iterations
@@ -605,7 +624,7 @@ def _pilot(
         problem = family.problems[own[0]]
         edges = even_steps(problem, first_count(problem))[None]
         grid = Grid(family, own, edges, stages, _resting(rest[own]))
-        (solution,) = _on_grid(grid, [None] * len(family.problems), PILOT * tolerance)
+        (solution,) = _on_grid(grid, [None] * len(family.problems), PILOT_GOAL * tolerance)
         if solution is not None:
             ledger.counts.newton_iterations += solution.iterations
             return solution, max(1.0, float(speeds.max() / speeds[k]) ** GROWTH)
@@ -616,14 +635,12 @@ def _resting(q: np.ndarray) -> State:
     return q, np.zeros_like(q)
 
 
-def _on_grid(
-    grid: Grid, guesses: Sequence[Solution | None], tolerance: float
-) -> list[Solution | None]:
+def _on_grid(grid: Grid, guesses: Sequence[Solution | None], goal: float) -> list[Solution | None]:
     """Return every problem's solution on the grid, None where Newton's method fails."""
     modes, count = grid.family.modes, grid.edges.shape[1] - 1
     nodes = radau_iia(grid.stages).c
     a = np.stack([_guess(grid, i, guesses[m]) for i, m in enumerate(grid.members)])
-    found = _newton(grid, modes.to_modes(a), GOAL * tolerance)
+    found = _newton(grid, modes.to_modes(a), goal)
     chosen = np.flatnonzero(found.converged)
     out: list[Solution | None] = [None] * len(a)
     if len(chosen) == 0:

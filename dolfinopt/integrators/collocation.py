@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from dolfinopt.integrators.modes import Modes
 from dolfinopt.integrators.problem import lagrange_integrals
-from dolfinopt.mechanism import Mechanism, Tangent, inverse_dynamics, linearise
+from dolfinopt.mechanism import Mechanism, Tangent, elastic_rows, linearise
 from dolfinopt.motion import RigidMotion
 
 
@@ -43,6 +44,7 @@ class Stages:
         method: collocation.
         h: (n,) steps, s.
         motion: rigid coordinates at the n s stages.
+        middle: in the middle of every step.
         runs: equal parts of the steps, each a problem of its own.
     """
 
@@ -51,6 +53,7 @@ class Stages:
     method: Collocation
     h: np.ndarray
     motion: RigidMotion
+    middle: RigidMotion
     runs: int = 1
 
     @property
@@ -61,17 +64,33 @@ class Stages:
     def window(self, first: int, last: int) -> Stages:
         """Return the steps first..last - 1."""
         s = len(self.method.c)
-        part = slice(first * s, last * s)
-        motion = RigidMotion(self.motion.q[part], self.motion.qd[part], self.motion.qdd[part])
-        return replace(self, h=self.h[first:last], motion=motion)
+        motion, middle = self.motion[first * s : last * s], self.middle[first:last]
+        return replace(self, h=self.h[first:last], motion=motion, middle=middle)
 
 
 def stages_of(modes: Modes, method: Collocation, edges: np.ndarray) -> Stages:
     """Return all stages of the steps between `edges` (n + 1,)."""
-    h = np.diff(edges)
-    times = (edges[:-1, None] + h[:, None] * method.c).ravel()
     problem = modes.problem
-    return Stages(problem.mechanism, modes.frequencies, method, h, problem.motion(times))
+    motion, middle = motions(problem.motion, method, edges)
+    return Stages(problem.mechanism, modes.frequencies, method, np.diff(edges), motion, middle)
+
+
+def motions(
+    motion: Callable[[np.ndarray], RigidMotion], method: Collocation, edges: np.ndarray
+) -> tuple[RigidMotion, RigidMotion]:
+    """Return the motion at all stages of the steps between `edges`, and in the steps' middles."""
+    h = np.diff(edges)
+    nodes = np.append(method.c, 0.5)
+    every = motion((edges[:-1, None] + h[:, None] * nodes).ravel())
+
+    def part(x: np.ndarray, chosen: slice | int) -> np.ndarray:
+        return x.reshape(len(h), len(nodes), -1)[:, chosen].reshape(-1, x.shape[1])
+
+    inner, middle = (
+        RigidMotion(part(every.q, chosen), part(every.qd, chosen), part(every.qdd, chosen))
+        for chosen in (slice(-1), -1)
+    )
+    return inner, middle
 
 
 def starts(
@@ -124,7 +143,7 @@ def rows_at(stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray) -> np.
     """Return the elastic rows (n, s, N) at all stages."""
     size = q.shape[2]
     flat = (x.reshape(-1, size) for x in (q, qd, a))
-    return inverse_dynamics(stages.mechanism, stages.motion, *flat)[0].reshape(q.shape)
+    return elastic_rows(stages.mechanism, stages.motion, *flat).reshape(q.shape)
 
 
 def tangent_at(

@@ -29,10 +29,13 @@ from dolfinopt.integrators.collocation import (
 from dolfinopt.mechanism import Tangent
 
 BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
-# Angles w h up to which coordinates are slow, tried in turn. Paper's example to 1e-4 with 3 | 4
-# stages, optimised, 4 coordinates an arm, from cold: 84 | 64 ms with 15, 67 | 40 with 20, 70 | 45
-# with 25; iterations 13 | 11, 8 | 5, 8 | 5. Of the initial design 40 | 30 ms with each.
-LIMITS = (20.0, 80.0, np.inf)
+# Angles w h up to which coordinates are slow, tried in turn. Simulations of a running optimisation
+# of the paper's example, 4 stages, take 35 ms with 20, 20 with 30, 17 with 40 (10, 6 and 6 Newton
+# iterations); with 3 stages 23 ms with each.
+LIMITS = (40.0, 120.0, np.inf)
+# As long as not all must be, the slowest so many are, or fewer that have room: on short steps
+# nearly all would. Without damping, optimised, 48 coordinates an arm, to 1e-5: 4 instead of 50 s.
+MOST = 24
 SMALL = 12  # coordinates up to which the exact matrix is cheap: an adjoint of 8 in 12, not 24 ms
 MEMORY_BYTES = 256e6  # of the factors of steps that are solved together
 
@@ -53,15 +56,24 @@ def next_slow(
     angles = stages.frequencies * np.median(stages.h)
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))
+    most = max(1, min(MOST, int(np.sqrt(MEMORY_BYTES / _bytes(stages)))))
+    if limit < np.inf and len(slow) > most:
+        slow = np.sort(np.argsort(angles, kind="stable")[:most])
     if len(slow) <= more_than and beyond:
         return next_slow(stages, tuple(beyond), more_than)
     return slow, tuple(beyond) if len(slow) < len(angles) else ()
 
 
+def _bytes(stages: Stages) -> int:
+    """Return the memory that factors take, over the square of the number of slow coordinates."""
+    s = len(stages.method.c)
+    return 8 * len(stages.h) * (s * s + 2 * s + 8)
+
+
 def windows(stages: Stages, slow: np.ndarray) -> list[slice]:
     """Return runs of steps whose factors fit in `MEMORY_BYTES`: mostly one."""
-    s, size, count = len(stages.method.c), len(slow), len(stages.h)
-    length = max(1, int(MEMORY_BYTES / (8 * size * size * (s * s + 2 * s + 8) + 1)))
+    size, count = len(slow), len(stages.h)
+    length = max(1, int(MEMORY_BYTES * count / (_bytes(stages) * size * size + 1)))
     return [slice(i, min(i + length, count)) for i in range(0, count, length)]
 
 
@@ -257,12 +269,16 @@ def factorise(
     diagonal = np.arange(slow_size)
     transfer[:, diagonal, slow_size + diagonal] += stages.h[:, None]
     dense = (inverse, answer, transfer, band_of(transfer, stages.length))
-    bodies = stages.mechanism.bodies
-    k = np.concatenate([np.diag(body.K) for body in bodies])[fast]
-    d = np.concatenate([np.diag(body.D) for body in bodies])[fast]
-    m = k / stages.frequencies[fast] ** 2  # with what the arm carries
-    single = diagonal_factors(stages, k[None], d[None], m[None])
+    single = diagonal_factors(stages, *(x[:, fast] for x in alone(stages)))
     return Factors(stages, tangent, slow, fast, *dense, *single)
+
+
+def alone(stages: Stages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stiffness, damping and mass (1, N) of every coordinate by itself."""
+    bodies = stages.mechanism.bodies
+    k = np.concatenate([np.diag(body.K) for body in bodies])
+    d = np.concatenate([np.diag(body.D) for body in bodies])
+    return k[None], d[None], (k / stages.frequencies**2)[None]  # mass with what the arm carries
 
 
 def _blocks(stages: Stages, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,27 +14,33 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.integrators.collocation import Collocation, Stages, end_gain
-from dolfinopt.integrators.factors import Factors, band_of
-from dolfinopt.mechanism import Tangent
+from dolfinopt.integrators.factors import Factors, band_of, diagonal_factors
+from dolfinopt.integrators.problem import lagrange_integrals
+from dolfinopt.mechanism import Tangent, linearise
+
+State = tuple[np.ndarray, np.ndarray]  # q, qd
 
 CHUNK = 512  # matrices that are inverted together: they stay in the processor's cache
 
 
 def held_factors(
     stages: Stages,
-    tangent: Tangent,
+    begin: State,
+    a: np.ndarray,
     slow: np.ndarray,
-    fast: np.ndarray,
-    single: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    single: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> Factors:
     """Return Newton's matrix, inverted; nan where a block is singular.
 
     Args:
         stages: n steps.
-        tangent: of all rows by the slow coordinates, in the middle of every step.
-        slow, fast: ascending coordinates (S,), (F,).
-        single: of the fast ones, see `diagonal_factors`.
+        begin: q, qd (n, N) at the steps' beginnings.
+        a: (n, s, N).
+        slow: ascending coordinates (S,) that are treated densely.
+        single: stiffness, damping and mass (1, N), or (n, N) of every step.
     """
+    fast = np.setdiff1d(np.arange(a.shape[2]), slow)
+    tangent = _tangent(stages, begin, a, slow)
     slopes = tangent.dense()
     size, count, s = len(slow), len(slopes), len(stages.method.c)
     h = stages.h[:, None, None]
@@ -47,7 +53,19 @@ def held_factors(
     diagonal = np.arange(size)
     transfer[:, diagonal, size + diagonal] += stages.h[:, None]
     dense = (inverse, answer, transfer, band_of(transfer, stages.length))
-    return Factors(stages, tangent, slow, fast, *dense, *single)
+    alone = diagonal_factors(stages, *(x[:, fast] for x in single))
+    return Factors(stages, tangent, slow, fast, *dense, *alone)
+
+
+def _tangent(stages: Stages, begin: State, a: np.ndarray, slow: np.ndarray) -> Tangent:
+    """Return the rows' derivative by the slow coordinates in the middle of every step."""
+    s = len(stages.method.c)
+    value, first, second = lagrange_integrals(stages.method.c, np.array([0.5]))
+    h = stages.h[:, None]
+    q = begin[0] + 0.5 * h * begin[1] + h * h * np.einsum("j,njk->nk", second[0], a)
+    qd = begin[1] + h * np.einsum("j,njk->nk", first[0], a)
+    qdd = np.einsum("j,njk->nk", value[0], a)
+    return linearise(stages.mechanism[::s], stages.middle, q, qd, qdd, slow)
 
 
 def _inverse(

@@ -84,6 +84,21 @@ def lagrange_integrals(
     return value @ coefficients, first @ coefficients, second @ coefficients
 
 
+def lagrange_slopes(nodes: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Return Lagrange polynomials of `nodes`, their first and second derivatives (3, m, s) at tau.
+
+    Args:
+        nodes: (s,).
+        tau: (m,).
+    """
+    powers = np.arange(len(nodes), dtype=float)
+    coefficients = np.linalg.inv(nodes[:, None] ** powers)  # (power, node)
+    value = tau[:, None] ** powers
+    first = powers * tau[:, None] ** np.maximum(powers - 1.0, 0.0)
+    second = powers * (powers - 1.0) * tau[:, None] ** np.maximum(powers - 2.0, 0.0)
+    return np.stack([value, first, second]) @ coefficients
+
+
 def even_steps(problem: ElasticProblem, count: int) -> np.ndarray:
     """Return about `count` even steps that end at the breakpoints."""
     ends = np.asarray(problem.breakpoints)
