@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from time import perf_counter
 
-from dolfinopt.bench import mesh, peers, reduction, time, tolerance, whole
+from dolfinopt.bench import mesh, peers, reduction, solvers, time, tolerance, whole
 from dolfinopt.bench.common import Diagram, Goal, Plan, Tell, measured, write_diagram
 from dolfinopt.files import write_text
 from dolfinopt.findings import Table
@@ -21,7 +21,8 @@ __all__ = ["QUICKLY", "Diagram", "Goal", "Plan", "bench", "diagrams"]
 
 def diagrams() -> tuple[Diagram, ...]:
     """Return all diagrams, the main one first."""
-    return tuple(module.diagram() for module in (time, peers, whole, mesh, reduction, tolerance))
+    modules = time, peers, whole, mesh, reduction, tolerance, solvers
+    return tuple(module.diagram() for module in modules)
 
 
 def bench(
