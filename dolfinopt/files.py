@@ -395,10 +395,9 @@ def _load_design(path: Path) -> dict[str, np.ndarray]:
         try:
             with np.load(stream, allow_pickle=False) as data:
                 return {key: data[key] for key in data.files}
-        except (ValueError, OSError, EOFError, KeyError, _zip_error()) as error:
+        except (ValueError, OSError, EOFError, KeyError, _zip_error()):
             raise InputError(
-                f"{path}: --design is no readable .npz file ({error}); give a design.npz "
-                "that dolfinopt wrote"
+                f"{path}: --design is no readable .npz file; give a design.npz that dolfinopt wrote"
             ) from None
 
 

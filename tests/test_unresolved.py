@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dolfinopt.integrators.collocation import radau_iia
+from dolfinopt.integrators.collocation import Stages, radau_iia
 from dolfinopt.integrators.problem import lagrange_slopes
-from dolfinopt.integrators.unresolved import _lost
+from dolfinopt.integrators.unresolved import _lost, unresolved
+from dolfinopt.mechanism import Mechanism
+from dolfinopt.motion import RigidMotion
 
 
 def test_slopes_of_polynomials() -> None:
@@ -18,6 +20,22 @@ def test_slopes_of_polynomials() -> None:
     for k, row in enumerate(found):
         # Rounding of the inverted powers' matrix, some thousand large.
         np.testing.assert_allclose(row, cubic.deriv(k)(tau) if k else cubic(tau), atol=1e-11)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("damping", [0.0, 1e30])
+def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
+    """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
+    method, h = radau_iia(3), np.full(10, 0.1)
+    still = RigidMotion(*np.zeros((3, 30, 1)))
+    mechanism = Mechanism((), 0.0, 0.0, (0.0, 0.0), 0.0)
+    stages = Stages(mechanism, np.array([1e154]), method, h, still, still)
+    t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]
+    states = (t**2, np.zeros_like(t), np.zeros_like(t))
+    single = tuple(np.full((1, 1), x) for x in (1.0, damping, 1e-290))
+    found = unresolved(stages, single, states, np.zeros((1, 1)), np.array([0]))
+    assert found.shape == (1, 1)
+    assert 0.0 <= found[0, 0] < 1e-12
 
 
 @pytest.mark.parametrize("stages", [2, 3, 4])

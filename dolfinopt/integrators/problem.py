@@ -151,8 +151,9 @@ def static_start(problem: ElasticProblem) -> np.ndarray:
             return q[0]
         moved_before = moved
     raise ConvergenceError(
-        "the mechanism finds no static equilibrium at t = 0: the arms are too soft for gravity; "
-        "raise material.young_modulus or interpolation.floor, or lower motion.gravity"
+        "the mechanism finds no static equilibrium at t = 0: the arms are too soft for gravity, or "
+        "for the acceleration that a tabulated motion begins with; raise material.young_modulus or "
+        "interpolation.floor, lower motion.gravity, or let the motion begin at rest"
     )
 
 

@@ -18,9 +18,11 @@ from dolfinopt.integrators.problem import lagrange_slopes
 
 # Numbers of steps, about sixteen of them, after which a free vibration is compared.
 LOOKS = 16
+FASTEST = 1e30  # rad/s: beyond, squares overflow
 ROUNDING = 1e-14  # of R, which grows with the steps
 
 
+@np.errstate(over="ignore")  # of what has no mass
 def unresolved(
     stages: Stages,
     single: tuple[np.ndarray, np.ndarray, np.ndarray],
@@ -43,9 +45,9 @@ def unresolved(
     k, d, m = (x[:, None] for x in single)
     jumps = _jumps(stages, single, states, kinks)
     jumps[0, :, 0] -= k[:, 0] * rest
-    square = k / m
+    square = np.minimum(k / m, FASTEST**2)
     amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
-    decay = 0.5 * d / m
+    decay = np.minimum(0.5 * (d / m), FASTEST)
     rate = -decay + np.sqrt((decay * decay - square).astype(complex))
     h = stages.h.reshape(stages.runs, -1, 1)[:, kinks]
     lost = _lost(radau_iia(len(stages.method.c) + 1), rate * h, stages.length - kinks)
