@@ -25,10 +25,12 @@ GRACE = 2.0  # s
 # Arms of fewer cells are faster on one rank than on two (see `share_arms`). One factorisation and
 # 18 solves, as an iteration needs, at 800 x 48 cells: 470 ms on one rank, 340 ms on two.
 SPLIT_CELLS = 40_000
-# From here on MUMPS's ordering beats the narrow band of PETSc's Cholesky. One factorisation and 18
-# solves on one rank, 400 x 24: 45 against 78 ms; 800 x 48 (78 000 rows): 470 against 520 ms;
-# 1600 x 96: 5.5 against 2.3 s.
-MUMPS_ROWS = 80_000
+# From so many rows on nested dissection beats the narrow band in PETSc's Cholesky. One
+# factorisation and 18 solves on one rank and thread, 400 x 24 cells: 47 against 43 ms, MUMPS 97,
+# CHOLMOD 57; 800 x 48: 330 against 460 ms, MUMPS 520, CHOLMOD 490; 1600 x 96: 2.2 against 5.5 s,
+# MUMPS 2.7, CHOLMOD 2.3 (`dolfinopt bench`, solvers). A second thread helps CHOLMOD alone: 0.37 and
+# 2.1 s.
+NESTED_ROWS = 30_000
 
 
 @dataclass(frozen=True)
@@ -180,20 +182,21 @@ def _all_arrive(comm: MPI.Comm) -> bool:
 
 
 def direct_solver(mat: PETSc.Mat, ordering: str) -> PETSc.KSP:
-    """Return a Cholesky solver: PETSc's own on one rank, MUMPS across ranks or when large.
+    """Return a Cholesky solver: PETSc's own on one rank, MUMPS across ranks.
 
     Args:
         mat: symmetric positive definite, marked so.
-        ordering: PETSc's name of the elimination order on one rank; MUMPS chooses its own.
+        ordering: PETSc's name of the elimination order of a small matrix on one rank; large ones
+            take nested dissection, MUMPS chooses its own.
     """
     ksp = PETSc.KSP().create(mat.comm)
     ksp.setOperators(mat)
     ksp.setType(PETSc.KSP.Type.PREONLY)
     pc = ksp.getPC()
     pc.setType(PETSc.PC.Type.CHOLESKY)
-    if mat.comm.size == 1 and mat.getSize()[0] < MUMPS_ROWS:
+    if mat.comm.size == 1:
         pc.setFactorSolverType("petsc")
-        pc.setFactorOrdering(ordering)
+        pc.setFactorOrdering(ordering if mat.getSize()[0] < NESTED_ROWS else "nd")
     else:
         pc.setFactorSolverType("mumps")
     return ksp

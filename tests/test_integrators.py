@@ -715,7 +715,7 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
         found.append(solution.error)
         assert len(matrices) <= 12  # of two grids, most of them with held tangents
     assert max(slow) <= 32  # of 96
-    assert max(iterations) <= 26  # on two grids; 21 to 24, by which coordinates are just fast
+    assert max(iterations) <= 30  # on two grids; 25 to 28, by which coordinates are just fast
     assert_close(found, found[:1] * 3, 0.2)  # other steps
 
 

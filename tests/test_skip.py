@@ -245,7 +245,7 @@ def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
     The optimiser's step is small, 0.02, and the tolerance of the usual size: at 1e-2 as many
     steps as the motion needs to look smooth are enough from cold, too.
     """
-    small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=5e-5")
+    small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=1e-5")
     first = counts(run("optimize", *small, "optimizer.max_iterations=0"))
     folder = run("optimize", *small, "optimizer.max_iterations=1")
     both = counts(folder)
@@ -254,10 +254,10 @@ def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
 
 
 def test_a_trajectory_starts_from_the_last_designs(run: Run) -> None:
-    """5 iterations of Newton against 10."""
+    """Half of the iterations or fewer: from cold it takes a second grid, too."""
     warm, cold = warm_and_cold(run)
     assert warm["simulations"] == cold["simulations"] == 1
-    assert 0 < warm["newton_iterations"] < cold["newton_iterations"]
+    assert 0 < 2 * warm["newton_iterations"] <= cold["newton_iterations"]
 
 
 @pytest.mark.parametrize(

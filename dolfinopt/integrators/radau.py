@@ -9,8 +9,7 @@ and the last stage ends the step. Newton's matrix is block lower bidiagonal: the
 steps are solved in one batch for an affine map of the state at their beginning, then a short
 recursion runs over the steps. Of many coordinates only the few that vibrate slowly have dense
 blocks (`factors`): 6 of 8 or of 96 coordinates of the paper's example. With 4 stages, to 1e-4, it
-takes 80 steps and 30 or 65 ms on one core from cold, optimised 163 steps and 31 or 86 ms; 10, 19,
-13 and 32 ms from the solution itself.
+takes 79 steps and 24 or 51 ms on one core from cold, optimised 189 steps and 29 or 79 ms.
 """
 
 from __future__ import annotations
@@ -75,8 +74,6 @@ HELD_RATE = 0.15  # of one with held tangents; 0.1 to 0.3 take as long in the ex
 SETTLED = 0.01
 GOAL = 1e-7  # what Newton may leave, as a share of the tolerance: Taylor tests look at 1e-10
 LEAST_RATE = 0.01  # contraction that is believed
-# Of a first grid from cold, which is hardly ever the last one: Newton's goal, in its usual ones.
-ROUGH = 1e3
 ROUGHLY = 0.2  # correction of an estimate that still lets it be believed: the next is a fifth
 CORRECTIONS = 4  # of an estimate: mostly one
 # Least growth of the steps at one refinement after the other: as long as vibrations are not
@@ -88,6 +85,12 @@ ACCEPT = 0.6
 # Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent
 # between neighbouring designs, and a grid that is refined twice costs more than one too fine.
 AIM = 0.4
+# Error with eight steps a period of the slowest vibration, by stages: paper's example, initial
+# design (optimised 0.012, 9e-4, 2e-5, 4e-6). Where so many more steps are needed the first grid is
+# the last one, mostly: from cold 24 instead of 30 ms with 4 stages; else it is better coarse: with
+# 3 stages 48 coordinates an arm take 78 ms, on the fine one at once 125.
+FIRST_ERROR = {1: 0.5, 2: 0.083, 3: 4.6e-3, 4: 1.1e-4, 5: 7e-6}
+FIRST_GROWTH = 1.6
 
 
 def integrate(
@@ -113,10 +116,10 @@ def integrate(
     modes = modes_of(problem)
     edges = next_edges(modes.problem, start, tolerance, stages)
     iterations = failures = refined = 0
-    before, rough = np.inf, start is None
+    before = np.inf
     for _ in range(MAX_GRIDS):
         try:
-            start = _on_grid(modes, edges, tolerance * (ROUGH if rough else 1.0), stages, start)
+            start = _on_grid(modes, edges, tolerance, stages, start)
         except ConvergenceError:
             failures += 1
             count = 4 * (len(edges) - 1)
@@ -125,16 +128,14 @@ def integrate(
             start, edges = None, even_steps(problem, count)
             continue
         iterations += start.iterations
-        if start.error > ACCEPT * tolerance:
-            if 0.9 * before < start.error < ROUNDING:
-                break
-            before, refined = start.error, refined + 1
-            least = REFINED[min(refined, len(REFINED)) - 1]
-            edges = next_edges(modes.problem, start, tolerance, stages, least)
-        elif not rough:
+        if start.error <= ACCEPT * tolerance:
             ledger.counts.newton_iterations += iterations
             return replace(start, iterations=iterations)
-        rough = False
+        if 0.9 * before < start.error < ROUNDING:
+            break
+        before, refined = start.error, refined + 1
+        least = REFINED[min(refined, len(REFINED)) - 1]
+        edges = next_edges(modes.problem, start, tolerance, stages, least)
     assert start is not None  # the last grid is no failure: there are fewer of them
     raise ConvergenceError(
         f"the simulation reaches an error of {start.error:.2g} with {len(start.a)} steps, not the "
@@ -195,7 +196,7 @@ def next_edges(
     at least by the factor `least`.
     """
     if start is None:
-        return even_steps(problem, first_count(problem))
+        return _first_edges(problem, tolerance, stages)
     count = len(start.a)
     order = 2 * stages - 1  # at the steps' ends
     growth = (start.error / (AIM * tolerance)) ** (1.0 / order)
@@ -204,6 +205,14 @@ def next_edges(
     if growth > 0.8 and np.isin(problem.breakpoints, start.edges).all():
         return start.edges
     return even_steps(problem, int(np.ceil(count * min(max(growth, 0.5), 1.0))))
+
+
+def _first_edges(problem: ElasticProblem, tolerance: float, stages: int) -> np.ndarray:
+    """Return steps from cold that are likely to meet the tolerance, or coarse ones."""
+    known = FIRST_ERROR.get(stages, FIRST_ERROR[5])
+    growth = (known / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
+    growth = max(growth, 0.6) if growth < FIRST_GROWTH else 1.0
+    return even_steps(problem, int(np.ceil(first_count(problem) * growth)))
 
 
 def _first_guess(
