@@ -29,7 +29,8 @@ from dolfinopt.mechanism import (
 from dolfinopt.motion import RigidMotion, quintic
 
 TOLERANCE = 1e-4
-LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
+# By Newton's method, of either of two; told by the last contraction seen, which may grow.
+LEFT = 5.0 * batch.GOAL * TOLERANCE
 DAMPING = 1e-3  # s
 
 

@@ -88,11 +88,11 @@ class Factors:
         inverse: (n, s S, s S) of the slow blocks.
         answer: (n, s, S, 2 S) change of their a by their state at the step's beginning.
         transfer: (n, 2 S, 2 S) change of that state over a step by that before it.
-        band: the same for `_carried`.
+        band: the same for `carried`.
         fast_inverse: (s, s, n, F).
         fast_loads: (2, n, s, F) change of the fast rows by their state (q, qd) at the beginning.
         fast_transfer: (n, 2, 2, F).
-        fast_band: the same for `_carried`, coordinate after coordinate.
+        fast_band: the same for `carried`, coordinate after coordinate.
     """
 
     stages: Stages
@@ -136,7 +136,7 @@ class Factors:
         y = np.empty((count, 2 * size))
         y[1:] = end_gain(self.stages, forced[..., None])[:-1, :, 0]
         y[:: self.stages.length] = before.ravel()
-        y = _carried(self.band, y)
+        y = carried(self.band, y)
         answer = self.answer.reshape(count, s * size, -1)
         step = forced + (answer @ y[:, :, None]).reshape(rows.shape)
         return step, *stage_values(self.stages, y[:, :size], y[:, size:], step)
@@ -149,7 +149,7 @@ class Factors:
         y[1:] = end_gain(self.stages, forced[..., None])[:-1].reshape(-1, 2, size)
         y[:: self.stages.length] = before
         # Coordinate by coordinate, one after the other.
-        y = _carried(self.fast_band, _in_turn(y))
+        y = carried(self.fast_band, _in_turn(y))
         y = y.reshape(size, count, 2).transpose(1, 2, 0)
         loads = y[:, None, 0] * self.fast_loads[0] + y[:, None, 1] * self.fast_loads[1]
         step = forced - _diagonal(self.fast_inverse, loads)
@@ -183,7 +183,7 @@ class Factors:
         flat = by_a.reshape(count, -1, 1)
         direct = (by_y.reshape(count, -1, 1) + answer.swapaxes(1, 2) @ flat)[:, :, 0]
         direct[-1] += after.ravel() @ self.transfer[-1]
-        p = np.concatenate([_carried(self.band, direct, 1)[1:], after.reshape(1, -1)])
+        p = np.concatenate([carried(self.band, direct, 1)[1:], after.reshape(1, -1)])
         flat = flat + _end_slopes(self.stages, p).reshape(flat.shape)
         return -(self.inverse.swapaxes(1, 2) @ flat).reshape(by_a.shape)
 
@@ -193,7 +193,7 @@ class Factors:
         direct = by_y - np.einsum("injk,njk->nik", self.fast_loads, eased)
         direct[-1] += np.einsum("ik,ijk->jk", after, self.fast_transfer[-1])
         count, _, size = direct.shape
-        p = _carried(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
+        p = carried(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
         p = np.concatenate([p.transpose(1, 2, 0)[1:], after[None]])
         return -_diagonal(turned, by_a + _end_slopes(self.stages, p.reshape(len(p), -1)))
 
@@ -211,7 +211,7 @@ def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
     return bands.reshape(count * m, 2 * m).T
 
 
-def _carried(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
+def carried(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
     """Return y_n+1 = T_n y_n + gain_n (n, m) from y_0 and the gains (n, m), or the transposed.
 
     One call instead of a loop over the steps: for 176 steps of 5 fast coordinates 0.01 instead of
