@@ -29,8 +29,7 @@ from dolfinopt.mechanism import (
 from dolfinopt.motion import RigidMotion, quintic
 
 TOLERANCE = 1e-4
-# By Newton's method, of either of two; told by the last contraction seen, which may grow.
-LEFT = 5.0 * batch.GOAL * TOLERANCE
+LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
 DAMPING = 1e-3  # s
 
 

@@ -65,6 +65,7 @@ GROWTH = 0.5
 # Steps times coordinates of a batch: with more, arrays leave the processor's cache.
 MAX_SIZE = 40_000
 CHORD_RATE = 0.2  # contraction that keeps a matrix: a new one costs four iterations
+LEAST_RATE = 0.2  # contraction that is believed: the first step may fall far better than later ones
 # Of a matrix that was made so near that a new one would be no better.
 NEAR, NEAR_RATE = 0.02, 0.6
 # Contraction of Newton's iteration up to which one answer, with what it may leave, estimates the
@@ -398,7 +399,7 @@ def _chord(grid: Grid, a: np.ndarray, goal: float) -> _Found:
         step, shift = factors.solve(rows, rest)
         moved = grid.relative(shift, q + shift)
         seen = np.maximum(moved / before, norm / norm_before)
-        rate = np.clip(np.where(np.isfinite(seen), seen, 0.5), radau.LEAST_RATE, 0.5)
+        rate = np.clip(np.where(np.isfinite(seen), seen, 0.5), LEAST_RATE, 0.5)
         lost = ~done & ~np.isfinite(moved)
         going = ~done & ~lost
         if made is None:
