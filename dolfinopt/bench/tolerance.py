@@ -36,7 +36,7 @@ SEED, CASES, QUICK_CASES = 3, 50, 8
 CELLS = 48, 6
 TOLERANCES, FINEST = (1e-2, 1e-3, 1e-4), 1e-6
 EVERY = 10  # of so many cases one is solved to the finest tolerance: its reference takes seconds
-STAGES = 3
+STAGES = 4  # as scenes have by default
 # The reference: another order, other steps, and a hundredth of the finest tolerance judged.
 REFERENCE_STAGES, FINER, MOST_STEPS = 5, 100.0, 5000
 INSTANTS = 10_001

@@ -5,9 +5,10 @@ NumPy serves them all; Newton's matrix holds the tangent over a step (`held`). A
 the vibrations of the first one's arms: the change of coordinates is exact, only how well they
 uncouple is not. What does not converge here is left to `radau.integrate`.
 
-Nine payloads of 4 to 8 kg, 4 coordinates an arm, take 3.7 times as long as one from cold, 83 and
-22 ms, initial design, 90 and 25 ms optimised; with 48 coordinates 6 to 7 times: the work is in
-large arrays, not in calls.
+Nine payloads of 4 to 8 kg, 4 coordinates an arm, take 4.0 times as long as one from cold, 88 and
+22 ms, initial design, 101 and 25 ms optimised; with 48 coordinates 7 times: the work is in large
+arrays, not in calls. Single precision for the matrix, or parts of the batch that stay in the
+processor's cache, were no faster.
 """
 
 from __future__ import annotations
