@@ -23,7 +23,9 @@ say() { echo "dolfinopt: $*" >&2; }
 
 # --- environment: what the user has set already stays ---------------------------------------------
 
-# One thread a rank: the ranks are the parallelism, and small matrices lose by threads.
+# One thread a rank: the ranks are the parallelism. 60 iterations with 400 x 24 cells take 11.3 and
+# 11.6 s with one thread, 11.8 and 10.9 s with two; a factorisation of 200 x 12 and its solves 5.9
+# and 8.2 ms.
 export OMP_NUM_THREADS="${OMP_NUM_THREADS-1}"
 # Packages in ~/.local must not take the place of the system's NumPy that DOLFINx was built for.
 export PYTHONNOUSERSITE="${PYTHONNOUSERSITE-1}"
