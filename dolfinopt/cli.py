@@ -440,7 +440,7 @@ def reproduce(
 
 @commands.command()
 @out_option("diagrams and bench.md; default: results/bench")
-@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: a little over two minutes")
+@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some two minutes")
 @click.pass_obj
 def bench(world: MPI.Comm, out: Path | None, quick: bool) -> None:
     """Measure run time against error: integrators, meshes, reductions, iterations, other programs.

@@ -213,7 +213,7 @@ def _motion(scene: Scene, rng: np.random.Generator, file: Path) -> tuple[str, ..
     if path == "arc":
         flattening = rng.uniform(0.0, 1.0)
         return *words, f"motion.radius={rng.uniform(0.5, 1.5)!r}", f"motion.flattening={flattening}"
-    start, end = rng.uniform((-1.0, -0.5), (1.0, 1.0), (2, 2)).tolist()
+    start, end = (list(map(float, p)) for p in rng.uniform((-1.0, -0.5), (1.0, 1.0), (2, 2)))
     return *words, f"motion.start={start}", f"motion.end={end}"
 
 
