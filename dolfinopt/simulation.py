@@ -164,7 +164,7 @@ def simulate_batch(
         ledger: counts the simulations.
         starts: solution of a nearby design for each, or None.
         differentiated: whether slopes are asked of the trajectories: Newton's method then leaves
-            1e-6 instead of 1e-3 of the tolerance, as it does of a single trajectory.
+            1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
         In the scenes' order; of one that fails its error, see `simulate`.

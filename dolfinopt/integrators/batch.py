@@ -35,7 +35,7 @@ from dolfinopt.integrators.collocation import (
 )
 from dolfinopt.integrators.factors import Factors
 from dolfinopt.integrators.held import held_factors
-from dolfinopt.integrators.modes import REFERENCES, Modes, modes_of
+from dolfinopt.integrators.modes import REFERENCES, Modes, modes_of, proportion
 from dolfinopt.integrators.problem import (
     ElasticProblem,
     Solution,
@@ -53,8 +53,6 @@ State = tuple[np.ndarray, np.ndarray]  # q, qd
 # Angle w h up to which coordinates are slow: with 40, as for one problem, nine take 145 instead of
 # 110 ms with 4 coordinates an arm, optimised, and 315 instead of 365 ms with 48, initial design.
 LIMIT = 20.0
-# Relative difference of the integrals that rounding makes of a factor.
-SAME = 1e-12
 MAX_NEWTON = 6  # factorisations: what needs more needs damping, and windows
 MAX_GRIDS = 4
 MAX_PILOTS = 3
@@ -181,7 +179,7 @@ def related(problems: Sequence[ElasticProblem]) -> list[np.ndarray | None]:
 
 
 def _shape_of_damping(body: FloatingBody) -> np.ndarray:
-    return body.K if _factor([body.K], [body.D]) is not None else body.D
+    return body.K if proportion([body.K], [body.D]) is not None else body.D
 
 
 def _scale(
@@ -196,25 +194,11 @@ def _scale(
     if not same:
         return None
     here, there = ([np.asarray(getattr(x, name)) for name in names] for x in (body, other))
-    mass, stiffness = _factor(here, there), _factor([body.K], [other.K])
-    damping = _factor([damper], [other.D])
+    mass, stiffness = proportion(here, there), proportion([body.K], [other.K])
+    damping = proportion([damper], [other.D])
     if mass is None or stiffness is None or damping is None:
         return None
     return mass, stiffness, damping
-
-
-def _factor(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> float | None:
-    """Return f where all of `there` is f times what is `here`, to rounding."""
-    largest = [float(np.abs(x).max(initial=0.0)) for x in here]
-    k = int(np.argmax(largest))
-    if largest[k] == 0.0:
-        return None if any(np.any(x) for x in there) else 1.0
-    place = np.unravel_index(np.abs(here[k]).argmax(), here[k].shape)
-    factor = float(there[k][place] / here[k][place])
-    for a, b, size in zip(here, there, largest, strict=True):
-        if np.abs(b - factor * a).max(initial=0.0) > SAME * abs(factor) * size:
-            return None
-    return factor
 
 
 def family_of(problems: Sequence[ElasticProblem], scales: Sequence[np.ndarray]) -> Family:

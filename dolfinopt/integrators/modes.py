@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +12,10 @@ from dolfinopt.body import FloatingBody
 from dolfinopt.integrators.problem import ElasticProblem
 from dolfinopt.mechanism import linearise
 
-# What T'KT may be away from the identity by rounding: 1e-13 with 100 coordinates an arm.
+# What T'KT may be away from the identity, and is still taken for it.
 ROUNDING = 1e-9
+# Relative difference of the integrals that rounding makes of a factor.
+SAME = 1e-12
 REFERENCES = 3  # instants of the horizon whose mass is averaged: 1 to 9 cost the same iterations
 
 
@@ -105,7 +108,7 @@ def _changed(body: FloatingBody, T: np.ndarray) -> FloatingBody:
     uncoupled = np.abs(K - one).max(initial=0.0) <= ROUNDING
     D = T.T @ body.D @ T
     if uncoupled:
-        share = _share(body.D, body.K)
+        share = proportion([body.K], [body.D])
         K, D = one, D if share is None else share * one
     return replace(
         body,
@@ -120,12 +123,15 @@ def _changed(body: FloatingBody, T: np.ndarray) -> FloatingBody:
     )
 
 
-def _share(D: np.ndarray, K: np.ndarray) -> float | None:
-    """Return the factor that makes K D, to rounding; None if there is none."""
-    largest = np.abs(K).max(initial=0.0)
-    if largest == 0.0:
-        return None
-    place = np.unravel_index(np.abs(K).argmax(), K.shape)
-    factor = float(D[place] / K[place])
-    same = np.abs(D - factor * K).max() <= ROUNDING * abs(factor) * largest
-    return factor if same else None
+def proportion(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> float | None:
+    """Return f where all of `there` is f times what is `here`, to rounding."""
+    largest = [float(np.abs(x).max(initial=0.0)) for x in here]
+    k = int(np.argmax(largest))
+    if largest[k] == 0.0:
+        return None if any(np.any(x) for x in there) else 1.0
+    place = np.unravel_index(np.abs(here[k]).argmax(), here[k].shape)
+    factor = float(there[k][place] / here[k][place])
+    for a, b, size in zip(here, there, largest, strict=True):
+        if np.abs(b - factor * a).max(initial=0.0) > SAME * abs(factor) * size:
+            return None
+    return factor

@@ -89,7 +89,7 @@ AIM = 0.4
 # design (optimised 0.012, 9e-4, 2e-5, 4e-6). Where so many more steps are needed the first grid is
 # the last one, mostly: from cold 24 instead of 30 ms with 4 stages; else it is better coarse: with
 # 3 stages 48 coordinates an arm take 78 ms, on the fine one at once 125.
-FIRST_ERROR = {1: 0.5, 2: 0.083, 3: 4.6e-3, 4: 1.1e-4, 5: 7e-6}
+FIRST_ERROR = {1: np.inf, 2: 0.083, 3: 4.6e-3, 4: 1.1e-4, 5: 7e-6}
 FIRST_GROWTH = 1.6
 
 
@@ -209,7 +209,7 @@ def next_edges(
 
 def _first_edges(problem: ElasticProblem, tolerance: float, stages: int) -> np.ndarray:
     """Return steps from cold that are likely to meet the tolerance, or coarse ones."""
-    known = FIRST_ERROR.get(stages, FIRST_ERROR[5])
+    known = FIRST_ERROR[min(stages, 5)]
     growth = (known / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
     growth = max(growth, 0.6) if growth < FIRST_GROWTH else 1.0
     return even_steps(problem, int(np.ceil(first_count(problem) * growth)))
