@@ -30,7 +30,7 @@ from dolfinopt.vibration import LoadedModes, RigidIntegrals, loaded_modes
 THRESHOLDS = 0.25, 0.75
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Realised:
     """One design that design variables stand for.
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from dolfinopt.reduction import Basis
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FloatingBody:
     """One arm reduced to q elastic coordinates in its tangent frame at the inboard joint.
 

@@ -26,7 +26,7 @@ SOLUTION = ("edges", "nodes", "q", "qd", "a")
 MAY_CHANGE = ("max_iterations", "tolerance")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Memory:
     """Everything the next iteration depends on; cell and node arrays are this rank's.
 

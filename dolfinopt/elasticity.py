@@ -34,7 +34,7 @@ STEADY = 1e-3
 LOWEST_CONTRAST = 5e-11
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ElementOperators:
     """Element matrices of one arm, for unit Young's modulus and unit mass density.
 
@@ -182,7 +182,7 @@ class InteriorMatrix:
         self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConstraintModes:
     """One arm under unit displacements (u_x, u_y, theta) of its outboard interface.
 

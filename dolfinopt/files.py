@@ -190,7 +190,7 @@ def versions() -> dict[str, str]:
 # -- views: what pictures and ParaView need of an arm ----------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArmView:
     """One whole arm on the root, cells in the order of their centroids.
 

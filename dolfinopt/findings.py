@@ -45,7 +45,7 @@ class Table:
         return _csv(self.columns, self.rows)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Line:
     """One curve.
 
@@ -101,7 +101,7 @@ class DesignFigure:
     designs: tuple[tuple[str, Scene, Path], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatrixFigure:
     """Design i in scenario j: values (n, n) with row and column labels."""
 
@@ -126,7 +126,7 @@ class TornadoFigure:
     panels: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Histogram:
     """How values (n,) of one design scatter, and the nominal one."""
 
@@ -145,7 +145,7 @@ class HistogramFigure:
     rows: tuple[tuple[Histogram, ...], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Bars:
     """Groups of bars: a label, and value, lower and upper end (n, 3) of each."""
 
@@ -164,7 +164,7 @@ class BarFigure:
     rows: tuple[tuple[Bars, ...], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScatterFigure:
     """Points: every row's values (n,) by every column's."""
 

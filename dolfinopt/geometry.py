@@ -41,7 +41,7 @@ FRAME_TOLERANCE = 0.05
 CELLS_ACROSS = 12  # of a STEP file without mesh_size
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FlatMesh:
     """The cells and interfaces of a Gmsh model as arrays.
 

@@ -42,18 +42,31 @@ class Ledger:
     """Seconds by phase and counts of one run on one rank.
 
     Attributes:
-        seconds: wall-clock time by phase, s.
+        seconds: wall-clock time by phase, s; a phase within another one counts for itself only,
+            so that their sum is the time spent in phases.
         counts: see `Counts`.
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
     counts: Counts = field(default_factory=Counts)
+    _running: list[str] = field(default_factory=list, repr=False)  # innermost last
+    _since: float = field(default=0.0, repr=False)  # what the innermost has not been given yet, s
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Add the time spent in the block to phase `name`."""
-        start = time.perf_counter()
+        """Add the time spent in the block, without the phases inside it, to phase `name`."""
+        self._credit()
+        self._running.append(name)
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            self._credit()
+            self._running.pop()
+
+    def _credit(self) -> None:
+        """Give the time since the last change of phase to the innermost one."""
+        now = time.perf_counter()
+        if self._running:
+            name = self._running[-1]
+            self.seconds[name] = self.seconds.get(name, 0.0) + now - self._since
+        self._since = now

@@ -26,7 +26,7 @@ SWITCH = 0.1  # x below which "pedersen" and "du-olhoff" leave "simp"
 MASS_6, MASS_7 = 6e5, -5e6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Interpolated:
     """Relative stiffness and mass of cells and their slopes; every array like x, dimensionless.
 

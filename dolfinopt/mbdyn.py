@@ -42,7 +42,7 @@ _TITLES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ModalElement:
     """A flexible body as MBDyn reads it.
 
@@ -69,7 +69,7 @@ class ModalElement:
     inertia: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LumpedNodes:
     """A whole arm's mesh nodes in the order of their places, the same on any partition.
 

@@ -21,7 +21,7 @@ from dolfinopt.motion import RigidMotion
 PerInstant = float | np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scale:
     """What multiplies a body's integrals, its stiffness and its damping."""
 
@@ -37,7 +37,7 @@ class Scale:
 UNSCALED = Scale()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shapes:
     """One body's constants in complex form, and tables that serve all instants in one product.
 
@@ -91,7 +91,7 @@ def _product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
     return x * A if A.ndim == 1 else x @ A
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mechanism:
     """A cart on a horizontal rail that carries a chain of arms and a payload.
 
@@ -163,7 +163,7 @@ def _column(x: PerInstant) -> PerInstant:
     return x[:, None] if isinstance(x, np.ndarray) else x
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Frame:
     """Motion of one tangent frame and what one body makes of it; arrays over n instants.
 
@@ -334,7 +334,7 @@ def _body_force(frame: _Frame) -> np.ndarray:
     return body.mass * frame.a + (1j * frame.wd - w * w) * frame.s + 2j * w * frame.sd + frame.sdd
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _BodyTangent:
     """One body's elastic rows, differentiated; arrays over n instants, S columns are kept.
 
@@ -388,7 +388,7 @@ class _BodyTangent:
         return k, -m * w * w, m * wd, d, 2.0 * m * w, m
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tangent:
     """Derivative of the elastic rows with respect to S coordinates and their rates, n instants.
 
@@ -706,7 +706,7 @@ def compliance(bodies: Sequence[FloatingBody], parts: Sequence[slice], q: np.nda
 # -- adjoint ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BodySlopes:
     """Derivatives of a scalar with respect to one body's constants; shapes as in `FloatingBody`.
 
@@ -770,7 +770,7 @@ def body_slopes(
     return slopes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Outer:
     """Everything from one frame outwards, as seen in it: forces and slopes of the virtual work.
 

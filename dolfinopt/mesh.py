@@ -15,7 +15,7 @@ from dolfinopt.geometry import INBOARD, OUTBOARD, PASSIVE, build_model, gmsh_on_
 from dolfinopt.parallel import on_root
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ArmMesh:
     """One arm's mesh on its communicator; every array holds this rank's part.
 

@@ -56,7 +56,7 @@ _TINY = float(np.finfo(np.float64).tiny)
 _BLOCK_ENTRIES = 12288
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MMAState:
     """Hold everything the method remembers from one step to the next.
 
@@ -151,7 +151,7 @@ def mma_step(
     return _conclude(given, dual, point, multipliers)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Given:
     """Hold the inputs of a step as arrays; `_fault` says what is wrong with them."""
 
@@ -255,7 +255,7 @@ def _asymptote_distance(given: _Given, columns: slice, width: Array) -> Array:
     return np.minimum(np.maximum(distance, _SMALLEST_DISTANCE), _LARGEST_DISTANCE)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Block:
     """Hold the approximation in some variables: G, H (1 + m, b), bounds of s and distance (b,)."""
 
@@ -282,7 +282,7 @@ def _block(given: _Given, columns: slice, felt: npt.NDArray[np.bool_], scale: Ar
     return _Block(G, H, s_min, s_max, distance)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _DualPoint:
     """Hold the dual function at some multipliers: its value, gradient (m,), minus Hessian (m, m).
 

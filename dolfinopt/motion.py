@@ -28,7 +28,7 @@ CART = "cart"  # first column of a table of joints
 MAX_KINKS = 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigidMotion:
     """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
 
@@ -52,7 +52,7 @@ class RigidMotion:
         return tuple(np.exp(1j * self.q[:, k]) for k in range(1, self.q.shape[1]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Path:
     """Points of a path at n instants with time derivatives, all (n, 2); m, m/s, m/s2."""
 

@@ -12,7 +12,7 @@ from dolfinopt.scene import Scene, WorstBy
 from dolfinopt.simulation import Trajectory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoadCases:
     """Instants that make up the objective, and how much each counts.
 

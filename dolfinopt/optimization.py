@@ -46,7 +46,7 @@ GREY = 0.02
 Report = Callable[[HistoryRow], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """An optimised design.
 
@@ -189,7 +189,7 @@ def optimize(
     return run.go(memory)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Slopes:
     """Gradients by this rank's design variables: objective (n,), constraints (k, n)."""
 

@@ -527,7 +527,7 @@ def cells_around(points: np.ndarray, view: ArmView) -> np.ndarray:
     return np.where(inside.any(axis=1), near[np.arange(len(points)), first], -1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Film:
     """The frames of a motion before they are drawn.
 

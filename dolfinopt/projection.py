@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 MIDDLE = 0.5  # threshold where none is better than another
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Projected:
     """A design projected at a fixed threshold; arrays (n_cells,), dimensionless.
 

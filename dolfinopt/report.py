@@ -377,7 +377,7 @@ def arm_picture(view: ArmView, width: int) -> bytes:
 # -- the animation ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Strip:
     """A moving design as paths of SVG, one a frame.
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Simulated:
     """One design in one scene, simulated; the trajectory is the root's, None elsewhere.
 

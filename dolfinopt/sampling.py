@@ -75,7 +75,7 @@ class Samples:
         return all(re.fullmatch(SCALING, key) for key in self.keys)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Responses:
     """What one design does in the scene and at every sample; nan where its simulation failed.
 

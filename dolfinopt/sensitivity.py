@@ -102,7 +102,7 @@ def _static_slope(arm: Arm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PeriodGradient:
     """Slopes of one arm's squared period.
 
@@ -136,7 +136,7 @@ def rigid_gradient(arm: Arm, by_rigid: RigidIntegrals) -> np.ndarray:
     return arm.solid.density * arm.material.mass_slope * masses
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _MassPartners:
     """Fields Y_k with d(integrals) = sum_k Y_k . dM V_k; (n_nodes, 2, q).
 

@@ -44,7 +44,7 @@ T = TypeVar("T")
 ZERO, DIAGONAL, SYMMETRIC, GENERAL, UNIT = range(5)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Taylor:
     """A matrix M(q) = M0 + sum_k q_k M1[:, k, :].
 

@@ -18,7 +18,7 @@ from dolfinopt.motion import RigidMotion, breakpoints, rigid_motion
 from dolfinopt.scene import Scene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
     """A simulated motion; samples are taken from the integrator's own interpolant.
 

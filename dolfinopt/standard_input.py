@@ -40,7 +40,7 @@ PLANAR = 1e-6
 CENTRIFUGAL = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SpatialMoments:
     """Integrals over the mass of a plate of constant thickness about its middle plane z = 0.
 
@@ -57,7 +57,7 @@ class SpatialMoments:
     mixed: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlaneNode:
     """A further node of the body.
 

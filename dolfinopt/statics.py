@@ -9,7 +9,7 @@ import numpy as np
 from dolfinopt.elasticity import ElasticArm
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StaticResponse:
     """What static loads do to one arm whose inboard interface is clamped; k load cases.
 

@@ -21,7 +21,7 @@ _FACES = ("ADVANCED_FACE", "FACE_SURFACE")
 _PATH = {*_EDGES, *_FACES, "FACE_BOUND", "FACE_OUTER_BOUND", "EDGE_LOOP", "ORIENTED_EDGE"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StepShapes:
     """Edges or faces that bear a name.
 

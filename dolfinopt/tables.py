@@ -15,7 +15,7 @@ from dolfinopt.errors import InputError
 TIME = "t"  # the column that a table may have before all others, s
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """The rows of a file.
 

@@ -338,7 +338,7 @@ def polynomial_indices(
     return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]), degree, best.left_out)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Fit:
     """A polynomial fitted by least squares.
 

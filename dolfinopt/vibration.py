@@ -128,7 +128,7 @@ def _moved_slopes(slope: RigidIntegrals, lever: complex) -> RigidIntegrals:
 # -- modes -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoadedModes:
     """The lowest modes of one clamped-free arm with a mass at its outboard interface.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -485,6 +486,26 @@ def test_arms_too_soft_are_a_named_error(integrator: str) -> None:
     )
     with pytest.raises(ConvergenceError, match=r"time step.*material\.young_modulus"):
         solve(integrator, problem, 1e-2)
+
+
+@pytest.mark.parametrize("failing", [{0, 11}, {11}, {0, 1, 2}, {3, 7, 11}])
+def test_failures_on_any_grid_are_a_named_error(
+    monkeypatch: pytest.MonkeyPatch, failing: set[int]
+) -> None:
+    """Early ones, the last one, and both: always a ConvergenceError that names the remedy."""
+    problem, _ = two_arms()
+    plain = radau.on_grid(problem, even_steps(problem, 20), 1e-2, 3)
+    grids = iter(range(radau.MAX_GRIDS))
+
+    def poor(*_: object) -> Solution:
+        grid = next(grids)
+        if grid in failing:
+            raise ConvergenceError("Newton's method fails; stiffen the arms")
+        return replace(plain, error=1.0)
+
+    monkeypatch.setattr(radau, "_on_grid", poor)
+    with pytest.raises(ConvergenceError, match="stiffen the arms"):
+        solve("radau", problem, 1e-2)
 
 
 @BOTH

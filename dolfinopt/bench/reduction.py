@@ -46,7 +46,7 @@ def diagram() -> Diagram:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Response:
     """What a reduced mechanism does: compliance of all arms (n,) N m, deviation (n, 2) m."""
 

@@ -77,7 +77,7 @@ def diagram() -> Diagram:
 # -- problems --------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Judge:
     """A problem and what its solutions are measured against.
 

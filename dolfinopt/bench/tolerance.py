@@ -85,7 +85,7 @@ def diagram() -> Diagram:
 # -- random cases ----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """A random design that moves in a random scene.
 

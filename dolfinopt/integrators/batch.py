@@ -75,7 +75,7 @@ TRUSTED = 0.2
 # -- what is solved --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Family:
     """R problems whose mechanisms differ by numbers alone, in the vibrations of the first.
 
@@ -215,7 +215,7 @@ def family_of(problems: Sequence[ElasticProblem], scales: Sequence[np.ndarray]) 
 # -- a grid ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grid:
     """Some problems of a family on their steps.
 
@@ -331,7 +331,7 @@ def _static_starts(family: Family) -> tuple[np.ndarray, np.ndarray]:
 # -- Newton ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Found:
     """Accelerations (R, n, s, N), who converged, contractions, iterations (R,)."""
 

@@ -14,7 +14,7 @@ from dolfinopt.mechanism import Mechanism, Tangent, elastic_rows, linearise
 from dolfinopt.motion import RigidMotion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Collocation:
     """Nodes c (s,) and matrices of an s-stage method: A (s, s) and A A."""
 
@@ -34,7 +34,7 @@ def radau_iia(stages: int) -> Collocation:
     return Collocation(c, A, A @ A)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stages:
     """The problem at all stages of a run of steps.
 

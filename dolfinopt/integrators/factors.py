@@ -77,7 +77,7 @@ def windows(stages: Stages, slow: np.ndarray) -> list[slice]:
     return [slice(i, min(i + length, count)) for i in range(0, count, length)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Factors:
     """Newton's matrix at some iterate, ready to be solved with.
 

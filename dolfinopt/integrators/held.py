@@ -24,7 +24,7 @@ State = tuple[np.ndarray, np.ndarray]  # q, qd
 CHUNK = 512  # matrices that are inverted together: they stay in the processor's cache
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HeldFactors(Factors):
     """Newton's matrix with held tangents; its slow blocks are kept in A's eigenvectors.
 

@@ -19,7 +19,7 @@ SAME = 1e-12
 REFERENCES = 3  # instants of the horizon whose mass is averaged: 1 to 9 cost the same iterations
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Modes:
     """A problem in the coordinates z of its arms' vibrations, q = T z arm by arm.
 

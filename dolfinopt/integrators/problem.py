@@ -28,7 +28,7 @@ class ElasticProblem:
     breakpoints: tuple[float, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Piecewise polynomial elastic motion.
 

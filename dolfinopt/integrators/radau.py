@@ -117,13 +117,13 @@ def integrate(
     edges = next_edges(modes.problem, start, tolerance, stages)
     iterations = failures = refined = 0
     before = np.inf
-    for _ in range(MAX_GRIDS):
+    for grid in range(1, MAX_GRIDS + 1):
         try:
             start = _on_grid(modes, edges, tolerance, stages, start)
         except ConvergenceError:
             failures += 1
             count = 4 * (len(edges) - 1)
-            if failures == MAX_FAILURES or count > MAX_RETRY:
+            if grid == MAX_GRIDS or failures == MAX_FAILURES or count > MAX_RETRY:
                 raise
             start, edges = None, even_steps(problem, count)
             continue
@@ -136,7 +136,7 @@ def integrate(
         before, refined = start.error, refined + 1
         least = REFINED[min(refined, len(REFINED)) - 1]
         edges = next_edges(modes.problem, start, tolerance, stages, least)
-    assert start is not None  # the last grid is no failure: there are fewer of them
+    assert start is not None  # a failure on the last grid has been raised
     raise ConvergenceError(
         f"the simulation reaches an error of {start.error:.2g} with {len(start.a)} steps, not the "
         f"simulation.tolerance of {tolerance:g}; raise it, or simulation.stages"

@@ -44,7 +44,7 @@ class Options:
     damping: float = 2e-4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Basis:
     """u(X, t) = V(X) q(t) on one arm; q coordinates.
 
@@ -63,7 +63,7 @@ class Basis:
     start: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AdjointFields:
     """Nodal fields that carry slopes by V to the cells.
 

@@ -27,7 +27,7 @@ def mac(arm: ElasticArm, V: np.ndarray, W: np.ndarray) -> np.ndarray:
     return dot(arm, V, MW) ** 2 / np.outer(v, w)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BasisErrors:
     """What a basis misses of a richer one.
 

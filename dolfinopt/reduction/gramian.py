@@ -99,7 +99,7 @@ def _inputs(free: FreeArm) -> Rows:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Reduced:
     """K^-1 M in a Krylov space, diagonal: scalar resonances.
 

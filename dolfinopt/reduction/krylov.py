@@ -99,7 +99,7 @@ def krylov_adjoint(
 _Group = Callable[[FreeArm], Rows]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Block:
     """Columns of K_w^-1 f and what became of them.
 
@@ -116,7 +116,7 @@ class _Block:
     expansion: Expansion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Recursion:
     """M-orthonormal V (n_nodes, 2, q), M V, and the blocks that made them, in their order."""
 

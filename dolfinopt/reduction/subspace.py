@@ -38,7 +38,7 @@ def combine(V: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return flat.reshape(*V.shape[:2], coefficients.shape[1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Expansion:
     """W[kept] = [V, Q] coefficients; what is not kept lies in the span of V and Q.
 

@@ -1,0 +1,77 @@
+"""Dataclasses all over the package compare without asking arrays for a truth value."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+import dolfinopt as do
+from dolfinopt.motion import RigidMotion
+
+OPTIONAL = {"bench"}  # imports programs that a plain installation does not have
+
+
+def dataclasses() -> Iterator[type]:
+    """Yield every dataclass that a module of the package defines."""
+    for module in pkgutil.walk_packages(do.__path__, "dolfinopt."):
+        if module.name.endswith("__main__"):
+            continue
+        try:
+            loaded = importlib.import_module(module.name)
+        except ImportError:
+            assert OPTIONAL & set(module.name.split("."))
+            continue
+        for _, found in inspect.getmembers(loaded, inspect.isclass):
+            if found.__module__ == module.name and is_dataclass(found):
+                yield found
+
+
+def holds_array(hint: Any) -> bool:
+    """Return whether values of this type, or what they contain, are arrays; not of functions."""
+    if isinstance(hint, str):  # a name that only type checkers import
+        return "ndarray" in hint and "Callable" not in hint
+    if typing.get_origin(hint) is Callable:
+        return False
+    if hint is np.ndarray or typing.get_origin(hint) is np.ndarray:
+        return True
+    return any(map(holds_array, typing.get_args(hint)))
+
+
+def hints(of: type) -> Iterator[Any]:
+    """Yield the types of a dataclass' fields, or their text where a name is not known here."""
+    known = vars(importlib.import_module(of.__module__))
+    for field in fields(of):  # type: ignore[arg-type]
+        if not isinstance(field.type, str):
+            yield field.type
+            continue
+        try:
+            yield eval(field.type, dict(known))
+        except NameError:
+            yield field.type
+
+
+def test_dataclasses_with_arrays_compare_by_identity() -> None:
+    """The generated == raises where a field is an array: it has no single truth value."""
+    found = list(dataclasses())
+    assert len(found) > 100
+    wrong = [
+        f"{one.__module__}.{one.__qualname__}"
+        for one in found
+        if one.__eq__ is not object.__eq__ and any(map(holds_array, hints(one)))
+    ]
+    assert not wrong, "write @dataclass(eq=False)"
+
+
+def test_comparison_of_arrays_does_not_raise() -> None:
+    """Equal arrays in two objects are no error, and the objects are told apart."""
+    one, other = (RigidMotion(*np.zeros((3, 4, 2))) for _ in range(2))
+    assert one == one
+    assert one != other
+    assert len({one, other}) == 2
