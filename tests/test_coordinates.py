@@ -328,9 +328,9 @@ def test_commands(tmp_path):
     said = run("export", SCENE, "--out", tmp_path / "e")
     assert f"{sentence}{found['coordinates']} coordinates an arm" in said
     assert sentence in run("gradient", SCENE, "--out", tmp_path / "g.npz")
-    from dolfinopt.cli import _scene_of
+    from dolfinopt.cli.shared import scene_of
 
-    assert _scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
+    assert scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
 
 
 @pytest.mark.serial

@@ -1,0 +1,42 @@
+"""`dolfinopt bench`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dolfinopt.cli.options import out_option
+from dolfinopt.cli.shared import prepare
+from dolfinopt.errors import InputError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+
+@click.command()
+@out_option("diagrams and bench.md; default: results/bench")
+@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some two minutes")
+@click.pass_obj
+def bench(world: MPI.Comm, out: Path | None, quick: bool) -> None:
+    """Measure run time against error: integrators, meshes, reductions, iterations, other programs.
+
+    What is measured is kept in DIR; a call that was interrupted goes on.
+    """
+    if world.size > 1:
+        raise InputError("bench: starts its ranks itself; call it without mpirun")
+    from dolfinopt.bench import QUICKLY, Plan, diagrams
+    from dolfinopt.bench import bench as run
+    from dolfinopt.bench.progress import live_diagrams
+    from dolfinopt.paper import load_paper
+
+    begun = time.perf_counter()
+    folder = out or Path("results") / "bench"
+    prepare(world, folder)
+    scene = load_paper(False, QUICKLY if quick else ())
+    with live_diagrams(len(diagrams())) as (tell, done):
+        summary = run(Plan(scene, quick), folder, tell, done=done)
+    seconds = time.perf_counter() - begun
+    click.echo(f"diagrams in {folder}, summary in {summary}; {seconds:.0f} s")

@@ -1,0 +1,76 @@
+"""`dolfinopt export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dolfinopt.cli.options import design_option, scene_argument, set_option
+from dolfinopt.cli.shared import design_of, load, prepare, tell
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.arm import Arm
+
+
+@click.command()
+@scene_argument
+@design_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="folder for the bodies",
+)
+@set_option
+@click.pass_obj
+def export(
+    world: MPI.Comm, scene: Path, design: Path | None, out: Path, overrides: tuple[str, ...]
+) -> None:
+    """Write the reduced arms of SCENE for other multibody codes: SID, .npz of it, MBDyn's .fem."""
+    from dolfinopt.coordinates import choose_coordinates
+    from dolfinopt.files import write_arrays, write_text
+    from dolfinopt.ledger import Ledger
+    from dolfinopt.mbdyn import fem_text
+    from dolfinopt.parallel import gather_arms
+    from dolfinopt.sid import sid_arrays, sid_text
+
+    loaded = load(world, scene, overrides)
+    share, arms, x_phys = design_of(world, loaded, design, Ledger())
+    prepare(world, out)
+    tell(world, choose_coordinates(loaded, share, arms, x_phys, Ledger()))
+    exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
+    bodies = gather_arms(share, exported)
+    if world.rank != 0:
+        return
+    for arm, owner in zip(loaded.arms, loaded.owners, strict=True):
+        if owner is None:
+            click.echo(f"{arm.name}: not exported, it is rigid or comes from a file")
+            continue
+        data, element = bodies[owner]
+        write_text(out / f"{arm.name}.sid", sid_text(data))
+        write_arrays(out / f"{arm.name}.sid.npz", sid_arrays(data))
+        write_text(out / f"{arm.name}.fem", fem_text(element))
+        click.echo(
+            f"{arm.name}: {data.mass:.6g} kg, {data.coordinates} coordinates, "
+            f"{len(element.labels)} nodes; in {out / arm.name}.sid, .sid.npz, .fem"
+        )
+
+
+def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
+    """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
+    from dolfinopt.mbdyn import lumped_nodes, modal_element
+    from dolfinopt.standard_input import spatial_moments, to_sid
+
+    body = arm.reduce(x_phys)
+    assert arm.basis is not None
+    moments = spatial_moments(arm.elastic, arm.basis, thickness)
+    nodes = lumped_nodes(arm.elastic, arm.basis)
+    if nodes is None:
+        return None
+    title = f"{arm.mesh.name} of {arm.scene.name}"
+    return to_sid(body, moments, comment=title), modal_element(body, moments, nodes, thickness)

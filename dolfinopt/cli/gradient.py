@@ -1,0 +1,99 @@
+"""`dolfinopt gradient`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dolfinopt.cli.options import design_option, scene_argument, set_option
+from dolfinopt.cli.shared import UNITS, design_of, load, prepare, tell
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.scene import Scene
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.arm import Arm
+    from dolfinopt.parallel import ArmShare
+
+
+@click.command()
+@scene_argument
+@design_option
+@click.option("--kind", type=click.Choice(["esl", "exact"]), default="esl", help="which gradient")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help="gradient.npz"
+)
+@click.option("--check", is_flag=True, help="Taylor test along the complete chain")
+@set_option
+@click.pass_obj
+def gradient(
+    world: MPI.Comm,
+    scene: Path,
+    design: Path | None,
+    kind: str,
+    out: Path,
+    check: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Write the objective's gradient with respect to the physical densities to FILE."""
+    from dolfinopt.coordinates import choose_coordinates
+    from dolfinopt.evaluation import evaluate
+    from dolfinopt.evaluation import gradient as slopes
+    from dolfinopt.files import write_gradient
+    from dolfinopt.ledger import Ledger
+    from dolfinopt.taylor import check_exact
+
+    if out.is_dir():
+        raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
+    loaded = load(world, scene, (*overrides, f'objective.gradient="{kind}"'))
+    if check:
+        check_exact(loaded)
+    ledger = Ledger()
+    share, arms, x_phys = design_of(world, loaded, design, ledger)
+    prepare(world, out.parent)
+    if loaded.objective.simulated:
+        tell(world, choose_coordinates(loaded, share, arms, x_phys, ledger))
+    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger, simulated=False)
+    by_cell = slopes(loaded, share, arms, trajectory, ledger)
+    write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
+    if world.rank == 0:
+        unit = UNITS[loaded.objective.kind]
+        name = kind if loaded.objective.simulated else "exact"
+        click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
+    if check:
+        _check_gradient(world, loaded, share, arms, x_phys, ledger)
+
+
+def _check_gradient(
+    world: MPI.Comm,
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x: Mapping[int, Any],
+    ledger: Any,
+) -> None:
+    """Print the Taylor test; raise ConvergenceError where a rate is too low."""
+    from dolfinopt.taylor import PASSES, STEPS, taylor_test
+
+    test = taylor_test(scene, share, arms, x, ledger)
+    if world.rank == 0:
+        steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
+        click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
+        for row in test.rows:
+            remainders = "".join(f"{r:12.2e}" for r in row.remainders)
+            slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
+            click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
+        if scene.objective.simulated:
+            click.echo(
+                f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
+                f"{test.ratio:.3f} times as long"
+            )
+    if not test.passed:
+        raise ConvergenceError(
+            f"the remainders fall at a rate below {PASSES}: the gradient is not exact here; a "
+            "tighter simulation.tolerance tells whether the simulation is to blame"
+        )

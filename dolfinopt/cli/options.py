@@ -1,0 +1,31 @@
+"""Options that several commands have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+scene_argument = click.argument("scene", type=click.Path(path_type=Path))
+
+
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a scene value"
+)
+
+
+design_option = click.option(
+    "--design", type=click.Path(path_type=Path), help="design.npz; default: the initial design"
+)
+
+
+plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
+
+
+def out_option(what: str) -> Callable[..., Any]:
+    """Return the --out option of a command that writes a folder."""
+    return click.option(
+        "--out", type=click.Path(path_type=Path), metavar="DIR", help=f"folder for {what}"
+    )

@@ -1,0 +1,36 @@
+"""`dolfinopt plot`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dolfinopt.cli.shared import design_of, draw
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.pass_obj
+def plot(world: MPI.Comm, folder: Path) -> None:
+    """Draw the pictures of a finished run in DIR anew."""
+    from dolfinopt.evaluation import evaluate
+    from dolfinopt.files import gather_views, read_history, read_initial_deviation
+    from dolfinopt.ledger import Ledger
+    from dolfinopt.parallel import on_root
+
+    loaded = on_root(world, scene_of, folder)
+    ledger = Ledger()
+    share, arms, x_phys = design_of(world, loaded, folder / "design.npz", ledger)
+    _, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
+    views = gather_views(loaded, share, arms, x_phys)
+    if trajectory is None:
+        return
+    history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
+    initial = read_initial_deviation(folder / "trajectory.npz")
+    draw(folder, loaded, views, trajectory, history, initial)
+    click.echo(f"pictures in {folder}")

@@ -1,0 +1,54 @@
+"""`dolfinopt reproduce`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from dolfinopt.cli.options import out_option, plots_option, set_option
+from dolfinopt.errors import ConvergenceError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+
+@click.command()
+@out_option("figures, report.html and cases; default: results/paper")
+@click.option("--check", is_flag=True, help="end with status 1 where a main finding fails")
+@click.option("--coarse", is_flag=True, help="100 x 6 cells and 60 iterations: a minute")
+@set_option
+@plots_option
+@click.pass_obj
+def reproduce(
+    world: MPI.Comm,
+    out: Path | None,
+    check: bool,
+    coarse: bool,
+    overrides: tuple[str, ...],
+    plots: bool,
+) -> None:
+    """Recreate figures 3 to 15 of the paper, and a page that compares the findings.
+
+    What is computed is kept in DIR/cases and taken from there the next time; a call that was
+    interrupted goes on.
+    """
+    from dolfinopt.claims import broken
+    from dolfinopt.paper import Plan, load_paper
+    from dolfinopt.paper import reproduce as run
+    from dolfinopt.parallel import on_root
+    from dolfinopt.report import write_reproduction
+
+    folder = out or Path("results") / "paper"
+    done = run(Plan(on_root(world, load_paper, coarse, overrides)), folder, world)
+    if world.rank == 0:
+        write_reproduction(done, folder, plots=plots)
+        for finding in done.findings:
+            click.echo(f"{finding.name} (paper: {finding.paper}). {finding.sentence}")
+        page = " and report.html" if plots else ""
+        click.echo(f"{done.outcomes.computed} cases computed; figures{page} in {folder}")
+    failures = [f"{o.case.label}: {o.failure}" for o in done.outcomes.failures]
+    wrong = [*failures, *(broken(done.findings) if check else ())]
+    if wrong:
+        raise ConvergenceError("; ".join(wrong))

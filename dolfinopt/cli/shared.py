@@ -1,0 +1,168 @@
+"""Steps that several commands share."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dolfinopt.errors import InputError
+from dolfinopt.scene import Scene, load_scene, scene_from_dict
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.arm import Arm
+    from dolfinopt.coordinates import Choice
+    from dolfinopt.files import ArmView, HistoryRow
+    from dolfinopt.parallel import ArmShare
+    from dolfinopt.simulation import Trajectory
+
+
+UNITS = {
+    "esl": "N m",
+    "compliance": "N m s",
+    "deviation": "m",
+    "static": "N m",
+    "eigenfrequency": "s2",
+}
+
+
+def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
+    """Read the scene on the root, check what can be checked, and hand it to all ranks."""
+    from dolfinopt.parallel import on_root
+
+    def load() -> Scene:
+        from dolfinopt.motion import check_motion
+
+        scene = load_scene(path, overrides)
+        check_motion(scene)
+        for index, arm in enumerate(scene.arms):
+            if arm.sid is not None:
+                from dolfinopt.arm import fixed_body
+
+                fixed_body(scene, index)
+        return scene
+
+    return on_root(world, load)
+
+
+def prepare(world: MPI.Comm, folder: Path) -> None:
+    from dolfinopt.files import prepare_folder
+    from dolfinopt.parallel import on_root
+
+    on_root(world, prepare_folder, folder)
+
+
+def scene_of(folder: Path) -> Scene:
+    """Return the scene of a run, with the coordinates that "auto" came to."""
+    path = folder / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        data = summary["scene"]
+        if data["reduction"]["coordinates"] == "auto":
+            data["reduction"]["coordinates"] = summary["reduction"]["coordinates"]
+            del data["reduction"]["tolerance"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({type(error).__name__}); name the folder of a finished "
+            "optimize or simulate run"
+        ) from None
+    return scene_from_dict(data, source=str(path))
+
+
+def design_of(
+    world: MPI.Comm, scene: Scene, design: Path | None, ledger: Any
+) -> tuple[ArmShare, dict[int, Arm], dict[int, Any]]:
+    """Build the arms and return them with the physical densities of a file or the initial ones."""
+    from dolfinopt.arm import build_arms
+    from dolfinopt.files import read_design
+    from dolfinopt.parallel import share_arms
+
+    share = share_arms(world, scene.cell_counts)
+    arms = build_arms(scene, share, ledger)
+    if design is not None:
+        return share, arms, read_design(design, share, arms)
+    return share, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+
+
+def draw(
+    folder: Path,
+    scene: Scene,
+    views: list[ArmView],
+    trajectory: Trajectory,
+    history: list[HistoryRow],
+    initial: Any,
+) -> None:
+    """Draw all pictures of a run (root only)."""
+    from dolfinopt import plots
+    from dolfinopt.files import designed
+
+    labels = {
+        "esl": "compliance of the load cases [N m]",
+        "compliance": "integral of the compliance [N m s]",
+        "deviation": "p-mean of the deviation [m]",
+        "static": "compliance under static loads [N m]",
+        "eigenfrequency": "squared longest periods [s2]",
+    }
+    plots.draw_design(folder / "design.png", designed(views), scene.name)
+    if history:
+        plots.draw_history(folder / "history.png", history, labels[scene.objective.kind])
+    plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
+    plots.draw_motion(
+        folder / "motion.gif",
+        views,
+        trajectory.mechanism,
+        trajectory.t,
+        trajectory.q_r,
+        trajectory.q_e,
+    )
+
+
+def conclude(summary: Mapping[str, Any], folder: Path) -> None:
+    """Print the run's warnings, and its figures in one line."""
+    for warning in summary["warnings"]:
+        click.echo(f"dolfinopt: warning: {warning}", err=True)
+    found = summary["reduction"]
+    if found["error_estimate"] is not None:
+        click.echo(_chosen(found["coordinates"], found["error_estimate"]))
+    click.echo(
+        f"{summary['name']}: {summary['iterations']} iterations ({summary['stop_reason']}), "
+        f"compliance {summary['compliance']:.4g} N m, "
+        f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
+        f"at {summary['max_deviation_time']:.3f} s, "
+        f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
+        f"{folder}"
+    )
+
+
+def tell(world: MPI.Comm, choice: Choice | None) -> None:
+    if choice is not None and world.rank == 0:
+        click.echo(_chosen(choice.coordinates, choice.error))
+
+
+def _chosen(coordinates: int, error: float) -> str:
+    return (
+        f'reduction.coordinates = "auto": {coordinates} coordinates an arm, estimated error '
+        f"{error:.2g}"
+    )
+
+
+def progress(
+    world: MPI.Comm, scene: Scene
+) -> AbstractContextManager[Callable[[HistoryRow], None] | None]:
+    """Return a live line an iteration on the root's terminal, nothing elsewhere."""
+    if world.rank != 0 or not sys.stderr.isatty():
+        return nullcontext(None)
+    from dolfinopt.progress import live_line
+
+    return live_line(scene.optimizer.max_iterations)
+
+
+BEGUN = time.perf_counter()
