@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.shared import design_of, draw
+from dolfinopt.cli.shared import design_of, draw, scene_of
 
 if TYPE_CHECKING:
     from mpi4py import MPI
