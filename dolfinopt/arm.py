@@ -29,6 +29,9 @@ from dolfinopt.vibration import LoadedModes, RigidIntegrals, loaded_modes
 
 THRESHOLDS = 0.25, 0.75
 
+# How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
+CLIPPED = 1e-10
+
 
 @dataclass(frozen=True, eq=False)
 class Realised:
@@ -37,10 +40,12 @@ class Realised:
     Attributes:
         x_phys: (n_cells,) physical densities.
         projected: the way back through the projection, None where there is none.
+        clipped: (n_cells,) True where the filter left [0, 1], None where it did nowhere.
     """
 
     x_phys: np.ndarray
     projected: Projected | None
+    clipped: np.ndarray | None = None
 
 
 class Arm:
@@ -90,13 +95,24 @@ class Arm:
 
     def physical(self, x: np.ndarray) -> np.ndarray:
         """Return the physical densities of design variables x: filtered, passive cells solid."""
+        return self.filtered(x).x_phys
+
+    def filtered(self, x: np.ndarray) -> Realised:
+        """Return the design of design variables x without projection.
+
+        Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
+        what is cut off there has no derivative, and `chain` knows.
+        """
         x = np.where(self.mesh.passive, 1.0, x)
         with self.ledger.phase("filter"):
             if self.symmetry is not None:
                 x = self.symmetry.forward(x)
-            x_phys = self.filter.forward(x)
-        # The filter keeps bounds up to rounding, and only they are in the laws' domain.
-        return np.where(self.mesh.passive, 1.0, np.clip(x_phys, 0.0, 1.0))
+            x_filtered = self.filter.forward(x)
+        clipped = None
+        if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
+            clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
+        x_phys = np.where(self.mesh.passive, 1.0, np.clip(x_filtered, 0.0, 1.0))
+        return Realised(x_phys, None, clipped)
 
     def uniform(self, density: float) -> np.ndarray:
         """Return the physical densities of the same design variable in every cell."""
@@ -112,16 +128,19 @@ class Arm:
             sharpness: beta of the scene's projection.
             threshold: its eta.
         """
-        x_phys = self.physical(x)
+        filtered = self.filtered(x)
         kind = self.scene.design.projection
         if not kind:
-            return (Realised(x_phys, None),)
+            return (filtered,)
         thresholds: Sequence[float] = (threshold,)
         if kind == "robust":
             eroded, nominal, dilated = robust_thresholds(self.scene.design.erosion)
             thresholds = (eroded, dilated, nominal)
-        projected = [project(x_phys, sharpness, eta) for eta in thresholds]
-        return tuple(Realised(np.where(self.mesh.passive, 1.0, p.value), p) for p in projected)
+        projected = [project(filtered.x_phys, sharpness, eta) for eta in thresholds]
+        return tuple(
+            Realised(np.where(self.mesh.passive, 1.0, p.value), p, filtered.clipped)
+            for p in projected
+        )
 
     def preserving_threshold(self, x: np.ndarray, sharpness: float) -> float:
         """Return the projection's threshold that keeps the volume of x (collective on the arm).
@@ -138,10 +157,12 @@ class Arm:
 
         Args:
             slope: (n_cells,).
-            realised: what `realise` made of x; None: not projected.
+            realised: what `realise` or `filtered` made of x; None: neither projected nor clipped.
         """
         if realised is not None and realised.projected is not None:
             slope = realised.projected.backward(self._active(slope))
+        if realised is not None and realised.clipped is not None:
+            slope = np.where(realised.clipped, 0.0, slope)
         with self.ledger.phase("filter"):
             slope = self.filter.backward(self._active(slope))
             if self.symmetry is not None:

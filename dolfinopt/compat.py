@@ -94,6 +94,20 @@ def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:
     return mesh.geometry.x[cell_geometry_nodes(mesh, num_cells)]
 
 
+def cell_facets(mesh: Any, num_cells: int) -> np.ndarray:
+    """Return the facets' local numbers (num_cells, facets a cell) of the first cells.
+
+    In the order of the reference cell: triangles opposite to corners 0, 1, 2; quadrilaterals
+    between corners 01, 02, 13, 23.
+    """
+    dim = mesh.topology.dim
+    mesh.topology.create_entities(dim - 1)
+    mesh.topology.create_connectivity(dim, dim - 1)
+    links = mesh.topology.connectivity(dim, dim - 1)
+    columns = 3 if cell_geometry_nodes(mesh, 0).shape[1] == 3 else 4
+    return _rows(links, columns)[:num_cells].astype(np.int32)
+
+
 def local_cell_counts(mesh: Any) -> tuple[int, int]:
     """Return the number of cells this rank owns and the number of its ghost cells."""
     cells = mesh.topology.index_map(mesh.topology.dim)

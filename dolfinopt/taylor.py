@@ -87,10 +87,10 @@ def taylor_test(
     exact = _with(scene, gradient="exact")
     x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
     evaluation, base = evaluate(exact, share, arms, _physical(arms, x), ledger, simulated=False)
-    slope = _by_x(arms, gradient(exact, share, arms, base, ledger))
+    slope = _by_x(arms, gradient(exact, share, arms, base, ledger), x)
     frozen = None
     if scene.objective.simulated:
-        frozen = _by_x(arms, gradient(_with(scene, gradient="esl"), share, arms, base, ledger))
+        frozen = _by_x(arms, gradient(_with(scene, gradient="esl"), share, arms, base, ledger), x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
     value = _fixed_objective(exact, share, arms, ledger, base)
@@ -143,8 +143,8 @@ def _physical(arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
     return {k: arm.physical(x[k]) for k, arm in arms.items()}
 
 
-def _by_x(arms: Mapping[int, Arm], slopes: Cells) -> dict[int, np.ndarray]:
-    return {k: arm.chain(slopes[k]) for k, arm in arms.items()}
+def _by_x(arms: Mapping[int, Arm], slopes: Cells, x: Cells) -> dict[int, np.ndarray]:
+    return {k: arm.chain(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
 
 
 def _dot(share: ArmShare, a: Cells, b: Cells) -> float:

@@ -275,6 +275,30 @@ def test_gradient_is_one(overrides: list[str]) -> None:
     assert_passed(taylor(scene(*overrides), wave))
 
 
+@pytest.mark.parametrize("kind", ["static", "compliance"])
+def test_gradient_on_skew_triangles(kind: str, shared_tmp_path: Path) -> None:
+    """Gmsh's transfinite triangles, where the filter couples cells through their facets."""
+    path = shared_tmp_path / "skew.geo"
+    if WORLD.rank == 0:
+        path.write_text(TRANSFINITE)
+    WORLD.barrier()
+    test = taylor(
+        do.load_scene(
+            SCENE,
+            (f"arms.mesh='{path}'", "design.filter_radius=0.02", f"objective.kind={kind}"),
+        )
+    )
+    assert_passed(test)
+
+
+TRANSFINITE = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
+Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+Transfinite Curve {1, 3} = 25; Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
+Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
+"""
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -391,7 +415,7 @@ def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def no_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the slopes by the physical densities for those by the variables."""
-    monkeypatch.setattr("dolfinopt.arm.Arm.chain", lambda arm, slope: arm._active(slope))
+    monkeypatch.setattr("dolfinopt.arm.Arm.chain", lambda arm, slope, _: arm._active(slope))
 
 
 @pytest.mark.parametrize("fault", [no_modes, no_trajectory, no_start, no_filter])
