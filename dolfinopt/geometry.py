@@ -113,7 +113,7 @@ def build_model(gmsh: Any, arm: scenes.Arm) -> np.ndarray:
     """Make the Gmsh model of an arm with a mesh file: read, mesh, name the groups, check.
 
     Returns:
-        Lines (n, 2, 2) of both interfaces, m, from which `arm.passive` is still to be measured;
+        Lines (n, 2, 2) of both interfaces, m, from which `arm.solid_ends` is still to be measured;
         none where the geometry has seen to it.
 
     Raises:
@@ -133,7 +133,7 @@ def build_model(gmsh: Any, arm: scenes.Arm) -> np.ndarray:
     except Exception as error:  # Gmsh knows no other
         text = " ".join(str(error).split()) or "Gmsh failed"
         raise InputError(f"{where}: {text}; open the file in Gmsh to mend it") from None
-    if solid_done or arm.passive == 0.0:
+    if solid_done or arm.solid_ends == 0.0:
         return np.empty((0, 2, 2))
     return flat.points[np.concatenate([flat.inboard, flat.outboard])][:, :, :2]
 
@@ -155,7 +155,7 @@ def _read_geo(gmsh: Any, arm: scenes.Arm) -> bool:
         values[SIZE] = arm.mesh_size
     if arm.cell_shape is not None:
         values[SHAPE] = float(arm.cell_shape == "quadrilateral")
-    if arm.passive > 0.0:
+    if arm.passive:
         values[SOLID] = arm.passive
     # Defaults computed from other parameters must not stay those of the first reading.
     gmsh.onelab.clear()

@@ -59,7 +59,7 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     if arm.mesh is not None:
         return file_arm(comm, arm)
     assert arm.cells is not None
-    return structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, arm.passive)
+    return structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, arm.solid_ends)
 
 
 def structured_arm(
@@ -98,7 +98,7 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     """Mesh an arm from its .geo, .msh or .step file.
 
     Solid are the cells of group "passive" and those with centroids nearer to an interface than
-    `arm.passive`; a .geo file with a parameter for that length sees to it in its geometry.
+    `arm.solid_ends`; a .geo file with a parameter for that length sees to it in its geometry.
 
     Raises:
         InputError: the file cannot be the arm; on all ranks of `comm`.
@@ -107,7 +107,7 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         lines = on_root(comm, build_model, gmsh if comm.rank == 0 else None, arm)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
     mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
-    mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.passive
+    mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
     return mesh
 
 

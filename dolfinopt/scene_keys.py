@@ -42,8 +42,18 @@ CellShape = Literal["quadrilateral", "triangle"]
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
-Frequency = Annotated[float, Field(ge=0)]  # Hz
+Frequency = Annotated[float, Field(ge=0, le=1e9)]  # Hz
+LARGEST_LOAD = 1e9  # N, N m
 Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
+# Ranges far beyond what machines need, within which products and quotients of all quantities stay
+# within double precision. What is merely improbable is for `plausibility.py` to say.
+Length = Annotated[float, Field(ge=1e-6, le=1e4)]  # m
+Position = Annotated[float, Field(ge=-1e4, le=1e4)]  # m
+Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
+Stiffness = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
+PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
+MassDensity = Annotated[float, Field(ge=1e-6, le=1e6)]  # kg/m3
+Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
 MAX_ITERATIONS = 1_000_000
 MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation
 
@@ -114,9 +124,9 @@ def check_scene_name(name: str) -> str:
 class Material(Table):
     """The solid material, linear elastic and isotropic, in plane stress."""
 
-    young_modulus: float = Field(gt=0, description="Young's modulus of the solid material [Pa]")
-    poisson_ratio: float = Field(gt=-1, lt=0.5, description="Poisson's ratio [-]")
-    density: float = Field(gt=0, description="mass density of the solid material [kg/m3]")
+    young_modulus: Stiffness = Field(description="Young's modulus of the solid material [Pa]")
+    poisson_ratio: PoissonRatio = Field(description="Poisson's ratio [-]")
+    density: MassDensity = Field(description="mass density of the solid material [kg/m3]")
 
 
 class Interpolation(Table):
@@ -126,11 +136,11 @@ class Interpolation(Table):
         default="two-material", description="interpolation law of stiffness and mass [-]"
     )
     penalty: float = Field(
-        default=3.0, ge=1, description='exponent p of x in the stiffness; q of "ramp" [-]'
+        default=3.0, ge=1, le=20, description='exponent p of x in the stiffness; q of "ramp" [-]'
     )
     floor: float = Field(
         default=1e-6,
-        gt=0,
+        ge=1e-12,
         lt=1,
         description="stiffness and mass of void relative to solid; its square but for "
         '"two-material" [-]',
@@ -143,25 +153,27 @@ class Arm(Table):
     name: Annotated[str, AfterValidator(check_arm_name)] = Field(
         description="unique name, used in files and messages [-]"
     )
-    length: float = Field(gt=0, description="from joint axis to joint axis, or to the end [m]")
-    height: float = Field(gt=0, description="height in the plane of motion [m]")
-    thickness: float = Field(gt=0, description="thickness normal to the plane of motion [m]")
+    length: Length = Field(description="from joint axis to joint axis, or to the end [m]")
+    height: Length = Field(description="height in the plane of motion [m]")
+    thickness: Length = Field(description="thickness normal to the plane of motion [m]")
     cells: tuple[CellCount, CellCount] | None = Field(
         default=(200, 12), description="number of cells along and across a rectangular arm [-]"
     )
     mesh: str | None = Field(
         default=None, description="geometry or mesh (.geo, .msh, .step) in place of cells [-]"
     )
-    mesh_size: float | None = Field(
-        default=None, gt=0, description="of the cells of a .geo or .step file [m]"
+    mesh_size: Length | None = Field(
+        default=None, description="of the cells of a .geo or .step file [m]"
     )
     cell_shape: CellShape | None = Field(
         default=None, description="of the cells of a .geo or .step file [-]"
     )
-    passive: float = Field(
-        default=0.0,
+    passive: float | None = Field(
+        default=None,
         ge=0,
-        description="solid material kept around both interfaces; 0 leaves it to a mesh file [m]",
+        description="solid material kept around both interfaces; 0 leaves it to a mesh file; "
+        "default: that, or a quarter of a rectangular arm's height, at most a tenth of its "
+        "length [m]",
     )
     symmetric: bool = Field(
         default=False, description="design symmetric about the arm's axis y = 0 [-]"
@@ -175,14 +187,14 @@ class Arm(Table):
     sid: str | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
-    young_modulus: float | None = Field(
-        default=None, gt=0, description="instead of material.young_modulus [Pa]"
+    young_modulus: Stiffness | None = Field(
+        default=None, description="instead of material.young_modulus [Pa]"
     )
-    poisson_ratio: float | None = Field(
-        default=None, gt=-1, lt=0.5, description="instead of material.poisson_ratio [-]"
+    poisson_ratio: PoissonRatio | None = Field(
+        default=None, description="instead of material.poisson_ratio [-]"
     )
-    density: float | None = Field(
-        default=None, gt=0, description="instead of material.density [kg/m3]"
+    density: MassDensity | None = Field(
+        default=None, description="instead of material.density [kg/m3]"
     )
 
     @model_validator(mode="after")
@@ -209,7 +221,7 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_ends(self) -> Arm:
-        if 2.0 * self.passive >= self.length:
+        if 2.0 * self.solid_ends >= self.length:
             raise Refusal(
                 f"expected less than half of length = {self.length} [m]", ("passive",), ("length",)
             )
@@ -238,6 +250,12 @@ class Arm(Table):
                 ("mesh",),
                 ("cells",),
             )
+        if self.mesh_size is not None and self.mesh_size > self.height:
+            raise Refusal(
+                f"expected at most height = {self.height} [m]: a cell must fit into the arm",
+                ("mesh_size",),
+                ("height",),
+            )
         kind = Path(self.mesh).suffix.lower()
         if kind not in MESH_FILES:
             raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
@@ -259,15 +277,26 @@ class Arm(Table):
         return round(2.0 * squares if self.cell_shape == "triangle" else squares)
 
     @property
+    def solid_ends(self) -> float:
+        """Return the length kept solid around both interfaces, m: `passive`, or its default.
+
+        The edges at the ends are rigid and the joint axes lie on them: without solid cells there
+        an optimised design may hold its joint in void. 0 for a mesh file, which has its own groups.
+        """
+        if self.passive is not None:
+            return self.passive
+        return 0.0 if self.cells is None else min(self.height / 4.0, self.length / 10.0)
+
+    @property
     def passive_columns(self) -> int:
-        """Count the columns of cells at each end with centroids nearer to it than `passive`.
+        """Count the columns of cells at each end with centroids nearer to it than `solid_ends`.
 
         0 for a mesh file, whose solid cells are known when it is read.
         """
         if self.cells is None:
             return 0
         # The expression of meshes/arm.geo, so that rounding cannot tell the two apart.
-        return math.ceil(self.passive / self.length * self.cells[0] - 0.5)
+        return math.ceil(self.solid_ends / self.length * self.cells[0] - 0.5)
 
     @property
     def passive_share(self) -> float:
@@ -294,14 +323,16 @@ class Motion(Table):
         description="of the end-effector: arc, line or table of points; or a table of joint "
         "coordinates [-]",
     )
-    radius: float = Field(
-        default=1.0, gt=0, description="radius of the semicircle about the origin, of an arc [m]"
+    radius: Length = Field(
+        default=1.0, description="radius of the semicircle about the origin, of an arc [m]"
     )
     flattening: float = Field(
         default=1.0, ge=0, le=1, description="factor of an arc's y; 0 is the straight line [-]"
     )
-    start: tuple[float, float] = Field(default=(-1.0, 0.0), description="where a line begins [m]")
-    end: tuple[float, float] = Field(default=(1.0, 0.0), description="where a line ends [m]")
+    start: tuple[Position, Position] = Field(
+        default=(-1.0, 0.0), description="where a line begins [m]"
+    )
+    end: tuple[Position, Position] = Field(default=(1.0, 0.0), description="where a line ends [m]")
     file: str | None = Field(
         default=None,
         description="table (CSV) of points or joints, from the scene's folder or the working "
@@ -310,25 +341,25 @@ class Motion(Table):
     law: TimeLaw = Field(
         default="quintic", description="time law along the path; not of a table with times [-]"
     )
-    duration: float = Field(default=1.9, gt=0, description="time from start to end of the path [s]")
-    horizon: float = Field(
-        default=3.0, gt=0, description="simulated time; at rest after duration [s]"
-    )
+    duration: Duration = Field(default=1.9, description="time from start to end of the path [s]")
+    horizon: Duration = Field(default=3.0, description="simulated time; at rest after duration [s]")
     base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
-    base_position: float = Field(
+    base_position: Position = Field(
         default=0.0, description="x of the shoulder joint on a fixed base [m]"
     )
     cart_follow: float = Field(
         default=0.5,
+        ge=-1e3,
+        le=1e3,
         description="position of the cart over the desired x of the end-effector; with one arm, a "
         "fixed base or a table of joints there is no choice [-]",
     )
-    joint_height: float = Field(default=-0.5, description="y of the shoulder joint [m]")
+    joint_height: Position = Field(default=-0.5, description="y of the shoulder joint [m]")
     elbow: Literal[-1, 1] = Field(
         default=-1,
         description="sign of the elbow angle beta; with one arm, of its cosine with +x [-]",
     )
-    gravity: tuple[float, float] = Field(
+    gravity: tuple[Acceleration, Acceleration] = Field(
         default=(0.0, 0.0), description="gravitational acceleration in x and y [m/s2]"
     )
 
@@ -370,9 +401,11 @@ class Motion(Table):
 class Payload(Table):
     """What the end-effector carries."""
 
-    mass: float = Field(default=6.0, ge=0, description="point mass at the end-effector [kg]")
+    mass: float = Field(
+        default=6.0, ge=0, le=1e9, description="point mass at the end-effector [kg]"
+    )
     inertia: float = Field(
-        default=0.0, ge=0, description="moment of inertia about its centre [kg m2]"
+        default=0.0, ge=0, le=1e9, description="moment of inertia about its centre [kg m2]"
     )
 
 
@@ -380,7 +413,7 @@ class Damping(Table):
     """Structural damping D = stiffness_proportional * K."""
 
     stiffness_proportional: float = Field(
-        default=2e-4, ge=0, description="factor of the stiffness matrix in D [s]"
+        default=2e-4, ge=0, le=1e3, description="factor of the stiffness matrix in D [s]"
     )
 
 
@@ -479,7 +512,7 @@ class Simulation(Table):
 
     tolerance: float = Field(
         default=1e-4,
-        gt=0,
+        ge=1e-12,
         le=0.1,
         description="relative error allowed in the elastic coordinates [-]",
     )
@@ -488,7 +521,9 @@ class Simulation(Table):
         default=0.8, ge=0, le=1, description="spectral radius at infinity of generalised-alpha [-]"
     )
     stages: int = Field(default=4, ge=2, le=5, description="stages of a Radau IIA step [-]")
-    sample: float = Field(default=1e-3, gt=0, description="interval of the output instants [s]")
+    sample: float = Field(
+        default=1e-3, ge=1e-9, le=1e5, description="interval of the output instants [s]"
+    )
 
 
 class Objective(Table):
@@ -528,6 +563,8 @@ class Objective(Table):
     )
     elbow_angle: float | None = Field(
         default=None,
+        ge=-100,
+        le=100,
         description="of every joint behind an arm while it vibrates; default: mid-path [rad]",
     )
     modes: int = Field(
@@ -543,6 +580,12 @@ class Objective(Table):
     def _check_loads(cls, loads: tuple[Load, ...]) -> tuple[Load, ...]:
         if not loads or not all(any(load) for load in loads):
             raise Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
+        sizes = [max(map(abs, load)) for load in loads]
+        if min(sizes) < 1.0 / LARGEST_LOAD or max(sizes) > LARGEST_LOAD:
+            raise Refusal(
+                f"expected loads whose largest component is between {1.0 / LARGEST_LOAD:g} and "
+                f"{LARGEST_LOAD:g} [N, N m]"
+            )
         return loads
 
     @property
@@ -556,13 +599,15 @@ class Constraints(Table):
 
     first_frequency: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-6,
+        le=1e9,
         description="least first frequency of every arm with what it carries "
         "(objective.attached) [Hz]",
     )
     tip_deflection: float | None = Field(
         default=None,
-        gt=0,
+        ge=1e-15,
+        le=1e4,
         description="largest static deflection of every arm's outboard interface under "
         "objective.loads [m]",
     )
@@ -572,15 +617,20 @@ class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
 
     volume_fraction: float = Field(
-        default=0.5, gt=0, le=1, description="volume limit of each arm [-]"
+        default=0.5, ge=1e-6, le=1, description="volume limit of each arm [-]"
     )
     shared_volume: bool = Field(
         default=False, description="one volume limit for all arms together [-]"
     )
-    initial: float = Field(default=0.5, gt=0, le=1, description="x of every cell at the start [-]")
-    minimum: float = Field(default=1e-3, gt=0, lt=1, description="lower bound of x [-]")
+    initial: float = Field(
+        default=0.5, ge=1e-6, le=1, description="x of every cell at the start [-]"
+    )
+    minimum: float = Field(default=1e-3, ge=1e-9, lt=1, description="lower bound of x [-]")
     filter_radius: float = Field(
-        default=0.0075, ge=0, description="radius of the equivalent cone filter; 0 is no filter [m]"
+        default=0.0075,
+        ge=0,
+        le=1e4,
+        description="radius of the equivalent cone filter; 0 is no filter [m]",
     )
     projection: Projection = Field(
         default=False,
@@ -591,12 +641,15 @@ class Design(Table):
         default=128.0, ge=1, le=1e4, description="beta of the projection in the end [-]"
     )
     continuation: int = Field(
-        default=25, ge=1, description="iterations until the projection's beta doubles [-]"
+        default=25,
+        ge=1,
+        le=MAX_ITERATIONS,
+        description="iterations until the projection's beta doubles [-]",
     )
     erosion: float = Field(
         default=0.1,
-        gt=0,
-        lt=0.5,
+        ge=1e-3,
+        le=0.499,
         description="distance of the robust thresholds from one half [-]",
     )
 
@@ -621,7 +674,7 @@ class Scenario(Table):
     changes: tuple[str, ...] = Field(
         description='what differs, as "key=value" of motion, payload, damping or material [-]'
     )
-    weight: float = Field(default=1.0, gt=0, description="of its objective [-]")
+    weight: float = Field(default=1.0, ge=1e-9, le=1e9, description="of its objective [-]")
 
     @field_validator("changes")
     @classmethod
@@ -645,10 +698,13 @@ class Optimizer(Table):
         default=400, ge=0, le=MAX_ITERATIONS, description="design iterations [-]"
     )
     move: float = Field(
-        default=0.2, gt=0, le=1, description="largest step of x in one iteration [-]"
+        default=0.2, ge=1e-6, le=1, description="largest step of x in one iteration [-]"
     )
     tolerance: float = Field(
-        default=1e-3, ge=0, description="converged when the largest change of x is below it [-]"
+        default=1e-3,
+        ge=0,
+        le=1,
+        description="converged when the largest change of x is below it [-]",
     )
 
 
@@ -767,7 +823,7 @@ class Scene(Table):
         if not vibrates or self.objective.attached != "none":
             return self
         for i in self.cell_counts:
-            if self.arms[i].passive == 0.0:
+            if self.arms[i].solid_ends == 0.0:
                 raise Refusal(
                     'expected more than 0 with objective.attached = "none": without a mass at its '
                     "end the optimiser would cut an arm off",
@@ -808,6 +864,18 @@ class Scene(Table):
                     ("reduction", "coordinates"),
                     ("arms", i, "cells"),
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _check_filter(self) -> Scene:
+        longest = max(arm.length for arm in self.arms)
+        if self.design.filter_radius > longest:
+            raise Refusal(
+                f"expected at most the length of the longest arm, {longest} [m]: a wider filter "
+                "leaves one density for a whole arm",
+                ("design", "filter_radius"),
+                *(("arms", i, "length") for i in range(len(self.arms))),
+            )
         return self
 
     @model_validator(mode="after")
@@ -885,7 +953,8 @@ class Scene(Table):
                 raise Refusal(
                     f"expected so little that volume_fraction = {limit} can be met: with "
                     f"design.minimum = {self.design.minimum} between them the solid ends of "
-                    f"share {share:.4g} exceed it; shorten passive or raise the volume",
+                    f"share {share:.4g} exceed it; shorten passive (0 keeps none) or raise "
+                    "the volume",
                     ("arms", i, "passive"),
                     ("arms", i, "length"),
                     ("arms", i, "cells"),

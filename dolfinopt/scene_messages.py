@@ -190,7 +190,7 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
     noun = noun.split()[1] + plural if plural else noun
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [
-        f"{sign} {getattr(rule, name)}"
+        f"{sign} {getattr(rule, name):.12g}"
         for rule in metadata
         for name, sign in signs.items()
         if hasattr(rule, name)

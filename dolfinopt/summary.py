@@ -16,6 +16,7 @@ from dolfinopt.evaluation import Evaluation, Motion
 from dolfinopt.files import versions
 from dolfinopt.ledger import Counts, Ledger
 from dolfinopt.parallel import ArmShare, gather_arms
+from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
@@ -89,7 +90,11 @@ def summarise(
         **({} if crisp is None else {"crisp": _figures(crisp)}),
         "simulation_error_estimate": evaluation.error,
         "reduction": _reduction(scene, choice),
-        "warnings": [*_warnings(scene, evaluation), *_too_few(scene, choice)],
+        "warnings": [
+            *implausible(scene),
+            *_warnings(scene, evaluation),
+            *_too_few(scene, choice),
+        ],
         "iterations": iterations,
         "converged": converged,
         "stop_reason": stop_reason,

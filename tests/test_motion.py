@@ -64,7 +64,7 @@ def scene(
     lengths: tuple[float, ...] = (1.0, 1.0), tables: dict[str, Any] | None = None, **motion: Any
 ) -> Scene:
     """Return the paper's example with these arms, this motion and other tables of the scene."""
-    section = {"height": 0.06, "thickness": 0.01, "cells": [20, 2]}
+    section = {"height": 0.06, "thickness": 0.01, "cells": [20, 2], "passive": 0.0}
     return scene_from_dict(
         {
             "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
@@ -575,6 +575,7 @@ def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> Non
                     "length": length,
                     "height": HEIGHT,
                     "thickness": THICKNESS,
+                    "passive": 0.0,
                     "cells": [70, 6],
                 }
             ],

@@ -84,7 +84,8 @@ def checked_line(caught, source):
 
 def test_demo_holds_the_defaults():
     demo = load_scene(TWO_ARM)
-    assert scene_from_dict(minimal(name="two-arm manipulator")) == demo
+    ends = ["arms.passive=0.0"]  # as in the paper
+    assert scene_from_dict(minimal(name="two-arm manipulator"), overrides=ends) == demo
 
 
 def test_demo_values():
@@ -247,10 +248,11 @@ def test_integer_stands_for_a_number():
         ("reduction", {"method": "modal", "coordinates": 1}),
         ("reduction", {"coordinates": "auto", "tolerance": 1e-6}),
         ("design", {"minimum": 0.3, "volume_fraction": 0.3}),
+        ("design.filter_radius", 1.0),  # the longest arm
     ],
 )
 def test_borders_of_the_ranges_are_allowed(path, value):
-    scene_from_dict(changed(path, value))
+    scene_from_dict(changed(path, value), overrides=["arms.passive=0"])
 
 
 # --- what an arm derives from its keys -------------------------------------------------------
@@ -278,6 +280,27 @@ def test_passive_share_counts_centroids(n_along, length):
 def test_centroid_on_the_border_is_not_solid():
     assert Arm(**ARM, cells=(2, 1), passive=0.25).passive_columns == 0
     assert Arm(**ARM, cells=(2, 1), passive=0.26).passive_columns == 1
+
+
+@pytest.mark.parametrize(
+    ("keys", "length"),
+    [
+        ({}, 0.015),  # a quarter of the height
+        ({"height": 0.8}, 0.1),  # a tenth of the length
+        ({"passive": 0.0}, 0.0),
+        ({"passive": 0.02}, 0.02),
+        ({"mesh": "a.msh"}, 0.0),  # has groups of its own
+        ({"mesh": "a.msh", "passive": 0.02}, 0.02),
+    ],
+)
+def test_ends_are_solid_unless_the_scene_says_otherwise(keys, length):
+    assert Arm(**ARM | keys).solid_ends == pytest.approx(length, rel=1e-15)
+
+
+def test_default_ends_follow_the_height():
+    data = scene_from_dict(minimal()).to_dict()
+    ends = [arm.solid_ends for arm in scene_from_dict(data, overrides=["arms.height=0.1"]).arms]
+    assert ends == [0.025, 0.025]
 
 
 # --- overrides -------------------------------------------------------------------------------
@@ -352,7 +375,7 @@ def test_override_finds_an_arm_by_its_new_name():
         ("arms.-1.length=1", ["unknown key arms.-1"]),
         ("arms." + 5000 * "1" + ".length=1", ['unknown key arms."111']),
         ("arms.1.grid=a.geo", ["unknown key arms.1.grid (arm2)", "allowed: name, length"]),
-        ("arms.1.length=0", ["arms.1.length (arm2) = 0", "a number > 0", "[m]"]),
+        ("arms.1.length=0", ["arms.1.length (arm2) = 0", "a number >= 1e-06", "[m]"]),
         ("arms.arm2.length=0", ["arms.1.length (arm2) = 0"]),
         ("arms=3", ["arms = 3", "an array of tables [[arms]]"]),
         ("material=3", ["material = 3", "a table with the keys young_modulus"]),
@@ -420,17 +443,17 @@ BAD_VALUES = [
     ("name", "  ", '"  "', "printable characters"),
     ("name", 201 * "x", 60 * "x", "1 to 200"),
     ("name", 5, "5", "a string"),
-    ("material.young_modulus", 0, "0", "a number > 0"),
-    ("material.young_modulus", "70e9", '"70e9"', "a number > 0"),
-    ("material.young_modulus", True, "true", "a number > 0"),
-    ("material.young_modulus", 10**400, "2**1328...", "a number > 0"),
-    ("material.poisson_ratio", 0.5, "0.5", "a number > -1 and < 0.5"),
-    ("material.poisson_ratio", -1.0, "-1.0", "a number > -1 and < 0.5"),
-    ("material.density", -2700.0, "-2700.0", "a number > 0"),
+    ("material.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
+    ("material.young_modulus", "70e9", '"70e9"', "a number >= 1 and <= 1e+15"),
+    ("material.young_modulus", True, "true", "a number >= 1 and <= 1e+15"),
+    ("material.young_modulus", 10**400, "2**1328...", "a number >= 1 and <= 1e+15"),
+    ("material.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
+    ("material.poisson_ratio", -1.0, "-1.0", "a number >= -0.99 and < 0.5"),
+    ("material.density", -2700.0, "-2700.0", "a number >= 1e-06 and <= 1000000"),
     ("interpolation.law", "SIMP", '"SIMP"', '"two-material" | "simp" | "pedersen"'),
     ("interpolation.penalty", 0.9, "0.9", "a number >= 1"),
-    ("interpolation.floor", 0.0, "0.0", "a number > 0 and < 1"),
-    ("interpolation.floor", 1, "1", "a number > 0 and < 1"),
+    ("interpolation.floor", 0.0, "0.0", "a number >= 1e-12 and < 1"),
+    ("interpolation.floor", 1, "1", "a number >= 1e-12 and < 1"),
     ("arms.0.name", "a/b", '"a/b"', "letters, digits"),
     ("arms.0.name", "", '""', "letters, digits"),
     ("arms.0.name", "-x", '"-x"', "letters, digits"),
@@ -442,17 +465,17 @@ BAD_VALUES = [
     ("arms.0.name", "12", '"12"', "not a digit"),
     ("arms.0.name", 65 * "a", 65 * "a", "1 to 64"),
     ("arms.0.name", "ARM2", '"arm2"', "no other arm has"),
-    ("arms.0.length", 0.0, "0.0", "a number > 0"),
+    ("arms.0.length", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
     ("arms.0.design", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
     ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
     ("arms.0.design", 1, "1", "a string"),
     ("arms.0.rigid", 1, "1", "true or false"),
     ("arms.0.sid", 1, "1", "a string"),
-    ("arms.0.young_modulus", 0, "0", "a number > 0"),
-    ("arms.0.poisson_ratio", 0.5, "0.5", "a number > -1 and < 0.5"),
-    ("arms.0.density", "steel", '"steel"', "a number > 0"),
-    ("arms.0.height", -0.06, "-0.06", "a number > 0"),
-    ("arms.0.thickness", math.inf, "inf", "a finite number > 0"),
+    ("arms.0.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
+    ("arms.0.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
+    ("arms.0.density", "steel", '"steel"', "a number >= 1e-06 and <= 1000000"),
+    ("arms.0.height", -0.06, "-0.06", "a number >= 1e-06 and <= 10000"),
+    ("arms.0.thickness", math.inf, "inf", "a finite number >= 1e-06 and <= 10000"),
     ("arms.0.cells", [0, 12], "[0, 12]", "two integers >= 1"),
     ("arms.0.cells", [0, 0], "[0, 0]", "two integers >= 1"),
     ("arms.0.cells", [MAX_CELLS + 1, 1], "[100001, 1]", "<= 100000"),
@@ -461,7 +484,7 @@ BAD_VALUES = [
     ("arms.0.cells", [200.0, 12], "[200.0, 12]", "two integers"),
     ("arms.0.cells", "200x12", '"200x12"', "two integers"),
     ("arms.0.mesh", 1, "1", "a string"),
-    ("arms.0.mesh_size", 0.0, "0.0", "a number > 0"),
+    ("arms.0.mesh_size", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
     ("arms.0.mesh_size", 0.01, "0.01", "only with mesh"),
     ("arms.0.cell_shape", "hexagon", '"hexagon"', '"quadrilateral" | "triangle"'),
     ("arms.0.cell_shape", "triangle", '"triangle"', "only with mesh"),
@@ -471,7 +494,7 @@ BAD_VALUES = [
     ("arms.0.passive", 0.26, "0.26", "volume_fraction = 0.5 can be met"),
     ("motion.path", "circle", '"circle"', '"arc" | "line" | "points" | "joints"'),
     ("motion.path", "joints", "None (default)", 'a table (CSV) with motion.path = "joints"'),
-    ("motion.radius", 0.0, "0.0", "a number > 0"),
+    ("motion.radius", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
     ("motion.flattening", -0.1, "-0.1", "a number >= 0 and <= 1"),
     ("motion.flattening", 1.1, "1.1", "a number >= 0 and <= 1"),
     ("motion.start", [0.0], "[0.0]", "an array of two numbers"),
@@ -482,8 +505,8 @@ BAD_VALUES = [
     ("motion.law", "cubic", '"cubic"', '"quintic" | "septic"'),
     ("motion.base", "rail", '"rail"', '"cart" | "fixed"'),
     ("motion.base_position", 1, "1", '0.0, the default, with motion.base = "cart"'),
-    ("motion.duration", 0.0, "0.0", "a number > 0"),
-    ("motion.horizon", 0, "0", "a number > 0"),
+    ("motion.duration", 0.0, "0.0", "a number >= 0.0001 and <= 100000"),
+    ("motion.horizon", 0, "0", "a number >= 0.0001 and <= 100000"),
     ("motion.cart_follow", math.nan, "nan", "a finite number"),
     ("motion.joint_height", "low", '"low"', "a number"),
     ("motion.elbow", 0, "0", "-1 | 1"),
@@ -516,16 +539,16 @@ BAD_VALUES = [
     ("reduction.band", [0.0], "[0.0]", "an array of two numbers >= 0"),
     ("reduction.band", [9.0, 9.0], "[9.0, 9.0]", "the lower of the two frequencies first"),
     ("reduction.band", [0.0, 9.0], "[0.0, 9.0]", "[0.0, 50.0], the default, with reduction.method"),
-    ("simulation.tolerance", 0.0, "0.0", "a number > 0 and <= 0.1"),
-    ("simulation.tolerance", 0.11, "0.11", "a number > 0 and <= 0.1"),
+    ("simulation.tolerance", 0.0, "0.0", "a number >= 1e-12 and <= 0.1"),
+    ("simulation.tolerance", 0.11, "0.11", "a number >= 1e-12 and <= 0.1"),
     ("simulation.integrator", "euler", '"euler"', '"radau" | "generalized-alpha"'),
     ("simulation.rho_inf", 1.01, "1.01", "a number >= 0 and <= 1"),
     ("simulation.stages", 1, "1", "an integer >= 2 and <= 5"),
     ("simulation.stages", 6, "6", "an integer >= 2 and <= 5"),
-    ("simulation.sample", 0.0, "0.0", "a number > 0"),
+    ("simulation.sample", 0.0, "0.0", "a number >= 1e-09 and <= 100000"),
     ("simulation.sample", 3.1, "3.1", "motion.horizon = 3.0 [s]"),
     ("simulation.sample", 1e-9, "1e-09", "between 3e-07 and"),
-    ("simulation.sample", 5e-324, "5e-324", "between 3e-07 and"),
+    ("simulation.sample", 5e-324, "5e-324", "a number >= 1e-09"),
     ("objective.kind", "strain", '"strain"', '"esl" | "compliance"'),
     ("objective.load_cases", 0, "0", "an integer >= 1"),
     ("objective.load_cases", 3001, "3001", "at most 3000"),
@@ -534,6 +557,8 @@ BAD_VALUES = [
     ("objective.worst", "stress", '"stress"', '"compliance" | "deviation"'),
     ("objective.loads", [], "[]", "at least one load [F_x, F_y, moment]"),
     ("objective.loads", [[0, 0, 0]], "[[0, 0, 0]]", "none of them all zero"),
+    ("objective.loads", [[0, 1e-300, 0]], "[[0, 1e-300, 0]]", "between 1e-09 and 1e+09 [N, N m]"),
+    ("objective.loads", [[0, 1e10, 0]], "[[0, 10000000000.0, 0]]", "between 1e-09 and 1e+09"),
     ("objective.loads", [[0, 1]], "[[0, 1]]", "an array of arrays of three numbers"),
     ("objective.loads", [0, 1, 0], "[0, 1, 0]", "an array of arrays of three numbers"),
     ("objective.attached", "springs", '"springs"', '"rigid-body" | "point-mass" | "none"'),
@@ -541,28 +566,29 @@ BAD_VALUES = [
     ("objective.modes", 0, "0", "an integer >= 1 and <= 50"),
     ("objective.follow", 1, "1", "true or false"),
     ("objective.scenarios", "mean", '"mean"', '"sum" | "worst"'),
-    ("constraints.first_frequency", 0.0, "0.0", "a number > 0"),
-    ("constraints.tip_deflection", -1e-3, "-0.001", "a number > 0"),
+    ("constraints.first_frequency", 0.0, "0.0", "a number >= 1e-06 and <= 1000000000"),
+    ("constraints.tip_deflection", -1e-3, "-0.001", "a number >= 1e-15 and <= 10000"),
     ("objective.exponent", 1.0, "1.0", "a number >= 2"),
-    ("design.volume_fraction", 0.0, "0.0", "a number > 0 and <= 1"),
-    ("design.volume_fraction", 1.5, "1.5", "a number > 0 and <= 1"),
+    ("design.volume_fraction", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
+    ("design.volume_fraction", 1.5, "1.5", "a number >= 1e-06 and <= 1"),
     ("design.volume_fraction", 5e-4, "0.001 (default)", "at most volume_fraction = 0.0005"),
-    ("design.initial", 1.01, "1.01", "a number > 0 and <= 1"),
+    ("design.initial", 1.01, "1.01", "a number >= 1e-06 and <= 1"),
     ("design.initial", 1e-3, "0.001 (default)", "less than initial = 0.001"),
-    ("design.minimum", 0.0, "0.0", "a number > 0 and < 1"),
+    ("design.minimum", 0.0, "0.0", "a number >= 1e-09 and < 1"),
+    ("design.filter_radius", 1.001, "1.001", "at most the length of the longest arm, 1.0 [m]"),
     ("design.filter_radius", -1e-9, "-1e-09", "a number >= 0"),
     ("design.projection", True, "true", "false"),
     ("design.projection", 0, "0", "false"),
     ("design.projection", "tanh", '"tanh"', 'false | "heaviside" | "robust"'),
     ("design.sharpness", 0.5, "0.5", "a number >= 1"),
     ("design.continuation", 0, "0", "an integer >= 1"),
-    ("design.erosion", 0.5, "0.5", "a number > 0 and < 0.5"),
+    ("design.erosion", 0.5, "0.5", "a number >= 0.001 and <= 0.499"),
     ("design.shared_volume", 1, "1", "true or false"),
     ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
     ("optimizer.max_iterations", 16**5000, "2**20000...", "an integer >= 0 and <= 1000000"),
     ("optimizer.max_iterations", 400.0, "400.0", "an integer >= 0"),
-    ("optimizer.move", 0.0, "0.0", "a number > 0 and <= 1"),
-    ("optimizer.move", 1.1, "1.1", "a number > 0 and <= 1"),
+    ("optimizer.move", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
+    ("optimizer.move", 1.1, "1.1", "a number >= 1e-06 and <= 1"),
     ("optimizer.tolerance", -1.0, "-1.0", "a number >= 0"),
     ("material", 5, "5", "a table with the keys young_modulus, poisson_ratio, density"),
     ("motion", [1, 2], "[1, 2]", "a table with the keys path, radius"),
@@ -623,6 +649,7 @@ def test_a_mesh_excludes_cells():
         (".toml", {}, "ends in .geo, .msh, .step, .stp"),
         (".msh", {"mesh_size": 0.01}, "a .msh file has its cells"),
         (".msh", {"cell_shape": "triangle"}, "a .msh file has its cells"),
+        (".geo", {"mesh_size": 0.07}, "at most height = 0.06 [m]: a cell must fit into the arm"),
     ],
 )
 def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
@@ -763,7 +790,8 @@ def test_several_shifts_and_a_band_are_accepted():
 
 def test_arm_is_named_in_the_path():
     message = message_of(changed("arms.1.height", -1))
-    assert message.startswith(f"{FILE}: arms.1.height (arm2) = -1: expected a number > 0 (height")
+    assert message.startswith(f"{FILE}: arms.1.height (arm2) = -1: expected a number >= 1e-06 and")
+    assert " (height in the plane of motion" in message
     assert message.endswith("[m])")
 
 
@@ -1090,7 +1118,7 @@ def test_import_needs_no_mpi_nor_numpy():
     ("scenario", "message"),
     [
         ({"changes": 5}, "scenarios.0.changes = 5: expected an array of strings"),
-        ({"changes": [], "weight": 0}, "scenarios.0.weight = 0: expected a number > 0"),
+        ({"changes": [], "weight": 0}, "scenarios.0.weight = 0: expected a number >= 1e-09"),
         ({"weight": 1.0}, "missing key scenarios.0.changes"),
         ({"changes": [], "wait": 1.0}, "unknown key scenarios.0.wait; did you mean scenarios.0.w"),
         ({"changes": ["arms.length=2"]}, "expected keys of motion, payload, damping or material"),
@@ -1181,12 +1209,10 @@ def test_own_material():
     ],
 )
 def test_nothing_attached_needs_solid_ends(tables):
-    assert "arms.0.passive (arm1) = 0.0 (default): expected more than 0" in message_of(
-        minimal(**tables)
-    )
     data = minimal(**tables)
-    data["arms"][0]["passive"] = 0.02
-    scene_from_dict(data)
+    scene_from_dict(data)  # they have them by default
+    data["arms"][0]["passive"] = 0.0
+    assert "arms.0.passive (arm1) = 0.0: expected more than 0" in message_of(data)
 
 
 def test_length_of_a_body_from_a_file(tmp_path):

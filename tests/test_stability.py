@@ -574,7 +574,7 @@ def drawn(rng: np.random.Generator, folder: Path) -> tuple[dict, list[str]]:
 
     count = int(rng.integers(1, 5))
     cells = [int(rng.integers(4, 16)), int(rng.integers(1, 4))]
-    arm = {"length": 1.6 / count, "height": 0.06, "thickness": 0.01, "cells": cells}
+    arm = {"length": 1.6 / count, "height": 0.06, "thickness": 0.01, "cells": cells, "passive": 0.0}
     arms: list[dict] = [{"name": f"a{k}"} for k in range(count)]
     arms[0] |= arm
     if rng.random() < 0.2:

@@ -21,6 +21,7 @@ STREET = (
     "sid",
     "spelling",
     "scene_keys",
+    "plausibility",
     "scene_messages",
     "scene",
     "compat",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt.errors import InputError
+from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene, load_scene, scene_from_dict
 
 if TYPE_CHECKING:
@@ -48,9 +49,21 @@ def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
                 from dolfinopt.arm import fixed_body
 
                 fixed_body(scene, index)
+        warn(implausible(scene))
         return scene
 
     return on_root(world, load)
+
+
+_told: set[str] = set()
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Print the warnings that this command has not told yet."""
+    for warning in warnings:
+        if warning not in _told:
+            _told.add(warning)
+            click.echo(f"dolfinopt: warning: {warning}", err=True)
 
 
 def prepare(world: MPI.Comm, folder: Path) -> None:
@@ -127,8 +140,7 @@ def draw(
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     """Print the run's warnings, and its figures in one line."""
-    for warning in summary["warnings"]:
-        click.echo(f"dolfinopt: warning: {warning}", err=True)
+    warn(summary["warnings"])
     found = summary["reduction"]
     if found["error_estimate"] is not None:
         click.echo(_chosen(found["coordinates"], found["error_estimate"]))
