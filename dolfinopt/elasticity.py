@@ -8,6 +8,7 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,18 +21,18 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt import compat
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.floating import HARMLESS, Connectivity, extremes
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import ArmMesh
 from dolfinopt.parallel import direct_solver
 
-# Imbalance of constraint modes up to which they are taken as they are: S is then right to 1e-5.
-# Connected designs have 1e-13 to 1e-9, checkerboards in a void of 1e-6 1e-5, of 1e-9 1e-2.
-BALANCED = 1e-3
-# Change of S by a step of refinement up to which it is believed.
-STEADY = 1e-3
-# Of void to solid where solids float. Rounding of the element matrices holds them, too, which no
-# refinement notices: S is off by up to 3e-8 in a void of 1e-6, 3e-5 of 1e-9, 6e-4 of 1e-10.
-LOWEST_CONTRAST = 5e-11
+# Largest error that rounding may make in the stiffness of a design in which solids float, relative.
+# Against long double errors are 0.03 to 0.35 of the estimate.
+ROUNDED = 1e-3
+# Share of a cell's displacement as a rigid translation in that estimate. The energy does not know
+# translations, the assembled matrix does: where they are lost in it, refinement fails.
+TRANSLATION = 0.03
+POWER_STEPS = 6  # of the estimate; four give two digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,8 +454,10 @@ class ElasticArm:
         if self._constraint_modes is None:
             coupling, corner = self.restrict(self.stiffness_times(self.rigid))
             modes = self._energies(self.solve(-coupling), coupling, corner)
-            if not self._imbalance(modes) <= BALANCED:  # not a number included
+            if self._floats():
                 modes = self._refined(modes)
+            if not _is_stiffness(modes.stiffness):
+                raise self._lost_in_rounding()
             self._constraint_modes = modes
         return self._constraint_modes
 
@@ -464,16 +467,27 @@ class ElasticArm:
         field = self.expand(interior, np.eye(3))
         return ConstraintModes(interior, field, self.energy_matrix(field), coupling, corner)
 
-    def _imbalance(self, modes: ConstraintModes) -> float:
-        """Return how far K_bb + K_bI Psi is from S, relative; inf where S is no stiffness.
+    @cached_property
+    def connectivity(self) -> Connectivity:
+        """Which cells share a facet, and which lie at the interfaces."""
+        cells, space = self.operators.cells, self.operators.space
+        return Connectivity(self.comm, space, cells, self.inboard, self.outboard)
 
-        Equal in exact arithmetic; off by the equilibrium's error to first order, S by its square.
-        """
-        lower = self.comm.allreduce(modes.coupling.T @ modes.interior)
-        return _relative_change(modes.stiffness, modes.corner + lower)
+    def _floats(self) -> bool:
+        """Return whether void that is softer by orders of magnitude holds solid cells."""
+        low, high = extremes(self.comm, self._young)
+        return low < 0.1 / HARMLESS * high and self.connectivity.floats(self._young)
+
+    def _lost_in_rounding(self) -> ConvergenceError:
+        low, high = extremes(self.comm, self._young)
+        return ConvergenceError(
+            f"arm {self.mesh.name!r}: solid parts of the design float in a void "
+            f"{low / high:.1g} times as stiff, lost in their rounding; raise "
+            "interpolation.floor or design.minimum, or connect the design to both interfaces"
+        )
 
     def _refined(self, modes: ConstraintModes) -> ConstraintModes:
-        """Return constraint modes after one step of iterative refinement, if it changes little.
+        """Return constraint modes after one step of iterative refinement, if rounding allows.
 
         Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below
         the rounding of their own. The residual is summed cell by cell without rigid motion, which
@@ -482,22 +496,56 @@ class ElasticArm:
         Raises:
             ConvergenceError: the void's stiffness is lost in the rounding of the solid's.
         """
+        if not _is_stiffness(modes.stiffness):
+            raise self._lost_in_rounding()
         values = self._on_cells(modes.field)
         forces = (self.operators.stiffness @ values) * self._young[:, None, None]
-        residual = np.zeros_like(modes.field)
-        np.add.at(residual, self.operators.cells, forces.reshape(*self.operators.cells.shape, 2, 3))
-        better = modes.interior - self.solve(self.restrict(residual)[0])
+        forces = forces.reshape(*self.operators.cells.shape, 2, 3)
+        better = modes.interior - self.solve(self.restrict(self._add_up(forces))[0])
         refined = self._energies(better, modes.coupling, modes.corner)
-        low = -self.comm.allreduce(-self._young.min(initial=np.inf), op=MPI.MAX)
-        high = self.comm.allreduce(self._young.max(initial=0.0), op=MPI.MAX)
-        change = _relative_change(refined.stiffness, modes.stiffness)
-        if low < LOWEST_CONTRAST * high or not change <= STEADY:
-            raise ConvergenceError(
-                f"arm {self.mesh.name!r}: solid parts of the design float in a void "
-                f"{low / high:.1g} times as stiff, lost in their rounding; raise "
-                "interpolation.floor or design.minimum, or connect the design to both interfaces"
-            )
+        if not (_is_stiffness(refined.stiffness) and self._rounding(refined) <= ROUNDED):
+            raise self._lost_in_rounding()
         return refined
+
+    def _rounding(self, modes: ConstraintModes) -> float:
+        """Return an estimate of the relative error of S by rounding.
+
+        An element matrix is known to eps times its diagonal D_e, so the energy of any field is to
+        eps u' D u, and relative to it to eps times the largest eigenvalue of D u = mu T'KT u.
+        Inverse iteration finds it from a start of random numbers: void that holds solids sets it
+        orders of magnitude apart from all others. What it returns is too small only where mu
+        exceeds 1 / eps, far beyond `ROUNDED`, because the factorised matrix is off by then.
+        """
+        diagonal = np.einsum("eii->ei", self.operators.stiffness) * self._young[:, None]
+        diagonal = diagonal.reshape(*self.operators.cells.shape, 2, 1)
+
+        def weighted(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Return T' D T u."""
+            values = field[self.operators.cells]
+            forces = diagonal * (values - kept * values.mean(axis=1, keepdims=True))
+            forces -= kept * forces.mean(axis=1, keepdims=True)
+            return self.restrict(self._add_up(forces))
+
+        kept = 1.0 - TRANSLATION
+        x, y = self.points.T / self.mesh.outboard_point[0]
+        # By place, so that numbers are random and yet the same on any number of ranks.
+        noise = np.sin(np.outer(1e4 * x + 7e4 * y + 1.0, [12.9898, 78.233])) * 43758.5453
+        start = (np.modf(np.abs(noise))[0] - 0.5)[:, :, None]
+        loads, outboard = weighted(
+            self.expand(start[self.interior_nodes].reshape(-1, 1), np.full((3, 1), 0.5))
+        )
+        ratio = np.inf
+        for _ in range(POWER_STEPS):
+            lift = self.comm.allreduce(modes.interior.T @ loads)
+            tip = np.linalg.solve(modes.stiffness, outboard + lift)
+            interior = self.solve(loads) + modes.interior @ tip
+            work = self.comm.allreduce(np.sum(interior * loads)) + np.sum(tip * outboard)
+            loads, outboard = weighted(self.expand(interior, tip))
+            energy = self.comm.allreduce(np.sum(interior * loads)) + np.sum(tip * outboard)
+            ratio = abs(float(energy / work))
+            scale = max(energy, np.finfo(float).tiny) ** -0.5
+            loads, outboard = scale * loads, scale * outboard
+        return ratio * float(np.finfo(float).eps)
 
     # -- cells -------------------------------------------------------------------------------
 
@@ -532,6 +580,12 @@ class ElasticArm:
         energy = self.comm.allreduce(values.reshape(-1, columns).T @ products.reshape(-1, columns))
         return 0.5 * (energy + energy.T)
 
+    def _add_up(self, forces: np.ndarray) -> np.ndarray:
+        """Return the nodal field (n_nodes, 2, k) of the cells' forces (n_cells, n, 2, k)."""
+        field = np.zeros((len(self.points), *forces.shape[2:]))
+        np.add.at(field, self.operators.cells, forces)
+        return field
+
     def _on_cells(self, field: np.ndarray) -> np.ndarray:
         """Return the cells' nodal values (n_cells, 2n, k) less their mean, which has no energy.
 
@@ -543,13 +597,15 @@ class ElasticArm:
         return values.reshape(len(cells), 2 * cells.shape[1], field.shape[2])
 
 
-def _relative_change(stiffness: np.ndarray, other: np.ndarray) -> float:
-    """Return the largest relative difference of two stiffnesses (3, 3), in any direction."""
+def _is_stiffness(matrix: np.ndarray) -> bool:
+    """Return whether a symmetric matrix is finite and positive definite."""
+    if not np.isfinite(matrix).all():
+        return False
     try:
-        inverse = np.linalg.inv(np.linalg.cholesky(stiffness))
+        np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
-        return np.inf
-    return float(np.linalg.norm(inverse @ (other - stiffness) @ inverse.T, 2))
+        return False
+    return True
 
 
 def _cell_products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:

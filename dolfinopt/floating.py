@@ -1,0 +1,93 @@
+"""Solid cells that only far softer ones connect to an arm's interfaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from scipy.sparse.csgraph import connected_components
+
+# Ratio of Young's moduli up to which floating solids do no harm: the stiffness of an arm is then
+# off by at most a few 1e-7, from rounding.
+HARMLESS = 1e6
+
+
+def extremes(comm: MPI.Comm, values: np.ndarray) -> tuple[float, float]:
+    """Return the least and the largest of positive values on all ranks."""
+    low = comm.allreduce(values.min(initial=np.inf), op=MPI.MIN)
+    return low, comm.allreduce(values.max(initial=0.0), op=MPI.MAX)
+
+
+class Connectivity:
+    """Which cells share a facet, and which of them lie at the interfaces (collective on `comm`).
+
+    Cells that touch at a corner alone are not connected: such a hinge does not stop rotation.
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        space: Any,
+        cells: np.ndarray,
+        inboard: np.ndarray,
+        outboard: np.ndarray,
+    ):
+        """Connect the cells of all ranks.
+
+        Args:
+            comm: the arm's ranks.
+            space: its `dofmap.index_map` numbers the nodes.
+            cells: (n_cells, n) local nodes of the owned cells.
+            inboard, outboard: (n_nodes,) True for the nodes of the interface.
+        """
+        self.comm = comm
+        nodes = space.dofmap.index_map.local_to_global(cells.ravel().astype(np.int32))
+        everywhere = np.concatenate(comm.allgather(nodes.reshape(cells.shape)))
+        # A facet has at least two nodes on any mesh, and no two cells share two but by a facet.
+        ends = [
+            np.concatenate(comm.allgather(mask[cells].sum(axis=1) >= 2))
+            for mask in (inboard, outboard)
+        ]
+        count, width = everywhere.shape
+        incidence = sp.csr_matrix(
+            (np.ones(everywhere.size), everywhere.ravel(), np.arange(0, count * width + 1, width)),
+            shape=(count, space.dofmap.index_map.size_global),
+        )
+        shared = sp.triu(incidence @ incidence.T, k=1).tocoo()
+        facets = shared.data >= 2.0
+        # Two more nodes of the graph stand for the interfaces. The outboard one is rigid: it
+        # connects the cells at it with each other, but does not hold them.
+        pairs = [(shared.row[facets], shared.col[facets])]
+        pairs += [
+            (np.flatnonzero(end), np.full(end.sum(), count + k)) for k, end in enumerate(ends)
+        ]
+        self._count = count
+        self._first, self._second = (np.concatenate(side) for side in zip(*pairs, strict=True))
+
+    def floats(self, young: np.ndarray) -> bool:
+        """Return whether cells hang on others that are softer by more than `HARMLESS`.
+
+        True whenever, on every path from a cell to the inboard interface, there is one
+        softer by more than ten times `HARMLESS`; never where there is a path that keeps above
+        `HARMLESS`. Collective; the same on all ranks.
+
+        Args:
+            young: (n_cells,) Young's moduli of the owned cells, Pa.
+        """
+        low, high = extremes(self.comm, young)
+        moduli = np.concatenate([*self.comm.allgather(young), [np.inf, np.inf]])
+        weakest = np.minimum(moduli[self._first], moduli[self._second])
+        moduli[-2:] = 0.0  # an interface does not float itself
+        level = high / HARMLESS
+        while level > low:
+            kept = weakest >= level
+            links = (np.ones(kept.sum()), (self._first[kept], self._second[kept]))
+            _, group = connected_components(
+                sp.coo_matrix(links, shape=(len(moduli), len(moduli))), directed=False
+            )
+            if (moduli[group != group[self._count]] > HARMLESS * level * (1.0 - 1e-9)).any():
+                return True
+            level *= 0.1
+        return False
