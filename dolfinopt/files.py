@@ -201,6 +201,7 @@ class ArmView:
         density: (n_cells,) physical densities.
         modes: (n_cells, 3 or 4, 2, q) the reduced basis at the corners; q = 0 if not reduced.
         designed: False for arms without a design: rigid ones and those from a file.
+        length: from joint axis to joint axis, m; None if not known.
     """
 
     name: str
@@ -209,6 +210,7 @@ class ArmView:
     density: np.ndarray
     modes: np.ndarray
     designed: bool = True
+    length: float | None = None
 
 
 def gather_views(
@@ -245,6 +247,7 @@ def gather_views(
                 centroids[owner][order],
                 densities[owner][order],
                 shapes[owner][order][:, around],
+                length=scene.arms[index].length,
             )
         )
     return views
@@ -271,7 +274,7 @@ def _bar_view(name: str, height: float, body: FloatingBody) -> ArmView:
     along = station[..., None] * u - side[:, None] * rotation
     modes = along[:, :, None] * axis[:, None] + deflection[:, :, None] * across[:, None]
     density = np.ones(len(corners))
-    return ArmView(name, corners, corners.mean(axis=1), density, modes, designed=False)
+    return ArmView(name, corners, corners.mean(axis=1), density, modes, False, length)
 
 
 def _canonical_order(points: np.ndarray) -> np.ndarray:

@@ -6,30 +6,39 @@ is computed by small functions of arrays, so that it can be checked without look
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.files import ArmView, HistoryRow, write_atomically
 from dolfinopt.mechanism import Mechanism
+from dolfinopt.style import (
+    BLUE,
+    COLOURS,
+    DENSITY,
+    GREY,
+    INITIAL,
+    LINE_WIDTH,
+    OPTIMISED,
+    ORANGE,
+    SOLID_FROM,
+    PathLike,
+    log_scale,
+    look,
+    look_numbers,
+    new_figure,
+    save,
+    spread,
+)
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from PIL.Image import Image as Picture
-
-COLOURS = "YlGnBu"  # void is light, solid is dark, lightness falls evenly between
-DENSITY = "physical density [-]"
-BLUE, ORANGE, GREY = "#1f5a99", "#d95f02", "#6e6e6e"  # told apart by colour-blind readers too
-
-PathLike = str | os.PathLike[str]
-
 
 # -- numbers ---------------------------------------------------------------------------------
 
@@ -41,15 +50,27 @@ def round_number(value: float) -> float:
     return float(choices[np.argmin(np.abs(np.log(choices / value)))])
 
 
-def round_magnification(largest: float, size: float) -> float:
-    """Return a round number, at least 1, that shows a deviation as about a tenth of `size`.
+LARGEST_MAGNIFICATION = 100.0  # beyond it a picture shows a deformation that nothing has
+
+
+def round_magnification(largest: float, size: float, turn: float = 0.0) -> float:
+    """Return a round number from 1 to 100 that shows a deviation as about a tenth of `size`.
 
     Args:
         largest: deviation, m.
         size: of the whole mechanism, m.
+        turn: largest rotation of an arm's end, rad; stays below `LARGEST_TURN` when magnified.
     """
     # Below a billionth nothing but rounding would be magnified.
-    return max(1.0, round_number(0.1 * size / largest)) if largest > 1e-9 * size else 1.0
+    if largest <= 1e-9 * size:
+        return 1.0
+    found = min(LARGEST_MAGNIFICATION, round_number(0.1 * size / largest))
+    while found > 1.0 and found * turn > LARGEST_TURN:
+        found = round_number(0.5 * found) if found > 2.0 else 1.0
+    return max(1.0, found)
+
+
+LARGEST_TURN = 0.5  # rad, about what an arm's end turns by when its tip moves a third of its length
 
 
 def ticks(low: float, high: float, count: int = 10) -> np.ndarray:
@@ -70,11 +91,6 @@ def volume_fraction(view: ArmView) -> float:
     """Return the mean physical density of an arm, weighted with its cells' areas."""
     area = cell_areas(view.corners)
     return float(area @ view.density / area.sum())
-
-
-def spans_decade(values: np.ndarray) -> bool:
-    """Return whether positive values differ by more than a factor of ten: drawn on a log scale."""
-    return bool(np.min(values) > 0.0 and np.max(values) > 10.0 * np.min(values))
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -154,25 +170,33 @@ def draw_design(path: PathLike, views: Sequence[ArmView], title: str) -> Path:
     Returns:
         The path.
     """
-    from PIL import Image
+    return save(design_page(views, title), path)
 
+
+def design_page(views: Sequence[ArmView], title: str) -> Figure:
+    """Return the figure of `draw_design`; a unit of its axes is a pixel."""
     layout = stack_arms([view.corners for view in views])
     page = _Page(layout.width, layout.height)
-    page.write(title, MARGIN, layout.height - HEAD + 30.0, TITLE, bold=True)
+    page.write(title, MARGIN, layout.height - HEAD + 40.0, TITLE, bold=True)
     for index, view in enumerate(views):
-        size = np.ptp(view.corners, axis=(0, 1))
-        label = (
-            f"{view.name}   {size[0]:.4g} m x {size[1]:.4g} m, "
-            f"volume fraction {volume_fraction(view):.3f}"
-        )
-        page.write(label, MARGIN, layout.tops[index] + 12.0, TEXT)
+        page.write(_caption(view), MARGIN, layout.tops[index] + 12.0, TEXT)
         page.fill(layout.place(index, view.corners), view.density)
+        if view.length is not None:
+            page.mark(layout.place(index, np.array([[0.0, 0.0], [view.length, 0.0]])))
     _draw_ruler(page, layout)
     _draw_colour_scale(page, layout)
-    image = Image.fromarray(page.render())
-    target = Path(path)
-    write_atomically(target, lambda stream: image.save(stream, format="PNG"))
-    return target
+    return page.figure
+
+
+def _caption(view: ArmView) -> str:
+    """Return what stands above an arm: from joint axis to joint axis, height, material."""
+    size = np.ptp(view.corners, axis=(0, 1))
+    long = f"{size[0]:.4g} m long"
+    if view.length is not None:
+        long = f"axis distance {view.length:.4g} m"
+    return (
+        f"{view.name}   {long}, {size[1]:.4g} m high, volume fraction {volume_fraction(view):.3f}"
+    )
 
 
 def _draw_ruler(page: _Page, layout: Layout) -> None:
@@ -185,7 +209,7 @@ def _draw_ruler(page: _Page, layout: Layout) -> None:
     page.lines([[[where, y], [where, y - 10.0]] for where in x])
     for mark, where in zip(marks, x):
         unit = " m" if mark == marks[-1] else ""
-        page.write(f"{mark:.6g}{unit}", where, y - 40.0, TEXT, centred=True)
+        page.write(f"{mark:.6g}{unit}", where, y - 34.0, TEXT, centred=True)
 
 
 def _draw_colour_scale(page: _Page, layout: Layout) -> None:
@@ -201,61 +225,40 @@ def _draw_colour_scale(page: _Page, layout: Layout) -> None:
     for mark in (0.0, 0.25, 0.5, 0.75, 1.0):
         where = x + mark * long
         page.lines([[[where, y], [where, y - 8.0]]])
-        page.write(f"{mark:g}", where, y - 36.0, TEXT, centred=True)
+        page.write(f"{mark:g}", where, y - 32.0, TEXT, centred=True)
     page.write(DENSITY, x - 20.0, y, TEXT, ends=True)
 
 
+PAGE_DPI = 100
+
+
 class _Page:
-    """A PyVista picture whose world coordinates are its pixels, so that text meets geometry."""
+    """A figure of one pair of axes whose unit is the pixel, so that text meets geometry."""
 
     def __init__(self, width: int, height: int):
-        if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-            # Without a display VTK would look for an X server first and complain.
-            os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-        import pyvista as pv
-
-        self.pv, self.width = pv, width
-        self.plotter = cast(Any, pv.Plotter(off_screen=True, window_size=[width, height]))
-        self.plotter.set_background("white")
-        camera = self.plotter.camera
-        camera.position = (width / 2, height / 2, 100.0)
-        camera.focal_point = (width / 2, height / 2, 0.0)
-        camera.up = (0.0, 1.0, 0.0)
-        camera.parallel_projection = True
-        camera.parallel_scale = height / 2
-        camera.clipping_range = (1.0, 200.0)
+        self.width = width
+        self.figure = new_figure(width / PAGE_DPI, height / PAGE_DPI, PAGE_DPI, laid_out=False)
+        self.axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        self.axes.set(xlim=(0.0, width), ylim=(0.0, height))
+        self.axes.axis("off")
 
     def fill(self, corners: np.ndarray, density: np.ndarray) -> None:
         """Fill polygons (n, k, 2) with the colours of (n,) densities and draw their outline."""
-        count, sides = corners.shape[:2]
-        faces = np.column_stack(
-            [np.full(count, sides), np.arange(count * sides).reshape(count, -1)]
-        )
-        mesh = self.pv.PolyData(_in_space(corners, 0.0), faces.ravel())
-        mesh.cell_data["density"] = density
-        self.plotter.add_mesh(
-            mesh,
-            scalars="density",
-            cmap=COLOURS,
-            clim=(0.0, 1.0),
-            lighting=False,
-            show_scalar_bar=False,
-            reset_camera=False,
-        )
-        outline = mesh.clean().extract_feature_edges(
-            boundary_edges=True, feature_edges=False, non_manifold_edges=False, manifold_edges=False
-        )
-        self.lines(outline.points[outline.lines.reshape(-1, 3)[:, 1:], :2], GREY)
+        self.axes.add_collection(filled(corners, density), autolim=False)
+        self.lines(outline(corners), GREY)
 
     def lines(self, ends: Any, colour: str = "black") -> None:
         """Draw lines between pairs of points (n, 2, 2)."""
-        ends = np.asarray(ends, dtype=float)
-        along = ends[:, 1] - ends[:, 0]
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        # A little longer, so that no gap is left between one and the next.
-        ends = ends + 0.7 * np.stack([-along, along], axis=1)
-        mesh = self.pv.line_segments_from_points(_in_space(ends, 1.0))
-        self.plotter.add_mesh(mesh, color=colour, line_width=2, lighting=False, reset_camera=False)
+        from matplotlib.collections import LineCollection
+
+        width = 1.5 * 72.0 / PAGE_DPI
+        drawn = LineCollection(list(np.asarray(ends, dtype=float)), colors=colour, linewidths=width)
+        drawn.set_capstyle("projecting")
+        self.axes.add_collection(drawn, autolim=False)
+
+    def mark(self, points: np.ndarray) -> None:
+        """Mark joint axes (n, 2)."""
+        self.axes.plot(*points.T, "o", mfc="white", mec="black", ms=5.0, mew=1.2, clip_on=False)
 
     def write(
         self,
@@ -269,51 +272,62 @@ class _Page:
         ends: bool = False,
     ) -> None:
         """Write words that begin, are centred or end at x, and stand on y; cut to the page."""
-        from vtkmodules.vtkRenderingCore import vtkTextActor
-
-        actor = vtkTextActor()
-        style = actor.GetTextProperty()
-        style.SetColor(0.0, 0.0, 0.0)
-        style.SetFontSize(size)
-        style.SetFontFamilyToArial()
-        style.SetBold(bold)
-        if centred:
-            style.SetJustificationToCentered()
-        elif ends:
-            style.SetJustificationToRight()
-        words = words.replace("$", r"\$")  # two of them would begin a formula
-        actor.SetInput(words)
+        text = self.axes.text(
+            x,
+            y,
+            words,
+            fontsize=size * 0.72 * 72.0 / PAGE_DPI,
+            fontweight="bold" if bold else "normal",
+            ha="center" if centred else "right" if ends else "left",
+            parse_math=False,
+        )
         room = self.width - MARGIN / 2 - x
-        while not (centred or ends) and len(words) > 1 and self._width(actor) > room:
+        while not (centred or ends) and len(words) > 1 and text.get_window_extent().width > room:
             words = words[:-1]
-            actor.SetInput(words.rstrip() + "...")
-        actor.SetPosition(x, y)
-        self.plotter.add_actor(actor, reset_camera=False, pickable=False, render=False)
-
-    def _width(self, actor: Any) -> float:
-        box = [0.0, 0.0, 0.0, 0.0]
-        actor.GetBoundingBox(self.plotter.renderer, box)
-        return box[1] - box[0]
-
-    def render(self) -> np.ndarray:
-        """Return the picture (height, width, 3), uint8, and free the window."""
-        try:
-            return np.asarray(self.plotter.screenshot(return_img=True))
-        finally:
-            self.plotter.close()
+            text.set_text(words.rstrip() + "...")
 
 
-def _in_space(points: np.ndarray, height: float) -> np.ndarray:
-    """Return points (..., 2) as (n, 3) at one height."""
-    flat = points.reshape(-1, 2)
-    return np.column_stack([flat, np.full(len(flat), height)])
+def filled(corners: np.ndarray, density: np.ndarray, *, smooth: bool = False) -> Any:
+    """Return polygons (n, k, 2) in the colours of their densities (n,), without seams.
+
+    Args:
+        corners: in order around each.
+        density: in [0, 1].
+        smooth: with edges that are blended, for cells of a pixel or two in any direction.
+    """
+    from matplotlib.collections import PolyCollection
+
+    # Without smoothing neighbours share the pixels of their edge, nothing shines through; with it
+    # edges of the faces' colours close the seams.
+    look = {"edgecolors": "face", "linewidths": 0.2} if smooth else {"linewidths": 0.0}
+    cells = PolyCollection(list(corners), cmap=COLOURS, antialiaseds=smooth, **look)
+    cells.set_array(density)
+    cells.set_clim(0.0, 1.0)
+    return cells
+
+
+def outline(corners: np.ndarray) -> np.ndarray:
+    """Return the edges (n, 2, 2) that only one of the polygons (m, k, 2) has."""
+    flat = corners.reshape(-1, 2)
+    size = float(np.ptp(flat, axis=0).max()) or 1.0
+    number = np.unique(np.round(flat / (1e-7 * size)), axis=0, return_inverse=True)[1]
+    number = number.reshape(corners.shape[:2])
+    pairs = np.stack([number, np.roll(number, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ends = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
+    _, first, count = np.unique(
+        np.sort(pairs, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return ends[first[count == 1]]
 
 
 # -- curves ----------------------------------------------------------------------------------
 
 
+FEW = 40  # points a line that get markers
+
+
 def draw_history(path: PathLike, rows: Sequence[HistoryRow], objective_label: str) -> Path:
-    """Draw objective, maximal deviation and grayness against the iteration (PNG).
+    """Draw what history.csv holds against the iteration (PNG).
 
     Args:
         path: of the picture.
@@ -323,50 +337,93 @@ def draw_history(path: PathLike, rows: Sequence[HistoryRow], objective_label: st
     Returns:
         The path.
     """
-    return _save(history_figure(rows, objective_label), path)
+    return save(history_figure(rows, objective_label), path)
 
 
 def history_figure(rows: Sequence[HistoryRow], objective_label: str) -> Figure:
-    """Return the figure of `draw_history`: three panels, one below the other."""
+    """Return the figure of `draw_history`: panels in two columns that share the iteration."""
     from matplotlib.ticker import MaxNLocator
 
-    figure = _figure(9.0, 8.0)
-    panels = figure.subplots(3, 1, sharex=True)
+    panels = history_panels(rows, objective_label)
+    height = -(-len(panels) // 2)
+    total = 0.9 + 2.2 * height
+    figure = new_figure(10.0, total, 110, laid_out=False)
+    grid = figure.subplots(height, 2, sharex=True, squeeze=False)
+    # Fixed margins, inches: there is nothing to be found out by drawing twice.
+    figure.subplots_adjust(left=0.075, right=0.985, wspace=0.17, hspace=0.32,
+                           bottom=0.5 / total, top=1.0 - 0.75 / total)  # fmt: skip
     iteration = np.array([row.iteration for row in rows])
-    curves = (
-        (objective_label, np.array([row.objective for row in rows])),
-        ("maximal deviation [mm]", 1e3 * np.array([row.max_deviation for row in rows])),
-        ("grayness [-]", np.array([row.grayness for row in rows])),
-    )
-    for axes, (label, values) in zip(panels, curves):
-        _draw_curve(axes, iteration, values, label)
-        if axes is not panels[2] and spans_decade(values):
-            _log_scale(axes)
-    panels[2].set_ylim(0.0, 1.05 * max(1e-3, *curves[2][1]))
-    panels[2].set_xlabel("iteration")
-    panels[2].set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
-    panels[2].xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+    ordered = grid.T.ravel()  # down the first column, then down the second
+    for axes, (label, values) in zip(ordered, panels.items()):
+        _draw_history_panel(axes, iteration, values, label)
+    for axes in ordered[len(panels) :]:
+        axes.set_visible(False)
+    for column in (grid[:, 0], grid[:, 1]):
+        last = [axes for axes in column if axes.get_visible()][-1]
+        last.set_xlabel("iteration")
+        last.tick_params(labelbottom=True)
+    grid[0, 0].set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
+    grid[0, 0].xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+    figure.suptitle("History of the optimisation", x=0.01, y=1.0 - 0.12 / total, va="top",
+                    ha="left", fontsize=12)  # fmt: skip
     return figure
 
 
-def _draw_curve(axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str) -> None:
-    """Draw one quantity of the history; first and last value stand above it."""
-    marker = "o" if len(values) <= 40 else ""
-    axes.plot(iteration, values, color=BLUE, marker=marker, markersize=4, clip_on=False, zorder=3)
-    axes.set_title(label, loc="left", fontsize=11, parse_math=False)
-    ends = f"{values[0]:.4g}" if len(values) == 1 else f"{values[0]:.4g} → {values[-1]:.4g}"
-    axes.set_title(ends, loc="right", fontsize=11)
+# Columns of the history in the order of their panels: label, factor.
+HISTORY = {
+    "max_deviation": ("maximal deviation [mm]", 1e3),
+    "grayness": ("grayness [-]", 1.0),
+    "volume_fraction": ("volume fraction [-]", 1.0),
+    "change": ("largest change of the design [-]", 1.0),
+    "kkt": ("Karush-Kuhn-Tucker residual [-]", 1.0),
+}
+SHARES = ("grayness", "volume_fraction")  # from 0 to 1, drawn on a linear scale
+
+
+def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str, np.ndarray]:
+    """Return label and values (n,) of every panel; what the rows do not have is left out.
+
+    A mapping of numbers in a row (constraints by name) gives a panel for each of its keys.
+    """
+    known = {"iteration", "objective", "seconds", *HISTORY}
+    panels = {objective_label: np.array([row.objective for row in rows])}
+    for name, (label, factor) in HISTORY.items():
+        if hasattr(rows[0], name):
+            panels[label] = factor * _numbers([getattr(row, name) for row in rows])
+    for name, value in vars(rows[0]).items():
+        if isinstance(value, Mapping):
+            for key in value:
+                panels[str(key)] = _numbers([getattr(row, name).get(key) for row in rows])
+        elif name not in known and isinstance(value, (int, float)):
+            panels[name.replace("_", " ")] = _numbers([getattr(row, name) for row in rows])
+    return {label: v for label, v in panels.items() if np.isfinite(v).any()}
+
+
+def _numbers(values: Sequence[float | None]) -> np.ndarray:
+    return np.array([np.nan if value is None else float(value) for value in values])
+
+
+def _draw_history_panel(axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str) -> None:
+    """Draw one quantity; first and last value stand above it."""
+    linear = label in [HISTORY[name][0] for name in SHARES]
+    positive = values > 0.0
+    if not linear:  # nothing has changed yet at the first row; zero has no logarithm
+        values = np.where(positive, values, np.nan) if positive.any() else values
+    marker = "o" if len(values) <= FEW else ""
+    axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, lw=LINE_WIDTH, clip_on=False)
+    axes.set_title(label, loc="left", fontsize=10, parse_math=False)
+    finite = values[np.isfinite(values)]
+    if len(finite):
+        ends = f"{finite[0]:.4g}" if len(finite) == 1 else f"{finite[0]:.4g} → {finite[-1]:.4g}"
+        axes.set_title(ends, loc="right", fontsize=10)
     axes.grid(True, alpha=0.3)
-
-
-def _log_scale(axes: Axes) -> None:
-    """Make y logarithmic, labelled with plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    if linear:
+        axes.set_ylim(0.0, 1.05 * max(1e-3, *finite))
+    elif len(finite) and finite.min() > 0.0:
+        log_scale(axes, finite)
+        if finite.max() <= 1.02 * finite.min():  # nothing but digits that do not matter
+            middle = float(np.sqrt(finite.min() * finite.max()))
+            axes.set_ylim(0.5 * middle, 2.0 * middle)
 
 
 def draw_deviation(
@@ -386,57 +443,49 @@ def draw_deviation(
     Returns:
         The path.
     """
-    return _save(deviation_figure(t, deviation, initial_deviation), path)
+    return save(deviation_figure(t, deviation, initial_deviation), path)
 
 
 def deviation_figure(
     t: np.ndarray, deviation: np.ndarray, initial_deviation: np.ndarray | None
 ) -> Figure:
-    """Return the figure of `draw_deviation`."""
-    figure = _figure(9.0, 5.0)
-    axes = figure.subplots()
-    curves = [("", deviation, BLUE)]
+    """Return the figure of `draw_deviation`; what a curve is stands at its peak."""
+    figure = new_figure(9.0, 5.0, 120, laid_out=False)
+    axes = figure.add_axes((0.07, 0.11, 0.91, 0.81))
+    curves = [("", deviation)]
     if initial_deviation is not None:
-        curves = [
-            ("initial design: ", initial_deviation, ORANGE),
-            ("optimised design: ", deviation, BLUE),
-        ]
-    for label, vectors, colour in curves:
-        distance = 1e3 * np.hypot(vectors[:, 0], vectors[:, 1])
+        curves = [(INITIAL, initial_deviation), (OPTIMISED, deviation)]
+    distances = [1e3 * np.hypot(*vectors.T) for _, vectors in curves]
+    top = 1.1 * max(float(d.max()) for d in distances) or 1.0
+    heights = spread([float(d.max()) / top for d in distances], 0.07)
+    numbers = look_numbers([[label for label, _ in curves]])
+    for (label, _), distance, height in zip(curves, distances, heights, strict=True):
         worst = int(np.argmax(distance))
-        note = f"{label}largest {distance[worst]:.3g} mm at {t[worst]:.3f} s"
-        curve = axes.plot(t, distance, color=colour, label=note, clip_on=False)[0]
-        curve.set(marker="o", markevery=[worst])
-    axes.set_xlim(t[0], t[-1])
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("deviation from the rigid path [mm]")
+        style = look(numbers[label]) | {"marker": "o", "markevery": [worst], "clip_on": False}
+        axes.plot(t, distance, label=label, **style)
+        late = t[worst] > 0.5 * (t[0] + t[-1])
+        note = f"{label}: largest" if label else "largest"
+        axes.annotate(
+            f"{note} {distance[worst]:.3g} mm at {t[worst]:.3f} s",
+            xy=(t[worst], distance[worst]),
+            xytext=((t[worst] - t[0]) / (t[-1] - t[0]) + (-0.02 if late else 0.02), height + 0.02),
+            textcoords="axes fraction",
+            ha="right" if late else "left",
+            fontsize=10,
+            color=style["color"],
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
+        )
+    axes.set(xlim=(t[0], t[-1]), ylim=(0.0, top), xlabel="time [s]")
+    axes.set_ylabel("deviation [mm]")
+    axes.set_title("Deviation of the end-effector from the rigid path", loc="left", fontsize=12)
     axes.grid(True, alpha=0.3)
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, fontsize=11)
     return figure
-
-
-def _figure(width: float, height: float) -> Figure:
-    """Return an empty figure, inches, that no global state knows of."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=130)
-    figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.1)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: PathLike) -> Path:
-    """Write a figure as PNG and return its path."""
-    target = Path(path)
-    write_atomically(target, lambda stream: figure.savefig(stream, format="png"))
-    return target
 
 
 # -- motion ----------------------------------------------------------------------------------
 
-CELLS = 5000  # of all arms in a frame; finer ones would be smaller than a pixel
+CELLS = 3000  # of all arms in a frame; finer ones would be hardly larger than a pixel
+FRAMES, FILM_SECONDS = 60, 6.0
 FILM_WIDTH, FILM_DPI = 9.0, 100  # inches, px per inch
 CART = np.array([0.06, 0.045])  # half its width and its height, as shares of the arms' reach
 
@@ -587,7 +636,9 @@ def make_film(
     rigid = chain(mechanism, q_r, np.zeros_like(q_e))[0]
     if magnification is None:
         largest = np.abs(chain(mechanism, q_r, q_e)[0][:, -1] - rigid[:, -1]).max()
-        magnification = round_magnification(float(largest), size)
+        parts = zip(mechanism.slices, mechanism.bodies, strict=True)
+        turn = max(np.abs(q_e[:, part] @ body.outboard[2]).max() for part, body in parts)
+        magnification = round_magnification(float(largest), size, float(turn))
     q_e = magnification * q_e
     place, swing = chain(mechanism, q_r, q_e)
     at = np.unique(np.round(np.linspace(0, len(t) - 1, frames)).astype(int))
@@ -615,8 +666,8 @@ def draw_motion(
     q_r: np.ndarray,
     q_e: np.ndarray,
     magnification: float | None = None,
-    frames: int = 120,
-    duration: float = 6.0,
+    frames: int = FRAMES,
+    duration: float = FILM_SECONDS,
 ) -> Path:
     """Draw the moving, deformed manipulator (animated GIF).
 
@@ -627,7 +678,7 @@ def draw_motion(
         t: (n,) even instants, s.
         q_r: (n, 1 + arms) rigid coordinates; m, rad.
         q_e: (n, N) elastic coordinates.
-        magnification: of the deformation; default a round number, at least 1, that shows the
+        magnification: of the deformation; default a round number from 1 to 100 that shows the
             largest deviation as about a tenth of the mechanism's size.
         frames: number of pictures, at most n.
         duration: of the film, s.
@@ -698,6 +749,20 @@ def film_bounds(film: Film) -> tuple[np.ndarray, np.ndarray]:
     return np.min(lows, axis=0) - margin, np.max(highs, axis=0) + margin
 
 
+def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
+    """Return the corners (4, 2), m, of the cart below the shoulder, or of a pedestal.
+
+    Args:
+        place: of the shoulder, m.
+        size: reach of all arms together, m.
+        stands: whether it never moves.
+    """
+    across, deep = CART * size
+    top = 0.25 * across if stands else across
+    box = np.array([[-across, -deep], [across, -deep], [top, 0.0], [-top, 0.0]])
+    return box + np.array([place.real, place.imag])
+
+
 class Stage:
     """A picture whose still parts are drawn once, the moving ones in every frame."""
 
@@ -746,7 +811,6 @@ class Stage:
 
     def _cast(self, mechanism: Mechanism) -> list[Artist]:
         """Make the moving parts, from the back to the front."""
-        from matplotlib.collections import PolyCollection
         from matplotlib.patches import Polygon
 
         self.ghost = self.axes.plot([], [], color=GREY, lw=1.0, marker="o", ms=2.5)[0]
@@ -755,9 +819,7 @@ class Stage:
         self.axes.add_patch(self.cart)
         self.arms: list[Any] = []
         for view in self.film.views:
-            cells = PolyCollection([], cmap=COLOURS, edgecolors="face", linewidths=0.3)
-            cells.set_array(view.density)
-            cells.set_clim(0.0, 1.0)
+            cells = filled(np.zeros((0, 4, 2)), view.density)
             self.arms.append(self.axes.add_collection(cells, autolim=False))
         self.joints = self.axes.plot([], [], "o", mfc="white", mec="black", ms=7)[0]
         size = 11 if mechanism.payload_mass > 0.0 else 6
@@ -797,11 +859,7 @@ class Stage:
         """Move the moving parts."""
         film = self.film
         place, rigid = film.place[frame], film.rigid[frame]
-        across, deep = CART * film.size
-        foot = np.array([place[0].real, place[0].imag])
-        top = 0.25 * across if film.stands else across  # a pedestal, or the cart
-        box = np.array([[-across, -deep], [across, -deep], [top, 0.0], [-top, 0.0]])
-        self.cart.set_xy(foot + box)
+        self.cart.set_xy(base_corners(place[0], film.size, film.stands))
         for k, cells in enumerate(self.arms):
             cells.set_verts(film.cells(k, frame))
         self.ghost.set_data(rigid.real, rigid.imag)
@@ -816,3 +874,152 @@ def _shift(figure: Figure) -> Any:
     from matplotlib.transforms import ScaledTranslation
 
     return ScaledTranslation(0.0, 6.0 / 72.0, figure.dpi_scale_trans)
+
+
+# -- the machine -----------------------------------------------------------------------------
+
+POSES = 5
+
+
+def draw_machine(
+    path: PathLike,
+    views: Sequence[ArmView],
+    mechanism: Mechanism,
+    t: np.ndarray,
+    q_r: np.ndarray,
+    title: str,
+) -> Path:
+    """Draw the assembled machine with its designs in a few poses along the path (PNG).
+
+    Args:
+        path: of the picture.
+        views: of all arms, from the cart outwards.
+        mechanism: that moves.
+        t: (n,) s.
+        q_r: (n, 1 + arms) rigid coordinates; m, rad.
+        title: above the picture.
+
+    Returns:
+        The path.
+    """
+    return save(machine_figure(views, mechanism, t, q_r, title), path)
+
+
+def poses_along(points: np.ndarray, count: int) -> np.ndarray:
+    """Return the indices of `count` points (n,), complex, evenly spaced along their path.
+
+    Fewer where the path is short of points or of no length.
+    """
+    length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
+    if length[-1] == 0.0:
+        return np.zeros(1, dtype=int)
+    return np.unique(np.searchsorted(length, np.linspace(0.0, length[-1] * (1 - 1e-9), count)))
+
+
+def machine_figure(
+    views: Sequence[ArmView], mechanism: Mechanism, t: np.ndarray, q_r: np.ndarray, title: str
+) -> Figure:
+    """Return the figure of `draw_machine`: arms undeformed, void left open."""
+    rigid = np.zeros((len(t), mechanism.slices[-1].stop))
+    place, swing = chain(mechanism, q_r, rigid)
+    size = sum(float(np.hypot(*body.outboard_point)) for body in mechanism.bodies)
+    at = poses_along(place[:, -1], POSES)
+    stands = bool(np.ptp(place[:, 0].real) == 0.0)
+    thinned = [thin(view, 2 * CELLS // len(views)) for view in views]
+    cells = [
+        [deformed_cells(view, place[n, k], swing[n, k], np.zeros(view.modes.shape[-1]))
+         for k, view in enumerate(thinned)]
+        for n in at
+    ]  # fmt: skip
+    bases = [base_corners(place[n, 0], size, stands) for n in at]
+    path = np.stack([place[:, -1].real, place[:, -1].imag], axis=1)
+    points = [path, *bases, *(one.reshape(-1, 2) for pose in cells for one in pose)]
+    low, high = (
+        np.min([p.min(axis=0) for p in points], axis=0),
+        np.max([p.max(axis=0) for p in points], axis=0),
+    )
+    low = low - size * np.array([0.12, 0.04])
+    high = high + size * np.array([0.12, 0.1])
+    figure, axes = _framed(high - low)
+    _draw_ground(axes, bases, stands)
+    axes.plot(*path.T, color=ORANGE, dashes=(4, 3), lw=1.2, zorder=1.0)
+    for number, (n, pose) in enumerate(zip(at, cells)):
+        _draw_pose(axes, pose, thinned, place[n], bases[number], 2.0 + number)
+        _name_instant(axes, place[n], f"{t[n]:.2f} s" if len(at) > 1 else "", 3.0 + len(at))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
+    axes.grid(True, alpha=0.3)
+    axes.set_axisbelow(True)
+    axes.set_title(title, loc="left", fontsize=12, parse_math=False)
+    scale = filled(np.zeros((0, 4, 2)), np.zeros(0))
+    figure.colorbar(scale, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)), label=DENSITY)
+    return figure
+
+
+def _framed(span: np.ndarray) -> tuple[Figure, Axes]:
+    """Return a figure and axes of equal scales for a part of the plane of size `span` (2,), m."""
+    left, right, below, above = 0.75, 0.95, 0.55, 0.4  # inches
+    scale = min(7.5 / span[0], 7.0 / span[1])
+    width, height = scale * span
+    total = np.array([width + left + right, height + below + above])
+    figure = new_figure(float(total[0]), float(total[1]), 110, laid_out=False)
+    box = (left / total[0], below / total[1], width / total[0], height / total[1])
+    return figure, figure.add_axes(box)
+
+
+def _draw_ground(axes: Axes, bases: Sequence[np.ndarray], stands: bool) -> None:
+    """Draw the rail below the carts, or the ground below a pedestal."""
+    y = bases[0][0, 1]
+    if stands:
+        axes.plot(bases[0][:2, 0] + 0.5 * np.diff(bases[0][:2, 0]) * [-1, 1], [y, y], color=GREY)
+    else:
+        axes.axhline(y, color=GREY, lw=1.5, zorder=1.0)
+
+
+def _draw_pose(
+    axes: Axes,
+    cells: Sequence[np.ndarray],
+    views: Sequence[ArmView],
+    place: np.ndarray,
+    base: np.ndarray,
+    order: float,
+) -> None:
+    """Draw cart, arms, joints and end-effector in one pose."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import Polygon
+
+    axes.add_patch(Polygon(base, facecolor="#d9d9d9", edgecolor="black", zorder=order))
+    for corners, view in zip(cells, views, strict=True):
+        edges = LineCollection(list(outline(corners)), colors=GREY, linewidths=0.6)
+        solid = view.density > SOLID_FROM
+        fine = filled(corners[solid], view.density[solid], smooth=True)
+        for drawn in (fine, edges):
+            drawn.set_zorder(order + 0.1)
+            axes.add_collection(drawn, autolim=False)
+    joints = np.stack([place.real, place.imag])
+    style: dict[str, Any] = {
+        "linestyle": "",
+        "marker": "o",
+        "mec": "black",
+        "ms": 5.0,
+        "zorder": order + 0.2,
+    }
+    axes.plot(*joints[:, :-1], mfc="white", **style)
+    axes.plot(*joints[:, -1:], mfc=ORANGE, **style)
+
+
+def _name_instant(axes: Axes, place: np.ndarray, words: str, order: float) -> None:
+    """Write the instant beyond the end-effector, away from the arm that carries it."""
+    along = place[-1] - place[-2]
+    away = 12.0 * along / (abs(along) or 1.0)
+    axes.annotate(
+        words,
+        xy=(place[-1].real, place[-1].imag),
+        xytext=(away.real, away.imag),
+        textcoords="offset points",
+        ha="left" if away.real > 4.0 else "right" if away.real < -4.0 else "center",
+        va="bottom" if away.imag > 4.0 else "top" if away.imag < -4.0 else "center",
+        fontsize=10,
+        color=ORANGE,
+        zorder=order,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
+    )

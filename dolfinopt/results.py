@@ -5,7 +5,8 @@ The summary is written last: a folder that holds one is complete.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,8 @@ from dolfinopt.summary import summarise
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
+
+Draw = Callable[[list[ArmView]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,26 +62,38 @@ class Written:
 
 
 def write_simulation(
-    folder: Path, simulated: Simulated, wall: float, *, paraview: bool = True
+    folder: Path,
+    simulated: Simulated,
+    wall: float,
+    *,
+    paraview: bool = True,
+    pictures: Draw | None = None,
 ) -> Written | None:
     """Write design, trajectory and summary of a simulation (collective); None but on the root.
 
     Args:
         folder: exists.
         simulated: what.
-        wall: seconds that it took in all.
+        wall: seconds that it took up to now; the summary's total also counts what follows.
         paraview: write design.xdmf, too.
+        pictures: called with the arms' views before the summary is written, on the root.
     """
-    s = simulated
+    s, begun = simulated, time.perf_counter() - wall
     views = gather_views(s.scene, s.share, s.arms, s.x_phys)
     summary = summarise(
         s.scene, s.share, s.arms, s.x_phys, s.evaluation, s.ledger, wall=wall, choice=s.choice
     )
-    return _write(folder, views, s.trajectory, None, summary, paraview)
+    return _write(folder, views, s.trajectory, None, summary, paraview, pictures, begun)
 
 
 def write_result(
-    scene: Scene, folder: Path, result: Result, wall: float, *, paraview: bool = True
+    scene: Scene,
+    folder: Path,
+    result: Result,
+    wall: float,
+    *,
+    paraview: bool = True,
+    pictures: Draw | None = None,
 ) -> Written | None:
     """Write design, trajectory and summary of an optimisation (collective); None but on the root.
 
@@ -86,9 +101,11 @@ def write_result(
         scene: that was optimised.
         folder: exists; history and checkpoint are there already.
         result: what `optimize` returned.
-        wall: seconds that it took in all.
+        wall: seconds that it took up to now; the summary's total also counts what follows.
         paraview: write design.xdmf, too.
+        pictures: called with the arms' views before the summary is written, on the root.
     """
+    begun = time.perf_counter() - wall
     views = gather_views(scene, result.share, result.arms, result.x_phys)
     summary = summarise(
         scene,
@@ -105,7 +122,8 @@ def write_result(
         converged=result.converged,
         stop_reason=result.stop_reason,
     )
-    return _write(folder, views, result.trajectory, result.initial_deviation, summary, paraview)
+    initial = result.initial_deviation
+    return _write(folder, views, result.trajectory, initial, summary, paraview, pictures, begun)
 
 
 def _write(
@@ -113,8 +131,10 @@ def _write(
     views: list[ArmView],
     trajectory: Trajectory | None,
     initial: np.ndarray | None,
-    summary: Mapping[str, Any],
+    summary: dict[str, Any],
     paraview: bool,
+    pictures: Draw | None = None,
+    begun: float = 0.0,
 ) -> Written | None:
     if trajectory is None:
         return None
@@ -122,5 +142,11 @@ def _write(
     if paraview:
         write_xdmf(folder, views)
     write_trajectory(folder, trajectory, initial)
+    if pictures is not None:
+        since = time.perf_counter()
+        pictures(views)
+        del summary["seconds"]["total"]  # stands last
+        summary["seconds"]["pictures"] = time.perf_counter() - since
+    summary["seconds"]["total"] = time.perf_counter() - begun
     write_summary(folder, summary)
     return Written(views, summary)

@@ -23,8 +23,8 @@ from dolfinopt.findings import (
     joined,
 )
 from dolfinopt.ledger import Ledger
-from dolfinopt.plots import COLOURS, DENSITY, GREY, spans_decade
 from dolfinopt.scene import Scene
+from dolfinopt.style import COLOURS, DENSITY, GREY, spans_decade
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -55,12 +56,26 @@ def test_optimize_writes_every_file(optimised):
         "deviation.png",
         "history.csv",
         "history.png",
-        "motion.gif",
+        "machine.png",
         "summary.json",
         "trajectory.csv",
         "trajectory.npz",
     }
     assert {path.name for path in optimised.iterdir()} == expected
+
+
+def test_time_is_the_time_one_waited(optimised):
+    """Pictures are part of it, and the animation is drawn on request only."""
+    seconds = json.loads((optimised / "summary.json").read_text())["seconds"]
+    assert seconds["pictures"] > 0.0
+    assert seconds["total"] >= sum(s for name, s in seconds.items() if name != "total")
+    if WORLD.rank == 0:
+        run_alone = optimised.parent / "animated"
+        shutil.copytree(optimised, run_alone)
+    WORLD.barrier()
+    run("plot", optimised.parent / "animated", "--animation")
+    WORLD.barrier()
+    assert (optimised.parent / "animated" / "motion.gif").stat().st_size > 10_000
 
 
 def test_design_file(optimised):

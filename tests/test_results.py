@@ -46,7 +46,7 @@ def test_files(result, shared_tmp_path, paraview):
     for folder, wall, iterations in ((one, 12.5, 1), (other, 2.5, 0)):
         assert {path.name for path in folder.iterdir()} == expected
         summary = json.loads((folder / "summary.json").read_text())
-        assert summary["seconds"]["total"] == wall
+        assert wall <= summary["seconds"]["total"] < wall + 60.0
         assert summary["iterations"] == iterations
     assert [view.name for view in written.views] == ["arm1", "arm2"]
     assert written.summary["compliance"] == result.evaluation.compliance

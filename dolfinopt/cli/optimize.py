@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.options import out_option, plots_option, scene_argument, set_option
-from dolfinopt.cli.shared import BEGUN, conclude, draw, load, prepare, progress
+from dolfinopt.cli.options import (
+    animation_option,
+    out_option,
+    plots_option,
+    scene_argument,
+    set_option,
+)
+from dolfinopt.cli.shared import conclude, draw, elapsed, load, prepare, progress
 from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+    from dolfinopt.files import ArmView
     from dolfinopt.optimization import Result
 
 
@@ -24,6 +30,7 @@ if TYPE_CHECKING:
 @click.option("--resume", is_flag=True, help="go on from the folder's checkpoint")
 @set_option
 @plots_option
+@animation_option
 @click.pass_obj
 def optimize(
     world: MPI.Comm,
@@ -32,6 +39,7 @@ def optimize(
     resume: bool,
     overrides: tuple[str, ...],
     plots: bool,
+    animation: bool,
 ) -> None:
     """Optimise the arms of SCENE for the loads of their motion."""
     from dolfinopt import checkpoint
@@ -45,17 +53,20 @@ def optimize(
     prepare(world, folder)
     with progress(world, loaded) as report:
         result = run(loaded, folder, resume=resume, world=world, report=report)
-    _write_result(loaded, folder, result, plots)
+    _write_result(loaded, folder, result, plots, animation)
 
 
-def _write_result(scene: Scene, folder: Path, result: Result, plots: bool) -> None:
+def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, animation: bool) -> None:
     """Write everything an optimisation leaves behind (collective)."""
     from dolfinopt.results import write_result
 
-    written = write_result(scene, folder, result, time.perf_counter() - BEGUN)
-    if written is None or result.trajectory is None:
-        return
-    if plots:
+    def pictures(views: list[ArmView]) -> None:
+        assert result.trajectory is not None
         history, initial = result.history, result.initial_deviation
-        draw(folder, scene, written.views, result.trajectory, history, initial)
+        draw(folder, scene, views, result.trajectory, history, initial, animation=animation)
+
+    drawn = pictures if plots or animation else None
+    written = write_result(scene, folder, result, elapsed(), pictures=drawn)
+    if written is None:
+        return
     conclude(written.summary, folder)

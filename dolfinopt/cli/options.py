@@ -24,6 +24,11 @@ design_option = click.option(
 plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
 
 
+animation_option = click.option(
+    "--animation", is_flag=True, help="draw the moving machine, too: motion.gif"
+)
+
+
 def out_option(what: str) -> Callable[..., Any]:
     """Return the --out option of a command that writes a folder."""
     return click.option(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dolfinopt.cli.options import animation_option
 from dolfinopt.cli.shared import design_of, draw, scene_of
 
 if TYPE_CHECKING:
@@ -15,8 +16,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@animation_option
 @click.pass_obj
-def plot(world: MPI.Comm, folder: Path) -> None:
+def plot(world: MPI.Comm, folder: Path, animation: bool) -> None:
     """Draw the pictures of a finished run in DIR anew."""
     from dolfinopt.evaluation import evaluate
     from dolfinopt.files import gather_views, read_history, read_initial_deviation
@@ -32,5 +34,5 @@ def plot(world: MPI.Comm, folder: Path) -> None:
         return
     history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
     initial = read_initial_deviation(folder / "trajectory.npz")
-    draw(folder, loaded, views, trajectory, history, initial)
+    draw(folder, loaded, views, trajectory, history, initial, animation=animation)
     click.echo(f"pictures in {folder}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -112,8 +113,10 @@ def draw(
     trajectory: Trajectory,
     history: list[HistoryRow],
     initial: Any,
+    *,
+    animation: bool = False,
 ) -> None:
-    """Draw all pictures of a run (root only)."""
+    """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt import plots
     from dolfinopt.files import designed
 
@@ -128,14 +131,10 @@ def draw(
     if history:
         plots.draw_history(folder / "history.png", history, labels[scene.objective.kind])
     plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
-    plots.draw_motion(
-        folder / "motion.gif",
-        views,
-        trajectory.mechanism,
-        trajectory.t,
-        trajectory.q_r,
-        trajectory.q_e,
-    )
+    mechanism, t, q_r = trajectory.mechanism, trajectory.t, trajectory.q_r
+    plots.draw_machine(folder / "machine.png", views, mechanism, t, q_r, scene.name)
+    if animation:
+        plots.draw_motion(folder / "motion.gif", views, mechanism, t, q_r, trajectory.q_e)
 
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:
@@ -169,12 +168,28 @@ def _chosen(coordinates: int, error: float) -> str:
 def progress(
     world: MPI.Comm, scene: Scene
 ) -> AbstractContextManager[Callable[[HistoryRow], None] | None]:
-    """Return a live line an iteration on the root's terminal, nothing elsewhere."""
-    if world.rank != 0 or not sys.stderr.isatty():
+    """Return a live line on the root's terminal, lines every few seconds where it has none."""
+    if world.rank != 0:
         return nullcontext(None)
-    from dolfinopt.progress import live_line
+    from dolfinopt.progress import live_line, plain_lines
 
-    return live_line(scene.optimizer.max_iterations)
+    shown = live_line if sys.stderr.isatty() else plain_lines
+    return shown(scene.optimizer.max_iterations)
 
 
-BEGUN = time.perf_counter()
+def elapsed() -> float:
+    """Return the seconds that the user has waited: since the process was started."""
+    return time.perf_counter() - BEGUN
+
+
+def _age() -> float:
+    """Return how long ago this process was started, s; 0 where the system does not tell."""
+    try:
+        words = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(words[19]) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return 0.0
+    return age if 0.0 <= age < 600.0 else 0.0  # imports do not take longer: another clock
+
+
+BEGUN = time.perf_counter() - _age()

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from dolfinopt.cli.options import (
+    animation_option,
     design_option,
     out_option,
     plots_option,
     scene_argument,
     set_option,
 )
-from dolfinopt.cli.shared import BEGUN, conclude, design_of, draw, load, prepare
+from dolfinopt.cli.shared import conclude, design_of, draw, elapsed, load, prepare
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+    from dolfinopt.files import ArmView
 
 
 @click.command()
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 @out_option("the results; default: results/SCENE-simulation")
 @set_option
 @plots_option
+@animation_option
 @click.pass_obj
 def simulate(
     world: MPI.Comm,
@@ -35,6 +38,7 @@ def simulate(
     out: Path | None,
     overrides: tuple[str, ...],
     plots: bool,
+    animation: bool,
 ) -> None:
     """Simulate SCENE with a given design and report compliance and deviation."""
     from dolfinopt.coordinates import choose_coordinates
@@ -50,9 +54,13 @@ def simulate(
     choice = choose_coordinates(loaded, share, arms, x_phys, ledger)
     evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
     simulated = Simulated(loaded, share, arms, x_phys, evaluation, trajectory, ledger, choice)
-    written = write_simulation(folder, simulated, time.perf_counter() - BEGUN)
-    if written is None or trajectory is None:
+
+    def pictures(views: list[ArmView]) -> None:
+        assert trajectory is not None
+        draw(folder, loaded, views, trajectory, [], None, animation=animation)
+
+    drawn = pictures if plots or animation else None
+    written = write_simulation(folder, simulated, elapsed(), pictures=drawn)
+    if written is None:
         return
-    if plots:
-        draw(folder, loaded, written.views, trajectory, [], None)
     conclude(written.summary, folder)
