@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ class ArmMesh:
         passive: (n_cells,) True where the cell stays solid.
         inboard_facets, outboard_facets: facets of the interfaces, local numbers.
         outboard_point: (2,) reference point of the outboard interface, m.
+        notes: what is doubtful about its file, a sentence each.
     """
 
     name: str
@@ -39,6 +40,7 @@ class ArmMesh:
     inboard_facets: np.ndarray
     outboard_facets: np.ndarray
     outboard_point: np.ndarray
+    notes: tuple[str, ...] = ()
 
     @property
     def num_cells(self) -> int:
@@ -104,11 +106,11 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         InputError: the file cannot be the arm; on all ranks of `comm`.
     """
     with gmsh_on_root(comm) as gmsh:
-        lines = on_root(comm, build_model, gmsh if comm.rank == 0 else None, arm)
+        lines, notes = on_root(comm, build_model, gmsh if comm.rank == 0 else None, arm)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
     mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
     mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
-    return mesh
+    return replace(mesh, notes=notes)
 
 
 def _arm_mesh(

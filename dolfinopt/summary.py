@@ -55,6 +55,7 @@ def summarise(
     """
     volumes = gather_arms(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
     sizes = gather_arms(share, {k: _volume(scene, k, a) for k, a in arms.items()})
+    notes = gather_arms(share, {k: a.mesh.notes for k, a in arms.items()})
     greys = gather_arms(share, {k: a.grayness(x_phys[k]) for k, a in arms.items()})
     seconds = _slowest(share.world, ledger.seconds)
     mine = (counts or ledger.counts) if share.leads else Counts()
@@ -92,6 +93,7 @@ def summarise(
         "reduction": _reduction(scene, choice),
         "warnings": [
             *implausible(scene),
+            *(note for mesh_notes in notes.values() for note in mesh_notes),
             *_warnings(scene, evaluation),
             *_too_few(scene, choice),
         ],

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dolfinopt import compat
+from dolfinopt import compat, geometry
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.geometry import FlatMesh, check_mesh, gmsh_on_root
+from dolfinopt.geometry import FlatMesh, _joint_curves, check_mesh, gmsh_on_root
 from dolfinopt.mesh import arm_mesh
 from dolfinopt.scene import Arm
 from dolfinopt.step import read_shapes
@@ -25,7 +25,8 @@ SIDES = {"quadrilateral": 4, "triangle": 3}
 
 
 def entry(mesh, **keys):
-    return Arm(name="a", mesh=str(mesh), **{"length": LENGTH, "height": HEIGHT} | keys, thickness=1)
+    keys = {"length": LENGTH, "height": HEIGHT, "thickness": 1.0} | keys
+    return Arm(name="a", mesh=str(mesh), **keys)
 
 
 def bores(**keys):
@@ -178,6 +179,29 @@ def test_own_geometry_without_parameters(write):
 def test_surfaces_in_no_group_are_left_out_if_there_is_a_design(write):
     path = write("own.geo", PLAIN + TIP + ENDS + 'Physical Surface("design") = {1};')
     assert figures(arm_mesh(COMM, entry(path)))[1:3] == pytest.approx([0.03, 0.0], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["passive2", "Passive boss", "PASSIVE_left"])
+def test_groups_are_told_by_how_their_names_begin(write, name):
+    path = write("own.geo", PLAIN + TIP + ENDS + f'Physical Surface("{name}") = {{2}};')
+    mesh = arm_mesh(COMM, entry(path))
+    assert figures(mesh)[2] == pytest.approx(0.02 * 0.04, rel=1e-9)
+    assert mesh.notes == ()
+
+
+def test_unknown_groups_of_surfaces_are_listed(write):
+    groups = 'Physical Surface("boss") = {2}; Physical Surface("web") = {1};'
+    mesh = arm_mesh(COMM, entry(write("own.geo", PLAIN + TIP + ENDS + groups)))
+    assert figures(mesh)[2] == 0.0
+    assert len(mesh.notes) == 1
+    assert 'surfaces named "boss", "web" are no group' in mesh.notes[0]
+
+
+def test_unknown_products_are_listed(shared_tmp_path):
+    path = step_file(shared_tmp_path / "arm.step", arm=plate, bush=ring)
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004))
+    assert not mesh.passive.any()
+    assert len(mesh.notes) == 1 and '"arm", "bush"' in mesh.notes[0]
 
 
 def test_passive_cells_lie_within_passive_of_an_interface(write):
@@ -424,6 +448,94 @@ def solid_box(occ):
     occ.synchronize()
 
 
+def chamfered(occ):
+    box = occ.addBox(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT, 0.01)
+    occ.synchronize()
+    edge = occ.getEntitiesInBoundingBox(-1.0, 0.029, 0.009, 1.0, 0.031, 0.011, 1)[0][1]
+    face = occ.getEntitiesInBoundingBox(-1.0, -1.0, 0.009, 1.0, 1.0, 0.011, 2)[0][1]
+    occ.chamfer([box], [edge], [face], [0.002])
+    occ.synchronize()
+
+
+def stepped(occ):
+    low = occ.addBox(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT, 0.01)
+    boss = occ.addBox(0.2, -0.01, 0.0, 0.02, 0.02, 0.02)
+    occ.fuse([(3, low)], [(3, boss)])
+    occ.synchronize()
+
+
+def lifted(make, z, thickness):
+    """Return what makes a solid from z on of the section that `make` makes."""
+
+    def solid(occ):
+        make(occ)
+        faces = occ.getEntities(2)
+        occ.translate(faces, 0.0, 0.0, z)
+        occ.extrude(faces, 0.0, 0.0, thickness)
+        occ.remove(occ.getEntities(2), recursive=False)
+        occ.synchronize()
+
+    return solid
+
+
+@pytest.mark.parametrize("z", [0.0, -0.005, 0.3])
+def test_prismatic_solid_is_taken_by_its_planar_face(shared_tmp_path, z):
+    path = step_file(shared_tmp_path / "arm.step", arm=lifted(plate, z, 0.01))
+    flat = step_file(shared_tmp_path / "flat.step", arm=plate)
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004, thickness=0.01))
+    expected = figures(arm_mesh(COMM, entry(flat, mesh_size=0.004)))
+    np.testing.assert_allclose(figures(mesh), expected, rtol=0.02)  # another triangulation
+    nodes = facet_nodes(mesh, mesh.inboard_facets)
+    assert np.abs(np.linalg.norm(nodes, axis=1) - 0.013).max() < 1e-9
+    assert np.abs(mesh.mesh.geometry.x[:, 2]).max() == 0.0
+
+
+def test_solids_side_by_side(shared_tmp_path):
+    path = step_file(
+        shared_tmp_path / "arm.step", arm=lifted(plate, 0.1, 0.01), passive2=lifted(ring, 0.1, 0.01)
+    )
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004, thickness=0.01))
+    assert np.array_equal(mesh.passive, np.linalg.norm(mesh.centroid, axis=1) < 0.0129)
+    assert COMM.allreduce(int(mesh.passive.sum())) >= 10
+
+
+@pytest.mark.parametrize(
+    ("make", "keys", "reason"),
+    [
+        (solid_box, {"thickness": 0.02}, "0.01 m thick along z, expected arms.thickness = 0.02 m"),
+        (solid_box, {"thickness": 1e-5}, "lengths are in metres, these look like millimetres"),
+        (chamfered, {"thickness": 0.01}, "is neither normal to z nor along it; expected a section"),
+        (stepped, {"thickness": 0.02}, "a solid with a step at z = 0.01 m between its end faces"),
+    ],
+)
+def test_solids_that_cannot_be_an_arm(shared_tmp_path, make, keys, reason):
+    path = step_file(shared_tmp_path / "arm.step", arm=make)
+    assert reason in message(path, **keys)
+
+
+INCHES = [k / 16.0 for k in range(1, 17)]
+
+
+@pytest.mark.parametrize("x", [0.0, 0.1])
+def test_bores_of_any_radius_are_interfaces(x):
+    """Also where rounding of an arc's points puts its two halves on either side of a border."""
+    radii = [0.5 * 0.0254 * inch for inch in INCHES] + [1e-3 * k for k in range(2, 16)]
+    radii += [0.0254 * k / 64.0 for k in range(5, 20)]
+    for radius in radii:
+        with gmsh_on_root(COMM) as gmsh:
+            if COMM.rank > 0:
+                continue
+            occ = gmsh.model.occ
+            centre = occ.addPoint(x, 0.0, 0.0)
+            ring = [occ.addPoint(x + s * radius, t * radius, 0.0) for s, t in QUARTERS]
+            arcs = [occ.addCircleArc(ring[k - 1], centre, ring[k]) for k in range(4)]
+            occ.synchronize()
+            assert sorted(_joint_curves(gmsh.model, x, 0.1)) == sorted(arcs), radius
+
+
+QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
+
 def outline(occ):
     occ.addCircle(0.0, 0.0, 0.0, BORE)
     occ.synchronize()
@@ -431,7 +543,6 @@ def outline(occ):
 
 def test_step_files_that_cannot_be_an_arm(shared_tmp_path, write):
     path = shared_tmp_path / "arm.step"
-    assert "a solid body; export the planar face" in message(step_file(path, box=solid_box))
     assert "it holds no face" in message(step_file(path, line=outline))
     assert "no interface at (0.4, 0) m: expected a circular" in message(
         step_file(path, arm=plate), length=0.4
@@ -495,3 +606,116 @@ def test_a_refused_file_does_not_reach_the_next(write):
     alone = figures(arm_mesh(COMM, entry(path)))
     assert "'bar'" in message(write("bad.geo", "foo bar;\nPoint(1) = {1, 2, 3};\n" + PLAIN))
     assert np.array_equal(figures(arm_mesh(COMM, entry(path))), alone)
+
+
+def fan(turns, count=12):
+    """Return triangles about the origin through so many turns, neighbours sharing a side."""
+    angle = np.linspace(0.0, 2.0 * np.pi * turns, count + 1)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count + 1)], axis=1)
+    cells = np.array([[0, k, k + 1] for k in range(1, count + 1)])
+    return np.concatenate([np.zeros((1, 3)), rim]), cells
+
+
+def grid(along=6, across=3):
+    """Return points (n, 3) and quadrilaterals of a grid of unit cells."""
+    x, y = np.meshgrid(np.arange(along + 1.0), np.arange(across + 1.0))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    first = (np.arange(across)[:, None] * (along + 1) + np.arange(along)).ravel()
+    return points, np.stack([first, first + 1, first + along + 2, first + along + 1], axis=1)
+
+
+def horseshoe(turn):
+    """Return a strip of unit width bent round by so many turns: beyond one it meets itself."""
+    points, cells = grid(40, 1)
+    angle = 2.0 * np.pi * turn * points[:, 0] / 40.0
+    radius = 4.0 + points[:, 1]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1), cells
+
+
+def check_cells(points, cells):
+    geometry._check_cells(FlatMesh(points, cells, cells[:1, :2], cells[:1, :2]))
+
+
+def pushed():
+    """Return triangles with an inner point beyond its neighbours."""
+    points, quads = grid()
+    cells = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    points[8] += [1.3, 0.2, 0.0]
+    return points, cells
+
+
+def mirrored():
+    """Return a grid of cells the last column of which is folded back onto the one before."""
+    points, cells = grid()
+    points[points[:, 0] == 6.0, 0] = 4.0
+    return points, cells
+
+
+def doubled():
+    """Return a grid and a moved copy of one of its cells, which shares a point with it."""
+    points, cells = grid()
+    copies = points[cells[7]] + [0.01, 0.013, 0.0]
+    new = len(points) + np.arange(4)
+    points = np.concatenate([points, copies])
+    new[2] = cells[7, 2]
+    return points, np.concatenate([cells, [new]])
+
+
+@pytest.mark.parametrize(
+    ("made", "overlaps"),
+    [
+        (grid(), False),
+        (fan(0.9), False),
+        (fan(1.1), True),
+        (horseshoe(0.95), False),
+        (horseshoe(1.02), True),
+        (pushed(), True),
+        (mirrored(), True),
+        (doubled(), True),
+    ],
+    ids=["grid", "fan", "fan-1.1", "horseshoe", "horseshoe-1.02", "pushed", "mirrored", "doubled"],
+)
+def test_overlapping_cells_are_refused(made, overlaps):
+    if not overlaps:
+        check_cells(*made)
+        return
+    with pytest.raises(InputError, match=r"\d+ cells overlap others, the first at \("):
+        check_cells(*made)
+
+
+def test_inverted_cells_of_a_mesh_file(shared_tmp_path):
+    """The mesh that was accepted with too much mass: one node moved across its neighbours."""
+    design = 'Physical Surface("design") = {1};'
+
+    def push(gmsh):
+        gmsh.model.mesh.generate(2)
+        tags, points, _ = gmsh.model.mesh.getNodes(2, 1)
+        gmsh.model.mesh.setNode(int(tags[0]), [points[0] + 0.045, points[1], 0.0], [])
+
+    path = remade(shared_tmp_path / "pushed.msh", PLAIN + ENDS + design, push)
+    assert re.search(r"\d+ cells (overlap|are folded)", message(path))
+
+
+# --- whose fault it is -----------------------------------------------------------------------
+
+
+def test_errors_of_the_program_are_not_the_users(write, monkeypatch):
+    path = write("own.geo", PLAIN + ENDS)
+
+    def broken(*_):
+        raise ZeroDivisionError("a mistake in here")
+
+    monkeypatch.setattr(geometry, "flatten", broken)
+    with gmsh_on_root(COMM) as gmsh:
+        if COMM.rank == 0:
+            with pytest.raises(ZeroDivisionError):
+                geometry.build_model(gmsh, entry(path))
+
+
+@pytest.mark.serial
+def test_truncated_step_file_leaves_the_terminal_alone(shared_tmp_path, capfd):
+    path = step_file(shared_tmp_path / "arm.step", arm=plate)
+    path.write_text(path.read_text()[:3000])
+    capfd.readouterr()
+    message(path)
+    assert capfd.readouterr() == ("", "")
