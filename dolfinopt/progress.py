@@ -1,17 +1,59 @@
-"""How far an optimisation is: a live line on a terminal, a line every few seconds elsewhere."""
+"""How far an optimisation is: a live line on a terminal, a line every few seconds elsewhere.
+
+Other work that takes long is logged, see `SlowWork`.
+"""
 
 from __future__ import annotations
 
+import logging
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from dolfinopt.files import HistoryRow
+if TYPE_CHECKING:
+    from dolfinopt.files import HistoryRow
 
 WIDE = 110  # characters a line
 EVERY = 5.0  # s between two lines where there is no terminal
+SILENT = 3.0  # s that work takes without a line, and between two lines of it
+log = logging.getLogger(__name__)
+
+
+class SlowWork:
+    """Tells how far some work is once it takes longer than a few seconds.
+
+    The lines go to the logger `dolfinopt.progress`, level INFO; the command line shows them.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Take what is done, and start the clock."""
+        self._name = name
+        self._begun = self._told = time.perf_counter()
+
+    def tell(self, how_far: str) -> None:
+        """Log a line, unless the work has just begun or one was logged just now."""
+        now = time.perf_counter()
+        if now - self._told >= SILENT:
+            self._told = now
+            log.info("%s: %s, %.0f s", self._name, how_far, now - self._begun)
+
+
+class _Lines(logging.Handler):
+    """Writes to what is the standard error when a line comes."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"dolfinopt: {record.getMessage()}", file=sys.stderr, flush=True)
+
+
+def show_slow_work() -> None:
+    """Write the lines of slow work to the standard error, once however often it is called."""
+    if not any(isinstance(handler, _Lines) for handler in log.handlers):
+        log.addHandler(_Lines())
+    log.propagate = False
+    log.setLevel(logging.INFO)
 
 
 def _words(row: HistoryRow, iterations: int) -> str:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
+from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
+import dolfinopt as do
 from dolfinopt.body import FloatingBody
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import factors, generalized_alpha, radau
@@ -506,6 +509,52 @@ def test_failures_on_any_grid_are_a_named_error(
     monkeypatch.setattr(radau, "_on_grid", poor)
     with pytest.raises(ConvergenceError, match="stiffen the arms"):
         solve("radau", problem, 1e-2)
+
+
+@pytest.mark.parametrize("stages", [2, 3, 4])
+def test_motion_that_every_grid_finds_otherwise_is_given_up(
+    monkeypatch: pytest.MonkeyPatch, stages: int
+) -> None:
+    """Undamped vibrations that feed on themselves: two grids are enough to tell, and few sweeps."""
+    scene = do.load_scene(
+        Path(__file__).parents[1] / "demos" / "two_arm.toml",
+        (
+            "arms.cells=[40,4]",
+            "payload.mass=11.2",
+            "motion.duration=0.87",
+            "motion.flattening=0.46",
+            "damping.stiffness_proportional=0",
+            "reduction.coordinates=9",
+            "simulation.tolerance=1e-2",
+            f"simulation.stages={stages}",
+        ),
+    )
+    ledger = Ledger()
+    share = do.share_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = do.build_arms(scene, share, ledger)
+    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
+    grids, work, told = [], [], []
+    on_grid, newton = radau._on_grid, radau._newton
+
+    def seen_grid(modes, edges, *others):  # type: ignore[no-untyped-def]
+        grids.append(len(edges) - 1)
+        return on_grid(modes, edges, *others)
+
+    def seen_newton(stages, *others):  # type: ignore[no-untyped-def]
+        found = newton(stages, *others)
+        work.append(found[1] * len(stages.h))
+        return found
+
+    monkeypatch.setattr(radau, "_on_grid", seen_grid)
+    monkeypatch.setattr(radau, "_newton", seen_newton)
+    monkeypatch.setattr("dolfinopt.progress.SILENT", 0.0)
+    monkeypatch.setattr("dolfinopt.progress.log.info", lambda *words: told.append(words))
+    remedy = r"beyond small-deflection theory.*material\.young_modulus.*motion\.duration"
+    with pytest.raises(ConvergenceError, match=remedy):
+        do.evaluate(scene, share, arms, x, ledger)
+    assert len(grids) == 2
+    assert sum(work) <= radau.MAX_SWEEPS * sum(grids)
+    assert len(told) >= 2
 
 
 @BOTH

@@ -32,8 +32,10 @@ def main() -> None:
     from mpi4py import MPI
 
     from dolfinopt.parallel import one_ending
+    from dolfinopt.progress import show_slow_work
 
     world = MPI.COMM_WORLD
+    show_slow_work()
     with one_ending(world):
         try:
             commands.main(

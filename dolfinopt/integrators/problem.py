@@ -42,6 +42,8 @@ class Solution:
         a: (n, s, N) accelerations at the nodes.
         error: estimated relative error of the elastic coordinates.
         iterations: Newton iterations spent.
+        windows: runs of steps that were solved one after the other; 1 where Newton's method
+            converged over all steps at once.
     """
 
     edges: np.ndarray
@@ -51,6 +53,7 @@ class Solution:
     a: np.ndarray
     error: float
     iterations: int
+    windows: int = 1
 
     def sample(self, t: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Return q, qd or qdd (n, N), by order of `derivative`, at instants t (n,) s."""
