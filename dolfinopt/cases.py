@@ -17,7 +17,6 @@ import fcntl
 import hashlib
 import json
 import math
-import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -31,8 +30,9 @@ from uuid import uuid4
 import numpy as np
 
 from dolfinopt.board import IDLE, Board, open_board
+from dolfinopt.contents import file_digest, with_digests
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene import FILE_KEYS, Scene
+from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -103,7 +103,7 @@ class Case:
         """What stands for the given design in the key."""
         if isinstance(self.design, Case):
             return self.design.key
-        return "initial" if self.design is None else _file_digest(self.design)
+        return "initial" if self.design is None else file_digest(self.design)
 
     @cached_property
     def arms_key(self) -> str:
@@ -230,35 +230,9 @@ class Outcomes:
 
 def scene_content(scene: Scene) -> dict[str, Any]:
     """Return everything that a scene computes with: its values, and its files' content."""
-    data = scene.to_dict()
+    data = with_digests(scene.to_dict())
     del data["name"]
-    for table, key in FILE_KEYS:
-        rows = data[table] if isinstance(data[table], list) else [data[table]]
-        for row in rows:
-            if row[key] is not None:
-                row[key] = _file_digest(Path(row[key]))
     return data
-
-
-def _file_digest(path: Path) -> str:
-    """Hash a file's content, and that of the files which a .geo merges or includes."""
-    known: dict[Path, str] = {}
-
-    def take(path: Path, asked: bool) -> None:
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            if asked:
-                raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-            return  # Gmsh will say so
-        known[path] = hashlib.sha256(content).hexdigest()
-        if path.suffix.lower() == ".geo":
-            for name in re.findall(r'(?:Merge|Include)\s*\(?\s*"([^"]+)"', content.decode()):
-                if path.parent / name not in known:
-                    take(path.parent / name, False)
-
-    take(path, True)
-    return _digest(list(known.values()))
 
 
 def _digest(content: Any) -> str:

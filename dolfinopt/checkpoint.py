@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.contents import DIGEST, with_digests
 from dolfinopt.coordinates import Choice
 from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
@@ -59,7 +60,8 @@ class Memory:
 
 
 def _scene_text(scene: Scene) -> str:
-    return json.dumps(scene.to_dict(), sort_keys=True)
+    """Return the scene as JSON; its files by their content, so that a project can be moved."""
+    return json.dumps(with_digests(scene.to_dict()), sort_keys=True)
 
 
 def begin(folder: Path, scene: Scene) -> None:
@@ -222,4 +224,8 @@ def _difference(theirs: Any, ours: Any, key: str = "") -> str:
             if found:
                 return found
         return ""
-    return "" if theirs == ours else f"{key} = {theirs!r} there, {ours!r} here"
+    if theirs == ours:
+        return ""
+    if all(isinstance(one, str) and one.startswith(DIGEST) for one in (theirs, ours)):
+        return f"the content of the file {key} has changed"
+    return f"{key} = {theirs!r} there, {ours!r} here"

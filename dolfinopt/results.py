@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.contents import named_files, with_relative_paths
 from dolfinopt.coordinates import Choice
 from dolfinopt.evaluation import Evaluation
 from dolfinopt.files import (
@@ -148,5 +149,8 @@ def _write(
         del summary["seconds"]["total"]  # stands last
         summary["seconds"]["pictures"] = time.perf_counter() - since
     summary["seconds"]["total"] = time.perf_counter() - begun
+    named = named_files(summary["scene"])
+    summary["files"] = {name: row[key] for name, row, key in named}
+    summary["scene"] = with_relative_paths(summary["scene"], folder)
     write_summary(folder, summary)
     return Written(views, summary)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -170,6 +171,41 @@ def test_plot_draws_anew(optimised):
     run("plot", optimised)
     WORLD.barrier()
     assert (optimised / "design.png").read_bytes() == before
+
+
+@pytest.mark.serial
+def test_a_project_can_be_moved(tmp_path):
+    """Scene, mesh and run folder together: it resumes and draws; another mesh is refused."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    shutil.copy(ROOT / "meshes" / "arm_bores.geo", there / "own.geo")
+    text = (ROOT / "demos" / "two_arm_bores.toml").read_text()
+    text = re.sub(r'mesh = ".*?"', 'mesh = "own.geo"', text)
+    (there / "scene.toml").write_text(text)
+    small = ["--set", "arms.mesh_size=0.02", "--set", "simulation.sample=0.005", "--no-plots"]
+    done = shell("optimize", there / "scene.toml", *small, "--out", there / "results" / "run",
+                 "--set", "optimizer.max_iterations=1")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for file in (there / "results" / "run" / "summary.json", there / "results/run/checkpoint.npz"):
+        assert file.is_file()
+    shutil.copytree(there, here)
+    shutil.rmtree(there)
+    resume = ["optimize", here / "scene.toml", *small, "--out", here / "results" / "run",
+              "--resume", "--set", "optimizer.max_iterations=2"]  # fmt: skip
+    done = shell(*resume)
+    assert done.returncode == 0, done.stderr
+    assert len((here / "results" / "run" / "history.csv").read_text().splitlines()) == 4
+    summary = json.loads((here / "results" / "run" / "summary.json").read_text())
+    assert summary["scene"]["arms"][0]["mesh"] == "../../own.geo"
+    assert shell("plot", here / "results" / "run").returncode == 0
+    # The run's folder alone finds the mesh where it was.
+    shutil.copytree(here / "results" / "run", tmp_path / "elsewhere" / "deep" / "run")
+    assert shell("plot", tmp_path / "elsewhere" / "deep" / "run").returncode == 0
+    with open(here / "own.geo", "a") as stream:
+        stream.write("// another\n")
+    done = shell(*resume)
+    assert done.returncode == 2
+    assert "the content of the file arms.0.mesh has changed" in done.stderr
 
 
 # -- bad input -------------------------------------------------------------------------------

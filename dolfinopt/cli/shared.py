@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dolfinopt.contents import found_again
 from dolfinopt.errors import InputError
 from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene, load_scene, scene_from_dict
@@ -79,7 +80,7 @@ def scene_of(folder: Path) -> Scene:
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-        data = summary["scene"]
+        data = found_again(summary["scene"], folder, summary.get("files", {}))
         if data["reduction"]["coordinates"] == "auto":
             data["reduction"]["coordinates"] = summary["reduction"]["coordinates"]
             del data["reduction"]["tolerance"]
