@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt import scene as scenes
-from dolfinopt.body import FloatingBody, floating_body, rigid_bar
+from dolfinopt.body import ShapeIntegrals, rigid_bar, shape_integrals
 from dolfinopt.elasticity import ElasticArm, element_operators
 from dolfinopt.errors import InputError
 from dolfinopt.filters import HelmholtzFilter
@@ -88,7 +88,7 @@ class Arm:
         self.basis: Basis | None = None
         self.start: np.ndarray | None = None
         self.loaded_starts: dict[int, np.ndarray] = {}
-        self._body: FloatingBody | None = None
+        self._body: ShapeIntegrals | None = None
         self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
         self._x_phys = np.empty(0)
         self._material: Interpolated | None = None
@@ -186,7 +186,7 @@ class Arm:
         self.basis = self._body = None
         self._loaded = {}
 
-    def reduce(self, x_phys: np.ndarray) -> FloatingBody:
+    def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
         """Return the floating body of physical densities in [0, 1] (collective on the arm).
 
         The modes found before are where the search for the new ones starts. Nothing is done
@@ -201,7 +201,7 @@ class Arm:
         self.start = self.basis.start
         with self.ledger.phase("inertia integrals"):
             damping = self.scene.damping.stiffness_proportional
-            self._body = floating_body(self.elastic, self.basis, damping)
+            self._body = shape_integrals(self.elastic, self.basis, damping)
         return self._body
 
     def take(self, coordinates: int) -> None:
@@ -233,7 +233,7 @@ class Arm:
             other.basis = other._body = other.start = None
         elif old.damping != new.damping:
             damping = scene.damping.stiffness_proportional
-            other._body = floating_body(other.elastic, self.basis, damping)
+            other._body = shape_integrals(other.elastic, self.basis, damping)
         return other
 
     def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
@@ -349,7 +349,7 @@ def _check_solid(scene: scenes.Scene, share: ArmShare, arms: Mapping[int, Arm]) 
             )
 
 
-def chain_of(scene: scenes.Scene, owned: Mapping[int, FloatingBody]) -> list[FloatingBody]:
+def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[ShapeIntegrals]:
     """Return the bodies from the cart outwards.
 
     Args:
@@ -363,12 +363,12 @@ def chain_of(scene: scenes.Scene, owned: Mapping[int, FloatingBody]) -> list[Flo
 
 
 @cache
-def _read_body(sid: str, changed: int, length: float) -> FloatingBody:
+def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
     """Read a body once for every state of its file: 4 ms, as long as the rest of an evaluation."""
     return load_body(Path(sid), length)
 
 
-def fixed_body(scene: scenes.Scene, index: int) -> FloatingBody:
+def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     """Return the body of an arm that is not designed here: rigid, or from a file."""
     arm = scene.arms[index]
     if arm.sid is not None:

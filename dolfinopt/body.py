@@ -1,9 +1,22 @@
-"""The inertia shape integrals (standard input data) of one flexible arm in planar motion."""
+"""The inertia shape integrals (standard input data) of one flexible body, in the plane or in space.
+
+With reference positions X and modes Phi of d components the point p of a body is p = N eta with
+N = [X, Phi_1 ... Phi_q] and eta = (1, q). All that its inertia needs are integrals over the mass
+
+    m = int 1,   w_a = int N_a,   W_c = int N' E_c N
+
+with the matrices E_c that a frame's angular velocity and acceleration are made of: the identity and
+the rotation by 90 degrees in the plane, the nine units in space. What every integral is multiplied
+by in a denser, stiffer or more damped material, and which of its axes run over the coordinates,
+stands beside it in one table: scaling, change of basis, addition and gradients follow from it.
+Source: Wallrapp (1994), doi:10.1080/08905459408905214; Schwertassek & Wallrapp (1999).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,49 +24,226 @@ if TYPE_CHECKING:
     from dolfinopt.elasticity import ElasticArm
     from dolfinopt.reduction import Basis
 
+# E_c of plane motion: A = wd S - w^2 I, and twice Omega = 2 w S.
+PLANE = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]]])
+# E_ab has a one at (a, b): W_ab = int N_a' N_b.
+SPACE = np.eye(9).reshape(9, 3, 3)
+
+
+@dataclass(frozen=True)
+class Integral:
+    """What one field of `ShapeIntegrals` is.
+
+    Attributes:
+        name: of the field.
+        scale: "mass", "stiffness" or "damping", which it is proportional to; None: geometry.
+        modes: axes that run over the q coordinates.
+        rigid: those axes have 1 + q entries, the first one for the reference position.
+    """
+
+    name: str
+    scale: str | None = None
+    modes: tuple[int, ...] = ()
+    rigid: bool = False
+
+
+# A further integral is a field of `ShapeIntegrals` and a line here.
+TABLE = (
+    Integral("mass", "mass"),
+    Integral("w", "mass", modes=(1,), rigid=True),
+    Integral("W", "mass", modes=(1, 2), rigid=True),
+    Integral("K", "stiffness", modes=(0, 1)),
+    Integral("D", "damping", modes=(0, 1)),
+    Integral("outboard", modes=(1,)),
+    Integral("outboard_point"),
+)
+
 
 @dataclass(frozen=True, eq=False)
-class FloatingBody:
-    """One arm reduced to q elastic coordinates in its tangent frame at the inboard joint.
+class ShapeIntegrals:
+    """One body reduced to q elastic coordinates in its tangent frame at the inboard joint.
 
-    With reference positions X, modes Phi and S = [[0, -1], [1, 0]]; all integrals over the mass.
-    Source: Wallrapp (1994), doi:10.1080/08905459408905214; Schwertassek & Wallrapp (1999).
+    d is 2 and g, the number of E_c, 2 in the plane; 3 and 9 in space. The derivatives of a scalar
+    by these integrals are kept in the same form (`Mechanism`'s adjoint): entry by entry, so that
+    the sum of products with a change of the integrals is the change of the scalar.
 
     Attributes:
         mass: m, kg.
-        moment: (2,) c = int X, kg m.
-        inertia: J = int X . X, kg m2.
-        C: (2, q) int Phi.
-        j: (q,) int X . Phi_k.
-        r: (q,) int (S X) . Phi_k.
-        M: (q, q) int Phi_k . Phi_l.
-        G: (q, q) int Phi_k . (S Phi_l), skew.
+        w: (d, 1 + q) int N_a; kg m for X in m.
+        W: (g, 1 + q, 1 + q) int N' E_c N; kg m2.
         K: (q, q) stiffness Phi' K Phi.
         D: (q, q) damping.
-        outboard: (3, q) u_x, u_y, theta of the outboard interface in each mode.
-        outboard_point: (2,) its reference position, m.
+        outboard: (3, q) in the plane, (6, q) in space: displacement and rotation of the outboard
+            interface in each mode.
+        outboard_point: (d,) its reference position, m.
     """
 
     mass: float
-    moment: np.ndarray
-    inertia: float
-    C: np.ndarray
-    j: np.ndarray
-    r: np.ndarray
-    M: np.ndarray
-    G: np.ndarray
+    w: np.ndarray
+    W: np.ndarray
     K: np.ndarray
     D: np.ndarray
     outboard: np.ndarray
     outboard_point: np.ndarray
 
     @property
-    def coordinates(self) -> int:
+    def num_modes(self) -> int:
         """Number q of elastic coordinates."""
         return len(self.K)
 
+    def __add__(self, other: ShapeIntegrals) -> ShapeIntegrals:
+        """Return the sum of derivatives, integral by integral."""
+        return ShapeIntegrals(*(getattr(self, i.name) + getattr(other, i.name) for i in TABLE))
 
-def floating_body(arm: ElasticArm, basis: Basis, stiffness_proportional: float) -> FloatingBody:
+    # -- as the equations of plane motion name them ----------------------------------------------
+
+    @cached_property
+    def moment(self) -> np.ndarray:
+        """First moment c = int X (d,), kg m."""
+        return self.w[:, 0]
+
+    @cached_property
+    def C(self) -> np.ndarray:
+        """Int Phi (d, q)."""
+        return self.w[:, 1:]
+
+    @cached_property
+    def inertia(self) -> float:
+        """J = int X . X, kg m2; plane bodies."""
+        return float(self.W[0, 0, 0])
+
+    @cached_property
+    def j(self) -> np.ndarray:
+        """Int X . Phi_k (q,); plane bodies."""
+        return self.W[0, 0, 1:]
+
+    @cached_property
+    def r(self) -> np.ndarray:
+        """Int (S X) . Phi_k (q,); plane bodies."""
+        return self.W[1, 1:, 0]
+
+    @cached_property
+    def M(self) -> np.ndarray:
+        """Int Phi_k . Phi_l (q, q); plane bodies."""
+        return self.W[0, 1:, 1:]
+
+    @cached_property
+    def G(self) -> np.ndarray:
+        """Int Phi_k . (S Phi_l) (q, q), skew; plane bodies."""
+        return self.W[1, 1:, 1:]
+
+
+def plane_body(
+    mass: float,
+    moment: np.ndarray,
+    inertia: float,
+    C: np.ndarray,
+    j: np.ndarray,
+    r: np.ndarray,
+    M: np.ndarray,
+    G: np.ndarray,
+    K: np.ndarray,
+    D: np.ndarray,
+    outboard: np.ndarray,
+    outboard_point: np.ndarray,
+) -> ShapeIntegrals:
+    """Return a plane body from its integrals by name, see `ShapeIntegrals`."""
+    q = len(K)
+    W = np.zeros((2, 1 + q, 1 + q))
+    W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
+    W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
+    w = np.column_stack([moment, C])
+    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point)
+
+
+# -- what follows from the table -------------------------------------------------------------
+
+
+def scaled(body: ShapeIntegrals, mass: float, stiffness: float, damping: float) -> ShapeIntegrals:
+    """Return a body (or derivatives) with every integral times the factor of its kind."""
+    factors = {"mass": mass, "stiffness": stiffness, "damping": damping}
+    changed = {i.name: factors[i.scale] * getattr(body, i.name) for i in TABLE if i.scale}
+    return replace(body, **changed)
+
+
+def of_material(
+    body: ShapeIntegrals, mass: float, stiffness: float, damping: float
+) -> ShapeIntegrals:
+    """Return the body of a denser, stiffer material.
+
+    Args:
+        body: reduced; its basis is that of the other material, too.
+        mass, stiffness: factors.
+        damping: beta in D = beta K of the result, s.
+    """
+    other = scaled(body, mass, stiffness, 1.0)
+    return replace(other, D=damping * other.K)
+
+
+def in_basis(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
+    """Return the body in the coordinates z with q = T z; T is (q, q')."""
+    rigid = np.eye(1 + len(T), 1 + T.shape[1])
+    rigid[1:, 1:] = T
+    changed: dict[str, Any] = {}
+    for one in TABLE:
+        if one.modes:
+            value, matrix = getattr(body, one.name), rigid if one.rigid else T
+            for axis in one.modes:
+                value = np.moveaxis(np.moveaxis(value, axis, -1) @ matrix, -1, axis)
+            changed[one.name] = np.ascontiguousarray(value)
+    return replace(body, **changed)
+
+
+def proportional(
+    body: ShapeIntegrals, other: ShapeIntegrals, scale: str
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the integrals of both that `scale` multiplies, as arrays."""
+    names = [one.name for one in TABLE if one.scale == scale]
+    here, there = ([np.asarray(getattr(x, name)) for name in names] for x in (body, other))
+    return here, there
+
+
+def same_geometry(body: ShapeIntegrals, other: ShapeIntegrals) -> bool:
+    """Return whether number of coordinates, outboard modes and point are equal."""
+    names = [one.name for one in TABLE if one.scale is None]
+    return body.num_modes == other.num_modes and all(
+        np.array_equal(getattr(body, name), getattr(other, name)) for name in names
+    )
+
+
+# -- from finite elements --------------------------------------------------------------------
+
+
+def augmented(points: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """Return the nodal fields N = [X, V] (n_nodes, d, 1 + q)."""
+    return np.concatenate([points[:, :, None], V], axis=2)
+
+
+def generators(dimension: int) -> np.ndarray:
+    """Return the matrices E_c (g, d, d) of the plane or of space."""
+    return PLANE if dimension == 2 else SPACE
+
+
+def second_moments(E: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return sum over the nodes of left' E_c right (g, k, l).
+
+    Args:
+        E: (g, d, d).
+        left: (n_nodes, d, k).
+        right: (n_nodes, d, l).
+    """
+    flat = left.reshape(-1, left.shape[2]).T
+    turned = np.einsum("cab,nbl->cnal", E, right)
+    return flat @ turned.reshape(len(E), -1, right.shape[2])
+
+
+def _without_rounding(E: np.ndarray, W: np.ndarray) -> np.ndarray:
+    """Return W with W_c' = int N' E_c' N exactly: symmetric and skew parts where E_c is so."""
+    partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
+    return 0.5 * (W + np.tensordot(partners, W.swapaxes(1, 2), 1))
+
+
+def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float) -> ShapeIntegrals:
     """Integrate the body's inertia over its current design (collective on the arm's ranks).
 
     Args:
@@ -61,40 +251,19 @@ def floating_body(arm: ElasticArm, basis: Basis, stiffness_proportional: float) 
         basis: of that design.
         stiffness_proportional: beta in D = beta K, s.
     """
-    V, MV = basis.V, basis.MV
-    q = V.shape[2]
-    X = arm.points
-    SX = np.stack([-X[:, 1], X[:, 0]], axis=1)
+    X, N = arm.points, augmented(arm.points, basis.V)
+    E = generators(X.shape[1])
     rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))  # M [1, X], per component
-    ones, positions = rigid[:, :, 0], rigid[:, :, 1]
-    flat = V.reshape(-1, q)
-    rotated = np.stack([-V[:, 1], V[:, 0]], axis=1).reshape(-1, q)  # S Phi
-    # One reduction for all integrals.
-    parts = (
-        ones[:, 0].sum(),
-        positions.sum(axis=0),
-        np.sum(X * positions),
-        MV.sum(axis=0),
-        np.einsum("ni,nik->k", X, MV),
-        np.einsum("ni,nik->k", SX, MV),
-        MV.reshape(-1, q).T @ flat,
-        MV.reshape(-1, q).T @ rotated,
-    )
+    MN = np.concatenate([rigid[:, :, 1:], basis.MV], axis=2)
+    parts = rigid[:, 0, 0].sum(), MN.sum(axis=0), second_moments(E, MN, N)
     packed = np.concatenate([np.ravel(part) for part in parts])
-    if arm.comm.size > 1:
+    if arm.comm.size > 1:  # one reduction for all integrals
         packed = arm.comm.allreduce(packed)
-    splits = np.cumsum([np.size(part) for part in parts])[:-1]
-    m, c, J, C, j, r, M, G = np.split(packed, splits)
-    M, G = M.reshape(q, q), G.reshape(q, q)
-    return FloatingBody(
-        mass=float(m[0]),
-        moment=c,
-        inertia=float(J[0]),
-        C=C.reshape(2, q),
-        j=j,
-        r=r,
-        M=0.5 * (M + M.T),
-        G=0.5 * (G - G.T),
+    mass, w, W = np.split(packed, np.cumsum([np.size(part) for part in parts])[:-1])
+    return ShapeIntegrals(
+        mass=float(mass[0]),
+        w=w.reshape(parts[1].shape),
+        W=_without_rounding(E, W.reshape(parts[2].shape)),
         K=basis.stiffness,
         D=stiffness_proportional * basis.stiffness,
         outboard=basis.outboard,
@@ -102,53 +271,77 @@ def floating_body(arm: ElasticArm, basis: Basis, stiffness_proportional: float) 
     )
 
 
-def rigid_bar(length: float, height: float, thickness: float, density: float) -> FloatingBody:
-    """Return a solid bar without elastic coordinates; m, kg/m3."""
-    mass = density * length * height * thickness
-    none, square = np.zeros(0), np.zeros((0, 0))
-    return FloatingBody(
-        mass=mass,
-        moment=np.array([0.5 * mass * length, 0.0]),
-        inertia=mass * (length**2 / 3.0 + height**2 / 12.0),
-        C=np.zeros((2, 0)),
-        j=none,
-        r=none,
-        M=square,
-        G=square,
-        K=square,
-        D=square,
-        outboard=np.zeros((3, 0)),
-        outboard_point=np.array([length, 0.0]),
-    )
+@dataclass(frozen=True, eq=False)
+class MassPartners:
+    """Nodal fields through which a function of the integrals feels the mass matrix; n nodes.
+
+    With dJ = sum_k left_k . dM right_k and, by the modes, dJ = sum_k (M by_modes)_k . dV_k.
+
+    Attributes:
+        left, right: (n, d, 2 + q).
+        by_modes: (n, d, q).
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    by_modes: np.ndarray
 
 
-def scaled(body: FloatingBody, mass: float, stiffness: float, damping: float) -> FloatingBody:
-    """Return the body of a denser, stiffer material: all its integrals are linear in them.
+def mass_partners(points: np.ndarray, V: np.ndarray, by: ShapeIntegrals) -> MassPartners:
+    """Return the fields that carry derivatives by the integrals to the mass of the cells.
+
+    Of sum_c Wbar_c,kl int N_k . E_c N_l the left factor is Y_l = sum_c,k E_c' N_k Wbar_c,kl.
 
     Args:
-        body: reduced; its basis is that of the other material, too.
-        mass, stiffness: factors.
-        damping: beta in D = beta K of the result, s.
+        points: (n, d) nodes, m.
+        V: (n, d, q) modes.
+        by: derivatives by the integrals.
     """
-    K = stiffness * body.K
-    return replace(
-        body,
-        mass=mass * body.mass,
-        moment=mass * body.moment,
-        inertia=mass * body.inertia,
-        C=mass * body.C,
-        j=mass * body.j,
-        r=mass * body.r,
-        M=mass * body.M,
-        G=mass * body.G,
-        K=K,
-        D=damping * K,
+    N, E = augmented(points, V), generators(points.shape[1])
+    unit = np.zeros_like(N[:, :, :1])
+    unit[:, 0] = 1.0  # m = int 1_x . 1_x
+    quadratic = np.einsum("cab,nak,ckl->nbl", E, N, by.W, optimize=True)
+    transposed = np.einsum("cab,nbk,clk->nal", E, N, by.W, optimize=True)
+    left = np.concatenate([quadratic + by.w, by.mass * unit], axis=2)
+    return MassPartners(
+        left=left,
+        right=np.concatenate([N, unit], axis=2),
+        by_modes=(quadratic + transposed + by.w)[:, :, 1:],
     )
 
 
-def first_frequency(body: FloatingBody) -> float:
+# -- single bodies ---------------------------------------------------------------------------
+
+
+def rigid_body(
+    mass: float, moment: np.ndarray, inertia: float, outboard_point: np.ndarray
+) -> ShapeIntegrals:
+    """Return a plane body without elastic coordinates, or the derivatives by one.
+
+    Args:
+        mass: kg.
+        moment: (2,) first moment about the frame's origin, kg m.
+        inertia: about it, kg m2.
+        outboard_point: (2,) m.
+    """
+    none, square = np.zeros(0), np.zeros((0, 0))
+    modes, outboard = np.zeros((2, 0)), np.zeros((3, 0))
+    return plane_body(
+        mass, moment, inertia, modes, none, none, square, square, square, square, outboard,
+        outboard_point,
+    )  # fmt: skip
+
+
+def rigid_bar(length: float, height: float, thickness: float, density: float) -> ShapeIntegrals:
+    """Return a solid bar without elastic coordinates; m, kg/m3."""
+    mass = density * length * height * thickness
+    inertia = mass * (length**2 / 3.0 + height**2 / 12.0)
+    return rigid_body(mass, np.array([0.5 * mass * length, 0.0]), inertia, np.array([length, 0.0]))
+
+
+def first_frequency(body: ShapeIntegrals) -> float:
     """Return the lowest natural frequency of the reduced clamped-free body, Hz; inf if rigid."""
-    if body.coordinates == 0:
+    if body.num_modes == 0:
         return float("inf")
     lower = np.linalg.cholesky(body.M)
     inverse = np.linalg.inv(lower)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arm import chain_of
-from dolfinopt.body import FloatingBody, floating_body
+from dolfinopt.body import ShapeIntegrals, shape_integrals
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.ledger import Ledger
 from dolfinopt.parallel import ArmShare, gather_arms, on_root
@@ -193,7 +193,7 @@ class _Comparison:
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
         beta = self.scenes[0].damping.stiffness_proportional
-        mine = {k: floating_body(self.arms[k].elastic, b, beta) for k, b in bases.items()}
+        mine = {k: shape_integrals(self.arms[k].elastic, b, beta) for k, b in bases.items()}
         owned = gather_arms(self.share, mine)
         kept: list[Trajectory] = []
         on_root(self.share.world, lambda: kept.extend(_simulate(self.scenes, owned, self.ledger)))
@@ -222,7 +222,7 @@ def _leading(basis: Basis, count: int) -> Basis:
 
 
 def _simulate(
-    scenes: Sequence[Scene], owned: Mapping[int, FloatingBody], ledger: Ledger
+    scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals], ledger: Ledger
 ) -> list[Trajectory]:
     """Simulate a scene and its scenarios."""
     scene, *others = scenes

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from dolfinopt.arm import chain_of, fixed_body
-from dolfinopt.body import FloatingBody, first_frequency
+from dolfinopt.body import ShapeIntegrals, first_frequency
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
-from dolfinopt.mechanism import BodySlopes
 from dolfinopt.motion import rigid_motion
 from dolfinopt.objective import (
     body_slopes_of,
@@ -218,7 +217,7 @@ def gradient(
         assert trajectory is not None
         return _by_owner(scene, _frozen_moments(trajectory))
 
-    def slopes() -> dict[int, BodySlopes]:
+    def slopes() -> dict[int, ShapeIntegrals]:
         assert trajectory is not None
         ledger.counts.adjoints += max(1, len(trajectory.scenarios))
         with ledger.phase("adjoint"):
@@ -265,7 +264,9 @@ def constraint_gradients(
 # -- the motion ------------------------------------------------------------------------------
 
 
-def _reduced(share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells) -> Mapping[int, FloatingBody]:
+def _reduced(
+    share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells
+) -> Mapping[int, ShapeIntegrals]:
     """Return the bodies of the arms with a design of their own, on the root (collective)."""
     return gather_arms(share, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
 
@@ -273,7 +274,7 @@ def _reduced(share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells) -> Mapping
 def _moved(
     scenes: Sequence[Scene],
     share: ArmShare,
-    owned: Mapping[int, FloatingBody],
+    owned: Mapping[int, ShapeIntegrals],
     ledger: Ledger,
     starts: Sequence[Sequence[Solution]],
 ) -> list[tuple[Motion | ConvergenceError, Trajectory | None]]:
@@ -301,7 +302,7 @@ def _moved(
 
 def _simulate(
     scenes: Sequence[Scene],
-    owned: Mapping[int, FloatingBody],
+    owned: Mapping[int, ShapeIntegrals],
     ledger: Ledger,
     starts: Sequence[Sequence[Solution]],
 ) -> list[Trajectory | ConvergenceError]:
@@ -374,13 +375,13 @@ def _frozen_moments(trajectory: Trajectory) -> list[np.ndarray]:
     return total
 
 
-def _body_slopes(trajectory: Trajectory) -> list[BodySlopes]:
+def _body_slopes(trajectory: Trajectory) -> list[ShapeIntegrals]:
     """Return `body_slopes_of` every body, of all scenarios together where there are any."""
     scene, others = trajectory.scene, trajectory.scenarios
     if not others:
         return body_slopes_of(trajectory, scene)
     _, weights = combined(scene, [objective(one, one.scene) for one in others])
-    total: list[BodySlopes] = []
+    total: list[ShapeIntegrals] = []
     for weight, one in zip(weights, others, strict=True):
         parts = [
             slopes_back(slopes, factors(scene, one.scene, index), weight)

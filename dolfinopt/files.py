@@ -19,7 +19,7 @@ import numpy as np
 
 from dolfinopt import __version__
 from dolfinopt.arm import fixed_body
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.errors import InputError
 from dolfinopt.parallel import ArmShare, gather_cells, on_root
 from dolfinopt.scene import Scene
@@ -253,7 +253,7 @@ def gather_views(
     return views
 
 
-def _bar_view(name: str, height: float, body: FloatingBody) -> ArmView:
+def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
     """Return a body whose shape is not known as a bar from joint to joint.
 
     Between them it bends like a beam without loads: cubic polynomials that fit the outboard

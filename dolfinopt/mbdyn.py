@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.errors import InputError
 from dolfinopt.standard_input import SpatialMoments
 
@@ -99,7 +99,7 @@ def lumped_nodes(arm: ElasticArm, basis: Basis) -> LumpedNodes | None:
 
 
 def modal_element(
-    body: FloatingBody, moments: SpatialMoments, nodes: LumpedNodes, thickness: float
+    body: ShapeIntegrals, moments: SpatialMoments, nodes: LumpedNodes, thickness: float
 ) -> ModalElement:
     """Return the element: node 1 is the inboard joint, 2 the outboard interface, then the mesh.
 
@@ -112,7 +112,7 @@ def modal_element(
         nodes: the same.
         thickness: t, m.
     """
-    count, q = len(nodes.points) + 2, body.coordinates
+    count, q = len(nodes.points) + 2, body.num_modes
     points, modes, lumped = np.zeros((count, 3)), np.zeros((count, 6, q)), np.zeros((count, 6))
     points[1, :2], points[2:, :2] = body.outboard_point, nodes.points
     modes[1, [0, 1, 5]], modes[2:, :2] = body.outboard, nodes.modes

@@ -8,13 +8,13 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.motion import RigidMotion
 
 # One number, or one at each of the n instants that a function is given.
@@ -52,7 +52,7 @@ class Shapes:
         K, D: (q, q), or their diagonals (q,) where there is nothing else; no D, None.
     """
 
-    body: FloatingBody
+    body: ShapeIntegrals
     c: complex
     C: np.ndarray
     B: np.ndarray
@@ -64,7 +64,7 @@ class Shapes:
     D: np.ndarray | None
 
 
-def _shapes(body: FloatingBody) -> Shapes:
+def _shapes(body: ShapeIntegrals) -> Shapes:
     C, (B_x, B_y, turn) = body.C, body.outboard
     return Shapes(
         body=body,
@@ -106,7 +106,7 @@ class Mechanism:
         scales: of every body's elastic rows, forces and moments, or none.
     """
 
-    bodies: tuple[FloatingBody, ...]
+    bodies: tuple[ShapeIntegrals, ...]
     payload_mass: PerInstant
     payload_inertia: PerInstant
     gravity: tuple[PerInstant, PerInstant]
@@ -116,13 +116,13 @@ class Mechanism:
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Each body's place in the vector of all elastic coordinates."""
-        ends = np.cumsum([0, *(body.coordinates for body in self.bodies)])
+        ends = np.cumsum([0, *(body.num_modes for body in self.bodies)])
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
     @property
     def coordinates(self) -> int:
         """Number N of elastic coordinates of all bodies."""
-        return sum(body.coordinates for body in self.bodies)
+        return sum(body.num_modes for body in self.bodies)
 
     @cached_property
     def shapes(self) -> tuple[Shapes, ...]:
@@ -692,7 +692,9 @@ def end_effector_slopes(
     return by_q, by_outboard
 
 
-def compliance(bodies: Sequence[FloatingBody], parts: Sequence[slice], q: np.ndarray) -> np.ndarray:
+def compliance(
+    bodies: Sequence[ShapeIntegrals], parts: Sequence[slice], q: np.ndarray
+) -> np.ndarray:
     """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper."""
     return np.stack(
         [
@@ -706,6 +708,7 @@ def compliance(bodies: Sequence[FloatingBody], parts: Sequence[slice], q: np.nda
 # -- adjoint ---------------------------------------------------------------------------------
 
 
+<<<<<<< HEAD
 @dataclass(frozen=True, eq=False)
 class BodySlopes:
     """Derivatives of a scalar with respect to one body's constants; shapes as in `FloatingBody`.
@@ -729,6 +732,8 @@ class BodySlopes:
         return BodySlopes(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
+=======
+>>>>>>> 68aaf26 (Shape integrals of any dimension in one table: scaling, change of basis, sums and gradients follow from it)
 def body_slopes(
     mechanism: Mechanism,
     motion: RigidMotion,
@@ -736,7 +741,7 @@ def body_slopes(
     qd: np.ndarray,
     qdd: np.ndarray,
     multipliers: np.ndarray,
-) -> list[BodySlopes]:
+) -> list[ShapeIntegrals]:
     """Return d(sum_n multipliers_n . rows_n) / d(constants) of every body, motion held.
 
     The multipliers are a virtual displacement of the elastic coordinates: the sum is the virtual
@@ -759,7 +764,7 @@ def body_slopes(
         next_a=tip[0],
         next_p=tip_p,
     )
-    slopes: list[BodySlopes] = []
+    slopes: list[ShapeIntegrals] = []
     for k in reversed(range(len(frames))):
         part = mechanism.slices[k]
         rates = (q[:, part], qd[:, part], qdd[:, part])
@@ -833,28 +838,34 @@ def _outboard_slopes(
 
 def _integral_slopes(
     frame: _Frame, rates: _Rates, virtual: _Rates, outboard: np.ndarray
-) -> BodySlopes:
+) -> ShapeIntegrals:
     """Return the slopes of one body's virtual work by its shape integrals."""
-    q, qd, qdd = rates
+    q, qd, _ = rates
     p, turn, multipliers = virtual
-    w, wd = frame.w, frame.wd
-    kappa = 1j * wd - w * w
+    eta, eta_d, eta_dd, virtual_eta = (
+        np.insert(x, 0, first, axis=1)
+        for x, first in zip((*rates, multipliers), (1.0, 0.0, 0.0, 0.0))
+    )
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    radial = eta_dd - w * w * eta  # of a point's acceleration, in N
+    around = wd * eta + 2.0 * w * eta_d  # in S N
+    turned = turn[:, None] * eta
+    kappa = 1j * frame.wd - frame.w * frame.w
     moment = p * np.conj(kappa) - 1j * turn * frame.a
-    by_C = moment @ q + (p * -2j * w) @ qd + p @ qdd + frame.a @ multipliers
-    turned = turn[:, None]
-    return BodySlopes(
+    by_w = moment @ eta + (p * -2j * frame.w) @ eta_d + p @ eta_dd + frame.a @ virtual_eta
+    return ShapeIntegrals(
         mass=float((np.conj(p) * frame.a).real.sum()),
-        moment=np.array([moment.real.sum(), moment.imag.sum()]),
-        inertia=float(wd @ turn),
-        C=np.stack([by_C.real, by_C.imag]),
-        j=(2.0 * turn * wd) @ q + (2.0 * turn * w) @ qd - (w * w) @ multipliers,
-        r=turn @ qdd + wd @ multipliers,
-        M=(turned * (wd[:, None] * q + 2.0 * w[:, None] * qd)).T @ q
-        + multipliers.T @ (qdd - (w * w)[:, None] * q),
-        G=(turned * qdd).T @ q + multipliers.T @ (wd[:, None] * q + 2.0 * w[:, None] * qd),
+        w=np.stack([by_w.real, by_w.imag]),
+        W=np.stack(
+            [
+                virtual_eta.T @ radial + turned.T @ around,
+                virtual_eta.T @ around + (turn[:, None] * radial).T @ eta,
+            ]
+        ),
         K=multipliers.T @ q,
         D=multipliers.T @ qd,
         outboard=outboard,
+        outboard_point=np.zeros(2),
     )
 
 

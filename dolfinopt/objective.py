@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.integrators.adjoint import trajectory_slopes
-from dolfinopt.mechanism import BodySlopes, end_effector_slopes
+from dolfinopt.mechanism import end_effector_slopes
 from dolfinopt.scene import Scene, WorstBy
 from dolfinopt.simulation import Trajectory
 
@@ -89,7 +90,7 @@ def _deviation_norm(
     return float(value), slope[:, None] * e
 
 
-def body_slopes_of(trajectory: Trajectory, scene: Scene) -> list[BodySlopes]:
+def body_slopes_of(trajectory: Trajectory, scene: Scene) -> list[ShapeIntegrals]:
     """Return the objective's exact slopes by the constants of every body.
 
     Its own, with the coordinates held, and the trajectory's, whose coordinates follow. The choice

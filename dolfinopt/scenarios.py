@@ -6,13 +6,12 @@ They all share the reduced bodies: a denser or stiffer material scales their int
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dolfinopt.arm import fixed_body
-from dolfinopt.body import FloatingBody, scaled
-from dolfinopt.mechanism import BodySlopes
+from dolfinopt.body import ShapeIntegrals, of_material, scaled
 from dolfinopt.scene import Scene
 
 # Exponent of the smooth largest of several objectives, unless one is given: 6 % above the largest
@@ -45,7 +44,9 @@ def factors(scene: Scene, other: Scene, index: int) -> Factors:
     )
 
 
-def bodies_in(scene: Scene, other: Scene, owned: Mapping[int, FloatingBody]) -> list[FloatingBody]:
+def bodies_in(
+    scene: Scene, other: Scene, owned: Mapping[int, ShapeIntegrals]
+) -> list[ShapeIntegrals]:
     """Return the bodies from the cart outwards in scenario `other` of `scene`.
 
     Args:
@@ -59,29 +60,18 @@ def bodies_in(scene: Scene, other: Scene, owned: Mapping[int, FloatingBody]) -> 
             bodies.append(fixed_body(other, index))
         else:
             f = factors(scene, other, owner)
-            bodies.append(scaled(owned[owner], f.mass, f.stiffness, f.damping))
+            bodies.append(of_material(owned[owner], f.mass, f.stiffness, f.damping))
     return bodies
 
 
-def slopes_back(slopes: BodySlopes, f: Factors, weight: float) -> BodySlopes:
+def slopes_back(slopes: ShapeIntegrals, f: Factors, weight: float) -> ShapeIntegrals:
     """Return weighted slopes by the scene's body from those by the scenario's, see `scaled`.
 
     Those of D join K's.
     """
-    m = weight * f.mass
-    return BodySlopes(
-        mass=m * slopes.mass,
-        moment=m * slopes.moment,
-        inertia=m * slopes.inertia,
-        C=m * slopes.C,
-        j=m * slopes.j,
-        r=m * slopes.r,
-        M=m * slopes.M,
-        G=m * slopes.G,
-        K=weight * f.stiffness * (slopes.K + f.damping * slopes.D),
-        D=np.zeros_like(slopes.D),
-        outboard=weight * slopes.outboard,
-    )
+    by_K = slopes.K + f.damping * slopes.D
+    back = replace(slopes, K=by_K, D=np.zeros_like(slopes.D), outboard=weight * slopes.outboard)
+    return scaled(back, weight * f.mass, weight * f.stiffness, 1.0)
 
 
 def worst_of(values: Sequence[float], exponent: float = WORST_CASE) -> tuple[float, list[float]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.mechanism import BodySlopes
+from dolfinopt.body import ShapeIntegrals, mass_partners, rigid_body
 from dolfinopt.reduction import METHODS, frame_fields
 from dolfinopt.statics import StaticResponse
 from dolfinopt.vibration import LoadedModes, RigidIntegrals, squared_period
@@ -44,7 +44,7 @@ def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
         return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
 
 
-def exact_gradient(arm: Arm, slopes: BodySlopes) -> np.ndarray:
+def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
     """Return the derivative by x_phys of one arm of a function of its floating body.
 
     Every integral is a product u . M v or u . K v of modes and rigid motions, so its derivative
@@ -63,8 +63,8 @@ def exact_gradient(arm: Arm, slopes: BodySlopes) -> np.ndarray:
         elastic, V = arm.elastic, arm.basis.V
         damping = arm.scene.damping.stiffness_proportional
         by_K = slopes.K + damping * slopes.D
-        Y = _mass_partners(elastic.points, V, slopes)
-        by_V = elastic.mass_times(2.0 * Y.quadratic + Y.linear)
+        partners = mass_partners(elastic.points, V, slopes)
+        by_V = elastic.mass_times(partners.by_modes)
         by_V += elastic.stiffness_times(V @ (by_K + by_K.T))
         interior, outboard = elastic.restrict(by_V)
         method = METHODS[arm.scene.reduction.method]
@@ -73,11 +73,10 @@ def exact_gradient(arm: Arm, slopes: BodySlopes) -> np.ndarray:
             elastic, arm.basis, arm.reduction_options, interior, outboard + slopes.outboard
         )
         energies = elastic.cell_stiffness_products(V @ by_K.T - fields.stiffness, V)
-        masses = elastic.cell_mass_products(Y.quadratic + Y.linear + fields.mass, V)
+        partners.left[:, :, 1:-1] += fields.mass
+        masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        rigid = slopes.mass, slopes.moment, slopes.inertia
-        masses += elastic.cell_mass_products(*_rigid_partners(elastic.points, *rigid))
         slope = arm.solid.young_modulus * arm.material.stiffness_slope * energies
         return slope + arm.solid.density * arm.material.mass_slope * masses
 
@@ -131,9 +130,12 @@ def period_gradient(arm: Arm, modes: LoadedModes, exponent: float, follow: bool)
 def rigid_gradient(arm: Arm, by_rigid: RigidIntegrals) -> np.ndarray:
     """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,)."""
     moment = np.array([by_rigid.moment.real, by_rigid.moment.imag])
-    partners = _rigid_partners(arm.elastic.points, by_rigid.mass, moment, by_rigid.inertia)
-    masses = arm.elastic.cell_mass_products(*partners)
+    points = arm.elastic.points
+    by = rigid_body(by_rigid.mass, moment, by_rigid.inertia, np.zeros(2))
+    partners = mass_partners(points, np.empty((*points.shape, 0)), by)
+    masses = arm.elastic.cell_mass_products(partners.left, partners.right)
     return arm.solid.density * arm.material.mass_slope * masses
+<<<<<<< HEAD
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,3 +171,5 @@ def _rigid_partners(
     first[:, 0, 0] = mass + points @ moment
     left = np.concatenate([first, inertia * points[:, :, None]], axis=2)
     return left, np.concatenate([ones, points[:, :, None]], axis=2)
+=======
+>>>>>>> 68aaf26 (Shape integrals of any dimension in one table: scaling, change of basis, sums and gradients follow from it)

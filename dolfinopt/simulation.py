@@ -8,7 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import batch, generalized_alpha, radau
 from dolfinopt.integrators.problem import ElasticProblem, Solution
@@ -103,7 +103,7 @@ class Trajectory:
         return float(distance[worst]), float(self.t[worst])
 
 
-def build_mechanism(scene: Scene, bodies: list[FloatingBody]) -> Mechanism:
+def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     """Put the bodies on the scene's cart, with its payload."""
     return Mechanism(
         bodies=tuple(bodies),
@@ -115,7 +115,7 @@ def build_mechanism(scene: Scene, bodies: list[FloatingBody]) -> Mechanism:
 
 
 def simulate(
-    scene: Scene, bodies: list[FloatingBody], ledger: Ledger, start: Solution | None = None
+    scene: Scene, bodies: list[ShapeIntegrals], ledger: Ledger, start: Solution | None = None
 ) -> Trajectory:
     """Integrate the elastic coordinates over the horizon to `simulation.tolerance`.
 
@@ -145,7 +145,7 @@ def simulate(
 
 def simulate_batch(
     scenes: Sequence[Scene],
-    bodies: Sequence[list[FloatingBody]],
+    bodies: Sequence[list[ShapeIntegrals]],
     ledger: Ledger,
     starts: Sequence[Solution | None] = (),
     *,
@@ -197,7 +197,7 @@ def simulate_batch(
 
 
 def _problems(
-    scenes: Sequence[Scene], bodies: Sequence[list[FloatingBody]]
+    scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]
 ) -> list[ElasticProblem]:
     """Return what moves in every scene; scenes of one motion share it."""
     motions: dict[object, Callable[[np.ndarray], RigidMotion]] = {}

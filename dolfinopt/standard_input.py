@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals, plane_body
 from dolfinopt.errors import InputError
 from dolfinopt.sid import (
     DIAGONAL,
@@ -102,13 +102,13 @@ def spatial_moments(arm: ElasticArm, basis: Basis, thickness: float) -> SpatialM
     )
 
 
-def slender_moments(body: FloatingBody) -> SpatialMoments:
+def slender_moments(body: ShapeIntegrals) -> SpatialMoments:
     """Return a guess from the planar integrals alone: all mass on the x axis, moving across it.
 
     int y^2 = int z^2 = int y Phi = int Phi_x Phi_x = 0, the rest as the planar integrals have it:
     the same motion in the plane, and out of it that of a thin bar.
     """
-    q = body.coordinates
+    q = body.num_modes
     first, mixed = np.zeros((2, 2, q)), np.zeros((2, 2, q, q))
     first[0, 0], first[0, 1] = body.j, body.r
     mixed[1, 1] = body.M
@@ -120,7 +120,7 @@ def slender_moments(body: FloatingBody) -> SpatialMoments:
 
 
 def to_sid(
-    body: FloatingBody,
+    body: ShapeIntegrals,
     moments: SpatialMoments | None = None,
     further: Sequence[PlaneNode] = (),
     comment: str = "",
@@ -136,7 +136,7 @@ def to_sid(
         further: nodes between the two.
         comment: for the file's first line.
     """
-    q = body.coordinates
+    q = body.num_modes
     held = PlaneNode("1", np.zeros(2), np.zeros((3, q)))
     nodes = (held, *further, PlaneNode("2", body.outboard_point, body.outboard))
     frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
@@ -178,9 +178,9 @@ def _node(node: PlaneNode, q: int) -> Node:
     )
 
 
-def _rigid_matrices(body: FloatingBody, moments: SpatialMoments) -> dict:
+def _rigid_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
     """Return what moves the frame: mdCM, J and Gr."""
-    q, (xx, yy) = body.coordinates, np.diag(moments.second)
+    q, (xx, yy) = body.num_modes, np.diag(moments.second)
     centre, centre_q = np.zeros((3, 1)), np.zeros((3, q, 1))
     centre[:2, 0], centre_q[:2, :, 0] = body.moment, body.C
     inertia, inertia_q = np.zeros((6, 1)), np.zeros((6, q, 1))
@@ -216,9 +216,9 @@ def _rigid_matrices(body: FloatingBody, moments: SpatialMoments) -> dict:
     }
 
 
-def _elastic_matrices(body: FloatingBody, moments: SpatialMoments) -> dict:
+def _elastic_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
     """Return what moves the coordinates: Ct, Cr, Ge and Oe."""
-    q, first, mixed = body.coordinates, moments.first, moments.mixed
+    q, first, mixed = body.num_modes, moments.first, moments.mixed
     push = np.zeros((q, 3))
     push[:, :2] = body.C.T
     turn, turn_q = np.zeros((q, 3)), np.zeros((q, q, 3))
@@ -245,7 +245,7 @@ def _elastic_matrices(body: FloatingBody, moments: SpatialMoments) -> dict:
 # -- from SID --------------------------------------------------------------------------------
 
 
-def load_body(path: Path, length: float | None = None) -> FloatingBody:
+def load_body(path: Path, length: float | None = None) -> ShapeIntegrals:
     """Read an SID file and return its plane body, see `from_sid`.
 
     Args:
@@ -271,7 +271,7 @@ def from_sid(
     inboard: str | None = None,
     outboard: str | None = None,
     source: str = "SID",
-) -> FloatingBody:
+) -> ShapeIntegrals:
     """Return the plane body of standard input data.
 
     The frame must be the tangent frame at the inboard node, all motion in x-y. Entries that plane
@@ -296,7 +296,7 @@ def from_sid(
     G, M = 0.5 * data.Ge.M0[:, 2::3], data.Me.M0
     if np.abs(G + G.T).max() > PLANAR * np.abs(M).max():
         raise InputError(f"{source}: the columns 3, 6, ... of Ge must be a skew matrix")
-    return FloatingBody(
+    return plane_body(
         mass=data.mass,
         moment=data.mdCM.M0[:2, 0].copy(),
         inertia=float(data.inertia(np.zeros(data.coordinates))[2, 2]),

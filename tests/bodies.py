@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals, plane_body
 from dolfinopt.mechanism import Mechanism
 
 
@@ -33,12 +33,12 @@ class Cloud:
     outboard: np.ndarray
     reach: np.ndarray
 
-    def body(self) -> FloatingBody:
+    def body(self) -> ShapeIntegrals:
         """Return the shape integrals as sums over the points."""
         m, X, Phi = self.masses, self.points, self.modes
         SX = np.stack([-X[:, 1], X[:, 0]], axis=1)
         SPhi = np.stack([-Phi[:, 1], Phi[:, 0]], axis=1)
-        return FloatingBody(
+        return plane_body(
             mass=m.sum(),
             moment=m @ X,
             inertia=m @ (X * X).sum(axis=1),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from bodies import beam, random_cloud
 
-from dolfinopt.body import FloatingBody, rigid_bar, scaled
+from dolfinopt.body import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import batch, radau
 from dolfinopt.integrators.adjoint import trajectory_slopes
@@ -57,7 +57,7 @@ def two_arms(
 ) -> ElasticProblem:
     """Return two slender arms of 1 to 50 Hz; factors of mass, stiffness, and the damping, s."""
     body = beam(bending=bending, axial=300.0, damping=DAMPING).body()
-    bodies = tuple(scaled(body, *factors) for _ in range(2))
+    bodies = tuple(of_material(body, *factors) for _ in range(2))
     mechanism = Mechanism(bodies, payload, inertia, gravity, 0.0)
     return ElasticProblem(mechanism, reach(duration, size), (0.0, duration, horizon))
 
@@ -129,7 +129,7 @@ def test_scales_are_those_of_scaled_bodies():
     for n in range(4):
         one = Mechanism(
             tuple(
-                scaled(body, f[0], f[1], f[2] / f[1])
+                of_material(body, f[0], f[1], f[2] / f[1])
                 for body, f in zip(bodies, factors[n], strict=True)
             ),
             payload[n, 0],
@@ -348,7 +348,7 @@ def test_bodies_without_coordinates(alone):
 
     def problem(payload: float) -> ElasticProblem:
         whole = two_arms(payload=payload)
-        bodies: tuple[FloatingBody, ...] = (bar, whole.mechanism.bodies[1])
+        bodies: tuple[ShapeIntegrals, ...] = (bar, whole.mechanism.bodies[1])
         return replace(whole, mechanism=replace(whole.mechanism, bodies=bodies))
 
     problems = [problem(1.0), problem(1.5)]

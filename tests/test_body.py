@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
-from dolfinopt.body import FloatingBody, first_frequency, floating_body
+from dolfinopt.body import first_frequency, plane_body, shape_integrals
 from dolfinopt.elasticity import ElasticArm, element_operators
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import structured_arm
@@ -52,7 +52,7 @@ def uneven_arm():
 
 
 def test_rigid_integrals_of_a_rectangle(uniform_arm):
-    body = floating_body(uniform_arm, craig_bampton(uniform_arm, Options(3)), DAMPING)
+    body = shape_integrals(uniform_arm, craig_bampton(uniform_arm, Options(3)), DAMPING)
     mass = DENSITY * LENGTH * HEIGHT * THICKNESS
     assert body.mass == pytest.approx(mass, rel=PLACING)
     expected = [0.5 * mass * LENGTH, 0.0]
@@ -60,7 +60,7 @@ def test_rigid_integrals_of_a_rectangle(uniform_arm):
     inertia = mass * (LENGTH**2 / 3.0 + HEIGHT**2 / 12.0)
     assert body.inertia == pytest.approx(inertia, rel=PLACING)
     assert np.array_equal(body.outboard_point, [LENGTH, 0.0])
-    assert body.coordinates == 3
+    assert body.num_modes == 3
 
 
 def test_integrals_of_rigid_motions(uneven_arm):
@@ -70,7 +70,7 @@ def test_integrals_of_rigid_motions(uneven_arm):
     one, none = np.ones_like(x), np.zeros_like(x)
     V = np.stack([[one, none], [none, one], [-y, x]]).transpose(2, 1, 0)
     basis = Basis(V, arm.mass_times(V), np.zeros((3, 3)), np.eye(3), np.empty((0, 0)))
-    body = floating_body(arm, basis, DAMPING)
+    body = shape_integrals(arm, basis, DAMPING)
     m, (cx, cy), J = body.mass, body.moment, body.inertia
     assert abs(cy) > 1e-6 * m  # the design is not symmetric: cy counts below
     # S (1, 0) = (0, 1), S (0, 1) = -(1, 0), S S X = -X.
@@ -116,7 +116,7 @@ def quadrature(arm, x, V):
 def test_integrals_of_modes_by_quadrature(uneven_arm, method):
     arm = uneven_arm
     basis = REDUCTORS[method](arm, Options(6))
-    body = floating_body(arm, basis, DAMPING)
+    body = shape_integrals(arm, basis, DAMPING)
     names = ("mass", "moment", "inertia", "C", "j", "r", "M", "G")
     for name, expected in zip(names, quadrature(arm, uneven(arm.mesh.centroid), basis.V)):
         scale = np.abs(expected).max()
@@ -135,7 +135,7 @@ def test_first_frequency():
     root, other = rng.normal(size=(2, 5, 5))
     M, K = root @ root.T + 0.1 * np.eye(5), 1e6 * (other @ other.T + 0.1 * np.eye(5))
     none = np.zeros(5)
-    body = FloatingBody(
+    body = plane_body(
         1.0, none[:2], 1.0, np.zeros((2, 5)), none, none, M, M, K, K, np.zeros((3, 5)), none[:2]
     )
     lowest = np.sqrt(scipy.linalg.eigvalsh(K, M)[0]) / (2.0 * np.pi)
@@ -145,7 +145,7 @@ def test_first_frequency():
 
 def test_first_frequency_of_a_spring_and_a_mass():
     none, one = np.zeros(1), np.ones((1, 1))
-    body = FloatingBody(
+    body = plane_body(
         1.0, np.zeros(2), 1.0, np.zeros((2, 1)), none, none,
         4.0 * one, 0.0 * one, 400.0 * one, one, np.zeros((3, 1)), np.zeros(2),
     )  # fmt: skip
@@ -153,12 +153,12 @@ def test_first_frequency_of_a_spring_and_a_mass():
 
 
 def test_modes_give_the_first_frequency_of_the_body(uneven_arm):
-    body = floating_body(uneven_arm, modal(uneven_arm, Options(2)), DAMPING)
+    body = shape_integrals(uneven_arm, modal(uneven_arm, Options(2)), DAMPING)
     values = np.sqrt(np.diag(body.K)) / (2.0 * np.pi)
     # Modes are orthonormal in M to 1e-12.
     assert first_frequency(body) == pytest.approx(values[0], rel=1e-11)
     # Every other basis gives an upper bound.
     for q in (3, 4, 8):
-        body = floating_body(uneven_arm, craig_bampton(uneven_arm, Options(q)), DAMPING)
+        body = shape_integrals(uneven_arm, craig_bampton(uneven_arm, Options(q)), DAMPING)
         assert first_frequency(body) > values[0] * (1.0 - 1e-11)
     assert first_frequency(body) == pytest.approx(values[0], rel=1e-5)  # measured: 3e-7

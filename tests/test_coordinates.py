@@ -345,5 +345,5 @@ def test_arm_from_a_file(tmp_path):
     built = auto(f"arms.arm1.sid={tmp_path / 'arm1.sid'}", tolerance=1e-3)
     choice = choose(built, built.fields(wave))
     _, trajectory = built.evaluate(built.fields(wave))
-    sizes = [body.coordinates for body in trajectory.mechanism.bodies]
+    sizes = [body.num_modes for body in trajectory.mechanism.bodies]
     assert sizes == [4, choice.coordinates]

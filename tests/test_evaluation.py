@@ -12,7 +12,7 @@ from remainders import SCENE, build, rates, tip, uneven, wave
 
 import dolfinopt as do
 from dolfinopt.arm import Arm, chain_of
-from dolfinopt.body import FloatingBody, rigid_bar
+from dolfinopt.body import ShapeIntegrals, rigid_bar
 from dolfinopt.evaluation import constraint_gradients
 from dolfinopt.mechanism import deviation
 from dolfinopt.motion import rigid_motion
@@ -160,7 +160,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
 # -- own materials ---------------------------------------------------------------------------
 
 
-def body_of(*overrides: str, index: int = 1) -> FloatingBody:
+def body_of(*overrides: str, index: int = 1) -> ShapeIntegrals:
     """Return one arm's body, on its own ranks."""
     arm = Arm(
         do.load_scene(SCENE, ("arms.cells=[24,3]", *overrides)), index, MPI.COMM_SELF, do.Ledger()

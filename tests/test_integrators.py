@@ -13,7 +13,7 @@ from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 import dolfinopt as do
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import plane_body
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import factors, generalized_alpha, radau
 from dolfinopt.integrators.adjoint import trajectory_slopes
@@ -81,7 +81,7 @@ def two_arms(
 
 def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> ElasticProblem:
     """Return one coordinate of that frequency (rad/s) and damping ratio that the cart pushes."""
-    body = FloatingBody(
+    body = plane_body(
         mass=1.0,
         moment=np.zeros(2),
         inertia=0.0,

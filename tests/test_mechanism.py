@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bodies import Chain, assert_close, derivative, random_cloud
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals, plane_body
 from dolfinopt.mechanism import (
     Mechanism,
     compliance,
@@ -161,9 +161,9 @@ def test_rigid_limit_is_the_two_link_arm() -> None:
     assert_close(drives, expected, 1e-13)
 
 
-def rigid_link(mass: float, centre: float, inertia: float, length: float) -> FloatingBody:
+def rigid_link(mass: float, centre: float, inertia: float, length: float) -> ShapeIntegrals:
     """Return a link with a single elastic coordinate that moves nothing but itself."""
-    return FloatingBody(
+    return plane_body(
         mass=mass,
         moment=np.array([mass * centre, 0.0]),
         inertia=inertia,

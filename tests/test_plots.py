@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 
 from dolfinopt import plots, style
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals, plane_body
 from dolfinopt.files import ArmView, HistoryRow
 from dolfinopt.mechanism import Mechanism, end_effector
 from dolfinopt.motion import RigidMotion
@@ -36,10 +36,10 @@ def beam(name: str, length: float, height: float, nx: int, ny: int) -> ArmView:
     return ArmView(name, corners, centroid, density, np.stack([stretch, bend], axis=-1))
 
 
-def beam_body(length: float) -> FloatingBody:
+def beam_body(length: float) -> ShapeIntegrals:
     """Return the body of `beam`; only what places it in the plane has a meaning."""
     none = np.zeros((2, 2))
-    return FloatingBody(
+    return plane_body(
         mass=1.0,
         moment=np.zeros(2),
         inertia=1.0,

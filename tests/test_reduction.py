@@ -14,7 +14,7 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 import dolfinopt as do
-from dolfinopt.body import floating_body
+from dolfinopt.body import shape_integrals
 from dolfinopt.elasticity import ElasticArm, element_operators
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.ledger import Ledger
@@ -198,7 +198,7 @@ def test_a_hundred_coordinates(method):
     mass = products(arm, basis)[1][first:, first:]
     # Measured: 2e-11 modal, 4e-13 Craig-Bampton.
     assert np.abs(mass - np.eye(100 - first)).max() < 1e-8
-    for array in dataclasses.astuple(floating_body(arm, basis, 0.0)):
+    for array in dataclasses.astuple(shape_integrals(arm, basis, 0.0)):
         assert np.isfinite(array).all()
 
 
@@ -209,7 +209,7 @@ def test_every_degree_of_freedom(method):
     own = make_arm((3, 1))
     for one in (arm, own):
         set_densities(one, graded(one.mesh.centroid))
-    body = floating_body(arm, ALL[method](arm, Options(arm.num_dofs)), 0.0)
+    body = shape_integrals(arm, ALL[method](arm, Options(arm.num_dofs)), 0.0)
     reduced = scipy.linalg.eigvalsh(body.K, body.M)
     assert arm.num_dofs == 11
     assert reduced == pytest.approx(scipy.linalg.eigvalsh(*dense(own)), rel=DENSE)
@@ -674,7 +674,7 @@ def test_ranks_agree_with_one_rank(shared_arm, own_arm, method, q):
         (by_place(shared_arm, together.V), by_place(own_arm, alone.V)),
     ]
     bodies = [
-        dataclasses.astuple(floating_body(arm, basis, 2e-4))
+        dataclasses.astuple(shape_integrals(arm, basis, 2e-4))
         for arm, basis in ((shared_arm, together), (own_arm, alone))
     ]
     pairs += list(zip(*bodies))
@@ -706,7 +706,7 @@ def beams():
 
 
 def _frequencies(arm: ElasticArm, basis: Basis) -> np.ndarray:
-    body = floating_body(arm, basis, 0.0)
+    body = shape_integrals(arm, basis, 0.0)
     return np.sqrt(scipy.linalg.eigvalsh(body.K, body.M)[:5]) / (2.0 * np.pi)
 
 

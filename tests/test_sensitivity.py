@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -20,13 +20,12 @@ from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.arm import Arm
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import TABLE, ShapeIntegrals, scaled
 from dolfinopt.errors import InputError
 from dolfinopt.integrators import radau
 from dolfinopt.integrators.adjoint import trajectory_slopes
 from dolfinopt.integrators.problem import ElasticProblem, Solution, even_steps
 from dolfinopt.mechanism import (
-    BodySlopes,
     Mechanism,
     body_slopes,
     end_effector,
@@ -45,7 +44,7 @@ WORLD = MPI.COMM_WORLD
 # As it was before this process began MPI, which would confuse another mpirun.
 ENVIRONMENT = dict(os.environ)
 
-CONSTANTS = [f.name for f in fields(BodySlopes)]
+CONSTANTS = [one.name for one in TABLE if one.name != "outboard_point"]
 ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
 
@@ -73,16 +72,17 @@ def random_instants(
     return RigidMotion(*rigid), rng.normal(scale=0.7, size=(4, count, model.coordinates))
 
 
-def unit_changes(body: FloatingBody, name: str) -> Iterator[np.ndarray]:
-    """Yield changes that span all a constant can do: M, K and D stay symmetric, G skew."""
+def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
+    """Yield changes that span all an integral can do: int N'N, K, D symmetric, int N'SN skew."""
     shape = np.shape(getattr(body, name))
     for index in np.ndindex(shape):
         change = np.zeros(shape)
         change[index] = 1.0
-        if name in ("M", "K", "D"):
+        if name in ("K", "D"):
             change = change + change.T
-        elif name == "G":
-            change = change - change.T
+        elif name == "W":
+            change[0] += change[0].T
+            change[1] -= change[1].T
         yield change
 
 
@@ -401,9 +401,12 @@ def no_modes(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hold the coordinates."""
 
-    def none(problem: ElasticProblem, *_: object) -> list[BodySlopes]:
-        shapes = [{n: np.shape(getattr(b, n)) for n in CONSTANTS} for b in problem.mechanism.bodies]
-        return [BodySlopes(**{n: np.zeros(s) for n, s in shape.items()}) for shape in shapes]
+    def none(problem: ElasticProblem, *_: object) -> list[ShapeIntegrals]:
+        bodies = problem.mechanism.bodies
+        return [
+            replace(scaled(body, 0.0, 0.0, 0.0), outboard=np.zeros_like(body.outboard))
+            for body in bodies
+        ]
 
     monkeypatch.setattr("dolfinopt.objective.trajectory_slopes", none)
 

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.arm import Arm, build_arms, chain_of
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.files import write_text
 from dolfinopt.findings import Cell, Line, LineFigure, Panel, Table
 from dolfinopt.ledger import Ledger
@@ -253,7 +253,7 @@ def designs(plan: Plan, tell: Tell) -> dict[str, tuple[dict[int, Arm], dict[int,
 
 def bodies_of(
     scene: Scene, arms: dict[int, Arm], x_phys: dict[int, np.ndarray]
-) -> list[FloatingBody]:
+) -> list[ShapeIntegrals]:
     """Reduce the arms as `scene` asks for; return the bodies from the cart outwards."""
     owned = {}
     for k, arm in arms.items():

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, curves, tidy, timed
-from dolfinopt.body import FloatingBody, first_frequency, floating_body
+from dolfinopt.body import ShapeIntegrals, first_frequency, shape_integrals
 from dolfinopt.compat import cell_coordinates, local_cell_counts
 from dolfinopt.elasticity import ElasticArm, ElementOperators, element_operators
 from dolfinopt.findings import Panel
@@ -224,10 +224,10 @@ def respond(scene: Scene, element: Element, cells: tuple[int, int], repeats: int
     ones = np.ones(elastic.mesh.num_cells)
     damping = scene.damping.stiffness_proportional
 
-    def reduce() -> FloatingBody:
+    def reduce() -> ShapeIntegrals:
         elastic.set_design(solid.young_modulus * ones, solid.density * ones)
         basis = METHODS["craig-bampton"].reduce(elastic, Options(COORDINATES), None)
-        return floating_body(elastic, basis, damping)
+        return shape_integrals(elastic, basis, damping)
 
     seconds = np.inf
     # The first one analyses the matrix for the whole run.

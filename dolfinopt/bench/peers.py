@@ -25,7 +25,7 @@ from dolfinopt.bench.common import (
 from dolfinopt.bench.mesh import FINER, Element
 from dolfinopt.bench.statics import Iteration, StaticArm, dolfinx_iteration, pymoto_iteration
 from dolfinopt.bench.whole import mpirun, run_worker
-from dolfinopt.body import floating_body
+from dolfinopt.body import shape_integrals
 from dolfinopt.elasticity import ElasticArm
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.files import HistoryRow
@@ -141,7 +141,7 @@ def _moved(scene: Scene, element: Element, cells: tuple[int, int]) -> Trajectory
     ones = np.ones(mesh.num_cells)
     elastic.set_design(solid.young_modulus * ones, solid.density * ones)
     basis = METHODS["craig-bampton"].reduce(elastic, Options(COORDINATES), None)
-    body = floating_body(elastic, basis, scene.damping.stiffness_proportional)
+    body = shape_integrals(elastic, basis, scene.damping.stiffness_proportional)
     return simulate(scene, [body] * len(scene.arms), Ledger())
 
 

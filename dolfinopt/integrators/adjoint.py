@@ -13,10 +13,9 @@ doi:10.1137/151002769.
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
+from dolfinopt.body import ShapeIntegrals
 from dolfinopt.integrators.collocation import (
     Stages,
     pulled_back,
@@ -34,7 +33,7 @@ from dolfinopt.integrators.factors import (
 )
 from dolfinopt.integrators.modes import modes_of
 from dolfinopt.integrators.problem import ElasticProblem, Solution, lagrange_integrals
-from dolfinopt.mechanism import BodySlopes, Tangent, body_slopes, tangent
+from dolfinopt.mechanism import Tangent, body_slopes, tangent
 
 # Share of the multipliers that a correction may have left: their error is a tenth of it or less.
 ENOUGH = 1e-8
@@ -43,7 +42,7 @@ POOR = 0.3  # contraction above which more coordinates are treated densely
 
 def trajectory_slopes(
     problem: ElasticProblem, solution: Solution, t: np.ndarray, by_q: np.ndarray
-) -> list[BodySlopes]:
+) -> list[ShapeIntegrals]:
     """Return dJ/d(constants) of every body through the trajectory's coordinates.
 
     Args:
@@ -66,12 +65,9 @@ def trajectory_slopes(
     return add_slopes(slopes, _start_slopes(problem, solution.q[0], by_start))
 
 
-def add_slopes(first: list[BodySlopes], second: list[BodySlopes]) -> list[BodySlopes]:
+def add_slopes(first: list[ShapeIntegrals], second: list[ShapeIntegrals]) -> list[ShapeIntegrals]:
     """Return the sums, body by body."""
-    return [
-        BodySlopes(*(getattr(a, f.name) + getattr(b, f.name) for f in fields(BodySlopes)))
-        for a, b in zip(first, second, strict=True)
-    ]
+    return [a + b for a, b in zip(first, second, strict=True)]
 
 
 def _sampled(solution: Solution, t: np.ndarray, by_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +143,7 @@ def _before(stages: Stages, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.stack([by_q.sum(axis=0), (by_v + since * by_q).sum(axis=0)])
 
 
-def _start_slopes(problem: ElasticProblem, q: np.ndarray, by_q: np.ndarray) -> list[BodySlopes]:
+def _start_slopes(problem: ElasticProblem, q: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
     """Return the part through the static equilibrium (N,) at t = 0 that the motion starts from."""
     motion = problem.motion(np.zeros(1))
     rest = np.zeros((1, len(q)))

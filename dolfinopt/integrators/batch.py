@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals, proportional, same_geometry
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.integrators import radau
 from dolfinopt.integrators.collocation import (
@@ -178,23 +178,18 @@ def related(problems: Sequence[ElasticProblem]) -> list[np.ndarray | None]:
     return found
 
 
-def _shape_of_damping(body: FloatingBody) -> np.ndarray:
+def _shape_of_damping(body: ShapeIntegrals) -> np.ndarray:
     return body.K if proportion([body.K], [body.D]) is not None else body.D
 
 
 def _scale(
-    body: FloatingBody, other: FloatingBody, damper: np.ndarray
+    body: ShapeIntegrals, other: ShapeIntegrals, damper: np.ndarray
 ) -> tuple[float, float, float] | None:
     """Return what makes one body the other: of its mass, stiffness, damping; None if nothing."""
-    names = ("mass", "moment", "inertia", "C", "j", "r", "M", "G")
-    same = body.coordinates == other.coordinates and all(
-        np.array_equal(getattr(body, name), getattr(other, name))
-        for name in ("outboard", "outboard_point")
-    )
-    if not same:
+    if not same_geometry(body, other):
         return None
-    here, there = ([np.asarray(getattr(x, name)) for name in names] for x in (body, other))
-    mass, stiffness = proportion(here, there), proportion([body.K], [other.K])
+    mass = proportion(*proportional(body, other, "mass"))
+    stiffness = proportion(*proportional(body, other, "stiffness"))
     damping = proportion([damper], [other.D])
     if mass is None or stiffness is None or damping is None:
         return None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 
-from dolfinopt.body import FloatingBody
+from dolfinopt.body import ShapeIntegrals, in_basis
 from dolfinopt.integrators.problem import ElasticProblem
 from dolfinopt.mechanism import linearise
 
@@ -97,30 +97,18 @@ def _vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return solve_triangular(L, Y, trans="T", lower=True), (L @ Y).T, np.maximum(m, 0.0)
 
 
-def _changed(body: FloatingBody, T: np.ndarray) -> FloatingBody:
+def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     """Return the body in other coordinates.
 
     Stiffness, and damping in proportion to it, lose the rounding beside their diagonals: whoever
     uses them sees that the coordinates are uncoupled by them.
     """
-    K = T.T @ body.K @ T
-    one = np.eye(len(K))
-    uncoupled = np.abs(K - one).max(initial=0.0) <= ROUNDING
-    D = T.T @ body.D @ T
-    if uncoupled:
-        share = proportion([body.K], [body.D])
-        K, D = one, D if share is None else share * one
-    return replace(
-        body,
-        C=body.C @ T,
-        j=body.j @ T,
-        r=body.r @ T,
-        M=T.T @ body.M @ T,
-        G=T.T @ body.G @ T,
-        K=K,
-        D=D,
-        outboard=body.outboard @ T,
-    )
+    changed = in_basis(body, T)
+    one = np.eye(len(changed.K))
+    if np.abs(changed.K - one).max(initial=0.0) > ROUNDING:
+        return changed
+    share = proportion([body.K], [body.D])
+    return replace(changed, K=one, D=changed.D if share is None else share * one)
 
 
 def proportion(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> float | None:
