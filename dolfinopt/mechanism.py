@@ -708,32 +708,6 @@ def compliance(
 # -- adjoint ---------------------------------------------------------------------------------
 
 
-<<<<<<< HEAD
-@dataclass(frozen=True, eq=False)
-class BodySlopes:
-    """Derivatives of a scalar with respect to one body's constants; shapes as in `FloatingBody`.
-
-    Those of D are part of K's only where the caller says so; M, G, K need not be symmetric.
-    """
-
-    mass: float
-    moment: np.ndarray
-    inertia: float
-    C: np.ndarray
-    j: np.ndarray
-    r: np.ndarray
-    M: np.ndarray
-    G: np.ndarray
-    K: np.ndarray
-    D: np.ndarray
-    outboard: np.ndarray
-
-    def __add__(self, other: BodySlopes) -> BodySlopes:
-        return BodySlopes(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
-
-
-=======
->>>>>>> 68aaf26 (Shape integrals of any dimension in one table: scaling, change of basis, sums and gradients follow from it)
 def body_slopes(
     mechanism: Mechanism,
     motion: RigidMotion,

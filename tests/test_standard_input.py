@@ -35,9 +35,8 @@ THICKNESS = 0.02  # m
 
 def symmetric(body):
     """Return the body with matrices that are symmetric or skew in all bits, as arms have them."""
-    M, G, K, D = body.M, body.G, body.K, body.D
-    halves = {"M": M + M.T, "G": G - G.T, "K": K + K.T, "D": D + D.T}
-    return replace(body, **{name: 0.5 * value for name, value in halves.items()})
+    W = body.W + np.array([1.0, -1.0])[:, None, None] * body.W.swapaxes(1, 2)
+    return replace(body, W=0.5 * W, K=0.5 * (body.K + body.K.T), D=0.5 * (body.D + body.D.T))
 
 
 def cloud_moments(cloud: Cloud, depth: float) -> SpatialMoments:
