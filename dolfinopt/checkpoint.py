@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 NAME = "checkpoint.npz"
 SOLUTION = ("edges", "nodes", "q", "qd", "a")
 # Keys a resumed run may change: they say when to stop, not what is computed.
-MAY_CHANGE = ("max_iterations", "tolerance")
+MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,8 @@ def save(
         "scene": np.array(_scene_text(scene)),
         "iteration": memory.iteration,
         "multipliers": memory.multipliers,
-        "history": np.array([astuple(row) for row in memory.history]),
+        "history": np.array([row.values for row in memory.history]),
+        "history_columns": np.array(memory.history[0].columns),
         "initial_deviation": memory.initial_deviation,
         "finished": np.array(memory.finished),
         "sharpness": memory.sharpness,
@@ -139,7 +140,8 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
         of = f"solution{len(solutions)}"
         parts = {field: arrays[f"{of}/{field}"] for field in SOLUTION}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
-    history = [HistoryRow(int(row[0]), *map(float, row[1:])) for row in arrays["history"]]
+    columns = arrays["history_columns"].tolist()
+    history = [HistoryRow.from_values(columns, row.tolist()) for row in arrays["history"]]
     choice = None
     if "coordinates" in arrays:
         tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
@@ -192,7 +194,8 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
         theirs = json.loads(str(arrays["scene"]))
-        int(arrays["iteration"])
+        if int(arrays["iteration"]) >= 0:
+            arrays["history_columns"]  # those of earlier versions have none
     except Exception as error:  # whatever a foreign or damaged file may raise
         raise InputError(
             f"{path}: --resume cannot read this checkpoint ({type(error).__name__}); start "

@@ -87,10 +87,12 @@ class Evaluation(Motion):
         objective: see `evaluate`; of all scenarios, if there are any; N m, N m s, m or s2.
         constraints: (k,) of the scene's [constraints], relative, kept where <= 0.
         loaded_frequencies: of every flexible arm with what it carries, Hz; empty unless asked for.
+        tip_deflections: largest static one of every designed arm, m; empty unless asked for.
     """
 
     constraints: tuple[float, ...] = ()
     loaded_frequencies: tuple[float, ...] = ()
+    tip_deflections: tuple[float, ...] = ()
 
 
 def evaluate(
@@ -187,13 +189,15 @@ def _judged(scene: Scene, share: ArmShare, arms: Mapping[int, Arm], motion: Moti
             value = float(periods.sum())
         if scene.constraints.first_frequency is not None:
             constraints += list(longest * scene.constraints.first_frequency**2 - 1.0)
+    largest: tuple[float, ...] = ()
     if scene.constraints.tip_deflection is not None:
-        tips = _deflections(scene, share, arms)
+        tips, largest = _deflections(scene, share, arms)
         constraints += list(tips / scene.constraints.tip_deflection - 1.0)
     return Evaluation(
         **vars(replace(motion, objective=value)),
         constraints=tuple(map(float, constraints)),
         loaded_frequencies=frequencies,
+        tip_deflections=largest,
     )
 
 
@@ -422,14 +426,16 @@ def _static_compliance(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
     return float(sum(_everywhere(share, values).values()))
 
 
-def _deflections(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> np.ndarray:
-    """Return every design's deflection under the loads, m (collective)."""
-    exponent = scene.objective.exponent
-    values = {
-        k: static_response(arm.elastic, _loads(scene)).deflection(exponent)
-        for k, arm in arms.items()
-    }
-    return np.array(list(_everywhere(share, values).values()))
+def _deflections(
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm]
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return every design's p-mean deflection under the loads and its largest, m (collective)."""
+    values = {}
+    for k, arm in arms.items():
+        response = static_response(arm.elastic, _loads(scene))
+        values[k] = response.deflection(scene.objective.exponent), response.largest
+    means, largest = zip(*_everywhere(share, values).values(), strict=True)
+    return np.array(means), largest
 
 
 def _everywhere(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:

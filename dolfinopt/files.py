@@ -11,7 +11,7 @@ import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, field, fields
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -21,8 +21,10 @@ from dolfinopt import __version__
 from dolfinopt.arm import fixed_body
 from dolfinopt.body import ShapeIntegrals
 from dolfinopt.errors import InputError
+from dolfinopt.motion import CART
 from dolfinopt.parallel import ArmShare, gather_cells, on_root
 from dolfinopt.scene import Scene
+from dolfinopt.units import OBJECTIVES
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
@@ -41,6 +43,8 @@ class HistoryRow:
         volume_fraction: over all arms.
         change: largest change of a design variable in the update that led here.
         seconds: wall-clock time since the run's beginning, earlier parts included.
+        kkt: Karush-Kuhn-Tucker residual of this design, see `optimality.kkt_residual`.
+        constraints: value of every constraint, by its name, see `limits.Limit`.
     """
 
     iteration: int
@@ -50,6 +54,32 @@ class HistoryRow:
     volume_fraction: float
     change: float
     seconds: float
+    kkt: float = np.nan
+    constraints: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of `values`, the header of history.csv."""
+        return [f.name for f in fields(self)][:-1] + list(self.constraints)
+
+    @property
+    def values(self) -> list[float]:
+        """The row of history.csv."""
+        return [*astuple(self)[:-1], *self.constraints.values()]
+
+    @classmethod
+    def from_values(cls, columns: Sequence[str], values: Sequence[float]) -> HistoryRow:
+        """Return the row of which `columns` and `values` are."""
+        own = len(fields(cls)) - 1
+        pairs = zip(columns[own:], map(float, values[own:]), strict=True)
+        iteration, *figures = values[:own]
+        # Columns by name: one by one they would hide what mypy can check.
+        named = dict(zip(columns[1:own], map(float, figures), strict=True))
+        return cls(iteration=int(iteration), constraints=dict(pairs), **named)  # type: ignore[arg-type]
+
+
+VTK_TRIANGLE, VTK_QUAD = 5, 9
+XDMF_CELLS = {3: 4, 4: 5}  # its numbers of triangles and quadrilaterals, by corners
 
 
 # -- writing ---------------------------------------------------------------------------------
@@ -109,12 +139,13 @@ class HistoryWriter:
     def __init__(self, path: Path, rows: Sequence[HistoryRow]):
         """Begin the file anew with the rows known so far."""
         self.path = path
-        header = [f.name for f in fields(HistoryRow)]
-        write_text(path, _csv_lines(header, [astuple(row) for row in rows]))
+        self.begun = bool(rows)
+        write_text(path, _csv_lines(rows[0].columns, [row.values for row in rows]) if rows else "")
 
     def append(self, row: HistoryRow) -> None:
-        """Add one line."""
-        line = _csv_lines([], [astuple(row)]).lstrip("\n")
+        """Add one line; the first row brings the header, too."""
+        line = _csv_lines([] if self.begun else row.columns, [row.values]).lstrip("\n")
+        self.begun = True
         with open(self.path, "a", encoding="utf-8") as stream:
             stream.write(line)
 
@@ -122,14 +153,14 @@ class HistoryWriter:
 def read_history(path: Path) -> list[HistoryRow]:
     """Read history.csv back."""
     with _open(path) as stream:
-        rows = list(csv.reader(stream.read().decode().splitlines()))[1:]
-        return [HistoryRow(int(row[0]), *map(float, row[1:])) for row in rows]
+        rows = list(csv.reader(stream.read().decode().splitlines()))
+        return [HistoryRow.from_values(rows[0], list(map(float, row))) for row in rows[1:]]
 
 
 def write_trajectory(
     folder: Path, trajectory: Trajectory, initial: np.ndarray | None = None
 ) -> None:
-    """Write trajectory.npz and trajectory.csv.
+    """Write trajectory.npz and trajectory.csv; their units stand in `trajectory_units`.
 
     Args:
         folder: where.
@@ -146,13 +177,53 @@ def write_trajectory(
     }
     if initial is not None:
         arrays["initial_deviation"] = initial
+    scene = trajectory.scene
+    units = {
+        "t": "s",
+        "q_r": ", ".join(("m", *["rad"] * len(scene.arms))),
+        "q_e": "m or rad: times V is a displacement in m",
+        "deviation": "m",
+        "compliance": "N m",
+        "joint_forces": ", ".join(drive_units(scene).values()),
+        "initial_deviation": "m",
+    }
+    arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])
     write_arrays(folder / "trajectory.npz", arrays)
     distance = np.hypot(*trajectory.deviation.T)
     table = np.column_stack(
-        [trajectory.t, trajectory.deviation, distance, trajectory.compliance.sum(axis=1)]
+        [
+            trajectory.t,
+            trajectory.deviation,
+            distance,
+            trajectory.compliance.sum(axis=1),
+            trajectory.q_r,
+            trajectory.q_e,
+            trajectory.compliance,
+            trajectory.joint_forces,
+        ]
     )
-    header = ["t", "deviation_x", "deviation_y", "deviation", "compliance"]
-    write_text(folder / "trajectory.csv", _csv_lines(header, table))
+    header = list(trajectory_units(trajectory))
+    line = ",".join(["%.10g"] * len(header)) + "\n"
+    text = line * len(table) % tuple(table.ravel().tolist())
+    write_text(folder / "trajectory.csv", ",".join(header) + "\n" + text)
+
+
+def drive_units(scene: Scene) -> dict[str, str]:
+    """Return the unit of the drive of every rigid coordinate, by its name: cart, then the arms."""
+    return {CART: "N", **{arm.name: "N m" for arm in scene.arms}}
+
+
+def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
+    """Return the unit of every column of trajectory.csv, in their order."""
+    scene, slices = trajectory.scene, trajectory.mechanism.slices
+    units = {"t": "s", "deviation_x": "m", "deviation_y": "m", "deviation": "m"}
+    units |= {"compliance": "N m", f"q_r_{CART}": "m"}
+    units |= {f"q_r_{arm.name}": "rad" for arm in scene.arms}
+    for arm, part in zip(scene.arms, slices, strict=True):
+        # Of normalised modes: a unit of their own, which times the mode is a displacement.
+        units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
+    units |= {f"compliance_{arm.name}": "N m" for arm in scene.arms}
+    return units | {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
 
 
 def read_initial_deviation(path: Path) -> np.ndarray | None:
@@ -295,6 +366,7 @@ def write_design(folder: Path, views: Sequence[ArmView]) -> None:
     for view in designed(views):
         arrays[f"{view.name}/centroid"] = view.centroid
         arrays[f"{view.name}/density"] = view.density
+    arrays["units"] = np.array(["centroid: m", "density: -"])
     write_arrays(folder / "design.npz", arrays)
 
 
@@ -319,34 +391,105 @@ def write_gradient(
         order, name = _canonical_order(centroid), scene.arms[index].name
         arrays[f"{name}/centroid"] = centroid[order]
         arrays[f"{name}/gradient"] = gathered[index][order]
+    unit = OBJECTIVES[scene.objective.kind][1]  # per physical density, which has none
+    arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
     write_arrays(path, arrays)
 
 
-def write_xdmf(folder: Path, views: Sequence[ArmView]) -> None:
-    """Write design.xdmf for ParaView: one grid an arm, one below the other, density by cell."""
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """All designed arms as one grid, one below the other, in m.
+
+    Attributes:
+        points: (n_points, 3).
+        cells: (n_cells, 3 or 4) points around each cell, an array an arm.
+        density: (all cells,).
+        arm: (all cells,) number of the arm, from 0 in the scene's order.
+    """
+
+    points: np.ndarray
+    cells: list[np.ndarray]
+    density: np.ndarray
+    arm: np.ndarray
+
+
+def _sheet(views: Sequence[ArmView]) -> _Sheet:
+    points, cells, arm = [], [], []
+    offset, count = 0.0, 0
+    for index, view in enumerate(views):
+        if view.designed:
+            own, corners = _merge_corners(view.corners)
+            points.append(np.column_stack([own[:, 0], own[:, 1] + offset, np.zeros(len(own))]))
+            cells.append(corners + count)
+            arm.append(np.full(len(corners), index))
+            offset -= 2.0 * np.ptp(own[:, 1])
+            count += len(own)
+    density = np.concatenate([view.density for view in designed(views)])
+    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm))
+
+
+def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.vtu and design.xdmf: density and arm by cell, see `_Sheet`.
+
+    One grid, because few programs read collections. ParaView and PyVista read both, meshio the
+    former: it takes no XDMF with the instant without which PyVista takes none.
+    """
+    sheet = _sheet(views)
+    _write_vtu(folder / "design.vtu", sheet)
+    _write_xdmf(folder / "design.xdmf", sheet)
+
+
+def _write_vtu(path: Path, sheet: _Sheet) -> None:
+    from xml.etree import ElementTree as Xml
+
+    root = Xml.Element("VTKFile", type="UnstructuredGrid", version="0.1")
+    piece = Xml.SubElement(Xml.SubElement(root, "UnstructuredGrid"), "Piece")
+    piece.set("NumberOfPoints", str(len(sheet.points)))
+    piece.set("NumberOfCells", str(len(sheet.density)))
+
+    def add(parent: Any, name: str, values: np.ndarray) -> None:
+        whole = values.dtype.kind == "i"
+        item = Xml.SubElement(parent, "DataArray", Name=name, format="ascii")
+        item.set("type", "Int64" if whole else "Float64")
+        if values.ndim == 2:
+            item.set("NumberOfComponents", str(values.shape[1]))
+        item.text = _text_of(values, "%d" if whole else "%.10g")
+
+    corners = np.concatenate([np.full(len(part), part.shape[1]) for part in sheet.cells])
+    add(Xml.SubElement(piece, "Points"), "Points", sheet.points)
+    cells = Xml.SubElement(piece, "Cells")
+    add(cells, "connectivity", np.concatenate([part.ravel() for part in sheet.cells]))
+    add(cells, "offsets", np.cumsum(corners))
+    add(cells, "types", np.where(corners == 4, VTK_QUAD, VTK_TRIANGLE))
+    data = Xml.SubElement(piece, "CellData", Scalars="density")
+    add(data, "density", sheet.density)
+    add(data, "arm", sheet.arm)
+    write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
+
+
+def _write_xdmf(path: Path, sheet: _Sheet) -> None:
     from xml.etree import ElementTree as Xml
 
     root = Xml.Element("Xdmf", Version="3.0")
-    arms = Xml.SubElement(
-        Xml.SubElement(root, "Domain"), "Grid", Name="arms", GridType="Collection"
-    )
-    arms.set("CollectionType", "Spatial")
-    offset = 0.0
-    for view in designed(views):
-        points, cells = _merge_corners(view.corners)
-        kind = "Quadrilateral" if cells.shape[1] == 4 else "Triangle"
-        grid = Xml.SubElement(arms, "Grid", Name=view.name, GridType="Uniform")
-        topology = Xml.SubElement(grid, "Topology", TopologyType=kind)
-        topology.set("NumberOfElements", str(len(cells)))
-        _data_item(topology, cells, "Int")
-        geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
-        shifted = np.column_stack([points[:, 0], points[:, 1] + offset, np.zeros(len(points))])
-        _data_item(geometry, shifted, "Float")
-        attribute = Xml.SubElement(grid, "Attribute", Name="density", Center="Cell")
+    grid = Xml.SubElement(Xml.SubElement(root, "Domain"), "Grid", Name="arms", GridType="Uniform")
+    Xml.SubElement(grid, "Time", Value="0")
+    topology = Xml.SubElement(grid, "Topology")
+    topology.set("NumberOfElements", str(len(sheet.density)))
+    shapes = {part.shape[1] for part in sheet.cells}
+    if len(shapes) == 1:
+        topology.set("TopologyType", "Quadrilateral" if shapes == {4} else "Triangle")
+        _data_item(topology, np.vstack(sheet.cells), "Int")
+    else:
+        topology.set("TopologyType", "Mixed")
+        parts = [np.insert(part, 0, XDMF_CELLS[part.shape[1]], axis=1) for part in sheet.cells]
+        _data_item(topology, np.concatenate([part.ravel() for part in parts]), "Int")
+    geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
+    _data_item(geometry, sheet.points, "Float")
+    for name, values, kind in (("density", sheet.density, "Float"), ("arm", sheet.arm, "Int")):
+        attribute = Xml.SubElement(grid, "Attribute", Name=name, Center="Cell")
         attribute.set("AttributeType", "Scalar")
-        _data_item(attribute, view.density, "Float")
-        offset -= 2.0 * np.ptp(points[:, 1])
-    write_atomically(folder / "design.xdmf", lambda stream: Xml.ElementTree(root).write(stream))
+        _data_item(attribute, values, kind)
+    write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
 
 
 def _data_item(parent: Any, values: np.ndarray, number_type: str) -> None:
@@ -356,9 +499,14 @@ def _data_item(parent: Any, values: np.ndarray, number_type: str) -> None:
     item.set("Dimensions", " ".join(map(str, values.shape)))
     if number_type == "Float":
         item.set("Precision", "8")
-    form = "%d" if number_type == "Int" else "%.10g"
+    item.text = _text_of(values, "%d" if number_type == "Int" else "%.10g")
+
+
+def _text_of(values: np.ndarray, form: str) -> str:
+    """Return numbers as text, a line a row."""
     rows = values if values.ndim == 2 else values[:, None]
-    item.text = "\n" + "\n".join(" ".join(form % v for v in row) for row in rows) + "\n"
+    line = " ".join([form] * rows.shape[1]) + "\n"
+    return "\n" + line * len(rows) % tuple(rows.ravel().tolist())
 
 
 def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -425,7 +573,7 @@ def _fit(path: Path, arm: Arm, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     keys = (f"{name}/centroid", f"{name}/density")
     missing = [key for key in keys if key not in arrays]
     if missing:
-        found = sorted({key.split("/")[0] for key in arrays})
+        found = sorted({key.split("/")[0] for key in arrays if "/" in key})
         raise InputError(
             f"{path}: missing key {missing[0]!r} for arm {name!r}; the file holds "
             f"{', '.join(map(repr, found)) or 'nothing'}; give a design made for these arms"

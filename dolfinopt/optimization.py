@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,11 +20,14 @@ from dolfinopt.evaluation import Evaluation, constraint_gradients, evaluate, gra
 from dolfinopt.files import HistoryRow, HistoryWriter
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Counts, Ledger
+from dolfinopt.limits import Limit, limits_of, violated, worst_limits
 from dolfinopt.mma import MMAState, initial_state, mma_step
+from dolfinopt.optimality import kkt_residual
 from dolfinopt.parallel import ArmShare, on_root, share_arms, sum_over_arms
 from dolfinopt.scenarios import worst_of
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
+from dolfinopt.units import NOT_MET
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm, Realised
@@ -35,8 +39,8 @@ CHECKPOINT_INTERVAL = 2.0  # s
 # Sharpness of the projection from which on the move limit falls with its square root.
 GENTLE = 4.0
 
-# Relative violation of a constraint from which on it is reported: an active one is met to less.
-EXCESS = 1e-3
+# A change of more than this part of the move limit is not small, whatever the tolerance.
+MOVING = 0.5
 # "auto" chooses coordinates for the initial design, so many times better than asked for: those of
 # an optimised one err 1.7 to 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
 RESERVE = 3.0
@@ -59,8 +63,11 @@ class Result:
         initial_deviation: (n, 2) of the initial design, m; on the root only.
         history: one row a design, the initial one first; on the root only.
         iterations: design updates made.
-        converged: True when the change of the design fell below the tolerance.
+        converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
+            within their tolerances and every constraint is met.
         stop_reason: in words.
+        kkt: the residual of the final design, see `optimality.kkt_residual`.
+        limits: every constraint and its value.
         ledger: seconds and counts of this rank.
         counts: those of the iterations alone, on this rank.
         choice: of the coordinates, and the error that they make of the final design's motion;
@@ -78,9 +85,16 @@ class Result:
     iterations: int
     converged: bool
     stop_reason: str
+    kkt: float
+    limits: tuple[Limit, ...]
     ledger: Ledger
     counts: Counts
     choice: Choice | None = None
+
+    @property
+    def violated(self) -> str:
+        """Which constraints the final design does not meet, in one line; "" if it meets all."""
+        return violated(self.limits)
 
 
 class _Variables:
@@ -198,12 +212,21 @@ class _Slopes:
 
 
 @dataclass(frozen=True)
+class _Posed:
+    """The problem at the current design, as MMA takes it: values f (m,) and gradients by x."""
+
+    df0dx: np.ndarray
+    f: np.ndarray
+    dfdx: np.ndarray
+
+
+@dataclass(frozen=True)
 class _Evaluated:
-    """One realised design, what it does, and its gradients unless they are still to be taken."""
+    """One realised design, what it does, and its gradients."""
 
     realised: Mapping[int, Realised]
     evaluation: Evaluation
-    slopes: _Slopes | None
+    slopes: _Slopes
 
     @property
     def x_phys(self) -> dict[int, np.ndarray]:
@@ -238,6 +261,8 @@ class _Run:
         self.history: list[HistoryRow] = []
         self.iteration = 0
         self.change = 0.0
+        self.kkt = np.nan  # residual of the current design
+        self.limits: tuple[Limit, ...] = ()
         self.grayness = 0.0  # of the nominal design; known on the root
         self.finished = ""
         self.sharpness = 1.0  # the projection's beta; grows to design.sharpness
@@ -259,12 +284,14 @@ class _Run:
             self.writer = HistoryWriter(self.folder / "history.csv", self.history)
         limit = self.scene.optimizer.max_iterations
         designs = self._evaluate()
+        posed = self._posed(designs)
         if memory is None:
-            self._record(designs)
+            self._record(designs, posed)
         while not self._finished(limit):
-            self._update(designs)
+            self._update(posed)
             designs = self._evaluate()
-            self._record(designs)
+            posed = self._posed(designs)
+            self._record(designs, posed)
             self._checkpoint(force=False)
         self._checkpoint(force=True)
         counts = replace(self.ledger.counts)
@@ -281,35 +308,46 @@ class _Run:
             history=self.history,
             iterations=self.iteration,
             converged=converged,
-            stop_reason=self._stop_reason(evaluation),
+            stop_reason=self._stop_reason(),
+            kkt=self.kkt,
+            limits=self.limits,
             ledger=self.ledger,
             counts=counts,
             choice=self.choice,
         )
 
-    def _stop_reason(self, evaluation: Evaluation) -> str:
-        """Say in words why the iterations ended, and whether a constraint is not met."""
+    def _stop_reason(self) -> str:
+        """Say in words why the iterations ended, and which constraints are not met."""
+        options = self.scene.optimizer
+        reason = f"largest change {self.change:.3g} <= {self._small_change:g}"
         if self.finished == "converged":
-            reason = f"largest change {self.change:.3g} <= {self.scene.optimizer.tolerance:g}"
-        else:
-            reason = f"{self.iteration} iterations (optimizer.max_iterations)"
-        excess = max(evaluation.constraints, default=0.0)
-        if excess > EXCESS:
-            reason += f"; a constraint is exceeded by {100.0 * excess:.3g} %"
+            reason += f", residual {self.kkt:.2g} <= {options.kkt_tolerance:g}"
+        elif self.finished == "limit":
+            reason = f"optimizer.max_iterations = {options.max_iterations}"
+        if broken := violated(self.limits):
+            reason += f"{NOT_MET}{broken}"
         if self.scene.design.projection and self.grayness > GREY:
             reason += f"; the projected design is still grey ({self.grayness:.2g})"
         return reason
 
     def _finished(self, limit: int) -> bool:
         """Decide whether to stop; the same on all ranks."""
-        rests = self.iteration > 0 and self.change <= self.scene.optimizer.tolerance
-        if rests and self._final_sharpness:
+        rests = self.iteration > 0 and self.change <= self._small_change and self._final_sharpness
+        if rests and violated(self.limits):
+            self.finished = "infeasible"  # no step mends it: MMA would take it
+        elif rests and self.kkt <= self.scene.optimizer.kkt_tolerance:
             self.finished = "converged"
         elif self.iteration >= limit:
             self.finished = "limit"
         else:
             self.finished = ""
         return bool(self.finished)
+
+    @property
+    def _small_change(self) -> float:
+        """Return the change up to which a design rests; one that the move limit made does not."""
+        options = self.scene.optimizer
+        return min(options.tolerance, MOVING * options.move)
 
     @property
     def _final_sharpness(self) -> bool:
@@ -350,9 +388,8 @@ class _Run:
             if trajectory is not None:
                 self.solutions = trajectory.solutions
             self.trajectory = trajectory
-            # One factorisation at hand at a time: with several designs the gradient is taken now.
-            slopes = self._slopes(mine) if several else None
-            designs.append(_Evaluated(mine, evaluation, slopes))
+            # Taken now, with this design's factorisation at hand.
+            designs.append(_Evaluated(mine, evaluation, self._slopes(mine)))
         if self.trajectory is not None and len(self.initial_deviation) == 0:
             self.initial_deviation = self.trajectory.deviation
         return designs
@@ -391,21 +428,53 @@ class _Run:
         rows = [by_x(row, realised) for row in constraint_gradients(*place)]
         return _Slopes(objective, np.array(rows).reshape(len(rows), self.variables.size))
 
-    def _update(self, designs: Sequence[_Evaluated]) -> None:
-        """Make one MMA step."""
-        slopes = [one.slopes or self._slopes(one.realised) for one in designs]
-        _, weights = worst_of([one.evaluation.objective for one in designs])
-        nominal = designs[-1]
+    def _objective(self, designs: Sequence[_Evaluated]) -> tuple[float, list[float]]:
+        """Return the objective of all designs together, and its slopes by theirs."""
+        values = [one.evaluation.objective for one in designs]
+        return worst_of(values, self.scene.objective.exponent)
+
+    def _posed(self, designs: Sequence[_Evaluated]) -> _Posed:
+        """Return the problem at the current design (collective); keep its limits."""
+        variables, nominal = self.variables, designs[-1]
+        _, weights = self._objective(designs)
+        slopes = [one.slopes for one in designs]
+        volume = variables.volume_constraints(nominal.x_phys)
+        fractions = (1.0 + volume) * self.scene.design.volume_fraction
+        self.limits = worst_limits(
+            [limits_of(self.scene, one.evaluation, fractions.tolist()) for one in designs]
+        )
         constraints = [value for one in designs for value in one.evaluation.constraints]
+        return _Posed(
+            np.sum([w * s.objective for w, s in zip(weights, slopes, strict=True)], axis=0),
+            np.append(volume, constraints),
+            np.vstack(
+                [variables.volume_slopes(nominal.realised)] + [one.constraints for one in slopes]
+            ),
+        )
+
+    def _residual(self, posed: _Posed) -> float:
+        """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
+        variables = self.variables
+        with self.ledger.phase("kkt residual"):
+            return kkt_residual(
+                self.x,
+                variables.xmin,
+                variables.xmax,
+                posed.df0dx,
+                posed.f,
+                posed.dfdx,
+                variables.slices,
+                partial(sum_over_arms, self.share),
+            )[0]
+
+    def _update(self, posed: _Posed) -> None:
+        """Make one MMA step."""
         with self.ledger.phase("mma"):
             x, self.state = mma_step(
                 self.x,
-                np.sum([w * s.objective for w, s in zip(weights, slopes, strict=True)], axis=0),
-                np.append(self.variables.volume_constraints(nominal.x_phys), constraints),
-                np.vstack(
-                    [self.variables.volume_slopes(nominal.realised)]
-                    + [one.constraints for one in slopes]
-                ),
+                posed.df0dx,
+                posed.f,
+                posed.dfdx,
                 self.variables.xmin,
                 self.variables.xmax,
                 self.state,
@@ -451,8 +520,9 @@ class _Run:
                 error = np.inf
             self.choice = replace(self.choice, error=error)
 
-    def _record(self, designs: Sequence[_Evaluated]) -> None:
+    def _record(self, designs: Sequence[_Evaluated], posed: _Posed) -> None:
         """Add a row to the history; collective, kept on the root."""
+        self.kkt = self._residual(posed)
         nominal = designs[-1]
         parts = {}
         for k, volume in self.variables.volume.items():
@@ -464,12 +534,14 @@ class _Run:
         self.grayness = float(grey / total)
         row = HistoryRow(
             iteration=self.iteration,
-            objective=worst_of([one.evaluation.objective for one in designs])[0],
+            objective=self._objective(designs)[0],
             max_deviation=nominal.evaluation.max_deviation,
             grayness=self.grayness,
             volume_fraction=float(volume / total),
             change=self.change,
             seconds=self.earlier + time.perf_counter() - self.begun,
+            kkt=self.kkt,
+            constraints={one.name: one.value for one in self.limits},
         )
         self.history.append(row)
         if self.writer is not None:
@@ -530,5 +602,6 @@ class _Run:
         self.sharpness = memory.sharpness
         self.thresholds = dict(memory.thresholds)
         self.change = memory.history[-1].change
+        self.kkt = memory.history[-1].kkt
         self.grayness = memory.history[-1].grayness
         self.earlier = memory.history[-1].seconds

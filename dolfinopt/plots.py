@@ -33,6 +33,7 @@ from dolfinopt.style import (
     save,
     spread,
 )
+from dolfinopt.units import constraint_label
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -393,7 +394,9 @@ def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str
     for name, value in vars(rows[0]).items():
         if isinstance(value, Mapping):
             for key in value:
-                panels[str(key)] = _numbers([getattr(row, name).get(key) for row in rows])
+                panels[constraint_label(str(key))] = _numbers(
+                    [getattr(row, name).get(key) for row in rows]
+                )
         elif name not in known and isinstance(value, (int, float)):
             panels[name.replace("_", " ")] = _numbers([getattr(row, name) for row in rows])
     return {label: v for label, v in panels.items() if np.isfinite(v).any()}

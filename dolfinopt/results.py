@@ -20,9 +20,9 @@ from dolfinopt.files import (
     ArmView,
     gather_views,
     write_design,
+    write_fields,
     write_summary,
     write_trajectory,
-    write_xdmf,
 )
 from dolfinopt.ledger import Ledger
 from dolfinopt.optimization import Result
@@ -76,13 +76,21 @@ def write_simulation(
         folder: exists.
         simulated: what.
         wall: seconds that it took up to now; the summary's total also counts what follows.
-        paraview: write design.xdmf, too.
+        paraview: write design.vtu and design.xdmf, too.
         pictures: called with the arms' views before the summary is written, on the root.
     """
     s, begun = simulated, time.perf_counter() - wall
     views = gather_views(s.scene, s.share, s.arms, s.x_phys)
     summary = summarise(
-        s.scene, s.share, s.arms, s.x_phys, s.evaluation, s.ledger, wall=wall, choice=s.choice
+        s.scene,
+        s.share,
+        s.arms,
+        s.x_phys,
+        s.evaluation,
+        s.ledger,
+        wall=wall,
+        choice=s.choice,
+        trajectory=s.trajectory,
     )
     return _write(folder, views, s.trajectory, None, summary, paraview, pictures, begun)
 
@@ -103,7 +111,7 @@ def write_result(
         folder: exists; history and checkpoint are there already.
         result: what `optimize` returned.
         wall: seconds that it took up to now; the summary's total also counts what follows.
-        paraview: write design.xdmf, too.
+        paraview: write design.vtu and design.xdmf, too.
         pictures: called with the arms' views before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
@@ -122,6 +130,9 @@ def write_result(
         iterations=result.iterations,
         converged=result.converged,
         stop_reason=result.stop_reason,
+        kkt=result.kkt if np.isfinite(result.kkt) else None,
+        limits=result.limits,
+        trajectory=result.trajectory,
     )
     initial = result.initial_deviation
     return _write(folder, views, result.trajectory, initial, summary, paraview, pictures, begun)
@@ -141,7 +152,7 @@ def _write(
         return None
     write_design(folder, views)
     if paraview:
-        write_xdmf(folder, views)
+        write_fields(folder, views)
     write_trajectory(folder, trajectory, initial)
     if pictures is not None:
         since = time.perf_counter()

@@ -14,10 +14,6 @@ from dolfinopt.arm import fixed_body
 from dolfinopt.body import ShapeIntegrals, of_material, scaled
 from dolfinopt.scene import Scene
 
-# Exponent of the smooth largest of several objectives, unless one is given: 6 % above the largest
-# of three equal ones.
-WORST_CASE = 20.0
-
 
 @dataclass(frozen=True)
 class Factors:
@@ -74,10 +70,11 @@ def slopes_back(slopes: ShapeIntegrals, f: Factors, weight: float) -> ShapeInteg
     return scaled(back, weight * f.mass, weight * f.stiffness, 1.0)
 
 
-def worst_of(values: Sequence[float], exponent: float = WORST_CASE) -> tuple[float, list[float]]:
+def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[float]]:
     """Return (sum f^p)^(1/p) of positive values and its slopes; a single value is itself.
 
-    The largest, made smooth: Kreisselmeier and Steinhauser's function of the logarithms.
+    The largest, made smooth; with p = 20 it is 6 % above the largest of three equal ones:
+    Kreisselmeier and Steinhauser's function of the logarithms.
     Source: Kreisselmeier & Steinhauser (1979), doi:10.1016/S1474-6670(17)65584-8.
     """
     largest = max(values)

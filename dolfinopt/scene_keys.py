@@ -548,7 +548,7 @@ class Objective(Table):
         ge=2,
         le=200,
         description="p of p-means: deviation over time, squared periods over modes, worst "
-        "scenario [-]",
+        "scenario or robust design [-]",
     )
     scenarios: Combination = Field(
         default="sum", description="of the scenarios: weighted sum, or smooth worst case [-]"
@@ -704,7 +704,13 @@ class Optimizer(Table):
         default=1e-3,
         ge=0,
         le=1,
-        description="converged when the largest change of x is below it [-]",
+        description="largest change of x of a converged design [-]",
+    )
+    kkt_tolerance: float = Field(
+        default=1e-2,
+        ge=0,
+        le=1e6,
+        description="largest Karush-Kuhn-Tucker residual of a converged design [-]",
     )
 
 

@@ -96,6 +96,27 @@ class Trajectory:
         return rigid_motion(self.t, self.scene)
 
     @property
+    def settling(self) -> float:
+        """Largest deviation after the motion has ended, t >= motion.duration, m.
+
+        With a horizon that ends with the motion, the deviation at its end.
+        """
+        distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
+        after = self.t >= self.scene.motion.duration - 1e-9 * self.scene.motion.horizon
+        after[-1] = True
+        return float(distance[after].max())
+
+    @property
+    def drives(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest absolute value and root mean square over time of `joint_forces` (1 + arms,)."""
+        forces = self.joint_forces
+        if len(self.t) == 1:
+            return np.abs(forces[0]), np.abs(forces[0])
+        steps = np.diff(self.t)[:, None]
+        squares = 0.5 * steps * (forces[1:] ** 2 + forces[:-1] ** 2)
+        return np.abs(forces).max(axis=0), np.sqrt(squares.sum(axis=0) / steps.sum())
+
+    @property
     def max_deviation(self) -> tuple[float, float]:
         """Largest distance between flexible and rigid end-effector, m, and its instant, s."""
         distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])

@@ -26,6 +26,11 @@ class StaticResponse:
         """Sum over the cases of load . displacement, N m."""
         return float(np.sum(self.loads * self.tip))
 
+    @property
+    def largest(self) -> float:
+        """Largest |u_k| of the outboard point, m."""
+        return float(np.hypot(self.tip[0], self.tip[1]).max())
+
     def deflection(self, exponent: float) -> float:
         """Return (sum_k |u_k|^p)^(1/p) of the outboard point, m: at least the largest |u_k|."""
         size = np.hypot(self.tip[0], self.tip[1])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,15 @@ from mpi4py import MPI
 from dolfinopt.arm import Arm
 from dolfinopt.coordinates import Choice
 from dolfinopt.evaluation import Evaluation, Motion
-from dolfinopt.files import versions
+from dolfinopt.files import drive_units, trajectory_units, versions
 from dolfinopt.ledger import Counts, Ledger
+from dolfinopt.limits import Limit, limits_of, summary_of
 from dolfinopt.parallel import ArmShare, gather_arms
 from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene
+from dolfinopt.simulation import Trajectory
+from dolfinopt.units import HISTORY, OBJECTIVES, SUMMARY
+from dolfinopt.vibration import frequency_excess
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -41,6 +45,9 @@ def summarise(
     iterations: int = 0,
     converged: bool = True,
     stop_reason: str = "simulated",
+    kkt: float | None = None,
+    limits: Sequence[Limit] | None = None,
+    trajectory: Trajectory | None = None,
 ) -> dict[str, Any]:
     """Return the content of summary.json on the root, an empty dict elsewhere (collective).
 
@@ -51,7 +58,9 @@ def summarise(
         counts: this rank's, where not all of the ledger's belong to the run.
         crisp: evaluation of the design cut at one half.
         choice: what `reduction.coordinates = "auto"` came to.
-        iterations, converged, stop_reason: of the optimisation.
+        iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
+        limits: the constraints; by default those of `evaluation` and `x_phys`.
+        trajectory: of the design, on the root.
     """
     volumes = gather_arms(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
     sizes = gather_arms(share, {k: _volume(scene, k, a) for k, a in arms.items()})
@@ -61,14 +70,18 @@ def summarise(
     mine = (counts or ledger.counts) if share.leads else Counts()
     counted = share.world.gather(mine, root=0)
     memory = share.world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
+    errors = _frequency_errors(share, arms, x_phys, ledger)
     if counted is None or memory is None:
         return {}
+    if limits is None:
+        limits = limits_of(scene, evaluation, _limited_fractions(scene, volumes, sizes))
     return {
         "name": scene.name,
         "objective": evaluation.objective,
         "compliance": evaluation.compliance,
         "max_deviation": evaluation.max_deviation,
         "max_deviation_time": evaluation.max_deviation_time,
+        **({} if trajectory is None else _machine(scene, trajectory)),
         "grayness": float(np.average([greys[k] for k in sizes], weights=list(sizes.values()))),
         "volume_fraction": {
             arm.name: volumes[owner]
@@ -80,10 +93,15 @@ def summarise(
             for arm, value in zip(scene.arms, evaluation.first_frequencies, strict=True)
             if np.isfinite(value)
         },
+        "first_frequency_error": {
+            arm.name: errors[owner]
+            for arm, owner in zip(scene.arms, scene.owners, strict=True)
+            if owner in errors
+        },
         "loaded_frequency": dict(
             zip(_flexible_names(scene), evaluation.loaded_frequencies, strict=False)
         ),
-        "constraints": list(evaluation.constraints),
+        "constraints": summary_of(limits),
         "scenarios": [
             {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
             for one, motion in zip(scene.scenarios, evaluation.scenarios, strict=True)
@@ -100,13 +118,67 @@ def summarise(
         "iterations": iterations,
         "converged": converged,
         "stop_reason": stop_reason,
+        "kkt": kkt,
         "seconds": {**seconds, "total": wall},
         "counts": asdict(sum(counted, Counts())),
         "peak_memory_mb": max(memory),
         "ranks": share.world.size,
+        "units": _units(scene, trajectory),
         "versions": versions(),
         "scene": scene.to_dict(),
     }
+
+
+def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
+    """Return masses, drives and residual vibration."""
+    peak, rms = trajectory.drives
+    names = list(drive_units(scene))
+    bodies = trajectory.mechanism.bodies
+    driven = range(1 if scene.motion.base == "fixed" else 0, len(names))  # a base is no drive
+    return {
+        "settling": trajectory.settling,
+        "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
+        "drive_peak": {names[k]: float(peak[k]) for k in driven},
+        "drive_rms": {names[k]: float(rms[k]) for k in driven},
+    }
+
+
+def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
+    """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
+    unit = OBJECTIVES[scene.objective.kind][1]
+    units: dict[str, Any] = {"objective": unit, **SUMMARY}
+    units["drive_peak"] = units["drive_rms"] = drive_units(scene)
+    units["history.csv"] = {"objective": unit, **HISTORY}
+    if trajectory is not None:
+        units["trajectory.csv"] = trajectory_units(trajectory)
+    return units
+
+
+def _limited_fractions(
+    scene: Scene, volumes: Mapping[int, float], sizes: Mapping[int, float]
+) -> list[float]:
+    """Return the volume fractions that have a limit: every design's, or that of all together."""
+    if not scene.design.shared_volume:
+        return [volumes[k] for k in scene.cell_counts]
+    weights = [sizes[k] for k in sizes]
+    return [float(np.average([volumes[k] for k in sizes], weights=weights))]
+
+
+def _frequency_errors(
+    share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray], ledger: Ledger
+) -> dict[int, float]:
+    """Return `frequency_excess` of every design that is reduced, on the root (collective).
+
+    It is not counted: nothing depends on it.
+    """
+    counts, errors = replace(ledger.counts), {}
+    with ledger.phase("frequency error"):
+        for index, arm in arms.items():
+            if arm.basis is not None:
+                body = arm.reduce(x_phys[index])
+                errors[index] = frequency_excess(arm.elastic, arm.basis.V, body.K, body.M)
+    ledger.counts = counts
+    return gather_arms(share, errors)
 
 
 def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:

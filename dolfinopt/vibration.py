@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from dolfinopt.elasticity import ElasticArm
 from dolfinopt.reduction.basis import lowest_eigenpairs
-from dolfinopt.reduction.free_arm import FreeOperators
+from dolfinopt.reduction.free_arm import FreeArm, FreeOperators
 
 # -- what an arm carries ---------------------------------------------------------------------
 
@@ -123,6 +124,31 @@ def _moved_slopes(slope: RigidIntegrals, lever: complex) -> RigidIntegrals:
     """Return the slopes by a body's integrals from those by its `moved` ones."""
     mass = slope.mass + (np.conj(slope.moment) * lever).real + slope.inertia * abs(lever) ** 2
     return RigidIntegrals(float(mass), slope.moment + 2.0 * slope.inertia * lever, slope.inertia)
+
+
+# -- how far off a reduced model is ------------------------------------------------------------
+
+
+def frequency_excess(arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: np.ndarray) -> float:
+    """Return by how much the reduced first frequency exceeds the full model's, relative.
+
+    Collective on the arm's ranks. One inverse iteration of the full clamped-free arm,
+    z = K^-1 M u, from the reduced model's first mode u: Rayleigh's quotients fulfil
+    lambda <= R(z) <= R(u), and R(z) has (lambda / lambda_2)^2 times the error of R(u), for a beam
+    1/1500. The estimate is sqrt(R(u) / R(z)) - 1.
+    Source: Parlett, The Symmetric Eigenvalue Problem (1998), doi:10.1137/1.9781611971163, ch. 4.
+
+    Args:
+        arm: with its design set.
+        V: (n_nodes, 2, q) reduced basis.
+        K_r, M_r: (q, q) reduced stiffness and mass.
+    """
+    values, vectors = eigh(K_r, M_r, subset_by_index=[0, 0])
+    mass_times_u = arm.mass_times(V @ vectors)
+    z = FreeArm(arm).solve(arm.restrict(mass_times_u))
+    parts = np.array([np.sum(z * mass_times_u), np.sum(z * arm.mass_times(z))])
+    energy, mass = arm.comm.allreduce(parts) if arm.comm.size > 1 else parts
+    return max(0.0, float(np.sqrt(values[0] * mass / energy)) - 1.0)
 
 
 # -- modes -----------------------------------------------------------------------------------

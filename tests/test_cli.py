@@ -53,6 +53,7 @@ def test_optimize_writes_every_file(optimised):
         "checkpoint.npz",
         "design.npz",
         "design.png",
+        "design.vtu",
         "design.xdmf",
         "deviation.png",
         "history.csv",
@@ -81,7 +82,9 @@ def test_time_is_the_time_one_waited(optimised):
 
 def test_design_file(optimised):
     with np.load(optimised / "design.npz") as design:
-        assert set(design.files) == {f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "density")}
+        arrays = {f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "density")}
+        assert set(design.files) == {"units", *arrays}
+        assert design["units"].tolist() == ["centroid: m", "density: -"]
         centroid, density = design["arm1/centroid"], design["arm1/density"]
     assert centroid.shape == (160, 2) and density.shape == (160,)
     assert 0.0 <= density.min() and density.max() <= 1.0
@@ -94,6 +97,10 @@ def test_trajectory_files(optimised):
     with np.load(optimised / "trajectory.npz") as data:
         shapes = {key: data[key].shape for key in data.files}
         deviation, compliance, t = data["deviation"], data["compliance"], data["t"]
+        q_r, q_e, forces = data["q_r"], data["q_e"], data["joint_forces"]
+        units = dict(text.split(": ", 1) for text in data["units"].tolist())
+    assert units["deviation"] == "m" and units["joint_forces"] == "N, N m, N m"
+    assert set(units) == set(shapes) - {"units"}
     assert shapes == {
         "t": (601,),
         "q_r": (601, 3),
@@ -102,19 +109,30 @@ def test_trajectory_files(optimised):
         "compliance": (601, 2),
         "joint_forces": (601, 3),
         "initial_deviation": (601, 2),
+        "units": (7,),
     }
     lines = (optimised / "trajectory.csv").read_text().splitlines()
-    assert lines[0] == "t,deviation_x,deviation_y,deviation,compliance"
-    table = np.array([[float(v) for v in line.split(",")] for line in lines[1:]])
-    np.testing.assert_allclose(table[:, 0], t, atol=1e-12)
+    assert lines[0].startswith("t,deviation_x,deviation_y,deviation,compliance,q_r_cart,")
+    table = np.genfromtxt(optimised / "trajectory.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["t"], t, atol=1e-12)
     # Ten digits are written.
-    np.testing.assert_allclose(table[:, 1:3], deviation, atol=1e-11)
-    np.testing.assert_allclose(table[:, 4], compliance.sum(axis=1), atol=1e-9)
+    np.testing.assert_allclose(table["deviation_x"], deviation[:, 0], atol=1e-11)
+    np.testing.assert_allclose(table["deviation_y"], deviation[:, 1], atol=1e-11)
+    np.testing.assert_allclose(table["compliance"], compliance.sum(axis=1), atol=1e-9)
+    np.testing.assert_allclose(table["compliance_arm2"], compliance[:, 1], atol=1e-9)
+    for k, name in enumerate(("cart", "arm1", "arm2")):
+        np.testing.assert_allclose(table[f"q_r_{name}"], q_r[:, k], rtol=1e-9)
+        np.testing.assert_allclose(table[f"joint_force_{name}"], forces[:, k], atol=1e-7)
+    np.testing.assert_allclose(table["q_e_arm2_4"], q_e[:, 7], atol=1e-9)
+    units = json.loads((optimised / "summary.json").read_text())["units"]["trajectory.csv"]
+    assert list(units) == lines[0].split(",")
+    assert units["joint_force_cart"] == "N" and units["joint_force_arm2"] == "N m"
 
 
 def test_history_ends_in_the_summary(optimised):
     lines = (optimised / "history.csv").read_text().splitlines()
-    header = "iteration,objective,max_deviation,grayness,volume_fraction,change,seconds"
+    header = "iteration,objective,max_deviation,grayness,volume_fraction,change,seconds,kkt,"
+    header += "volume_fraction_arm1,volume_fraction_arm2"
     assert lines[0] == header
     assert [int(line.split(",")[0]) for line in lines[1:]] == [0, 1, 2, 3]
     last = dict(zip(header.split(","), map(float, lines[-1].split(",")), strict=True))
@@ -125,6 +143,11 @@ def test_history_ends_in_the_summary(optimised):
     assert last["grayness"] == pytest.approx(summary["grayness"], rel=1e-9)
     assert summary["iterations"] == 3 and summary["converged"] is False
     assert "max_iterations" in summary["stop_reason"]
+    assert last["kkt"] == pytest.approx(summary["kkt"], rel=1e-9)
+    assert 1e-2 < summary["kkt"] < 1.0  # far from an optimum after three iterations
+    for name, one in summary["constraints"].items():
+        assert one["value"] == pytest.approx(last[name], rel=1e-9)
+        assert (one["limit"], one["unit"], one["met"]) == (0.5, "-", True)
 
 
 def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
@@ -156,6 +179,7 @@ def test_gradient_file(optimised, shared_tmp_path):
     with np.load(out) as data:
         assert set(data.files) == {
             "objective",
+            "units",
             *(f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "gradient")),
         }
         assert data["objective"] > 0.0

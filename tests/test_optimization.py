@@ -141,9 +141,15 @@ def test_bounds_out_of_reach_are_told():
     """No design of half the material is so stiff: the run says so."""
     result = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1e-6"))
     assert max(result.evaluation.constraints) > 10.0
-    assert "a constraint is exceeded by" in result.stop_reason
+    assert not result.converged
+    value = 1e6 * max(result.evaluation.tip_deflections)
+    assert value > 10.0
+    assert (
+        "tip deflection of arm1" in result.violated and "at most 1e-06 m asked" in result.violated
+    )
+    assert result.violated in result.stop_reason
     kept = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1.0"))
-    assert "exceeded" not in kept.stop_reason
+    assert kept.violated == "" and "not met" not in kept.stop_reason
 
 
 # -- resume ----------------------------------------------------------------------------------
@@ -287,6 +293,7 @@ def test_same_design_on_any_number_of_ranks(tmp_path):
         line += ["--set", "arms.cells=[100,6]", "--set", "optimizer.max_iterations=15"]
         subprocess.run(command(*line, ranks=ranks), env=ENVIRONMENT, check=True, timeout=120)
         with np.load(folder / "design.npz") as data:
-            designs.append(np.concatenate([data[key].ravel() for key in data.files]))
+            keys = [key for key in data.files if key != "units"]
+            designs.append(np.concatenate([data[key].ravel() for key in keys]))
     for other in designs[1:]:
         np.testing.assert_array_equal(other, designs[0])

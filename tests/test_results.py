@@ -13,7 +13,14 @@ from dolfinopt.results import Simulated, write_result, write_simulation
 SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
 SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01")
-FILES = {"design.npz", "design.xdmf", "summary.json", "trajectory.csv", "trajectory.npz"}
+FILES = {
+    "design.npz",
+    "design.vtu",
+    "design.xdmf",
+    "summary.json",
+    "trajectory.csv",
+    "trajectory.npz",
+}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +49,7 @@ def test_files(result, shared_tmp_path, paraview):
     if WORLD.rank > 0:
         assert written is None and again is None
         return
-    expected = FILES if paraview else FILES - {"design.xdmf"}
+    expected = FILES if paraview else FILES - {"design.vtu", "design.xdmf"}
     for folder, wall, iterations in ((one, 12.5, 1), (other, 2.5, 0)):
         assert {path.name for path in folder.iterdir()} == expected
         summary = json.loads((folder / "summary.json").read_text())

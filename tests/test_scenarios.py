@@ -152,15 +152,15 @@ def test_frozen_gradient_adds_up():
 
 def test_worst_case_bounds_and_slopes():
     values = [3.0, 2.9, 0.1]
-    worst, slopes = worst_of(values)
+    worst, slopes = worst_of(values, 20.0)
     assert 3.0 < worst < 3.0 * 3 ** (1 / 20)
     step = 1e-6
     for k in range(3):
         moved = [v + step * (i == k) for i, v in enumerate(values)]
         back = [v - step * (i == k) for i, v in enumerate(values)]
-        difference = (worst_of(moved)[0] - worst_of(back)[0]) / (2.0 * step)
+        difference = (worst_of(moved, 20.0)[0] - worst_of(back, 20.0)[0]) / (2.0 * step)
         assert slopes[k] == pytest.approx(difference, abs=1e-8)
-    assert worst_of([5.0]) == (5.0, [1.0])
+    assert worst_of([5.0], 20.0) == (5.0, [1.0])
 
 
 def test_weights_scale_the_worst_case():

@@ -43,7 +43,7 @@ QUICK = (
     "simulation.tolerance=1e-2",
 )
 ITERATIONS = 2
-ARMS, DESIGNS = 2, ITERATIONS + 1  # the last design is evaluated, but has no gradient
+ARMS, DESIGNS = 2, ITERATIONS + 1  # the last one's gradient tells how far it is from an optimum
 
 Counts = dict[str, int]
 Run = Callable[..., Path]
@@ -88,19 +88,19 @@ CASES: dict[tuple[str, ...], Counts] = {
     # Nothing twice for one design: a factor an arm and design; frozen loads need no adjoint.
     (): {**ONCE, "eigenproblems": EACH, "simulations": DESIGNS, "adjoints": 0},
     ("objective.kind=deviation",): {"simulations": DESIGNS, "adjoints": 0},
-    # With everything a scene may ask for the factor is the same; the last design needs no gradient.
-    (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1e-4"): {
+    # With everything a scene may ask for the factor is the same.
+    (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0"): {
         **ONCE,
         "eigenproblems": 2 * EACH,  # of the basis, and with what the arm carries
         "simulations": DESIGNS,
-        "adjoints": ITERATIONS,
+        "adjoints": DESIGNS,
     },
     # q = 3: no eigenproblem, three solves for the constraint modes, three more for their adjoints.
     ("reduction.coordinates=3",): {**ONCE, "eigenproblems": 0, "solves": 3 * EACH},
     ("reduction.coordinates=3", EXACT): {
         **ONCE,
         "eigenproblems": 0,
-        "solves": 3 * EACH + 3 * ARMS * ITERATIONS,
+        "solves": 3 * EACH + 3 * EACH,
     },
     ("reduction.method=krylov",): {**ONCE, "eigenproblems": 0, "solves": 4 * EACH},
     # Static: no simulation, no basis, no mass matrix, whatever the damping, payload and motion.
@@ -111,7 +111,7 @@ CASES: dict[tuple[str, ...], Counts] = {
         "solves": 3 * EACH,
         "eigenproblems": 0,
     },
-    ("objective.kind=static", "constraints.tip_deflection=1e-6", EXACT): {
+    ("objective.kind=static", "constraints.tip_deflection=1.0", EXACT): {
         **STILL,
         "assemblies": EACH,
         "factorisations": EACH,
@@ -125,7 +125,7 @@ CASES: dict[tuple[str, ...], Counts] = {
         "assemblies": 2 * EACH,
         "factorisations": EACH,
         "eigenproblems": EACH,
-        "energy_fields": (2 * 3 * ARMS + 2) * ITERATIONS,
+        "energy_fields": (2 * 3 * ARMS + 2) * DESIGNS,
     },
     # Bounded as well as maximised: the same modes.
     ("objective.kind=eigenfrequency", "constraints.first_frequency=1.0"): {
@@ -135,7 +135,7 @@ CASES: dict[tuple[str, ...], Counts] = {
     },
     # A shared design: all that concerns one arm alone once.
     (SHARED,): {**ONE_ARM, "eigenproblems": DESIGNS, "simulations": DESIGNS},
-    (SHARED, EXACT): {**ONE_ARM, "eigenproblems": DESIGNS, "adjoints": ITERATIONS},
+    (SHARED, EXACT): {**ONE_ARM, "eigenproblems": DESIGNS, "adjoints": DESIGNS},
     (SHARED, "objective.kind=static"): {**STILL, "assemblies": DESIGNS, "solves": 3 * DESIGNS},
     (SHARED, "objective.kind=eigenfrequency"): {
         **STILL,
@@ -155,8 +155,8 @@ def test_only_what_the_scene_needs(run: Run, overrides: tuple[str, ...]) -> None
     assert {key: found[key] for key in expected} == expected
 
 
-def test_a_first_design_alone_needs_no_gradient(run: Run) -> None:
-    found = counts(run("optimize", EXACT, "optimizer.max_iterations=0"))
+def test_a_simulation_needs_no_gradient(run: Run) -> None:
+    found = counts(run("simulate", EXACT))
     assert found["adjoints"] == found["energy_fields"] == 0
     assert found["factorisations"] == ARMS and found["simulations"] == 1
 
@@ -199,7 +199,7 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
     del few["newton_iterations"], many["newton_iterations"]
     assert few == many
     if gradient == "esl":
-        assert few["energy_fields"] == 3 * ARMS * ITERATIONS
+        assert few["energy_fields"] == 3 * EACH
 
 
 # -- damping ---------------------------------------------------------------------------------
@@ -333,4 +333,4 @@ def test_nothing_is_drawn_exported_or_gathered_unless_asked(
     folder = run("optimize", "optimizer.max_iterations=3")
     assert len(gathered) == 1
     kinds = {path.suffix for path in folder.iterdir()}
-    assert kinds == {".json", ".npz", ".csv", ".xdmf"}
+    assert kinds == {".json", ".npz", ".csv", ".vtu", ".xdmf"}

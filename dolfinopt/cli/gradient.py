@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt.cli.options import design_option, scene_argument, set_option
-from dolfinopt.cli.shared import UNITS, design_of, load, prepare, tell
+from dolfinopt.cli.shared import design_of, load, prepare, tell
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.scene import Scene
+from dolfinopt.units import OBJECTIVES
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -61,7 +62,7 @@ def gradient(
     by_cell = slopes(loaded, share, arms, trajectory, ledger)
     write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
-        unit = UNITS[loaded.objective.kind]
+        unit = OBJECTIVES[loaded.objective.kind][1]
         name = kind if loaded.objective.simulated else "exact"
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
     if check:

@@ -15,6 +15,7 @@ from dolfinopt.cli.options import (
     set_option,
 )
 from dolfinopt.cli.shared import conclude, draw, elapsed, load, prepare, progress
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
@@ -57,7 +58,11 @@ def optimize(
 
 
 def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, animation: bool) -> None:
-    """Write everything an optimisation leaves behind (collective)."""
+    """Write everything an optimisation leaves behind (collective).
+
+    Raises:
+        ConvergenceError: the design does not meet a constraint; everything is written.
+    """
     from dolfinopt.results import write_result
 
     def pictures(views: list[ArmView]) -> None:
@@ -67,6 +72,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
 
     drawn = pictures if plots or animation else None
     written = write_result(scene, folder, result, elapsed(), pictures=drawn)
-    if written is None:
-        return
-    conclude(written.summary, folder)
+    if written is not None:
+        conclude(written.summary, folder)
+    if result.violated:  # known to all ranks
+        raise ConvergenceError(f"the design is not feasible: {result.violated}")

@@ -17,6 +17,7 @@ from dolfinopt.contents import found_again
 from dolfinopt.errors import InputError
 from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene, load_scene, scene_from_dict
+from dolfinopt.units import NOT_MET, OBJECTIVES
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -26,15 +27,6 @@ if TYPE_CHECKING:
     from dolfinopt.files import ArmView, HistoryRow
     from dolfinopt.parallel import ArmShare
     from dolfinopt.simulation import Trajectory
-
-
-UNITS = {
-    "esl": "N m",
-    "compliance": "N m s",
-    "deviation": "m",
-    "static": "N m",
-    "eigenfrequency": "s2",
-}
 
 
 def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
@@ -121,16 +113,10 @@ def draw(
     from dolfinopt import plots
     from dolfinopt.files import designed
 
-    labels = {
-        "esl": "compliance of the load cases [N m]",
-        "compliance": "integral of the compliance [N m s]",
-        "deviation": "p-mean of the deviation [m]",
-        "static": "compliance under static loads [N m]",
-        "eigenfrequency": "squared longest periods [s2]",
-    }
+    label = "{} [{}]".format(*OBJECTIVES[scene.objective.kind])
     plots.draw_design(folder / "design.png", designed(views), scene.name)
     if history:
-        plots.draw_history(folder / "history.png", history, labels[scene.objective.kind])
+        plots.draw_history(folder / "history.png", history, label)
     plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
     mechanism, t, q_r = trajectory.mechanism, trajectory.t, trajectory.q_r
     plots.draw_machine(folder / "machine.png", views, mechanism, t, q_r, scene.name)
@@ -144,14 +130,32 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     found = summary["reduction"]
     if found["error_estimate"] is not None:
         click.echo(_chosen(found["coordinates"], found["error_estimate"]))
+    ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
+    optimised = summary["kkt"] is not None
+    if optimised:
+        ending = f"{summary['iterations']} iterations ({ending}), minimised"
     click.echo(
-        f"{summary['name']}: {summary['iterations']} iterations ({summary['stop_reason']}), "
-        f"compliance {summary['compliance']:.4g} N m, "
+        f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
         f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
         f"at {summary['max_deviation_time']:.3f} s, "
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
     )
+
+
+def _minimised(summary: Mapping[str, Any]) -> str:
+    """Return name, value and unit of the objective, and the frequencies that it stands for."""
+    options, scenarios = summary["scene"]["objective"], summary["scenarios"]
+    name, unit = OBJECTIVES[options["kind"]]
+    if scenarios:
+        how = "weighted sum" if options["scenarios"] == "sum" else "worst"
+        name += f" ({how} of {len(scenarios)} scenarios)"
+    text = f"{name} {summary['objective']:.4g} {unit}"
+    if options["kind"] == "eigenfrequency":
+        frequencies = summary["loaded_frequency"].items()
+        found = ", ".join(f"{arm} {value:.4g} Hz" for arm, value in frequencies)
+        text += f" (first frequency of {found})"
+    return text
 
 
 def tell(world: MPI.Comm, choice: Choice | None) -> None:
