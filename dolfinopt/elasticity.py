@@ -24,8 +24,9 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.floating import HARMLESS, Connectivity, extremes
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import ArmMesh
-from dolfinopt.parallel import direct_solver
+from dolfinopt.parallel import direct_solver, obeying_options
 
+OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Largest error that rounding may make in the stiffness of a design in which solids float, relative.
 # Against long double errors are 0.03 to 0.35 of the estimate.
 ROUNDED = 1e-3
@@ -409,11 +410,12 @@ class ElasticArm:
         if self._K_II is None:
             self._K_II = InteriorMatrix(self.comm, local, 1, self._numbers, self.num_interior)
         if self._ksp is None:
-            self._ksp = direct_solver(self._K_II.mat, "natural")  # numbered for it
+            self._ksp = direct_solver(self._K_II.mat, "natural", OPTIONS)  # numbered for it
         with self.ledger.phase("factorisation"):
             self._K_II.update(local.data)
             self._ksp.setOperators(self._K_II.mat)
-            self._ksp.setUp()
+            with obeying_options(OPTIONS):
+                self._ksp.setUp()
         self.ledger.counts.factorisations += 1
         self._factor_ready = True
         return self._ksp
@@ -426,12 +428,14 @@ class ElasticArm:
         """
         b, x = self.factorise().getOperators()[0].createVecs()
         out = np.empty_like(right)
+        failed = False
         with self.ledger.phase("solves"):
             for k in range(right.shape[1]):
                 b.array = right[:, k]
                 self.solve_vector(b, x)
                 out[:, k] = x.array_r
-        if self.factorise().getConvergedReason() < 0:  # the same on all ranks
+                failed = failed or self.factorise().getConvergedReason() < 0
+        if failed:  # the same on all ranks
             raise ConvergenceError(
                 f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is lost "
                 "in the rounding of solid; raise interpolation.floor or design.minimum"

@@ -153,7 +153,7 @@ class _TwoPoint:
         self.area = mesh.area
         leak = np.where(sides.open, r * r * sides.length / (sides.distance + r), 0.0).sum(axis=1)
         matrix = _two_point_operator(mesh, r, leak)
-        self._solver = direct_solver(matrix, "rcm")
+        self._solver = direct_solver(matrix, "rcm", "dolfinopt_filter_")
         self._b, self._x = matrix.createVecs()
 
     def forward(self, x: np.ndarray) -> np.ndarray:
@@ -225,7 +225,7 @@ class _Hybrid:
         number = number.astype(PETSc.IntType).reshape(sides.facet.shape)
         self._C = _matrix(mesh, c[:, None, :], np.arange(mesh.num_cells)[:, None], number)
         self._A = _positive_definite(_matrix(mesh, A, number, number))
-        self._solver = direct_solver(self._A, "rcm")
+        self._solver = direct_solver(self._A, "rcm", "dolfinopt_filter_")
         self._y, self._u = self._C.createVecLeft(), self._C.createVecRight()
         self._b = self._u.duplicate()
 

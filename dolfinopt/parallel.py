@@ -181,15 +181,41 @@ def _all_arrive(comm: MPI.Comm) -> bool:
     return False
 
 
-def direct_solver(mat: PETSc.Mat, ordering: str) -> PETSc.KSP:
+@contextmanager
+def obeying_options(prefix: str) -> Iterator[None]:
+    """Name the user's PETSc options of this prefix where PETSc or SLEPc refuses them.
+
+    Raises:
+        InputError: PETSc failed, and there are such options.
+    """
+    try:
+        yield
+    except PETSc.Error as error:
+        given = PETSc.Options(prefix).getAll()
+        if not given:
+            raise
+        options = " ".join(f"-{prefix}{key} {value}".strip() for key, value in given.items())
+        raise InputError(
+            f"PETSc options {options}: PETSc refuses them or fails with them (error {error.ierr})"
+        ) from None
+
+
+def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str) -> PETSc.KSP:
     """Return a Cholesky solver: PETSc's own on one rank, MUMPS across ranks.
+
+    PETSc options that begin with the prefix replace these choices.
 
     Args:
         mat: symmetric positive definite, marked so.
         ordering: PETSc's name of the elimination order of a small matrix on one rank; large ones
             take nested dissection, MUMPS chooses its own.
+        prefix: of the options, e.g. "dolfinopt_stiffness_".
+
+    Raises:
+        InputError: PETSc refuses the user's options.
     """
     ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOptionsPrefix(prefix)
     ksp.setOperators(mat)
     ksp.setType(PETSc.KSP.Type.PREONLY)
     pc = ksp.getPC()
@@ -199,4 +225,6 @@ def direct_solver(mat: PETSc.Mat, ordering: str) -> PETSc.KSP:
         pc.setFactorOrdering(ordering if mat.getSize()[0] < NESTED_ROWS else "nd")
     else:
         pc.setFactorSolverType("mumps")
+    with obeying_options(prefix):
+        ksp.setFromOptions()
     return ksp

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
+import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.parallel import (
     SPLIT_CELLS,
@@ -225,9 +227,92 @@ def test_direct_solver(ordering):
     first, last = mat.getOwnershipRange()
     x.array = np.sin(np.arange(first, last))
     mat.mult(x, b)
-    solver = direct_solver(mat, ordering)
+    solver = direct_solver(mat, ordering, "test_")
     found = x.duplicate()
     solver.solve(b, found)
     assert np.abs(found.array_r - x.array_r).max(initial=0.0) < 1e-14 * 9.0  # the condition
     kind = solver.getPC().getFactorSolverType()
     assert kind == ("petsc" if COMM.size == 1 else "mumps")
+
+
+# -- PETSc's options -------------------------------------------------------------------------
+
+SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
+VIEWED = {  # option, what the view shows by default and with the option
+    "dolfinopt_stiffness_": (
+        "ksp_view",
+        "pc_factor_mat_ordering_type rcm",
+        "ordering: natural",
+        "ordering: rcm",
+    ),
+    "dolfinopt_filter_": (
+        "ksp_view",
+        "pc_factor_mat_ordering_type nd",
+        "ordering: rcm",
+        "ordering: nd",
+    ),
+    "dolfinopt_modes_": ("eps_view", "eps_type arnoldi", "type: krylovschur", "type: arnoldi"),
+}
+
+
+def views(folder, *options):
+    """Return what PETSc shows of each solver of a simulation with these options."""
+    given = [f"-{p}{one[0]} ascii:{folder}/{p}.txt" for p, one in VIEWED.items()]
+    scene = [SCENE, "--set", "arms.cells=[16,3]", "--out", folder / "out", "--no-plots"]
+    run = subprocess.run(
+        [sys.executable, "-m", "dolfinopt", "simulate", *map(str, scene)],
+        env=os.environ | {"PETSC_OPTIONS": " ".join([*given, *options])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    return run, {p: (folder / f"{p}.txt") for p in VIEWED}
+
+
+@pytest.mark.serial
+def test_petsc_options_reach_every_solver(tmp_path):
+    """What PETSC_OPTIONS says of a solver holds for it; every solver has its own prefix."""
+    for kind, changes in (("default", ()), ("changed", VIEWED)):
+        folder = tmp_path / kind
+        folder.mkdir()
+        run, files = views(folder, *(f"-{p}{VIEWED[p][1]}" for p in changes))
+        assert run.returncode == 0, run.stderr
+        for prefix, (_, _, default, other) in VIEWED.items():
+            seen = files[prefix].read_text()
+            assert f"({prefix})" in seen
+            assert (other in seen) == bool(changes)
+            assert (default in seen) != bool(changes)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    "option",
+    [
+        "-dolfinopt_stiffness_pc_type nonsense",
+        "-dolfinopt_stiffness_pc_factor_mat_solver_type nonsense",
+        "-dolfinopt_filter_pc_type nonsense",
+        "-dolfinopt_modes_eps_type nonsense",
+    ],
+)
+def test_options_that_petsc_refuses(tmp_path, option):
+    run, _ = views(tmp_path, option)
+    assert run.returncode == 2
+    assert "Traceback" not in run.stderr
+    assert any(option in line for line in run.stderr.splitlines())
+
+
+def test_options_of_other_programs_change_nothing():
+    """Options without a prefix of ours are for other solvers in the same process."""
+    options = PETSc.Options()
+    for key, value in (("ksp_type", "cg"), ("pc_type", "jacobi"), ("eps_type", "arnoldi")):
+        options[key] = value
+    try:
+        scene = do.load_scene(SCENE, ("arms.cells=[16,3]",))
+        share = do.share_arms(COMM, scene.cell_counts)
+        for arm in do.build_arms(scene, share, do.Ledger()).values():
+            arm.reduce(arm.uniform(0.5))
+            assert arm.elastic.factorise().getType() == "preonly"
+            assert arm.elastic.factorise().getPC().getType() == "cholesky"
+    finally:
+        for key in ("ksp_type", "pc_type", "eps_type"):
+            options.delValue(key)

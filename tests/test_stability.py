@@ -201,8 +201,8 @@ def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
     contrast is refused, whatever rounding makes of it.
     """
     estimates = []
-    for floor in 10.0 ** -np.arange(6.0, 17.0):
-        arm = one_arm("interpolation.law=two-material", f"interpolation.floor={floor}", cells=cells)
+    for floor in 10.0 ** (-0.5 * np.arange(6.0, 17.0)):  # SIMP: its square to solid
+        arm = one_arm("interpolation.law=simp", f"interpolation.floor={floor}", cells=cells)
         arm.set_design(DESIGNS[name](0, *arm.mesh.centroid.T))
         if estimates and 10.0 * estimates[-1] > 0.9 * ROUNDED:
             with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):

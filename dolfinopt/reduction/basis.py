@@ -11,7 +11,9 @@ from slepc4py import SLEPc
 
 from dolfinopt.elasticity import ElasticArm
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.parallel import obeying_options
 
+OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
 # equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
 EIGEN_TOLERANCE = 1e-12
@@ -170,6 +172,7 @@ class _Eigenproblem:
             beside: (rows, k) vectors to which the new ones are M-orthogonal.
         """
         eps = SLEPc.EPS().create(self.arm.comm)
+        eps.setOptionsPrefix(OPTIONS)
         eps.setOperators(self.stiffness, self.mass)
         eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
         eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_REAL)
@@ -184,7 +187,9 @@ class _Eigenproblem:
         eps.setInitialSpace(_initial_space(vector, start))
         if beside is not None:
             eps.setDeflationSpace([_filled(vector, column) for column in beside.T])
-        eps.solve()
+        with obeying_options(OPTIONS):
+            eps.setFromOptions()
+            eps.solve()
         found = min(eps.getConverged(), count)
         values = np.empty(found)
         vectors = np.empty((vector.getLocalSize(), found))
@@ -254,6 +259,7 @@ class _Inverse:
 def _as_ksp(operator: PETSc.Mat, solve: Callable[[PETSc.Vec, PETSc.Vec], None]) -> PETSc.KSP:
     """Wrap a solver for SLEPc, which resets the KSP it was given and would drop its factors."""
     ksp = PETSc.KSP().create(operator.comm)
+    ksp.setOptionsPrefix(f"{OPTIONS}st_")
     ksp.setType(PETSc.KSP.Type.PREONLY)
     ksp.setOperators(operator)
     pc = ksp.getPC()
