@@ -52,7 +52,7 @@ Position = Annotated[float, Field(ge=-1e4, le=1e4)]  # m
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
 Stiffness = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
 PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
-MassDensity = Annotated[float, Field(ge=1e-6, le=1e6)]  # kg/m3
+MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
 Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
 MAX_ITERATIONS = 1_000_000
 MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation

@@ -500,7 +500,7 @@ def test_singular_arms_are_named() -> None:
     """Within a millionth of stretched or folded the scene is refused, with time and distance."""
     for overrides, word in (
         (["motion.joint_height=-0.9999999"], "stretched"),
-        (["motion.radius=1e-7", "motion.joint_height=0.0", "motion.cart_follow=0.0"], "folded"),
+        (["motion.radius=1e-6", "motion.joint_height=0.0", "motion.cart_follow=0.0"], "folded"),
     ):
         with pytest.raises(InputError, match=word):
             moved(*overrides)
