@@ -14,6 +14,7 @@ from dolfinopt.contents import DIGEST, with_digests
 from dolfinopt.coordinates import Choice
 from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
+from dolfinopt.folders import CHECKPOINT, remove_stale
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root
 from dolfinopt.scene import Scene
@@ -21,7 +22,7 @@ from dolfinopt.scene import Scene
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm
 
-NAME = "checkpoint.npz"
+NAME = CHECKPOINT
 SOLUTION = ("edges", "nodes", "q", "qd", "a")
 # Keys a resumed run may change: they say when to stop, not what is computed.
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance")
@@ -65,8 +66,14 @@ def _scene_text(scene: Scene) -> str:
 
 
 def begin(folder: Path, scene: Scene) -> None:
-    """Write the checkpoint of a run that has done nothing yet (root only)."""
+    """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
+    remove_stale(folder)
     write_arrays(folder / NAME, {"scene": np.array(_scene_text(scene)), "iteration": -1})
+
+
+def reopen(folder: Path) -> None:
+    """Remove what a run that goes on will write anew, so that nothing old stands beside it."""
+    remove_stale(folder, keep=(NAME, "history.csv"))
 
 
 def save(

@@ -85,23 +85,6 @@ XDMF_CELLS = {3: 4, 4: 5}  # its numbers of triangles and quadrilaterals, by cor
 # -- writing ---------------------------------------------------------------------------------
 
 
-def prepare_folder(folder: Path) -> None:
-    """Create the output folder and make sure that it can be written.
-
-    Raises:
-        InputError: it cannot.
-    """
-    probe = folder / f".write-test-{os.getpid()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.write_bytes(b"")
-        probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
-        ) from None
-
-
 def write_atomically(path: Path, write: Any) -> None:
     """Call `write(stream)` on a temporary neighbour and rename it over `path` when complete."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")

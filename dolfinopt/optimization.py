@@ -177,7 +177,8 @@ def optimize(
 
     Args:
         scene: what to optimise.
-        folder: for history.csv and the checkpoint; None keeps everything in memory.
+        folder: for history.csv and the checkpoint; what an earlier run left there is removed. None
+            keeps everything in memory.
         resume: go on from the folder's checkpoint.
         world: all ranks; default MPI.COMM_WORLD.
         report: called on the root with every row of the history.
@@ -200,6 +201,7 @@ def optimize(
     if resume:
         assert folder is not None
         memory = checkpoint.load(folder, scene, share, arms)
+        on_root(world, checkpoint.reopen, folder)
     return run.go(memory)
 
 

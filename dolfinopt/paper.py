@@ -311,7 +311,7 @@ def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) 
     Raises:
         InputError: the scene does not allow what the paper varies, or DIR cannot be written.
     """
-    from dolfinopt.files import prepare_folder
+    from dolfinopt.folders import prepare_folder
     from dolfinopt.parallel import on_root
 
     cases = on_root(world, lambda: plan.cases)

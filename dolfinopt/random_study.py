@@ -116,7 +116,7 @@ def study_random(
     Raises:
         InputError: something asked for is not possible.
     """
-    from dolfinopt.files import prepare_folder
+    from dolfinopt.folders import prepare_folder
     from dolfinopt.parallel import on_root
 
     asked: _Asked = on_root(world, _ask, scene, tuple(random), tuple(designs), plan)

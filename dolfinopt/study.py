@@ -54,7 +54,7 @@ def study(
     Raises:
         InputError: something asked for is not possible; nothing was computed.
     """
-    from dolfinopt.files import prepare_folder
+    from dolfinopt.folders import prepare_folder
     from dolfinopt.parallel import on_root
 
     plan = on_root(world, _plan, scene, topic, tuple(vary), tuple(designs), reoptimize)

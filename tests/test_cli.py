@@ -14,9 +14,15 @@ from mpi4py import MPI
 
 from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
+from dolfinopt.folders import RUN_FILES
 
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "demos" / "two_arm.toml"
+TINY = [
+    word
+    for value in ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
+    for word in ("--set", value)
+]
 SMALL = ["--set", "arms.cells=[40,4]", "--set", "simulation.sample=0.005"]
 WORLD = MPI.COMM_WORLD
 
@@ -232,6 +238,97 @@ def test_a_project_can_be_moved(tmp_path):
     assert "the content of the file arms.0.mesh has changed" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ([], "esl"),
+        (["--set", "objective.gradient=exact"], "exact"),
+        (["--set", "objective.gradient=exact", "--kind", "esl"], "esl"),
+    ],
+)
+def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
+    def written(name, *more):
+        run("gradient", SCENE, *TINY, *more, "--out", shared_tmp_path / name)
+        WORLD.barrier()
+        with np.load(shared_tmp_path / name) as data:
+            return data["arm1/gradient"]
+
+    expected = {one: written(f"{one}.npz", "--kind", one) for one in ("esl", "exact")}
+    capsys.readouterr()
+    np.testing.assert_array_equal(written("g.npz", *words), expected[kind])
+    assert not np.allclose(expected["esl"], expected["exact"], rtol=0.1)
+    if WORLD.rank == 0:
+        assert f"{kind} gradient in" in capsys.readouterr().out
+
+
+# -- used folders ----------------------------------------------------------------------------
+
+USED = {
+    "optimize": ["optimize", SCENE, "--set", "optimizer.max_iterations=1", "--no-plots"],
+    "simulate": ["simulate", SCENE, "--no-plots"],
+    "export": ["export", SCENE],
+    "gradient": ["gradient", SCENE],
+}
+
+
+@pytest.mark.parametrize("name", USED)
+def test_results_are_replaced_only_when_asked(shared_tmp_path, name):
+    """A used folder is refused; --overwrite removes what the program itself has left there."""
+    folder = shared_tmp_path / "o"
+    line = [*USED[name], *TINY, "--out", folder / "g.npz" if name == "gradient" else folder]
+    run(*line)
+    WORLD.barrier()
+    written = {path.name for path in folder.iterdir()}
+    contents = {path.name: path.read_bytes() for path in folder.iterdir()}
+    WORLD.barrier()
+    with pytest.raises(InputError, match=r"holds results already.*--overwrite") as caught:
+        run(*line)
+    assert "\n" not in str(caught.value)
+    assert ("--resume" in str(caught.value)) == (name == "optimize")
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == contents
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        for stale in ("design.png", "motion.gif", "notes.txt", "mine.png"):
+            (folder / stale).write_bytes(b"old")
+    WORLD.barrier()
+    run(*line, "--overwrite")
+    WORLD.barrier()
+    own = {"notes.txt", "mine.png"}
+    if name in ("export", "gradient"):  # they write no pictures that could be stale
+        own |= {"design.png", "motion.gif"}
+    assert {path.name for path in folder.iterdir()} == written | own
+
+
+def test_every_file_of_a_run_is_known(optimised):
+    """What a run writes is what --overwrite removes."""
+    assert {path.name for path in optimised.iterdir()} <= set(RUN_FILES)
+
+
+@pytest.mark.parametrize("how", ["--overwrite", "--resume"])
+def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, how):
+    """No summary of an earlier run stands beside a new history, which `plot` would mix."""
+    from dolfinopt import optimization
+
+    folder = shared_tmp_path / "o"
+    line = ["optimize", SCENE, *TINY, "--no-plots", "--out", folder, "--set"]
+    run(*line, "optimizer.max_iterations=1")
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        (folder / "design.png").write_bytes(b"old")
+    WORLD.barrier()
+
+    def killed(*_):
+        raise RuntimeError("killed")
+
+    monkeypatch.setattr(optimization._Run, "_update", killed)
+    with pytest.raises(RuntimeError, match="killed"):
+        run(*line, "optimizer.max_iterations=3", how)
+    WORLD.barrier()
+    assert {path.name for path in folder.iterdir()} == {"checkpoint.npz", "history.csv"}
+    with pytest.raises(InputError, match=r"summary\.json"):
+        run("plot", folder)
+
+
 # -- bad input -------------------------------------------------------------------------------
 
 
@@ -330,6 +427,49 @@ def test_exit_status_and_streams(shared_tmp_path, ranks):
     assert "Traceback" not in done.stderr and done.stdout == ""
     if not ranks:
         assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.mark.parametrize("words", [[], ["--help"], ["optimize", "--help"]])
+def test_help_is_printed_once(words, ranks):
+    """On standard output, with status 0, before MPI could tell the ranks apart."""
+    done = shell(*words, ranks=ranks)
+    assert done.returncode == 0 and done.stderr == ""
+    assert done.stdout.count("Usage: dolfinopt") == 1
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["optimise", SCENE], ["optimise", "did you mean optimize?", "(see dolfinopt --help)"]),
+        (["optimize", SCENE, "--ot", "x"], ["--ot", "(see dolfinopt optimize --help)"]),
+        (["gradient"], ["SCENE", "(see dolfinopt gradient --help)"]),
+    ],
+)
+def test_a_wrong_word_is_told_once(words, parts, ranks):
+    done = shell(*words, ranks=ranks)
+    assert done.returncode == 2 and done.stdout == ""
+    [line] = [line for line in done.stderr.splitlines() if line.startswith("dolfinopt: ")]
+    for part in parts:
+        assert part in line
+
+
+@pytest.mark.serial
+def test_without_petsc_one_line_says_how_to_get_it(tmp_path):
+    code = """if True:
+        import sys
+        sys.modules["petsc4py"] = None  # as if it were not installed
+        from dolfinopt.cli import main
+        main()"""
+    line = [sys.executable, "-c", code, "simulate", str(SCENE), "--out", str(tmp_path / "o")]
+    done = subprocess.run(line, capture_output=True, text=True, env=dict(os.environ), timeout=60)
+    assert done.returncode == 1 and done.stdout == ""
+    [line] = done.stderr.splitlines()
+    assert "petsc4py not installed" in line and "conda install" in line
+    assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.serial

@@ -303,9 +303,36 @@ def test_the_package_imports_nothing() -> None:
     assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
 
 
+# What can be answered before MPI and PETSc are loaded, which takes a second.
+WORDS = {
+    "nothing": [],
+    "help": ["--help"],
+    "version": ["--version"],
+    "help of a command": ["optimize", "--help"],
+    "unknown command": ["optimise", SCENE],
+    "unknown option": ["optimize", SCENE, "--nonsense"],
+    "no scene": ["simulate"],
+    "unknown choice": ["gradient", SCENE, "--kind", "fast"],
+    "unknown key": ["optimize", SCENE, "--set", "payload.mas=1"],
+    "value out of range": ["simulate", SCENE, "--set", "payload.mass=-1"],
+    "no such file": ["simulate", "nowhere.toml"],
+}
+
+
 @pytest.mark.serial
-def test_help_needs_no_solver() -> None:
-    assert loaded(DRAW | SOLVE | {"click"}, MAIN, "optimize", "--help") == {"click"}
+@pytest.mark.parametrize("name", WORDS)
+def test_words_need_no_solver(name: str) -> None:
+    names = DRAW | SOLVE | {"petsc4py", "mpi4py", "numpy", "click"}
+    assert loaded(names, MAIN, *WORDS[name]) == {"click"}
+
+
+@pytest.mark.serial
+def test_completion_needs_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_DOLFINOPT_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", "dolfinopt opt")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    names = DRAW | SOLVE | {"petsc4py", "mpi4py", "numpy", "click"}
+    assert loaded(names, MAIN) == {"click"}
 
 
 @pytest.mark.serial

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.serial  # nothing here knows of ranks
 # Data walks down this street; a module imports only from those before it.
 STREET = (
     "errors",
+    "folders",
     "data",
     "ledger",
     "sid",

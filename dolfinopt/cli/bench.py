@@ -10,21 +10,22 @@ import click
 
 from dolfinopt.cli.options import out_option
 from dolfinopt.cli.shared import prepare
+from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
+    pass
 
 
 @click.command()
 @out_option("diagrams and bench.md; default: results/bench")
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some two minutes")
-@click.pass_obj
-def bench(world: MPI.Comm, out: Path | None, quick: bool) -> None:
+def bench(out: Path | None, quick: bool) -> None:
     """Measure run time against error: integrators, meshes, reductions, iterations, other programs.
 
     What is measured is kept in DIR; a call that was interrupted goes on.
     """
+    world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
     from dolfinopt.bench import QUICKLY, Plan, diagrams

@@ -7,31 +7,38 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.options import design_option, scene_argument, set_option
-from dolfinopt.cli.shared import design_of, load, prepare, tell
+from dolfinopt.cli.options import (
+    design_option,
+    out_option,
+    overwrite_option,
+    scene_argument,
+    set_option,
+)
+from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from dolfinopt.arm import Arm
+
+
+KINDS = (".sid", ".sid.npz", ".fem")
 
 
 @click.command()
 @scene_argument
 @design_option
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="DIR",
-    help="folder for the bodies",
-)
+@out_option("the bodies; default: results/SCENE-bodies")
+@overwrite_option
 @set_option
-@click.pass_obj
 def export(
-    world: MPI.Comm, scene: Path, design: Path | None, out: Path, overrides: tuple[str, ...]
+    scene: Path,
+    design: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    overrides: tuple[str, ...],
 ) -> None:
     """Write the reduced arms of SCENE for other multibody codes: SID, .npz of it, MBDyn's .fem."""
+    world, loaded = load(scene, overrides)
+    folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.files import write_arrays, write_text
     from dolfinopt.ledger import Ledger
@@ -39,9 +46,10 @@ def export(
     from dolfinopt.parallel import gather_arms
     from dolfinopt.sid import sid_arrays, sid_text
 
-    loaded = load(world, scene, overrides)
+    names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
+    claim(world, folder, overwrite, names)
     share, arms, x_phys = design_of(world, loaded, design, Ledger())
-    prepare(world, out)
+    prepare(world, folder)
     tell(world, choose_coordinates(loaded, share, arms, x_phys, Ledger()))
     exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(share, exported)
@@ -52,12 +60,12 @@ def export(
             click.echo(f"{arm.name}: not exported, it is rigid or comes from a file")
             continue
         data, element = bodies[owner]
-        write_text(out / f"{arm.name}.sid", sid_text(data))
-        write_arrays(out / f"{arm.name}.sid.npz", sid_arrays(data))
-        write_text(out / f"{arm.name}.fem", fem_text(element))
+        write_text(folder / f"{arm.name}.sid", sid_text(data))
+        write_arrays(folder / f"{arm.name}.sid.npz", sid_arrays(data))
+        write_text(folder / f"{arm.name}.fem", fem_text(element))
         click.echo(
             f"{arm.name}: {data.mass:.6g} kg, {data.coordinates} coordinates, "
-            f"{len(element.labels)} nodes; in {out / arm.name}.sid, .sid.npz, .fem"
+            f"{len(element.labels)} nodes; in {folder / arm.name}.sid, .sid.npz, .fem"
         )
 
 

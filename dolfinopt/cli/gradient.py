@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.options import design_option, scene_argument, set_option
-from dolfinopt.cli.shared import design_of, load, prepare, tell
+from dolfinopt.cli.options import design_option, overwrite_option, scene_argument, set_option
+from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene import Scene
 from dolfinopt.units import OBJECTIVES
 
 if TYPE_CHECKING:
@@ -19,28 +18,42 @@ if TYPE_CHECKING:
 
     from dolfinopt.arm import Arm
     from dolfinopt.parallel import ArmShare
+    from dolfinopt.scene import Scene
 
 
 @click.command()
 @scene_argument
 @design_option
-@click.option("--kind", type=click.Choice(["esl", "exact"]), default="esl", help="which gradient")
 @click.option(
-    "--out", type=click.Path(path_type=Path), required=True, metavar="FILE", help="gradient.npz"
+    "--kind",
+    type=click.Choice(["esl", "exact"]),
+    help="which gradient; default: the scene's objective.gradient",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="gradient.npz; default: results/SCENE-gradient/gradient.npz",
 )
 @click.option("--check", is_flag=True, help="Taylor test along the complete chain")
+@overwrite_option
 @set_option
-@click.pass_obj
 def gradient(
-    world: MPI.Comm,
     scene: Path,
     design: Path | None,
-    kind: str,
-    out: Path,
+    kind: str | None,
+    out: Path | None,
     check: bool,
+    overwrite: bool,
     overrides: tuple[str, ...],
 ) -> None:
     """Write the objective's gradient with respect to the physical densities to FILE."""
+    out = out or Path("results") / f"{scene.stem}-gradient" / "gradient.npz"
+    if out.is_dir():
+        raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
+    if kind is not None:
+        overrides = (*overrides, f'objective.gradient="{kind}"')
+    world, loaded = load(scene, overrides)
     from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.evaluation import evaluate
     from dolfinopt.evaluation import gradient as slopes
@@ -48,9 +61,7 @@ def gradient(
     from dolfinopt.ledger import Ledger
     from dolfinopt.taylor import check_exact
 
-    if out.is_dir():
-        raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
-    loaded = load(world, scene, (*overrides, f'objective.gradient="{kind}"'))
+    claim(world, out.parent, overwrite, [out.name])
     if check:
         check_exact(loaded)
     ledger = Ledger()
@@ -63,7 +74,7 @@ def gradient(
     write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
         unit = OBJECTIVES[loaded.objective.kind][1]
-        name = kind if loaded.objective.simulated else "exact"
+        name = loaded.objective.gradient if loaded.objective.simulated else "exact"
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
     if check:
         _check_gradient(world, loaded, share, arms, x_phys, ledger)

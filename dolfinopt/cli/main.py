@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
-from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager, nullcontext, redirect_stdout
+from io import StringIO
+from typing import Any
 
 import click
 
@@ -16,61 +18,76 @@ from dolfinopt.cli.optimize import optimize
 from dolfinopt.cli.plot import plot
 from dolfinopt.cli.reproduce import reproduce
 from dolfinopt.cli.simulate import simulate
+from dolfinopt.cli.start import Start, end_before_start
 from dolfinopt.cli.study import study
 from dolfinopt.errors import InputError
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
 
 
 def main() -> None:
     """Run the command line on every rank and exit: 0, 1 (failed), 2 (bad input)."""
-    import petsc4py
-
-    # PETSc would turn a closed pipe or Ctrl-C into an abort with a page of advice.
-    petsc4py.init(["dolfinopt", "-no_signal_handler"])
-    from mpi4py import MPI
-
-    from dolfinopt.parallel import one_ending
-    from dolfinopt.progress import show_slow_work
-
-    world = MPI.COMM_WORLD
-    show_slow_work()
-    with one_ending(world):
-        try:
-            commands.main(
-                args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=world
-            )
-        except click.ClickException as error:
-            raise InputError(f"{error.format_message()} (see dolfinopt --help)") from None
-        except click.Abort:
-            raise KeyboardInterrupt from None
+    try:
+        with Start() as begun:
+            try:
+                commands.main(
+                    args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=begun
+                )
+            except click.ClickException as error:
+                raise InputError(_with_help(error)) from None
+            except click.Abort:
+                raise KeyboardInterrupt from None
+    except SystemExit:
+        raise
+    except BaseException as error:
+        sys.exit(end_before_start(error))
 
 
-class _Quiet(click.Group):
-    """A group whose help is printed by the root alone."""
+def _with_help(error: click.ClickException) -> str:
+    """Return the message, and which help tells more."""
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "dolfinopt"
+    return f"{error.format_message()} (see {command} --help)"
+
+
+class _Commands(click.Group):
+    """A group whose help is printed by the root alone, and that knows what a wrong word meant."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
-        world: MPI.Comm = kwargs["obj"]
-        silent = nullcontext() if world.rank == 0 else _no_output()
+        given = kwargs["obj"]
+        silent: AbstractContextManager[Any] = nullcontext()
+        if not isinstance(given, Start) and given.rank > 0:
+            silent = redirect_stdout(StringIO())
         with silent:
             return super().main(*args, **kwargs)
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Say which command an unknown one resembles."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            near = difflib.get_close_matches(args[0], self.list_commands(ctx), 1)
+            if not near or "mean" in error.message:
+                raise
+            message = f"{error.message.rstrip('.')}; did you mean {near[0]}?"
+            raise click.UsageError(message, ctx) from None
 
-def _no_output() -> AbstractContextManager[Any]:
-    from contextlib import redirect_stdout
-    from io import StringIO
 
-    return redirect_stdout(StringIO())
-
-
-@click.group(cls=_Quiet, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    invoke_without_command=True,
+    no_args_is_help=False,
+)
 @click.version_option(__version__, prog_name="dolfinopt")
-def commands() -> None:
+@click.pass_context
+def commands(ctx: click.Context) -> None:
     """Stiffen the flexible arms of a moving machine by topology optimisation.
 
     Every command also runs under mpirun, with the same result.
     """
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
 
 
 for command in (optimize, simulate, gradient, export, study, reproduce, bench, plot):

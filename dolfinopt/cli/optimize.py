@@ -10,47 +10,50 @@ import click
 from dolfinopt.cli.options import (
     animation_option,
     out_option,
+    overwrite_option,
     plots_option,
     scene_argument,
     set_option,
 )
-from dolfinopt.cli.shared import conclude, draw, elapsed, load, prepare, progress
-from dolfinopt.errors import ConvergenceError
-from dolfinopt.scene import Scene
+from dolfinopt.cli.shared import claim, conclude, draw, elapsed, load, prepare, progress
+from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from dolfinopt.files import ArmView
     from dolfinopt.optimization import Result
+    from dolfinopt.scene import Scene
 
 
 @click.command()
 @scene_argument
 @out_option("the results; default: results/SCENE")
 @click.option("--resume", is_flag=True, help="go on from the folder's checkpoint")
+@overwrite_option
 @set_option
 @plots_option
 @animation_option
-@click.pass_obj
 def optimize(
-    world: MPI.Comm,
     scene: Path,
     out: Path | None,
     resume: bool,
+    overwrite: bool,
     overrides: tuple[str, ...],
     plots: bool,
     animation: bool,
 ) -> None:
     """Optimise the arms of SCENE for the loads of their motion."""
+    if resume and overwrite:
+        raise InputError("--resume, --overwrite: expected only one of them")
+    world, loaded = load(scene, overrides)
+    folder = out or Path("results") / scene.stem
     from dolfinopt import checkpoint
     from dolfinopt.optimization import optimize as run
     from dolfinopt.parallel import on_root
 
-    loaded = load(world, scene, overrides)
-    folder = out or Path("results") / scene.stem
     if resume:
         on_root(world, checkpoint.check, folder, loaded)
+    else:
+        claim(world, folder, overwrite, resume=True)
     prepare(world, folder)
     with progress(world, loaded) as report:
         result = run(loaded, folder, resume=resume, world=world, report=report)

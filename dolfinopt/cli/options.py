@@ -29,6 +29,11 @@ animation_option = click.option(
 )
 
 
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="replace the results that are there already"
+)
+
+
 def out_option(what: str) -> Callable[..., Any]:
     """Return the --out option of a command that writes a folder."""
     return click.option(

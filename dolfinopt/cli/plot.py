@@ -9,17 +9,18 @@ import click
 
 from dolfinopt.cli.options import animation_option
 from dolfinopt.cli.shared import design_of, draw, scene_of
+from dolfinopt.cli.start import start
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
+    pass
 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @animation_option
-@click.pass_obj
-def plot(world: MPI.Comm, folder: Path, animation: bool) -> None:
+def plot(folder: Path, animation: bool) -> None:
     """Draw the pictures of a finished run in DIR anew."""
+    world = start()
     from dolfinopt.evaluation import evaluate
     from dolfinopt.files import gather_views, read_history, read_initial_deviation
     from dolfinopt.ledger import Ledger

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from dolfinopt.cli.options import out_option, plots_option, set_option
+from dolfinopt.cli.start import start
 from dolfinopt.errors import ConvergenceError
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
+    pass
 
 
 @click.command()
@@ -20,9 +21,7 @@ if TYPE_CHECKING:
 @click.option("--coarse", is_flag=True, help="100 x 6 cells and 60 iterations: a minute")
 @set_option
 @plots_option
-@click.pass_obj
 def reproduce(
-    world: MPI.Comm,
     out: Path | None,
     check: bool,
     coarse: bool,
@@ -34,6 +33,7 @@ def reproduce(
     What is computed is kept in DIR/cases and taken from there the next time; a call that was
     interrupted goes on.
     """
+    world = start()
     from dolfinopt.claims import broken
     from dolfinopt.paper import Plan, load_paper
     from dolfinopt.paper import reproduce as run

@@ -6,17 +6,17 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.contents import found_again
+from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
-from dolfinopt.plausibility import implausible
-from dolfinopt.scene import Scene, load_scene, scene_from_dict
+from dolfinopt.folders import RUN_FILES, check_unused, prepare_folder
 from dolfinopt.units import NOT_MET, OBJECTIVES
 
 if TYPE_CHECKING:
@@ -26,15 +26,25 @@ if TYPE_CHECKING:
     from dolfinopt.coordinates import Choice
     from dolfinopt.files import ArmView, HistoryRow
     from dolfinopt.parallel import ArmShare
+    from dolfinopt.scene import Scene
     from dolfinopt.simulation import Trajectory
 
 
-def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
-    """Read the scene on the root, check what can be checked, and hand it to all ranks."""
+def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
+    """Start MPI; return all ranks, and the scene as the root read and checked it.
+
+    A process alone finds a wrong key before MPI and the solvers are loaded.
+    """
+    from dolfinopt.scene import load_scene
+
+    if alone():
+        load_scene(path, overrides)
+    world = start()
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
         from dolfinopt.motion import check_motion
+        from dolfinopt.plausibility import implausible
 
         scene = load_scene(path, overrides)
         check_motion(scene)
@@ -46,7 +56,22 @@ def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
         warn(implausible(scene))
         return scene
 
-    return on_root(world, load)
+    return world, on_root(world, load)
+
+
+def claim(
+    world: MPI.Comm,
+    folder: Path,
+    overwrite: bool,
+    names: Collection[str] = RUN_FILES,
+    *,
+    resume: bool = False,
+) -> None:
+    """Raise InputError if the folder holds results that --overwrite does not give up."""
+    from dolfinopt.parallel import on_root
+
+    if not overwrite:
+        on_root(world, partial(check_unused, resume=resume), folder, names)
 
 
 _told: set[str] = set()
@@ -61,7 +86,6 @@ def warn(warnings: Iterable[str]) -> None:
 
 
 def prepare(world: MPI.Comm, folder: Path) -> None:
-    from dolfinopt.files import prepare_folder
     from dolfinopt.parallel import on_root
 
     on_root(world, prepare_folder, folder)
@@ -69,6 +93,9 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 def scene_of(folder: Path) -> Scene:
     """Return the scene of a run, with the coordinates that "auto" came to."""
+    from dolfinopt.contents import found_again
+    from dolfinopt.scene import scene_from_dict
+
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))

@@ -11,14 +11,15 @@ from dolfinopt.cli.options import (
     animation_option,
     design_option,
     out_option,
+    overwrite_option,
     plots_option,
     scene_argument,
     set_option,
 )
-from dolfinopt.cli.shared import conclude, design_of, draw, elapsed, load, prepare
+from dolfinopt.cli.shared import claim, conclude, design_of, draw, elapsed, load, prepare
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
+    pass
 
     from dolfinopt.files import ArmView
 
@@ -27,27 +28,30 @@ if TYPE_CHECKING:
 @scene_argument
 @design_option
 @out_option("the results; default: results/SCENE-simulation")
+@overwrite_option
 @set_option
 @plots_option
 @animation_option
-@click.pass_obj
 def simulate(
-    world: MPI.Comm,
     scene: Path,
     design: Path | None,
     out: Path | None,
+    overwrite: bool,
     overrides: tuple[str, ...],
     plots: bool,
     animation: bool,
 ) -> None:
     """Simulate SCENE with a given design and report compliance and deviation."""
+    world, loaded = load(scene, overrides)
+    folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.coordinates import choose_coordinates
     from dolfinopt.evaluation import evaluate
+    from dolfinopt.folders import remove_stale
     from dolfinopt.ledger import Ledger
+    from dolfinopt.parallel import on_root
     from dolfinopt.results import Simulated, write_simulation
 
-    loaded = load(world, scene, overrides)
-    folder = out or Path("results") / f"{scene.stem}-simulation"
+    claim(world, folder, overwrite)
     ledger = Ledger()
     share, arms, x_phys = design_of(world, loaded, design, ledger)
     prepare(world, folder)
@@ -60,6 +64,7 @@ def simulate(
         draw(folder, loaded, views, trajectory, [], None, animation=animation)
 
     drawn = pictures if plots or animation else None
+    on_root(world, remove_stale, folder)
     written = write_simulation(folder, simulated, elapsed(), pictures=drawn)
     if written is None:
         return

@@ -13,7 +13,7 @@ from dolfinopt.cli.shared import load
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
+    pass
 
 
 class _Listing(click.Command):
@@ -75,9 +75,7 @@ class _Listing(click.Command):
 @out_option("tables, pictures and cases; default: results/SCENE-study")
 @set_option
 @plots_option
-@click.pass_obj
 def study(
-    world: MPI.Comm,
     scene: Path,
     topic: Any,
     vary: tuple[str, ...],
@@ -103,7 +101,7 @@ def study(
     options = {"samples": samples, "seed": seed, "sampler": sampler, "indices": indices}
     given = {name: value for name, value in options.items() if value is not None}
     _check_random(bool(random), bool(topic or vary or reoptimize), given)
-    loaded = load(world, scene, overrides)
+    world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-study"
     if random:
         from dolfinopt.random_study import Plan, study_random

@@ -1,0 +1,111 @@
+"""When MPI and PETSc are loaded: by a command that has something to compute, not before.
+
+Whatever can be answered from the words alone (help, completion, a wrong word) is answered without
+them. A launcher's ranks then know one another only by the environment.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Mapping
+from contextlib import ExitStack, redirect_stdout
+from importlib.util import find_spec
+from io import StringIO
+from typing import TYPE_CHECKING
+
+import click
+
+from dolfinopt.errors import ConvergenceError, InputError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+# What Open MPI, PMIx, and MPICH with its relatives tell a rank.
+RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
+NEEDED = ("petsc4py", "slepc4py", "mpi4py", "dolfinx", "gmsh")
+
+
+class MissingLibrary(RuntimeError):
+    """A library that does not come with pip is not installed."""
+
+
+def launched_rank(environment: Mapping[str, str] = os.environ) -> int | None:
+    """Return this process's rank as a launcher (mpirun) states it, None without one."""
+    for name in RANK_VARIABLES:
+        text = environment.get(name, "")
+        if text.isdigit():
+            return int(text)
+    return None
+
+
+class Start:
+    """Loads MPI when a command asks for the ranks; from then on all ranks end together."""
+
+    def __init__(self) -> None:
+        self._ending = ExitStack()
+        self._world: MPI.Comm | None = None
+
+    def __enter__(self) -> Start:
+        if launched_rank():
+            self._ending.enter_context(redirect_stdout(StringIO()))  # the root speaks
+        return self
+
+    def __exit__(self, *error: object) -> bool | None:
+        return self._ending.__exit__(*error)  # type: ignore[arg-type]
+
+    @property
+    def world(self) -> MPI.Comm:
+        """All ranks; the first access starts MPI (collective)."""
+        if self._world is None:
+            missing = [name for name in NEEDED if find_spec(name) is None]
+            if missing:
+                raise MissingLibrary(
+                    f"{', '.join(missing)} not installed; on Debian 12 or 13 run ./dolfinopt.sh, "
+                    "elsewhere: conda install -c conda-forge fenics-dolfinx slepc4py python-gmsh"
+                )
+            import petsc4py
+
+            # PETSc would turn a closed pipe or Ctrl-C into an abort with a page of advice.
+            petsc4py.init(["dolfinopt", "-no_signal_handler"])
+            from mpi4py import MPI
+
+            from dolfinopt.parallel import one_ending
+            from dolfinopt.progress import show_slow_work
+
+            self._world = MPI.COMM_WORLD
+            show_slow_work()
+            self._ending.enter_context(one_ending(self._world))
+            if self._world.rank > 0:
+                self._ending.enter_context(redirect_stdout(StringIO()))
+        return self._world
+
+
+def start() -> MPI.Comm:
+    """Return all ranks for the command at work, and start MPI unless that was done."""
+    given = click.get_current_context().obj
+    return given.world if isinstance(given, Start) else given
+
+
+def alone() -> bool:
+    """Tell whether this process is known to be the only rank before MPI is started."""
+    return isinstance(click.get_current_context().obj, Start) and launched_rank() is None
+
+
+def end_before_start(error: BaseException) -> int:
+    """Report an error that came before MPI was started; return the exit status.
+
+    What all ranks found wrong alike is printed by the first one. The others end with status 0: a
+    launcher kills all ranks as soon as one fails, which could be before the first has spoken.
+    """
+    told_by_another = (launched_rank() or 0) > 0
+    if isinstance(error, InputError | ConvergenceError | KeyboardInterrupt) and told_by_another:
+        return 0
+    if isinstance(error, KeyboardInterrupt):
+        print("dolfinopt: interrupted", file=sys.stderr)
+    elif isinstance(error, InputError | ConvergenceError | MissingLibrary):
+        print(f"dolfinopt: {error}", file=sys.stderr)
+    else:
+        traceback.print_exception(error)
+    return 2 if isinstance(error, InputError) else 1

@@ -1,0 +1,83 @@
+"""Folders of results: one run each. What an earlier run left is never mixed with a new one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from contextlib import suppress
+from pathlib import Path
+
+from dolfinopt.errors import InputError
+
+CHECKPOINT = "checkpoint.npz"
+# All files that a run writes, the one that says a run is complete first; nothing else is removed.
+RUN_FILES = (
+    "summary.json",
+    "history.csv",
+    "trajectory.npz",
+    "trajectory.csv",
+    "design.npz",
+    "design.xdmf",
+    "design.vtu",
+    "design.png",
+    "history.png",
+    "deviation.png",
+    "motion.gif",
+    "machine.png",
+    CHECKPOINT,
+)
+
+
+def prepare_folder(folder: Path) -> None:
+    """Create the output folder and make sure that it can be written.
+
+    Raises:
+        InputError: it cannot.
+    """
+    probe = folder / f".write-test-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
+        ) from None
+
+
+def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: bool = False) -> None:
+    """Raise InputError if the folder holds a file of these names.
+
+    Args:
+        folder: need not exist.
+        names: what the command would write.
+        resume: the command has an option --resume, too.
+    """
+    found = [name for name in names if (folder / name).exists()]
+    if found:
+        more = f" and {len(found) - 1} more files" if len(found) > 1 else ""
+        others = "--resume to go on, " if resume and (folder / CHECKPOINT).exists() else ""
+        raise InputError(
+            f"{folder}: holds results already ({found[0]}{more}); {others}--overwrite to replace "
+            "them, or another --out"
+        )
+
+
+def remove_stale(
+    folder: Path, names: Collection[str] = RUN_FILES, *, keep: Collection[str] = ()
+) -> None:
+    """Remove what an earlier run left, but for `keep`; other files stay.
+
+    Raises:
+        InputError: a file cannot be removed.
+    """
+    for name in names:
+        if name in keep:
+            continue
+        try:
+            with suppress(FileNotFoundError):
+                (folder / name).unlink()
+        except OSError as error:
+            raise InputError(
+                f"{folder / name}: cannot be replaced ({error.strerror}); name another --out"
+            ) from None
