@@ -61,12 +61,21 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves over one pair of axes, which are labelled with their units."""
+    """Curves over one pair of axes, which are labelled with their units.
+
+    Attributes:
+        title, x_label, y_label: above and beside it.
+        lines: curves.
+        x_log2: numbers that are doubled rather than added to, as those of coordinates.
+        y_log: logarithmic y although the values span no decade.
+    """
 
     title: str
     x_label: str
     y_label: str
     lines: tuple[Line, ...]
+    x_log2: bool = False
+    y_log: bool = False
 
 
 @dataclass(frozen=True)

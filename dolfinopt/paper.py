@@ -462,7 +462,7 @@ def _convergence_figures(plan: Plan, outcomes: Outcomes) -> list[Numbered]:
         )
 
     compliance = Panel("", "iteration [-]", "compliance, own model [N m]",
-                       lines(lambda row: row.objective))  # fmt: skip
+                       lines(lambda row: row.objective), y_log=True)  # fmt: skip
     grayness = Panel("", "iteration [-]", "grayness [-]", lines(lambda row: row.grayness))
     return [
         _plot(5, "Convergence of the compliance by reduction", compliance),
@@ -478,7 +478,13 @@ def _coordinate_figures(plan: Plan, outcomes: Outcomes, measured: Measured) -> l
             Line(one.method, np.array(one.coordinates), np.array(one.compliance)) for one in mine
         ]
         panels.append(
-            Panel(design, "elastic coordinates of each arm [-]", "compliance [N m]", tuple(lines))
+            Panel(
+                design,
+                "elastic coordinates of each arm [-]",
+                "compliance [N m]",
+                tuple(lines),
+                x_log2=True,
+            )
         )
     ends = [
         outcomes[case]

@@ -51,14 +51,19 @@ def write_reproduction(done: Reproduction, folder: Path, *, plots: bool = True) 
         plots: False leaves out pictures and page.
     """
     from dolfinopt.files import write_text
-    from dolfinopt.study_plots import column_figure, draw, save
+    from dolfinopt.study_plots import column_figure, common_looks, draw
+    from dolfinopt.style import save
 
+    styles = common_looks(numbered.figure for numbered in done.figures)
     write_text(folder / "measured.json", done.measured.json())
     for numbered in done.figures:
         write_text(folder / f"{numbered.name}.csv", numbered.csv())
         if plots:
             figure = numbered.figure
-            drawn = column_figure(figure) if isinstance(figure, LineFigure) else draw(figure)
+            if isinstance(figure, LineFigure):
+                drawn = column_figure(figure, styles)
+            else:
+                drawn = draw(figure, styles)
             save(drawn, folder / f"{numbered.name}.png")
     if plots:
         write_text(folder / "report.html", page(done, folder))
@@ -357,7 +362,7 @@ def arm_picture(view: ArmView, width: int) -> bytes:
     from matplotlib import colormaps
     from PIL import Image, ImageDraw
 
-    from dolfinopt.plots import COLOURS
+    from dolfinopt.style import COLOURS
 
     low = view.corners.min(axis=(0, 1))
     size = view.corners.max(axis=(0, 1)) - low

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from dolfinopt import findings
-from dolfinopt.files import designed, gather_views, read_design, write_atomically
+from dolfinopt.files import designed, gather_views, read_design
 from dolfinopt.findings import (
     BarFigure,
     DesignFigure,
@@ -24,7 +24,20 @@ from dolfinopt.findings import (
 )
 from dolfinopt.ledger import Ledger
 from dolfinopt.scene import Scene
-from dolfinopt.style import COLOURS, DENSITY, GREY, spans_decade
+from dolfinopt.style import (
+    COLOURS,
+    DENSITY,
+    GREY,
+    PALETTE,
+    ends_right,
+    label_ends,
+    log2_scale,
+    log_scale,
+    looks,
+    new_figure,
+    save,
+    spans_decade,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,137 +45,167 @@ if TYPE_CHECKING:
 
     from dolfinopt.files import ArmView
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; then the same with dashes.
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-DASHES = ("-", "--", ":", "-.")
-MARKERS = "osD^vPX"
 FEW = 40  # points a line that get markers
-FEW_DECADES = 300.0  # ratio up to which a logarithmic axis names 1, 2 and 5
 NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
+LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
+PANEL = 3.2  # inches, height of a panel of curves
+
+Looks = Mapping[str, Mapping[str, Any]]
 
 
 def draw_study(study: Study, folder: Path) -> list[Path]:
     """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
+    styles = common_looks(study.figures)
     paths = []
     for figure in study.figures:
         name = joined(study.name, figure.name)
-        paths.append(save(draw(figure), folder / f"{name}.png"))
+        paths.append(save(draw(figure, styles), folder / f"{name}.png"))
     return paths
 
 
-def draw(figure: findings.Figure) -> Figure:
-    """Return a study's figure, drawn."""
+def common_looks(figures: Iterable[findings.Figure]) -> Looks:
+    """Return one look for every curve's name in all these figures, and for every design's."""
+    groups = []
+    for figure in figures:
+        if isinstance(figure, LineFigure):
+            groups.append([line.label for row in figure.rows for p in row for line in p.lines])
+        elif isinstance(figure, HistogramFigure):
+            groups.append([panels[0].title for panels in figure.rows])
+    return looks(groups)
+
+
+def draw(figure: findings.Figure, styles: Looks | None = None) -> Figure:
+    """Return a study's figure, drawn.
+
+    Args:
+        figure: what.
+        styles: of curves and designs by name, see `common_looks`; default: of this figure alone.
+    """
     if isinstance(figure, LineFigure):
-        return line_figure(figure)
+        return line_figure(figure, styles)
     if isinstance(figure, MatrixFigure):
         return matrix_figure(figure)
     if isinstance(figure, TornadoFigure):
         return tornado_figure(figure)
     if isinstance(figure, HistogramFigure):
-        return histogram_figure(figure)
+        return histogram_figure(figure, styles)
     if isinstance(figure, BarFigure):
         return bar_figure(figure)
     if isinstance(figure, ScatterFigure):
-        return scatter_figure(figure)
+        return scatter_figure(figure, styles)
     return design_figure(figure)
 
 
-def line_figure(figure: LineFigure) -> Figure:
-    """Return the panels of curves, with one legend beside the last of each row."""
+def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
+    """Return the panels of curves.
+
+    Names stand where the curves end, in the last panel of each row that shows them; or in a legend
+    beside it, where curves end anywhere. Panels of one quantity share its axis.
+    """
     rows, columns = len(figure.rows), max(map(len, figure.rows))
-    looks = _looks(figure)
-    drawn = _figure((4.6 if columns > 1 else 6.5) * columns + 3.0, 3.6 * rows + 0.4)
+    styles = styles or common_looks([figure])
+    drawn = new_figure((4.4 if columns > 1 else 6.5) * columns + 3.0, (PANEL + 0.4) * rows + 0.4)
     grid = drawn.subplots(rows, columns, squeeze=False)
     for row, panels in zip(grid, figure.rows, strict=True):
         for axes in row[len(panels) :]:
             axes.set_visible(False)
         for axes, panel in zip(row, panels):
-            _draw_panel(axes, panel, looks)
-        # Curves of one name look alike: any of them stands for all.
-        handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
-        names = [label for label in looks if label in handles]
-        if all(names == [panel.title] for panel in panels):  # the title says it
-            continue
-        row[len(panels) - 1].legend(
-            [handles[name] for name in names],
-            names,
-            loc="upper left",
-            bbox_to_anchor=(1.0, 1.02),
-            frameon=False,
-            fontsize=9,
-        )
+            _draw_panel(axes, panel, styles)
+    _share_axes(grid, figure.rows)
+    for row, panels in zip(grid, figure.rows, strict=True):
+        _name_curves(row, panels)
     drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12, parse_math=False)
     return drawn
 
 
-def column_figure(figure: LineFigure) -> Figure:
-    """Return the panels below each other, each with its legend below: legible on a phone."""
+def _share_axes(grid: np.ndarray, rows: Sequence[Sequence[Panel]]) -> None:
+    """Let panels below each other share x, and those beside each other y, of one quantity each."""
+    for row, panels in zip(grid, rows, strict=True):
+        for axes, panel in zip(row[1:], panels[1:]):
+            same = panel.y_label == panels[0].y_label
+            if same and axes.get_yscale() == row[0].get_yscale():
+                axes.sharey(row[0])
+                row[0].autoscale(axis="y")
+                if row[0].get_yscale() == "linear" and row[0].get_ylim()[0] > 0.0:
+                    row[0].set_ylim(bottom=0.0)
+    for j, column in enumerate(grid.T):
+        shown = [(axes, row[j]) for axes, row in zip(column, rows, strict=True) if j < len(row)]
+        for axes, panel in shown[1:]:
+            first, one = shown[0]
+            if panel.x_label == one.x_label and axes.get_xscale() == first.get_xscale():
+                limits = [v for a in (first, axes) for v in a.get_xlim()]
+                axes.sharex(first)
+                first.set_xlim(min(limits), max(limits))
+
+
+def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
+    """Write the names of a row's curves, each once."""
+    last = len(panels) - 1
+    left = dict.fromkeys(line.label for panel in panels for line in panel.lines)
+    if all(list(left) == [panel.title] for panel in panels):  # the title says it
+        return
+    if all(ends_right(axes) for axes in row[: last + 1] if axes.lines):
+        for k in range(last, -1, -1):
+            mine = {line.label for line in panels[k].lines} & set(left)
+            label_ends(row[k], PANEL - 0.7, mine)
+            left = {name: None for name in left if name not in mine}
+        return
+    handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
+    row[last].legend(
+        [handles[name] for name in left],
+        list(left),
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.02),
+        frameon=False,
+        fontsize=9,
+        handlelength=3.0,
+    )
+
+
+def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
+    """Return the panels below each other, each with its legend below: legible on a phone.
+
+    Their left edges are one line.
+    """
     panels = [panel for row in figure.rows for panel in row]
-    looks = _looks(figure)
-    heights = [3.0 + 0.21 * len(panel.lines) for panel in panels]
-    drawn = _figure(NARROW, sum(heights), dpi=160)
-    parts = np.atleast_1d(np.array(drawn.subfigures(len(panels), 1, height_ratios=heights)))
-    for part, panel in zip(parts.ravel(), panels, strict=True):
-        axes = part.subplots()
-        _draw_panel(axes, panel, looks)
-        part.legend(
-            *axes.get_legend_handles_labels(),
-            loc="outside lower left",
-            frameon=False,
-            fontsize=9,
-        )
+    styles = styles or common_looks([figure])
+    heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
+    drawn = new_figure(NARROW, sum(heights), 160)
+    grid = drawn.subplots(len(panels), 1, squeeze=False, height_ratios=[1.0] * len(panels))[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        _draw_panel(axes, panel, styles)
+        if panel.lines and [line.label for line in panel.lines] != [panel.title]:
+            axes.legend(
+                loc="upper left",
+                bbox_to_anchor=(0.0, -0.2),
+                borderaxespad=0.0,
+                frameon=False,
+                fontsize=9,
+                handlelength=3.0,
+            )
+    drawn.align_ylabels(list(grid))
     return drawn
 
 
-def _looks(figure: LineFigure) -> dict[str, dict[str, Any]]:
-    """Return how every curve looks: alike in all panels, and different within a row."""
-    numbers: dict[str, int] = {}
-    for row in figure.rows:
-        labels = dict.fromkeys(line.label for panel in row for line in panel.lines)
-        taken = {numbers[label] for label in labels if label in numbers}
-        free = (number for number in range(len(labels)) if number not in taken)
-        for label in labels:
-            if label not in numbers:
-                numbers[label] = next(free)
-    return {label: _look(number) for label, number in numbers.items()}
-
-
-def _look(index: int) -> dict[str, Any]:
-    colour = PALETTE[index % len(PALETTE)]
-    return {
-        "color": colour,
-        "linestyle": DASHES[index // len(PALETTE) % len(DASHES)],
-        "marker": MARKERS[index % len(MARKERS)],
-        # Smaller and thinner ones on top: curves that coincide can be told apart.
-        "markersize": max(4.0, 9.0 - 1.5 * index),
-        "linewidth": max(1.2, 2.6 - 0.7 * index),
-        "zorder": 2.0 + 0.01 * index,
-    }
-
-
-def _draw_panel(axes: Axes, panel: Panel, looks: dict[str, dict[str, Any]]) -> None:
+def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
     """Draw one panel."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import MaxNLocator
 
     for line in panel.lines:
-        look = dict(looks[line.label])
-        if len(panel.lines) == 1 or len(line.x) <= FEW:
-            look["linewidth"] = 1.4
+        style = dict(styles[line.label])
         if len(line.x) > FEW:
-            look["marker"] = ""
-        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **look)
+            style["marker"] = ""
+        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **style)
     values = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
     x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
-    if len(values) and spans_decade(values):
-        axes.set_yscale("log")
-        if values.max() < FEW_DECADES * values.min():
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(NullFormatter())
+    if len(values) and (spans_decade(values) or (panel.y_log and values.min() > 0.0)):
+        log_scale(axes, values)
     elif len(values) and values.min() >= 0.0 and values.min() < 0.5 * values.max():
         axes.set_ylim(bottom=0.0)
-    if len(x) and (x % 1 == 0).all():
+    if panel.x_log2 and len(x) and x.min() > 0.0:
+        log2_scale(axes)
+    elif len(x) and (x % 1 == 0).all():
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if any(len(line.x) > FEW for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
@@ -176,13 +219,12 @@ def matrix_figure(figure: MatrixFigure) -> Figure:
     """Return heat maps with their numbers."""
     count = len(figure.labels)
     side = max(3.6, 0.62 * count + 1.6)
-    drawn = _figure(side * len(figure.panels) + 0.6, side + 0.5)
+    drawn = new_figure(side * len(figure.panels) + 0.6, side + 0.5)
     for axes, (title, values) in zip(drawn.subplots(1, len(figure.panels), squeeze=False)[0],
                                      figure.panels, strict=True):  # fmt: skip
-        largest = np.nanmax(np.abs(values)) or 1.0
-        image = axes.imshow(values, cmap="RdBu_r", vmin=-largest, vmax=largest)
+        image = axes.imshow(values, cmap="RdBu_r", vmin=-LOSS, vmax=LOSS)
         for (i, j), value in np.ndenumerate(values):
-            dark = abs(value) > 0.6 * largest
+            dark = abs(value) > 0.6 * LOSS
             axes.text(j, i, f"{value:.2f}", ha="center", va="center", color="w" if dark else "k",
                       fontsize=9 if count <= CROWD else 7)  # fmt: skip
         axes.set_xticks(range(count), figure.labels)
@@ -190,14 +232,20 @@ def matrix_figure(figure: MatrixFigure) -> Figure:
         axes.set_xlabel(figure.column_label, parse_math=False)
         axes.set_ylabel(figure.row_label, parse_math=False)
         axes.set_title(title, loc="left", fontsize=10)
-        drawn.colorbar(image, ax=axes, shrink=0.8)
+        drawn.colorbar(image, ax=axes, shrink=0.8, extend=_beyond(values))
     drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
     return drawn
 
 
+def _beyond(values: np.ndarray) -> Literal["neither", "min", "max", "both"]:
+    """Return at which ends of the colour scale values lie beyond it."""
+    low, high = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
+    return "both" if low and high else "min" if low else "max" if high else "neither"
+
+
 def tornado_figure(figure: TornadoFigure) -> Figure:
     """Return bars from the lowest to the highest value, the most telling key on top."""
-    drawn = _figure(9.0, sum(1.1 + 0.45 * len(bars) for _, bars in figure.panels) + 0.4)
+    drawn = new_figure(9.0, sum(1.1 + 0.45 * len(bars) for _, bars in figure.panels) + 0.4)
     heights = [1.0 + 0.5 * len(bars) for _, bars in figure.panels]
     grid = drawn.subplots(len(figure.panels), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (title, bars) in zip(grid, figure.panels, strict=True):
@@ -228,7 +276,7 @@ def design_figure(figure: DesignFigure) -> Figure:
     columns = max(map(len, views))
     tall = max(np.ptp(v.corners[..., 1]) / np.ptp(v.corners[..., 0]) for row in views for v in row)
     wide = 6.0
-    drawn = _figure(wide * columns + 0.4, len(views) * (wide * tall + 0.45) + 1.2)
+    drawn = new_figure(wide * columns + 0.4, len(views) * (wide * tall + 0.45) + 1.2)
     grid = drawn.subplots(len(views), columns, squeeze=False)
     for row, arms, (label, _, _) in zip(grid, views, figure.designs, strict=True):
         for axes, view in zip(row, arms):
@@ -278,16 +326,17 @@ def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
 # -- random values ---------------------------------------------------------------------------
 
 
-def histogram_figure(figure: HistogramFigure) -> Figure:
+def histogram_figure(figure: HistogramFigure, styles: Looks | None = None) -> Figure:
     """Return histograms, the share of the samples below as a curve, and the nominal values."""
     from matplotlib.ticker import MaxNLocator
 
     rows, columns = len(figure.rows), max(map(len, figure.rows))
-    drawn = _figure(5.2 * columns, 3.2 * rows + 0.5)
+    styles = styles or common_looks([figure])
+    drawn = new_figure(5.2 * columns, 3.2 * rows + 0.5)
     grid = drawn.subplots(rows, columns, squeeze=False)
-    for i, (row, panels) in enumerate(zip(grid, figure.rows, strict=True)):
+    for row, panels in zip(grid, figure.rows, strict=True):
         for axes, panel in zip(row, panels):
-            colour = PALETTE[i % len(PALETTE)]
+            colour = styles[panels[0].title]["color"]
             axes.hist(panel.values, bins="fd", color=colour, alpha=0.55)
             axes.axvline(panel.nominal, color="black", linestyle="--", linewidth=1.2)
             axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
@@ -308,7 +357,7 @@ def bar_figure(figure: BarFigure) -> Figure:
     """Return groups of bars with their intervals."""
     rows, columns = len(figure.rows), max(map(len, figure.rows))
     place = np.arange(len(figure.labels))
-    drawn = _figure((1.5 + 1.1 * max(3, len(place))) * columns + 0.6, 3.2 * rows + 0.8)
+    drawn = new_figure((1.5 + 1.1 * max(3, len(place))) * columns + 0.6, 3.2 * rows + 0.8)
     grid = drawn.subplots(rows, columns, squeeze=False, sharey=True)
     for row, panels in zip(grid, figure.rows, strict=True):
         for axes, panel in zip(row, panels):
@@ -330,16 +379,18 @@ def bar_figure(figure: BarFigure) -> Figure:
     return drawn
 
 
-def scatter_figure(figure: ScatterFigure) -> Figure:
+def scatter_figure(figure: ScatterFigure, styles: Looks | None = None) -> Figure:
     """Return points, a row a quantity and a column an input."""
     from matplotlib.ticker import EngFormatter
 
     rows, columns = len(figure.rows), len(figure.columns)
-    drawn = _figure(3.2 * columns + 0.8, 2.5 * rows + 0.5)
+    names = [label.partition(": ")[0] for label, _ in figure.rows]
+    styles = styles if styles and set(names) <= set(styles) else looks([names])
+    drawn = new_figure(3.2 * columns + 0.8, 2.5 * rows + 0.5)
     grid = drawn.subplots(rows, columns, squeeze=False, sharex="col", sharey="row")
     for i, (row, (y_label, y)) in enumerate(zip(grid, figure.rows, strict=True)):
         for axes, (x_label, x) in zip(row, figure.columns):
-            axes.plot(x, y, ".", color=PALETTE[i // 2 % len(PALETTE)], alpha=0.35, markersize=3)
+            axes.plot(x, y, ".", color=styles[names[i]]["color"], alpha=0.35, markersize=3)
             axes.grid(True, alpha=0.3)
             if np.abs(x).max() >= 1e4:  # 70 G rather than a power of ten in a corner
                 axes.xaxis.set_major_formatter(EngFormatter())
@@ -349,23 +400,3 @@ def scatter_figure(figure: ScatterFigure) -> Figure:
                 axes.set_xlabel(x_label, fontsize=9, parse_math=False)
     drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
     return drawn
-
-
-# -- files -----------------------------------------------------------------------------------
-
-
-def _figure(width: float, height: float, dpi: int = 110) -> Figure:
-    """Return an empty figure, inches, that no global state knows of."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=dpi)
-    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG; return its path."""
-    write_atomically(path, lambda stream: figure.savefig(stream, format="png"))
-    return path

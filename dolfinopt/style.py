@@ -141,6 +141,7 @@ def label_ends(axes: Axes, height: float, names: Iterable[str] | None = None) ->
             parse_math=False,
             arrowprops={
                 "arrowstyle": "-",
+                "relpos": (0.0, 0.5),  # from the first letter, not through the words
                 "color": line.get_color(),
                 "linewidth": 0.7,
                 "shrinkA": 1.0,

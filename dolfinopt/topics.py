@@ -146,7 +146,9 @@ class _Coordinates(Plan):
                 y = [take(outcomes[self.case(label, design, scene)]) for scene in mine]
                 if mine:
                     lines.append(Line(method, x, np.array(y)))
-            return Panel(label, "elastic coordinates of each arm [-]", y_label, tuple(lines))
+            return Panel(
+                label, "elastic coordinates of each arm [-]", y_label, tuple(lines), x_log2=True
+            )
 
         return tuple(
             tuple(panel(*one, y_label, take) for y_label, take in QUANTITIES)
@@ -301,7 +303,7 @@ def _convergence(found: Sequence[Outcome]) -> LineFigure:
     unit = {"compliance": "N m s", "deviation": "m", "eigenfrequency": "s2"}
     label = f"objective [{unit.get(found[0].case.scene.objective.kind, 'N m')}]"
     panels = (
-        (Panel("as the own model sees it", "iteration [-]", label, tuple(objective)),),
+        (Panel("as the own model sees it", "iteration [-]", label, tuple(objective), y_log=True),),
         (Panel("", "iteration [-]", "grayness [-]", tuple(grayness)),),
     )
     return LineFigure("convergence", "Convergence", panels)

@@ -26,7 +26,8 @@ from dolfinopt.ledger import Ledger
 from dolfinopt.optimization import optimize
 from dolfinopt.parallel import share_arms
 from dolfinopt.scene import Scene
-from dolfinopt.study_plots import line_figure, save
+from dolfinopt.study_plots import line_figure
+from dolfinopt.style import save
 from dolfinopt.variants import changed
 
 if TYPE_CHECKING:
