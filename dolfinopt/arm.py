@@ -55,7 +55,6 @@ class Arm:
 
     Attributes:
         mesh: see `ArmMesh`.
-        elastic: stiffness and mass of the current design.
         solid: the arm's solid material.
         coordinates: number q that `reduce` keeps; None until `take`, where the scene says "auto".
         basis: of the current design; None before `reduce`.
@@ -67,6 +66,9 @@ class Arm:
     def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, ledger: Ledger):
         """Mesh arm number `index` on the ranks of `comm` (collective there)."""
         arm = scene.arms[index]
+        self._x_phys = np.empty(0)
+        self._material: Interpolated | None = None
+        self._young = self._density = np.empty(0)  # of every cell of the current design, Pa, kg/m3
         self.scene = scene
         self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
         self.solid = scene.material_of(index)
@@ -75,8 +77,10 @@ class Arm:
             self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
         with ledger.phase("element operators"):
             operators = element_operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
-            self.elastic = ElasticArm(self.mesh, operators, ledger)
-            self.filter = HelmholtzFilter(self.mesh, scene.design.filter_radius)
+            self._elastic = ElasticArm(self.mesh, operators, ledger)
+            design = scene.design
+            # A member along an edge would be half as thin if the filter mirrored it there.
+            self.filter = HelmholtzFilter(self.mesh, design.radius, design.minimum_member > 0.0)
         self.coordinates = scene.reduction.count or None
         # Of a mesh file known only now.
         if self.coordinates is not None and self.coordinates > self.elastic.num_dofs:
@@ -90,8 +94,16 @@ class Arm:
         self.loaded_starts: dict[int, np.ndarray] = {}
         self._body: ShapeIntegrals | None = None
         self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
-        self._x_phys = np.empty(0)
-        self._material: Interpolated | None = None
+
+    @property
+    def elastic(self) -> ElasticArm:
+        """Stiffness and mass of the current design.
+
+        Arms `under` other scenes share them: they hold the design of the one that is asked.
+        """
+        if self._material is not None:
+            self._elastic.set_design(self._young, self._density)
+        return self._elastic
 
     def physical(self, x: np.ndarray) -> np.ndarray:
         """Return the physical densities of design variables x: filtered, passive cells solid."""
@@ -173,18 +185,38 @@ class Arm:
         return np.where(self.mesh.passive, 0.0, values)
 
     def set_design(self, x_phys: np.ndarray) -> None:
-        """Take physical densities in [0, 1]; what was made of others is forgotten."""
+        """Take physical densities in [0, 1]; what was made of others is forgotten.
+
+        Raises:
+            InputError: on this rank, see `refusal`.
+        """
         if np.array_equal(x_phys, self._x_phys):
             return
+        if reason := self.refusal(x_phys):
+            raise InputError(reason)
         options = self.scene.interpolation
         self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
-        self.elastic.set_design(
-            self.solid.young_modulus * self._material.stiffness,
-            self.solid.density * self._material.mass,
-        )
+        self._young = self.solid.young_modulus * self._material.stiffness
+        self._density = self.solid.density * self._material.mass
         self._x_phys = x_phys.copy()
         self.basis = self._body = None
         self._loaded = {}
+
+    def refusal(self, x_phys: np.ndarray) -> str:
+        """Return why these cannot be physical densities of this rank's cells, "" if they can."""
+        name, shape = self.mesh.name, np.shape(x_phys)
+        if shape != (self.mesh.num_cells,):
+            return (
+                f"arm {name!r}: densities of shape {shape}: expected ({self.mesh.num_cells},), one "
+                "of every cell of this rank"
+            )
+        wrong = np.flatnonzero(~((x_phys >= 0.0) & (x_phys <= 1.0)))  # nan, too
+        if len(wrong):
+            return (
+                f"arm {name!r}: density {x_phys[wrong[0]]:.4g} of cell {wrong[0]}: expected a "
+                "number >= 0 and <= 1 (0 is void, 1 solid)"
+            )
+        return ""
 
     def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
         """Return the floating body of physical densities in [0, 1] (collective on the arm).
@@ -214,7 +246,8 @@ class Arm:
         """Return this arm in a scene that differs in what it does, not in what it is.
 
         Mesh, element matrices, filter and the current design's factorisation are shared; so is
-        the basis unless the reduction differs. Use one or the other, not both in turn.
+        the basis unless the reduction differs. Each has a design of its own from then on: while
+        the two differ, using both in turn factorises anew each time.
 
         Args:
             scene: with the same arms, material, interpolation and design options.

@@ -14,7 +14,7 @@ import numpy as np
 
 from dolfinopt.arm import chain_of, fixed_body
 from dolfinopt.body import ShapeIntegrals, first_frequency
-from dolfinopt.errors import ConvergenceError
+from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.integrators.problem import Solution
 from dolfinopt.ledger import Ledger
 from dolfinopt.motion import rigid_motion
@@ -123,8 +123,10 @@ def evaluate(
         The evaluation, and on the root the trajectory, if there is one.
 
     Raises:
+        InputError: densities that are none, see `Arm.refusal`; on all ranks.
         ConvergenceError: on all ranks alike.
     """
+    _check_densities(share, arms, x_phys)
     for index, arm in arms.items():
         arm.set_design(x_phys[index])
     motion, trajectory = Motion(), None
@@ -156,7 +158,11 @@ def evaluate_batch(
 
     Returns:
         What `evaluate` does of every scene, or the error that it would raise.
+
+    Raises:
+        InputError: as `evaluate` does.
     """
+    _check_densities(share, arms, x_phys)
     try:
         owned = _reduced(share, arms, x_phys)
     except ConvergenceError as error:
@@ -174,6 +180,17 @@ def evaluate_batch(
         except ConvergenceError as error:
             found.append(error)
     return found
+
+
+def _check_densities(share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells) -> None:
+    """Raise InputError on all ranks where densities of one cannot be those of a design."""
+    mine = [
+        arm.refusal(x_phys[k]) if k in x_phys else f"arm {arm.mesh.name!r}: expected densities"
+        for k, arm in arms.items()
+    ]
+    for reason in share.world.allgather(next(filter(None, mine), "")):
+        if reason:
+            raise InputError(reason)
 
 
 def _judged(scene: Scene, share: ArmShare, arms: Mapping[int, Arm], motion: Motion) -> Evaluation:

@@ -437,10 +437,9 @@ class _Run:
 
     def _posed(self, designs: Sequence[_Evaluated]) -> _Posed:
         """Return the problem at the current design (collective); keep its limits."""
-        variables, nominal = self.variables, designs[-1]
         _, weights = self._objective(designs)
         slopes = [one.slopes for one in designs]
-        volume = variables.volume_constraints(nominal.x_phys)
+        volume, by_volume = self._volume(designs)
         fractions = (1.0 + volume) * self.scene.design.volume_fraction
         self.limits = worst_limits(
             [limits_of(self.scene, one.evaluation, fractions.tolist()) for one in designs]
@@ -449,9 +448,7 @@ class _Run:
         return _Posed(
             np.sum([w * s.objective for w, s in zip(weights, slopes, strict=True)], axis=0),
             np.append(volume, constraints),
-            np.vstack(
-                [variables.volume_slopes(nominal.realised)] + [one.constraints for one in slopes]
-            ),
+            np.vstack([by_volume] + [one.constraints for one in slopes]),
         )
 
     def _residual(self, posed: _Posed) -> float:
@@ -489,6 +486,20 @@ class _Run:
         self.x = x
         self.iteration += 1
         self._sharpen()
+
+    def _volume(self, designs: Sequence[_Evaluated]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the volume constraints and their gradients by x.
+
+        Of robust designs the dilated one carries the limit, chosen anew in every step so that the
+        nominal one meets its own: V_dilated / (V_dilated / V_nominal limit) - 1, the quotient held.
+        Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
+        """
+        nominal = self.variables.volume_constraints(designs[-1].x_phys)
+        if len(designs) == 1:
+            return nominal, self.variables.volume_slopes(designs[-1].realised)
+        _, dilated, _ = designs
+        ratio = (1.0 + nominal) / (1.0 + self.variables.volume_constraints(dilated.x_phys))
+        return nominal, ratio[:, None] * self.variables.volume_slopes(dilated.realised)
 
     def _assess(self, designs: Sequence[_Evaluated]) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate what the iterations left out: motions not simulated, and the crisp design."""

@@ -47,7 +47,7 @@ def _materials(scene: Scene) -> list[str]:
 
 def _sizes(scene: Scene) -> list[str]:
     found = []
-    radius = scene.design.filter_radius
+    radius = scene.design.radius
     for arm in scene.arms:
         if not arm.own:
             continue

@@ -54,6 +54,7 @@ Stiffness = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
 PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
 MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
 Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
+MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell more or less decides
 MAX_ITERATIONS = 1_000_000
 MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation
 
@@ -302,6 +303,13 @@ class Arm(Table):
     def passive_share(self) -> float:
         """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
         return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
+
+    @property
+    def cell_size(self) -> float | None:
+        """Longest side of a cell, m; None for a mesh file that does not depend on it."""
+        if self.cells is None:
+            return self.mesh_size
+        return max(self.length / self.cells[0], self.height / self.cells[1])
 
     @property
     def n_reducible(self) -> int | None:
@@ -652,6 +660,50 @@ class Design(Table):
         le=0.499,
         description="distance of the robust thresholds from one half [-]",
     )
+    minimum_member: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e4,
+        description="width of the thinnest member and gap of the robust designs, from which the "
+        "filter's radius follows (filter_radius stays at its default); 0 is off [m]",
+    )
+
+    @property
+    def radius(self) -> float:
+        """Radius of the cone filter: `filter_radius`, or what `minimum_member` asks for, m.
+
+        Filtered by exp(-|s| / r) / (2 r), a strip of solid of width 2 a has the density
+        1 - exp(-a / r) cosh(s / r) within. Its middle reaches the eroded design's threshold
+        1/2 + erosion where exp(-a / r) = 1/2 - erosion; the nominal design is then as wide as
+        2 r arcosh(1 / (1 - 2 erosion)), and no member that survives the erosion is thinner.
+        By symmetry the same holds for gaps and the dilated design. The radius is 2 sqrt(3) r.
+        After Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y, and Trillet, Duysinx &
+        Fernandez (2021), doi:10.1007/s00158-021-02998-w, for the Helmholtz filter's kernel.
+        """
+        if not self.minimum_member:
+            return self.filter_radius
+        return self.minimum_member * math.sqrt(3.0) / math.acosh(1.0 / (1.0 - 2.0 * self.erosion))
+
+    @model_validator(mode="after")
+    def _check_member(self) -> Design:
+        if not self.minimum_member:
+            return self
+        if self.projection != "robust":
+            raise Refusal(
+                'expected 0, the default, unless design.projection = "robust": other designs hold '
+                "no width",
+                ("minimum_member",),
+                ("projection",),
+            )
+        default = type(self).model_fields["filter_radius"].default
+        if self.filter_radius not in (default, self.radius):
+            raise Refusal(
+                f"expected {default}, the default, with minimum_member = {self.minimum_member}: "
+                f"the radius that gives this width is {self.radius:.6g} [m]",
+                ("filter_radius",),
+                ("minimum_member",),
+            )
+        return self
 
     @model_validator(mode="after")
     def _check_minimum(self) -> Design:
@@ -821,6 +873,26 @@ class Scene(Table):
             raise Refusal(
                 "expected at least one arm with a design: none is flexible", ("arms", 0, "rigid")
             )
+        return self
+
+    @model_validator(mode="after")
+    def _check_member(self) -> Scene:
+        width = self.design.minimum_member
+        for i in self.cell_counts if width else ():
+            arm, keys = self.arms[i], (("design", "minimum_member"), ("arms", i, "height"))
+            size = arm.cell_size
+            if size is not None and width < MEMBER_CELLS * size * (1.0 - 1e-9):
+                raise Refusal(
+                    f'expected at least {MEMBER_CELLS} cells of arm "{arm.name}", '
+                    f"{MEMBER_CELLS * size:.4g} [m]; a wider member or finer cells",
+                    *keys,
+                )
+            if 3.0 * width > arm.height * (1.0 + 1e-9):
+                raise Refusal(
+                    f'expected at most a third of the height of arm "{arm.name}", '
+                    f"{arm.height / 3.0:.4g} [m]: two members and a gap",
+                    *keys,
+                )
         return self
 
     @model_validator(mode="after")

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt import compat
 from dolfinopt.arm import Arm
 from dolfinopt.coordinates import Choice
 from dolfinopt.evaluation import Evaluation, Motion
 from dolfinopt.files import drive_units, trajectory_units, versions
 from dolfinopt.ledger import Counts, Ledger
 from dolfinopt.limits import Limit, limits_of, summary_of
-from dolfinopt.parallel import ArmShare, gather_arms
+from dolfinopt.members import thinnest
+from dolfinopt.parallel import ArmShare, gather_arms, gather_cells
 from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
@@ -28,6 +30,8 @@ from dolfinopt.vibration import frequency_excess
 # out. The rotation tells where soft material at the end gives way: arms fold there, undeflected.
 SMALL = 0.1
 SMALL_TURN = 0.2  # rad
+# Radius of the filter in cells from which on no chains of cells that touch in corners remain.
+FILTER_CELLS = 2.0
 
 
 def summarise(
@@ -63,9 +67,11 @@ def summarise(
         trajectory: of the design, on the root.
     """
     volumes = gather_arms(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
+    sides = gather_arms(share, {k: _cell_size(scene, k, a) for k, a in arms.items()})
     sizes = gather_arms(share, {k: _volume(scene, k, a) for k, a in arms.items()})
     notes = gather_arms(share, {k: a.mesh.notes for k, a in arms.items()})
     greys = gather_arms(share, {k: a.grayness(x_phys[k]) for k, a in arms.items()})
+    widths = _widths(share, arms, x_phys)
     seconds = _slowest(share.world, ledger.seconds)
     mine = (counts or ledger.counts) if share.leads else Counts()
     counted = share.world.gather(mine, root=0)
@@ -88,6 +94,8 @@ def summarise(
             for arm, owner in zip(scene.arms, scene.owners, strict=True)
             if owner is not None
         },
+        **_by_arm(scene, "minimum_member_measured", {k: w[0] for k, w in widths.items()}),
+        **_by_arm(scene, "minimum_gap_measured", {k: w[1] for k, w in widths.items()}),
         "first_frequency": {
             arm.name: value
             for arm, value in zip(scene.arms, evaluation.first_frequencies, strict=True)
@@ -114,6 +122,7 @@ def summarise(
             *(note for mesh_notes in notes.values() for note in mesh_notes),
             *_warnings(scene, evaluation),
             *_too_few(scene, choice),
+            *(_filter_warnings(scene, sides) if iterations else ()),
         ],
         "iterations": iterations,
         "converged": converged,
@@ -179,6 +188,46 @@ def _frequency_errors(
                 errors[index] = frequency_excess(arm.elastic, arm.basis.V, body.K, body.M)
     ledger.counts = counts
     return gather_arms(share, errors)
+
+
+def _widths(
+    share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+) -> dict[int, tuple[float | None, float | None]]:
+    """Return the widths of member and gap of the designs cut at one half, m; on the root."""
+    corners, solid = {}, {}
+    for k, arm in arms.items():
+        points = compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)[:, :, :2]
+        corners[k] = points[:, [0, 1, 3, 2]] if points.shape[1] == 4 else points
+        solid[k] = x_phys[k] > 0.5
+    whole, cut = gather_cells(share, corners), gather_cells(share, solid)
+    return {k: thinnest(whole[k], cut[k]) for k in whole}
+
+
+def _by_arm(scene: Scene, name: str, values: Mapping[int, Any]) -> dict[str, dict[str, Any]]:
+    """Return a value of every arm that has a design, by the arm's name."""
+    pairs = zip(scene.arms, scene.owners, strict=True)
+    return {name: {arm.name: values[k] for arm, k in pairs if k is not None}}
+
+
+def _cell_size(scene: Scene, index: int, arm: Arm) -> float:
+    """Return the longest side of a cell, of a mesh file the root of the mean area, m."""
+    known = scene.arms[index].cell_size
+    area, count = arm.mesh.comm.allreduce(np.array([arm.mesh.area.sum(), arm.mesh.num_cells]))
+    return float(np.sqrt(area / count)) if known is None else known
+
+
+def _filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
+    """Return a sentence for every arm whose cells are too large for the filter."""
+    radius, found = scene.design.radius, []
+    for k, size in sizes.items():
+        if radius < FILTER_CELLS * size * (1.0 - 1e-9):
+            found.append(
+                f"the filter's radius of {radius:.4g} m is {radius / size:.2g} cells of arm "
+                f"{scene.arms[k].name!r}: below {FILTER_CELLS:g} cells designs may hang together "
+                f"by corners of cells, which is stiff in the model alone; set "
+                f"design.filter_radius = {FILTER_CELLS * size:.4g} or more, or use finer cells"
+            )
+    return found
 
 
 def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:

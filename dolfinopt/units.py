@@ -23,6 +23,8 @@ SUMMARY = {
     "mass": "kg",
     "grayness": "-",
     "volume_fraction": "-",
+    "minimum_member_measured": "m",
+    "minimum_gap_measured": "m",
     "first_frequency": "Hz",
     "first_frequency_error": "-",
     "loaded_frequency": "Hz",

@@ -13,7 +13,7 @@ from remainders import SCENE, build, rates, tip, uneven, wave
 import dolfinopt as do
 from dolfinopt.arm import Arm, chain_of
 from dolfinopt.body import ShapeIntegrals, rigid_bar
-from dolfinopt.evaluation import constraint_gradients
+from dolfinopt.evaluation import constraint_gradients, evaluate, evaluate_batch
 from dolfinopt.mechanism import deviation
 from dolfinopt.motion import rigid_motion
 from dolfinopt.objective import load_cases, objective
@@ -391,3 +391,48 @@ def test_loaded_frequencies_are_in_the_order_of_the_arms() -> None:
     assert first < second
     alone = build("objective.kind=eigenfrequency", "arms.arm1.rigid=true")
     assert alone.evaluate(alone.fields(same))[0].loaded_frequencies == (second,)
+
+
+# -- what is refused, and what is shared -----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda x: np.where(np.arange(len(x)) == 3, -0.5, x), r"density -0.5 of cell 3: expected"),
+        (lambda x: np.where(np.arange(len(x)) == 3, 1.01, x), r"density 1.01 of cell 3"),
+        (lambda x: np.where(np.arange(len(x)) == 3, np.nan, x), r"density nan of cell 3"),
+        (lambda x: x[:-1], r"densities of shape \(\d+,\): expected \(\d+,\)"),
+        (lambda x: x[:, None], r"densities of shape"),
+    ],
+    ids=["negative", "above one", "nan", "too few", "columns"],
+)
+def test_densities_that_are_none_are_refused(change, reason) -> None:
+    """On all ranks, although one alone has them."""
+    built = build()
+    x = built.fields(same)
+    if 1 in x:
+        x[1] = change(x[1])
+    with pytest.raises(do.InputError, match=f"arm 'arm2': {reason}"):
+        built.evaluate(x)
+    with pytest.raises(do.InputError, match=reason):
+        evaluate_batch([built.scene] * 2, built.share, built.arms, x, do.Ledger())
+
+
+def test_arms_under_another_scene_keep_their_own_design() -> None:
+    """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
+    built = build("objective.kind=static", "constraints.first_frequency=4.0")
+    stiff, weak = built.fields(same), {k: 0.4 * v for k, v in built.fields(same).items()}
+    place = built.scene, built.share
+    expected = [evaluate(*place, built.arms, x, do.Ledger())[0] for x in (weak, stiff)]
+    slopes = built.gradient()
+    other = {k: arm.under(built.scene) for k, arm in built.arms.items()}
+    for _ in range(2):
+        for arms, x, want in ((other, weak, expected[0]), (built.arms, stiff, expected[1])):
+            found = evaluate(*place, arms, x, do.Ledger())[0]
+            assert found.objective == pytest.approx(want.objective, rel=1e-9)
+            assert found.compliance == pytest.approx(want.compliance, rel=1e-6)
+            assert found.constraints == pytest.approx(want.constraints, rel=1e-7)
+    evaluate(*place, other, weak, do.Ledger())
+    for k, slope in built.gradient().items():
+        np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())
