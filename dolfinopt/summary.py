@@ -217,17 +217,16 @@ def _cell_size(scene: Scene, index: int, arm: Arm) -> float:
 
 
 def _filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
-    """Return a sentence for every arm whose cells are too large for the filter."""
-    radius, found = scene.design.radius, []
-    for k, size in sizes.items():
-        if radius < FILTER_CELLS * size * (1.0 - 1e-9):
-            found.append(
-                f"the filter's radius of {radius:.4g} m is {radius / size:.2g} cells of arm "
-                f"{scene.arms[k].name!r}: below {FILTER_CELLS:g} cells designs may hang together "
-                f"by corners of cells, which is stiff in the model alone; set "
-                f"design.filter_radius = {FILTER_CELLS * size:.4g} or more, or use finer cells"
-            )
-    return found
+    """Return a sentence where cells are too large for the filter, about the largest ones."""
+    radius, (k, size) = scene.design.radius, max(sizes.items(), key=lambda item: item[1])
+    if radius >= FILTER_CELLS * size * (1.0 - 1e-9):
+        return []
+    return [
+        f"the filter's radius of {radius:.4g} m is {radius / size:.2g} cells of arm "
+        f"{scene.arms[k].name!r}: below {FILTER_CELLS:g} cells designs may hang together by "
+        "corners of cells, which is stiff in the model alone; set design.filter_radius = "
+        f"{FILTER_CELLS * size:.4g} or more, or use finer cells"
+    ]
 
 
 def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
