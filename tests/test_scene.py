@@ -120,6 +120,8 @@ def test_demo_states_every_other_key():
         "stages",
         "sample",
         "shared_volume",
+        "minimum_member",
+        "kkt_tolerance",
         "exponent",
         "start",
         "end",
@@ -582,6 +584,8 @@ BAD_VALUES = [
     ("design.projection", "tanh", '"tanh"', 'false | "heaviside" | "robust"'),
     ("design.sharpness", 0.5, "0.5", "a number >= 1"),
     ("design.continuation", 0, "0", "an integer >= 1"),
+    ("design.minimum_member", -1e-9, "-1e-09", "a number >= 0 and <= 10000"),
+    ("optimizer.kkt_tolerance", -1e-9, "-1e-09", "a number >= 0 and <= 1000000"),
     ("design.erosion", 0.5, "0.5", "a number >= 0.001 and <= 0.499"),
     ("design.shared_volume", 1, "1", "true or false"),
     ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
@@ -1086,7 +1090,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 78
+    assert len({info.key for info in keys}) == len(keys) == 80
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info
