@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from dolfinopt import scene as scenes
 from dolfinopt.body import ShapeIntegrals, rigid_bar, shape_integrals
+from dolfinopt.budget import check_budget
 from dolfinopt.elasticity import ElasticArm, element_operators
 from dolfinopt.errors import InputError
 from dolfinopt.filters import HelmholtzFilter
@@ -344,8 +345,10 @@ def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int
     need no mesh.
 
     Raises:
-        InputError: a mesh file cannot be an arm, or holds more solid cells than the volume allows.
+        InputError: the meshes exceed the memory; a mesh file cannot be an arm, or holds more solid
+            cells than the volume allows.
     """
+    check_budget(share.world, scene)
     arms = {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
     if any(scene.arms[index].mesh is not None for index in scene.cell_counts):
         _check_solid(scene, share, arms)

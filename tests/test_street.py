@@ -28,6 +28,7 @@ STREET = (
     "contents",
     "compat",
     "parallel",
+    "budget",
     "step",
     "geometry",
     "mesh",

@@ -56,7 +56,11 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
         warn(implausible(scene))
         return scene
 
-    return world, on_root(world, load)
+    from dolfinopt.budget import check_budget
+
+    scene = on_root(world, load)
+    check_budget(world, scene)
+    return world, scene
 
 
 def claim(
