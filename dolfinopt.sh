@@ -5,6 +5,7 @@ set -u
 usage() {
   cat <<'TEXT'
 usage: ./dolfinopt.sh [-n RANKS] COMMAND ...               run a command, with -n under mpirun
+       ./dolfinopt.sh [-n RANKS] python FILE ...           run a script with the same interpreter
        ./dolfinopt.sh [-n RANKS] test [PYTEST ARGUMENTS]   ruff, mypy, pytest alone and on RANKS (2)
        ./dolfinopt.sh --help                               list the commands
 
@@ -229,6 +230,18 @@ case ${1-} in
     ranks=${ranks:-2}
     ensure ready-dev "${here}[dev]"
     run_tests "$@"
+    ;;
+  python)
+    shift
+    if [ $# -eq 0 ]; then
+      say "python needs a script: ./dolfinopt.sh python FILE ..."
+      exit 2
+    fi
+    ensure ready "$here"
+    answer_soon
+    [ -n "$ranks" ] || exec "$python" "$@"
+    exec 2> >(drop_chatter >&2)
+    exec /usr/bin/mpirun -n "$ranks" "$python" "$@"
     ;;
   *)
     ensure ready "$here"

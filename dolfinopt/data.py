@@ -19,6 +19,11 @@ def paper_scene() -> Path:
     return Path(__file__).parent / "scenes" / "two_arm.toml"
 
 
+def template_folder() -> Path:
+    """Return the folder of the scenes that `dolfinopt init` starts from."""
+    return Path(__file__).parent / "templates"
+
+
 def page_folder() -> Path:
     """Return the folder of the templates that make report.html."""
     return Path(__file__).parent / "pages"

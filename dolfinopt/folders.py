@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -81,3 +81,26 @@ def remove_stale(
             raise InputError(
                 f"{folder / name}: cannot be replaced ({error.strerror}); name another --out"
             ) from None
+
+
+def write_new(texts: Mapping[Path, str], replaced: Mapping[Path, str]) -> None:
+    """Write text files: all of `texts`, which must be new, and those of `replaced`.
+
+    Raises:
+        InputError: one exists, or cannot be written; then none of `texts` is left.
+    """
+    for path in texts:
+        if path.exists():
+            raise InputError(f"{path}: exists already and stays as it is; give another name")
+    written: list[Path] = []
+    path = Path()
+    try:
+        for path, text in [*texts.items(), *replaced.items()]:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path in texts:
+                written.append(path)
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        for done in written:
+            done.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

@@ -24,6 +24,7 @@ STREET = (
     "scene_keys",
     "plausibility",
     "scene_messages",
+    "scene_schema",
     "scene",
     "contents",
     "compat",

@@ -14,9 +14,12 @@ from dolfinopt import __version__
 from dolfinopt.cli.bench import bench
 from dolfinopt.cli.export import export
 from dolfinopt.cli.gradient import gradient
+from dolfinopt.cli.init import init
+from dolfinopt.cli.keys import keys
 from dolfinopt.cli.optimize import optimize
 from dolfinopt.cli.plot import plot
 from dolfinopt.cli.reproduce import reproduce
+from dolfinopt.cli.schema import schema
 from dolfinopt.cli.simulate import simulate
 from dolfinopt.cli.start import Start, end_before_start
 from dolfinopt.cli.study import study
@@ -90,5 +93,7 @@ def commands(ctx: click.Context) -> None:
         click.echo(ctx.get_help())
 
 
-for command in (optimize, simulate, gradient, export, study, reproduce, bench, plot):
+STARTING = (init, keys, schema)
+WORKING = (optimize, simulate, gradient, export, study, reproduce, bench, plot)
+for command in (*STARTING, *WORKING):
     commands.add_command(command)
