@@ -422,7 +422,7 @@ def test_densities_that_are_none_are_refused(change, reason) -> None:
 def test_arms_under_another_scene_keep_their_own_design() -> None:
     """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
     built = build("objective.kind=static", "constraints.first_frequency=4.0")
-    stiff, weak = built.fields(same), {k: 0.4 * v for k, v in built.fields(same).items()}
+    stiff, weak = built.fields(same), {k: 0.8 * v for k, v in built.fields(same).items()}
     place = built.scene, built.share
     expected = [evaluate(*place, built.arms, x, do.Ledger())[0] for x in (weak, stiff)]
     slopes = built.gradient()
