@@ -26,6 +26,7 @@ from dolfinopt.claims import (
     Measured,
     Reduced,
     Resolved,
+    Setting,
     Swept,
     Used,
     find,
@@ -56,6 +57,7 @@ PAYLOADS, MASSES = (4.0, 6.0, 8.0), tuple(4.0 + 0.5 * k for k in range(9))
 PATHS, FLATTENINGS = (0.0, 0.25, 0.5, 0.75, 1.0), tuple(0.125 * k for k in range(9))
 INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
 SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
+NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")
 
 
@@ -339,7 +341,40 @@ def measure(plan: Plan, outcomes: Outcomes) -> Measured:
             _all_made(plan.ends, outcomes),
             tuple(_reduced(plan.ends, outcomes, case) for case in plan.ends.compared),
         ),
+        setting_of(plan.scene),
     )
+
+
+def setting_of(scene: Scene) -> Setting:
+    """Return what the texts say of a scene."""
+    from dolfinopt.material import interpolate
+
+    options, x = scene.interpolation, scene.design.initial
+    law, p = options.law, options.penalty
+    stiffness = interpolate(np.array([x]), law, p, options.floor).stiffness[0]
+    count = len([arm for arm in scene.arms if arm.flexible])
+    arms = f"{NUMBERS.get(count, count)} flexible arm{'s' if count != 1 else ''}"
+    base = "A cart" if scene.motion.base == "cart" else "A fixed base"
+    verb = "moves" if count == 1 else "move"
+    return Setting(
+        scene.payload.mass,
+        f"{base} carries {arms} that {verb} {scene.payload.mass:g} kg along {_path_words(scene)}.",
+        round(float(stiffness), 4),
+        f"{x:g} with q = {p:g} of RAMP" if law == "ramp" else f"{x:g} to the power {p:g}",
+        scene.design.volume_fraction,
+    )
+
+
+def _path_words(scene: Scene) -> str:
+    """Return what the end-effector follows."""
+    motion = scene.motion
+    if motion.path == "arc" and motion.flattening == 1.0:
+        return "a semicircle"
+    if motion.path == "arc" and motion.flattening > 0.0:
+        return f"a semicircle flattened to {motion.flattening:g}"
+    if motion.path in ("arc", "line"):
+        return "a straight line"
+    return "a given path"
 
 
 def _all_made(plan: Plan, outcomes: Outcomes) -> tuple[Made, ...]:

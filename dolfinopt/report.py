@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from dolfinopt.paper import INITIAL, OPTIMUM, Numbered, Reproduction
 if TYPE_CHECKING:
     from dolfinopt.cases import Case, Outcome
     from dolfinopt.files import ArmView
+    from dolfinopt.scene import Scene
     from dolfinopt.simulation import Trajectory
 
 WIDTH = 900  # px of a picture of the longest arm
@@ -76,6 +77,7 @@ def page(done: Reproduction, folder: Path) -> str:
     assert used == {numbered.number for numbered in done.figures}
     return _template("report.html").substitute(
         style=_text("report.css"),
+        machine=escape(done.measured.setting.machine),
         headline=_headline(done),
         player=_player(done),
         summary=_summary(done.findings),
@@ -295,8 +297,35 @@ def _method(done: Reproduction) -> str:
         f"y = {m.joint_height:g} m, damping {scene.damping.stiffness_proportional:g} s times the "
         f"stiffness, {scene.objective.load_cases} load cases in {m.horizon:g} s. Nothing was tuned "
         f"towards the paper’s figures. Where several of its figures show one thing, which of them "
-        f"shows what is our choice.</p>{failed}"
+        f"shows what is our choice.</p>{_overridden(scene)}{failed}"
     )
+
+
+def _overridden(scene: Scene) -> str:
+    """Say where the scene is another than the paper's, which every figure here is compared with."""
+    from dolfinopt.paper import load_paper
+
+    theirs, ours = _flat(load_paper().to_dict()), _flat(scene.to_dict())
+    changed = [
+        f"{key} = {ours.get(key)} in place of {theirs.get(key)}"
+        for key in dict.fromkeys([*theirs, *ours])
+        if theirs.get(key) != ours.get(key)
+    ]
+    if not changed:
+        return ""
+    return f"<p>Not as in the paper’s scene: {escape('; '.join(changed))}.</p>"
+
+
+def _flat(data: Any, key: str = "") -> dict[str, Any]:
+    """Return nested tables as one, keys dotted."""
+    if isinstance(data, list) and data and isinstance(data[0], dict):
+        data = {str(k): row for k, row in enumerate(data)}
+    if not isinstance(data, dict):
+        return {key: data}
+    found: dict[str, Any] = {}
+    for name, value in data.items():
+        found |= _flat(value, f"{key}.{name}" if key else name)
+    return found
 
 
 # -- designs ---------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import pytest
 from mpi4py import MPI
 
 from dolfinopt import cases, paper
-from dolfinopt.claims import bend, broken, find, percent, power, read_measured, span
+from dolfinopt.claims import Setting, bend, broken, find, percent, power, read_measured, span
 from dolfinopt.cli import commands
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError
@@ -40,6 +40,28 @@ def tiny_plan():
         payload=dataclasses.replace(paper.PAYLOAD, values=(4.0, 6.0, 8.0)),
         path=dataclasses.replace(paper.PATH, values=(0.0, 0.5, 1.0), optimised=(0.0, 1.0)),
     )
+
+
+# -- what the texts say of the scene ---------------------------------------------------------
+
+
+def test_texts_take_their_values_from_the_scene():
+    """Payload, path, penalty and volume are those of --set, not the paper's."""
+    assert paper.setting_of(paper.load_paper()) == Setting()
+    settings = ["payload.mass=4", "motion.flattening=0.5", "interpolation.penalty=2"]
+    settings += ["design.initial=0.25", "design.volume_fraction=0.25"]
+    setting = paper.setting_of(paper.load_paper(overrides=settings))
+    assert setting.machine == (
+        "A cart carries two flexible arms that move 4 kg along a semicircle flattened to 0.5."
+    )
+    measured = dataclasses.replace(RECORDED, setting=setting)
+    assert read_measured(measured.json()) == measured
+    words = {finding.name: finding.reason for finding in find(measured)}
+    assert "has 6.25 % of the solid arm's stiffness (0.25 to the power 2)" in words["path, a tenth"]
+    assert "25.0 % of the material in two flanges has 57.8 % of it" in words["path, a tenth"]
+    assert "4 times the material" in words["path, a tenth"]
+    paper_words = {finding.name: finding.reason for finding in find(RECORDED)}
+    assert "12.5 %" in paper_words["path, a tenth"] and "14.3 %" in paper_words["path, a tenth"]
 
 
 # -- findings on the recorded run ------------------------------------------------------------

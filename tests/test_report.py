@@ -65,6 +65,14 @@ def page(folder):
     return Reader((folder / "report.html").read_text(encoding="utf-8"))
 
 
+def test_page_says_where_the_scene_is_not_the_papers(folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert "two flexible arms that move 6 kg along a semicircle." in text
+    assert "simulation.sample = 0.01 in place of 0.001" in text
+    assert "arms.0.cells = [16, 3] in place of [200, 12]" in text
+    assert "payload.mass =" not in text and "$" not in text.split("</style>")[1].split("<script")[0]
+
+
 # -- the files -------------------------------------------------------------------------------
 
 
