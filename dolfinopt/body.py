@@ -100,12 +100,12 @@ class ShapeIntegrals:
     @cached_property
     def moment(self) -> np.ndarray:
         """First moment c = int X (d,), kg m."""
-        return self.w[:, 0]
+        return np.ascontiguousarray(self.w[:, 0])
 
     @cached_property
     def C(self) -> np.ndarray:
         """Int Phi (d, q)."""
-        return self.w[:, 1:]
+        return np.ascontiguousarray(self.w[:, 1:])
 
     @cached_property
     def inertia(self) -> float:
@@ -115,22 +115,22 @@ class ShapeIntegrals:
     @cached_property
     def j(self) -> np.ndarray:
         """Int X . Phi_k (q,); plane bodies."""
-        return self.W[0, 0, 1:]
+        return np.ascontiguousarray(self.W[0, 0, 1:])
 
     @cached_property
     def r(self) -> np.ndarray:
         """Int (S X) . Phi_k (q,); plane bodies."""
-        return self.W[1, 1:, 0]
+        return np.ascontiguousarray(self.W[1, 1:, 0])
 
     @cached_property
     def M(self) -> np.ndarray:
         """Int Phi_k . Phi_l (q, q); plane bodies."""
-        return self.W[0, 1:, 1:]
+        return np.ascontiguousarray(self.W[0, 1:, 1:])
 
     @cached_property
     def G(self) -> np.ndarray:
         """Int Phi_k . (S Phi_l) (q, q), skew; plane bodies."""
-        return self.W[1, 1:, 1:]
+        return np.ascontiguousarray(self.W[1, 1:, 1:])
 
 
 def plane_body(
@@ -182,16 +182,26 @@ def of_material(
 
 def in_basis(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     """Return the body in the coordinates z with q = T z; T is (q, q')."""
-    rigid = np.eye(1 + len(T), 1 + T.shape[1])
-    rigid[1:, 1:] = T
     changed: dict[str, Any] = {}
     for one in TABLE:
         if one.modes:
-            value, matrix = getattr(body, one.name), rigid if one.rigid else T
-            for axis in one.modes:
-                value = np.moveaxis(np.moveaxis(value, axis, -1) @ matrix, -1, axis)
-            changed[one.name] = np.ascontiguousarray(value)
+            first = 1 if one.rigid else 0
+            changed[one.name] = _transformed(getattr(body, one.name), T, len(one.modes), first)
     return replace(body, **changed)
+
+
+def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.ndarray:
+    """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay."""
+    q = T.shape[1]
+    out = np.empty((*value.shape[:-rank], *(first + q,) * rank))
+    if rank == 1:
+        out[..., :first], out[..., first:] = value[..., :first], value[..., first:] @ T
+        return out
+    out[..., :first, :first] = value[..., :first, :first]
+    out[..., :first, first:] = value[..., :first, first:] @ T
+    out[..., first:, :first] = (value[..., first:, :first].swapaxes(-1, -2) @ T).swapaxes(-1, -2)
+    out[..., first:, first:] = T.T @ value[..., first:, first:] @ T
+    return out
 
 
 def proportional(
@@ -224,25 +234,6 @@ def generators(dimension: int) -> np.ndarray:
     return PLANE if dimension == 2 else SPACE
 
 
-def second_moments(E: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return sum over the nodes of left' E_c right (g, k, l).
-
-    Args:
-        E: (g, d, d).
-        left: (n_nodes, d, k).
-        right: (n_nodes, d, l).
-    """
-    flat = left.reshape(-1, left.shape[2]).T
-    turned = np.einsum("cab,nbl->cnal", E, right)
-    return flat @ turned.reshape(len(E), -1, right.shape[2])
-
-
-def _without_rounding(E: np.ndarray, W: np.ndarray) -> np.ndarray:
-    """Return W with W_c' = int N' E_c' N exactly: symmetric and skew parts where E_c is so."""
-    partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
-    return 0.5 * (W + np.tensordot(partners, W.swapaxes(1, 2), 1))
-
-
 def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float) -> ShapeIntegrals:
     """Integrate the body's inertia over its current design (collective on the arm's ranks).
 
@@ -251,24 +242,54 @@ def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float
         basis: of that design.
         stiffness_proportional: beta in D = beta K, s.
     """
-    X, N = arm.points, augmented(arm.points, basis.V)
-    E = generators(X.shape[1])
+    X, V, MV = arm.points, basis.V, basis.MV
+    d, q = X.shape[1], V.shape[2]
+    E = generators(d)
     rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))  # M [1, X], per component
-    MN = np.concatenate([rigid[:, :, 1:], basis.MV], axis=2)
-    parts = rigid[:, 0, 0].sum(), MN.sum(axis=0), second_moments(E, MN, N)
+    MX, MV_flat = rigid[:, :, 1], MV.reshape(-1, q)
+    EX = np.einsum("cab,nb->cna", E, X)
+    EV = np.einsum("cab,nbl->cnal", E, V).reshape(len(E), -1, q)
+    parts = (
+        rigid[:, 0, 0].sum(),
+        MX.sum(axis=0),
+        MV.sum(axis=0),
+        np.array([np.sum(one * MX) for one in EX]),
+        np.array([np.einsum("ni,nik->k", one, MV) for one in EX]),
+        MV_flat.T @ EV,
+    )
     packed = np.concatenate([np.ravel(part) for part in parts])
     if arm.comm.size > 1:  # one reduction for all integrals
         packed = arm.comm.allreduce(packed)
-    mass, w, W = np.split(packed, np.cumsum([np.size(part) for part in parts])[:-1])
+    pieces = np.split(packed, np.cumsum([np.size(part) for part in parts])[:-1])
+    mass, moment, C, second, first, modes = (
+        piece.reshape(np.shape(part)) for piece, part in zip(pieces, parts, strict=True)
+    )
     return ShapeIntegrals(
-        mass=float(mass[0]),
-        w=w.reshape(parts[1].shape),
-        W=_without_rounding(E, W.reshape(parts[2].shape)),
+        mass=float(mass),
+        w=np.column_stack([moment, C]),
+        W=_assembled(E, second, first, modes),
         K=basis.stiffness,
         D=stiffness_proportional * basis.stiffness,
         outboard=basis.outboard,
         outboard_point=arm.mesh.outboard_point,
     )
+
+
+def _assembled(
+    E: np.ndarray, second: np.ndarray, first: np.ndarray, modes: np.ndarray
+) -> np.ndarray:
+    """Return W (g, 1 + q, 1 + q) of int X' E_c X, int Phi' E_c X and int Phi' E_c Phi.
+
+    The integral with E_c' is the transposed one: exactly, so that rounding goes.
+    """
+    partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
+    q = first.shape[1]
+    W = np.empty((len(E), 1 + q, 1 + q))
+    W[:, 0, 0] = 0.5 * (second + partners @ second)
+    W[:, 1:, 0] = first
+    W[:, 0, 1:] = partners @ first
+    W[:, 1:, 1:] = 0.5 * (modes + np.tensordot(partners, modes.swapaxes(1, 2), 1))
+    return W
 
 
 @dataclass(frozen=True, eq=False)
