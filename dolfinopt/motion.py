@@ -14,8 +14,19 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
+from dolfinopt.laws import Law, Limits, law_for
 from dolfinopt.scene import Motion, Scene
-from dolfinopt.tables import TIME, Curve, curve_by_chord, curve_in_time, read_table
+from dolfinopt.tables import (
+    TIME,
+    Curve,
+    Table,
+    curve_by_chord,
+    curve_by_laws,
+    curve_in_time,
+    last_instant,
+    moves,
+    read_table,
+)
 
 # Nearer to a singular position than this share of the largest arm, joint speeds lose their
 # digits: accelerations grow with the inverse cube of sin(elbow angle).
@@ -26,6 +37,7 @@ POINT = ("x", "y")  # columns of a table of points
 CART = "cart"  # first column of a table of joints
 # With more rows a table's kinks are many and small; the integrator's steps need not end there.
 MAX_KINKS = 20
+SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,56 +111,101 @@ def check_motion(scene: Scene) -> None:
 def breakpoints(scene: Scene) -> tuple[float, ...]:
     """Return the instants between which the motion is smooth, first 0, last the horizon; s.
 
-    They are the end of the path, and the rows of a short table without times: there the third
-    derivative of the cubic spline jumps.
+    They are the end of the path, where the law's phases end, beginnings and ends of stops, and the
+    rows of a short table without times: there the third derivative of the cubic spline jumps.
     """
     motion = scene.motion
-    instants = [motion.duration]
+    kinks, timed = np.zeros(0), False
     if motion.path in ("points", "joints"):
-        kinks = np.array(_curve(motion, _columns(scene), _stamp(motion))[0].kinks)
-        if len(kinks) <= MAX_KINKS:
-            instants = [*_when(kinks, motion), motion.duration]
-    return (0.0, *(t for t in instants if t < motion.horizon), motion.horizon)
+        curve, timed = _curve(motion, _columns(scene), _stamp(motion))
+        kinks = np.array(curve.kinks)
+    if not timed:
+        rows = _when(kinks, motion) if 0 < len(kinks) <= MAX_KINKS else []
+        kinks = np.concatenate([rows, time_law(motion).knots * motion.duration])
+    instants = np.sort(np.append(kinks, motion.duration))
+    apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
+    apart &= instants < motion.horizon * (1.0 - SAME_TIME)
+    return (0.0, *instants[apart].tolist(), motion.horizon)
 
 
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
     """Return the instants at which the time law reaches s, in (0, 1), by bisection."""
+    law = time_law(motion)
     low, high = np.zeros_like(s), np.full_like(s, motion.duration)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        late = LAWS[motion.law](middle, motion.duration)[0] >= s
+        late = law(middle, motion.duration)[0] >= s
         low, high = np.where(late, low, middle), np.where(late, middle, high)
     return [float(t) for t in high]
 
 
-# -- time laws and paths ---------------------------------------------------------------------
+# -- paths --------------------------------------------------------------------------------------
 
 
-def quintic(t: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return s = 10 u^3 - 15 u^4 + 6 u^5, u = t / duration, and two time derivatives.
+def time_law(motion: Motion) -> Law:
+    """Return the law by which the scene runs along its path.
 
-    s runs from 0 to 1 and rests outside [0, duration]; speed and acceleration are continuous.
+    Raises:
+        InputError: the table cannot be used, or the limits need more time than there is.
     """
-    u = np.clip(t / duration, 0.0, 1.0)
-    s = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
-    sd = 30.0 * u**2 * (1.0 - u) ** 2 / duration
-    sdd = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / duration**2
-    return s, sd, sdd
+    length = path_length(motion) if limits_of(motion).any else 1.0
+    law = _law(motion.law, length, limits_of(motion), motion.acceleration_share)
+    if motion.duration < law.least * (1.0 - SAME_TIME):
+        raise InputError(f"motion.duration = {motion.duration:g}: {too_short(law)}")
+    return law
 
 
-def septic(t: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return s = 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7, u = t / duration, and two time derivatives.
+_law = lru_cache(maxsize=64)(law_for)
 
-    As `quintic`, and the jerk is continuous, too.
+
+def limits_of(motion: Motion) -> Limits:
+    """Return the scene's limits along the path."""
+    values = (motion.max_speed, motion.max_acceleration, motion.max_jerk)
+    return Limits(*(np.inf if value is None else value for value in values))
+
+
+def too_short(law: Law) -> str:
+    """Return what is wrong with a duration that the limits do not allow."""
+    return (
+        f"expected at least {law.least:.6g} [s], which motion.max_speed, max_acceleration and "
+        "max_jerk need; leave it out, or raise them"
+    )
+
+
+def least_duration(motion: Motion) -> tuple[float | None, bool]:
+    """Return the duration that a table's last row or else the limits ask for, s, if any does.
+
+    Returns:
+        The duration, s, or None; whether the limits ask for it.
+
+    Raises:
+        InputError: the table cannot be read.
     """
-    u = np.clip(t / duration, 0.0, 1.0)
-    s = u**4 * (35.0 - 84.0 * u + 70.0 * u**2 - 20.0 * u**3)
-    sd = 140.0 * (u * (1.0 - u)) ** 3 / duration
-    sdd = 420.0 * (u * (1.0 - u)) ** 2 * (1.0 - 2.0 * u) / duration**2
-    return s, sd, sdd
+    if motion.path in ("points", "joints"):
+        last = last_instant(motion.file or "")
+        if last is not None:
+            return last, False
+    limits = limits_of(motion)
+    if not limits.any:
+        return None, False
+    return _law(motion.law, path_length(motion), limits, motion.acceleration_share).least, True
 
 
-LAWS = {"quintic": quintic, "septic": septic}
+def path_length(motion: Motion) -> float:
+    """Return the length that the limits refer to, m: of the semicircle, the line, the chords."""
+    if motion.path == "arc":
+        return np.pi * motion.radius
+    if motion.path == "line":
+        return float(np.hypot(*np.subtract(motion.end, motion.start)))
+    assert motion.file is not None
+    return _chords(motion.file, _stamp(motion))
+
+
+@lru_cache(maxsize=64)
+def _chords(file: str, stamp: int) -> float:
+    """Return the length of the straight lines through a table of points, m."""
+    rows = read_table(file, POINT).rows
+    return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
 
 
 def desired_path(t: np.ndarray, motion: Motion) -> Path:
@@ -165,7 +222,7 @@ def arc(t: np.ndarray, motion: Motion) -> Path:
 
     p = r (cos phi, flattening sin phi), phi from pi to 0 with the time law.
     """
-    s, sd, sdd = LAWS[motion.law](t, motion.duration)
+    s, sd, sdd = time_law(motion)(t, motion.duration)
     phi, phid, phidd = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
     c, z = np.cos(phi), np.sin(phi)
     scale = motion.radius * np.array([1.0, motion.flattening])
@@ -179,7 +236,7 @@ def arc(t: np.ndarray, motion: Motion) -> Path:
 def line(t: np.ndarray, motion: Motion) -> Path:
     """Return the straight line p = start + s (end - start), s from 0 to 1 with the time law."""
     start, end = np.array(motion.start), np.array(motion.end)
-    s, sd, sdd = (value[:, None] for value in LAWS[motion.law](t, motion.duration))
+    s, sd, sdd = (value[:, None] for value in time_law(motion)(t, motion.duration))
     return Path(start + s * (end - start), sd * (end - start), sdd * (end - start))
 
 
@@ -190,7 +247,7 @@ def _along(
     curve, timed = _curve(motion, columns, _stamp(motion))
     if timed:
         return curve(t)
-    s, sd, sdd = (value[:, None] for value in LAWS[motion.law](t, motion.duration))
+    s, sd, sdd = (value[:, None] for value in time_law(motion)(t, motion.duration))
     value, first, second = curve(s[:, 0])
     return value, first * sd, second * sd**2 + first * sdd
 
@@ -217,13 +274,38 @@ def _curve(motion: Motion, columns: tuple[str, ...], stamp: int) -> tuple[Curve,
             f"motion.duration = {motion.duration:g} [s] in the last row; set motion.duration = "
             f"{last:g}"
         )
-    default = Motion.model_fields["law"].default
-    if motion.law != default:
-        raise InputError(
-            f"{motion.file}: a column t with motion.law = {motion.law!r}: the table has its own "
-            f"times; set motion.law = {default!r}, the default, or leave out the column"
-        )
-    return curve_in_time(table), True
+    limits, default = limits_of(motion), Motion.model_fields["law"].default
+    if motion.law == default and not limits.any:
+        return curve_in_time(table), True
+    return _stop_to_stop(motion, table), True
+
+
+def _stop_to_stop(motion: Motion, table: Table) -> Curve:
+    """Return the motion through a table with times that runs straight by the law between stops.
+
+    Raises:
+        InputError: a row between two stops, or the limits need more time; names file and line.
+    """
+    assert table.t is not None
+    laws = []
+    for line, i, j in ((table.lines[j], i, j) for i, j in moves(table.rows)):
+        if j - i > 1:
+            raise InputError(
+                f"{table.file}: line {table.lines[i + 1]}: a row between two stops with motion.law "
+                f"= {motion.law!r} or limits, by which each move runs from stop to stop; repeat "
+                f"the row at a later {TIME} to stop there, leave it out, or leave out the column "
+                f"{TIME}, the law's name and the limits"
+            )
+        length = float(np.linalg.norm(table.rows[j] - table.rows[i]))
+        law = _law(motion.law, length, limits_of(motion), motion.acceleration_share)
+        time = float(table.t[j] - table.t[i])
+        if time < law.least * (1.0 - SAME_TIME):
+            raise InputError(
+                f"{table.file}: line {line}, column {TIME} = {table.t[j]:g}: {time:g} s for this "
+                f"move: {too_short(law)}"
+            )
+        laws.append((i, j, law))
+    return curve_by_laws(table, laws)
 
 
 # -- inverse kinematics ----------------------------------------------------------------------

@@ -213,7 +213,7 @@ class _Slopes:
     constraints: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Posed:
     """The problem at the current design, as MMA takes it: values f (m,) and gradients by x."""
 

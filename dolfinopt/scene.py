@@ -122,12 +122,14 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
     _resolve_files(tree, source, changes)
     _measure_bodies(tree, inherited)
+    derived = _time_motion(tree, source, changes)
     try:
         scene = Scene.model_validate(tree)
     except ValidationError as error:
         message = first_problem(error, tree, inherited, source, changes)
         raise InputError(message) from None
     scene._source = source
+    scene._derived = derived
     pose_scenarios(scene)
     return scene
 
@@ -141,7 +143,7 @@ def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
     """
     if not scene.scenarios:
         return ()
-    plain = scene.to_dict() | {"scenarios": []}
+    plain = scene.to_tree() | {"scenarios": []}
     return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
 
 
@@ -184,6 +186,52 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
         for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
             if loc[2] in ("passive", *MESH_KEYS):
                 arm.pop(loc[2], None)
+
+
+def _time_motion(
+    tree: dict[str, Any], source: str, changes: list[Override]
+) -> tuple[tuple[str, str], ...]:
+    """Complete duration and horizon of the motion where they follow from other values.
+
+    Returns:
+        The keys that do, as (table, key).
+
+    Raises:
+        InputError: a stated duration is too short for the limits.
+    """
+    motion = tree.get("motion")
+    if not isinstance(motion, dict):
+        return ()
+    asked = ("file", "max_speed", "max_acceleration", "max_jerk")
+    derived: list[tuple[str, str]] = []
+    if any(motion.get(key) is not None for key in asked):
+        from dolfinopt.motion import SAME_TIME, least_duration  # NumPy, which others do not need
+
+        rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
+        try:
+            least, limited = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
+        except (ValidationError, InputError):  # told where the scene is checked, or its motion
+            least, limited = None, False
+        stated = motion.get("duration")
+        if stated is None and least is not None:
+            motion["duration"] = least
+            derived.append(("motion", "duration"))
+        if not (limited and isinstance(stated, (int, float)) and least is not None):
+            pass  # what the duration is, validation will say
+        elif stated < least * (1.0 - SAME_TIME):
+            where = blamed(source, changes, (("motion", "duration"),))
+            keys = " and ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
+            raise input_error(
+                where,
+                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s], which "
+                f"{keys} need; leave it out to have just that, or raise the limits",
+            )
+    duration = motion.get("duration")
+    default = Motion.model_fields["horizon"].default
+    if "horizon" not in motion and isinstance(duration, (int, float)) and duration > default:
+        motion["horizon"] = duration
+        derived.append(("motion", "horizon"))
+    return tuple(derived)
 
 
 def resolve_file(source: str, value: str, key: str, where: str = "") -> str:

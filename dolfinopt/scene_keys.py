@@ -27,7 +27,7 @@ from dolfinopt.spelling import shown
 # What this version offers; a new method is added here and nowhere else in this file.
 Law = Literal["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
 Path2D = Literal["arc", "line", "points", "joints"]
-TimeLaw = Literal["quintic", "septic"]
+TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
 Base = Literal["cart", "fixed"]
 ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
 Integrator = Literal["radau", "generalized-alpha"]
@@ -55,6 +55,7 @@ PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
 MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
 Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
 MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell more or less decides
+PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 MAX_ITERATIONS = 1_000_000
 MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation
 
@@ -347,10 +348,35 @@ class Motion(Table):
         "directory [-]",
     )
     law: TimeLaw = Field(
-        default="quintic", description="time law along the path; not of a table with times [-]"
+        default="quintic",
+        description="time law along the path; of a table with times from stop to stop [-]",
     )
-    duration: Duration = Field(default=1.9, description="time from start to end of the path [s]")
-    horizon: Duration = Field(default=3.0, description="simulated time; at rest after duration [s]")
+    acceleration_share: float = Field(
+        default=0.25,
+        ge=1e-3,
+        le=0.5,
+        description='share of the time in which "trapezoidal" and "s-curve" accelerate, and as '
+        "long in which they brake, unless their last limit tells [-]",
+    )
+    max_speed: PathLimit | None = Field(
+        default=None, description="limit of the speed along the path [m/s]"
+    )
+    max_acceleration: PathLimit | None = Field(
+        default=None, description="limit of the acceleration along the path [m/s2]"
+    )
+    max_jerk: PathLimit | None = Field(
+        default=None, description='limit of the jerk along the path; not of "trapezoidal" [m/s3]'
+    )
+    duration: Duration = Field(
+        default=1.9,
+        description="time from start to end of the path; unless stated the last t of a table, or "
+        "what the limits need [s]",
+    )
+    horizon: Duration = Field(
+        default=3.0,
+        description="simulated time, the duration or more; at rest after duration; unless stated "
+        "the duration where that is longer than the default [s]",
+    )
     base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
     base_position: Position = Field(
         default=0.0, description="x of the shoulder joint on a fixed base [m]"
@@ -386,9 +412,33 @@ class Motion(Table):
         self._refuse_idle(self.path == "line", "path", "start", "end")
         self._refuse_idle(tabulated, "path", "file")
         self._refuse_idle(self.path != "joints", "path", "cart_follow", "elbow")
+        self._check_law()
         self._refuse_idle(self.base == "cart", "base", "cart_follow")
         self._refuse_idle(self.base == "fixed", "base", "base_position")
         return self
+
+    def _check_law(self) -> None:
+        """Raise where the law does not use a limit, or the path ends behind the horizon."""
+        profile = self.law in ("trapezoidal", "s-curve")
+        self._refuse_idle(profile, "law", "acceleration_share")
+        self._refuse_idle(self.law != "trapezoidal", "law", "max_jerk")
+        limits = ("max_speed", "max_acceleration", "max_jerk")
+        self._refuse_idle(self.path != "joints", "path", *limits)
+        last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
+        share = type(self).model_fields["acceleration_share"].default
+        if profile and getattr(self, last) is not None and self.acceleration_share != share:
+            raise Refusal(
+                f"expected {shown(share)}, the default, with motion.{last}, which tells how long "
+                "the law accelerates",
+                ("acceleration_share",),
+                (last,),
+            )
+        if self.horizon < self.duration:
+            raise Refusal(
+                f"expected at least motion.duration = {self.duration:g} [s], the end of the path",
+                ("horizon",),
+                ("duration",),
+            )
 
     def _refuse_idle(self, used: bool, choice: str, *keys: str) -> None:
         """Raise unless `keys` have their defaults or are `used` with this value of `choice`."""
@@ -789,6 +839,7 @@ class Scene(Table):
     )
 
     _source: str = PrivateAttr("<scene>")
+    _derived: tuple[tuple[str, str], ...] = PrivateAttr(())  # (table, key), see `to_tree`
 
     @property
     def source(self) -> str:
@@ -819,6 +870,13 @@ class Scene(Table):
     def to_dict(self) -> dict[str, Any]:
         """Return all resolved values as JSON-able data, from which `scene_from_dict` restores."""
         return self.model_dump(mode="json")
+
+    def to_tree(self) -> dict[str, Any]:
+        """Return `to_dict` without the values that follow from others, to be changed further."""
+        data = self.to_dict()
+        for table, key in self._derived:
+            del data[table][key]
+        return data
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Scene):

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 
 from dolfinopt.errors import InputError
+from dolfinopt.laws import SAME, Law
 
 TIME = "t"  # the column that a table may have before all others, s
 
@@ -40,15 +41,20 @@ class Curve:
         end: of the parameter, which begins at 0: the table's last instant, s, or 1.
         derivatives: functions of the parameter (n,) that return the curve (n, k) and its first
             and second derivative.
-        kinks: parameters inside where the third derivative jumps.
+        kinks: parameters inside where the second or third derivative jumps.
+        rests: whether the derivatives are to be zero at both ends; else they are the functions'.
     """
 
     end: float
     derivatives: tuple[Callable[[np.ndarray], np.ndarray], ...]
     kinks: tuple[float, ...] = ()
+    rests: bool = True
 
     def __call__(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the curve and two derivatives (n, k); it rests before 0 and behind `end`."""
+        if not self.rests:
+            value, first, second = (f(u) for f in self.derivatives)
+            return value, first, second
         inside = ((u > 0.0) & (u < self.end))[:, None]
         value, first, second = (f(np.clip(u, 0.0, self.end)) for f in self.derivatives)
         return value, first * inside, second * inside
@@ -85,16 +91,89 @@ def read_table(file: str, columns: Sequence[str]) -> Table:
     return Table(file, lines, t, values[:, [names.index(name) for name in columns]])
 
 
-def curve_in_time(table: Table) -> Curve:
-    """Return the quintic spline through a table with times, at rest at both ends.
+def last_instant(file: str) -> float | None:
+    """Return the last t of a table, s; None where it has no such column, or no number there."""
+    lines = [line for line in _text(file).splitlines() if line.strip() and line.lstrip()[0] != "#"]
+    names, last = (_cells(lines[k]) if lines else [] for k in (0, -1))
+    if TIME not in names or len(last) != len(names):
+        return None
+    try:
+        return float(last[names.index(TIME)])
+    except ValueError:
+        return None
 
-    Four times continuously differentiable; speed and acceleration vanish at the first and the
-    last instant, which makes the interpolation of n rows by degree 5 definite.
+
+def moves(rows: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and last row of every move; rows in succession that are equal are a stop."""
+    found: list[tuple[int, int]] = []
+    for i in np.flatnonzero((np.diff(rows, axis=0) != 0.0).any(axis=1)).tolist():
+        if found and found[-1][1] == i:
+            found[-1] = (found[-1][0], i + 1)
+        else:
+            found.append((i, i + 1))
+    return found
+
+
+def curve_in_time(table: Table) -> Curve:
+    """Return the quintic spline through a table with times, at rest at both ends and in stops.
+
+    Four times continuously differentiable between stops; speed and acceleration vanish at the
+    first and the last instant of each move, which makes the interpolation of n rows by degree 5
+    definite. Rows in succession that are equal are a stop: exactly there, without speed.
     """
     assert table.t is not None
-    rest = [(1, np.zeros(table.rows.shape[1])), (2, np.zeros(table.rows.shape[1]))]
-    spline = make_interp_spline(table.t, table.rows, k=5, bc_type=(rest, rest))
-    return Curve(float(table.t[-1]), (spline, spline.derivative(1), spline.derivative(2)))
+    t, rows = table.t, table.rows
+    rest = [(1, np.zeros(rows.shape[1])), (2, np.zeros(rows.shape[1]))]
+    pieces = []
+    for i, j in moves(rows):
+        part = slice(i, j + 1)
+        spline = make_interp_spline(t[part], rows[part], k=5, bc_type=(rest, rest))
+        pieces.append((t[i], t[j], (spline, spline.derivative(1), spline.derivative(2))))
+    if len(pieces) == 1 and len(moves(rows)) == 1 and moves(rows)[0] == (0, len(t) - 1):
+        return Curve(float(t[-1]), pieces[0][2])
+
+    def derivative(order: int) -> Callable[[np.ndarray], np.ndarray]:
+        def value(u: np.ndarray) -> np.ndarray:
+            here = rows[np.clip(np.searchsorted(t, u, side="right") - 1, 0, len(t) - 1)]
+            found = here if order == 0 else np.zeros_like(here)
+            for first, last, functions in pieces:
+                inside = (first < u) & (u < last)
+                found[inside] = functions[order](u[inside])
+            return found
+
+        return value
+
+    return Curve(float(t[-1]), tuple(map(derivative, range(3))), _ends(table))
+
+
+def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
+    """Return straight moves from row i to row j of a table with times, each by its law."""
+    assert table.t is not None
+    t, rows = table.t, table.rows
+
+    def derivative(order: int) -> Callable[[np.ndarray], np.ndarray]:
+        def value(u: np.ndarray) -> np.ndarray:
+            here = rows[np.clip(np.searchsorted(t, u, side="right") - 1, 0, len(t) - 1)]
+            found = here if order == 0 else np.zeros_like(here)
+            for i, j, law in laws:
+                # The end of a move belongs to it: there the acceleration may jump.
+                inside = (t[i] < u) & (u <= t[j] + SAME * t[-1])
+                s = law(np.minimum(u[inside], t[j]) - t[i], t[j] - t[i])[order][:, None]
+                found[inside] = s * (rows[j] - rows[i]) + (rows[i] if order == 0 else 0.0)
+            return found
+
+        return value
+
+    knots = [t[i] + law.knots * (t[j] - t[i]) for i, j, law in laws]
+    kinks = np.unique(np.concatenate([_ends(table), *knots]))
+    return Curve(float(t[-1]), tuple(map(derivative, range(3))), tuple(kinks.tolist()), rests=False)
+
+
+def _ends(table: Table) -> tuple[float, ...]:
+    """Return the instants inside at which moves begin or end."""
+    assert table.t is not None
+    ends = {float(table.t[k]) for move in moves(table.rows) for k in move}
+    return tuple(sorted(ends - {float(table.t[0]), float(table.t[-1])}))
 
 
 def curve_by_chord(table: Table) -> Curve:

@@ -108,7 +108,7 @@ def changed(scene: Scene, *overrides: str) -> Scene:
     """
     from dolfinopt.motion import check_motion
 
-    other = scene_from_dict(scene.to_dict(), scene.source, overrides)
+    other = scene_from_dict(scene.to_tree(), scene.source, overrides)
     check_motion(other)
     return other
 

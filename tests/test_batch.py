@@ -18,6 +18,7 @@ from dolfinopt.integrators.factors import factorise
 from dolfinopt.integrators.held import held_factors
 from dolfinopt.integrators.modes import modes_of
 from dolfinopt.integrators.problem import ElasticProblem, Solution, even_steps, relative_error
+from dolfinopt.laws import quintic
 from dolfinopt.ledger import Ledger
 from dolfinopt.mechanism import (
     Mechanism,
@@ -26,7 +27,7 @@ from dolfinopt.mechanism import (
     linearise,
     tangent,
 )
-from dolfinopt.motion import RigidMotion, quintic
+from dolfinopt.motion import RigidMotion
 
 TOLERANCE = 1e-4
 LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two

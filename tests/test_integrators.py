@@ -30,9 +30,10 @@ from dolfinopt.integrators.problem import (
     relative_error,
     static_start,
 )
+from dolfinopt.laws import Limits, law_for, quintic
 from dolfinopt.ledger import Ledger
 from dolfinopt.mechanism import Mechanism, inverse_dynamics, tangent
-from dolfinopt.motion import RigidMotion, quintic
+from dolfinopt.motion import RigidMotion
 
 Motion = Callable[[np.ndarray], RigidMotion]
 BOTH = pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
@@ -284,6 +285,40 @@ def test_order_of_radau(stages: int, counts: tuple[int, int]) -> None:
     )
     # Shaken by the fastest vibration, 43 Hz, of which the longest steps see one period.
     assert order == pytest.approx(2 * stages - 1, abs=0.2)
+
+
+def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
+    """Return a motion over half a second by a drive's profile, and where its phases end."""
+    law, size = law_for(name, 1.0, Limits(), 0.4), np.array([0.1, 0.5, -0.4])
+
+    def motion(t: np.ndarray) -> RigidMotion:
+        s, sd, sdd = law(t, 0.5)
+        return RigidMotion(HOMES[:3] + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size))
+
+    return motion, (0.0, *(0.5 * law.knots).tolist(), 0.5)
+
+
+@pytest.mark.parametrize("name", ["trapezoidal", "s-curve"])
+@pytest.mark.parametrize(("stages", "counts"), [(2, (40, 160)), (3, (40, 160)), (4, (40, 80))])
+def test_order_of_radau_with_jumps(name: str, stages: int, counts: tuple[int, int]) -> None:
+    """Accelerations and jerks that jump at the steps' ends, and only there, keep the order."""
+    problem, _ = two_arms(*profile(name), axial=100.0, damping=2e-3)
+    reference = radau.on_grid(problem, even_steps(problem, max(counts)), 1e-12, stages + 1)
+    order = fitted_order(
+        problem, lambda edges: radau.on_grid(problem, edges, 1e-12, stages), counts, reference
+    )
+    assert order == pytest.approx(2 * stages - 1, abs=0.4)
+
+
+@BOTH
+def test_jumps_of_acceleration_meet_the_tolerance(integrator: str) -> None:
+    """Against finer steps of one stage more; every jump is at the end of a step."""
+    problem, _ = two_arms(*profile("trapezoidal"))
+    exact = radau.integrate(problem, 1e-8, 5, Ledger())
+    tolerance = 1e-5 if integrator == "radau" else 1e-3
+    found = solve(integrator, problem, tolerance)
+    assert np.isin(problem.breakpoints, found.edges).all()
+    assert distance(problem, found, exact) <= tolerance
 
 
 @pytest.mark.parametrize("rho_inf", [0.0, 0.5, 0.8, 1.0])

@@ -18,6 +18,7 @@ from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.errors import InputError
+from dolfinopt.laws import quintic, septic
 from dolfinopt.mechanism import inverse_dynamics
 from dolfinopt.motion import (
     MAX_KINKS,
@@ -28,9 +29,7 @@ from dolfinopt.motion import (
     check_motion,
     desired_path,
     line,
-    quintic,
     rigid_motion,
-    septic,
 )
 from dolfinopt.parallel import on_root
 from dolfinopt.scene import Scene, scene_from_dict
@@ -408,13 +407,12 @@ def test_angles_do_not_depend_on_the_instants_asked_for(arms: int) -> None:
         ),
         (
             (1.0, 1.0),
-            {"path": "line", "start": [0, 0], "end": [1e200, 1e300], "cart_follow": 1e200},
-            r"at t = .* s the end-effector is (inf|nan) m from the shoulder, stretched .*",
+            {"path": "line", "start": [0, 0], "end": [1e4, 1e4], "cart_follow": 1e3},
+            r"at t = .* s the end-effector is .*e\+06 m from the shoulder, stretched .*",
         ),
     ],
-    ids=["far", "near", "above", "below", "overflow"],
+    ids=["far", "near", "above", "below", "very far"],
 )
-@pytest.mark.filterwarnings("ignore:overflow|invalid")
 def test_reach_of_any_number_of_arms(
     lengths: tuple[float, ...], keys: dict[str, Any], pattern: str
 ) -> None:
@@ -442,7 +440,6 @@ def test_points_of_a_straight_line_are_the_line(tmp_path: Path) -> None:
 def test_breakpoints(tmp_path: Path) -> None:
     """The end of the path, and the rows of a short table without times."""
     assert breakpoints(scene()) == (0.0, DURATION, 3.0)
-    assert breakpoints(scene(horizon=1.0)) == (0.0, 1.0)
     assert breakpoints(scene(horizon=DURATION)) == (0.0, DURATION)
     assert breakpoints(of_kind(tmp_path, 2, "points in time", "quintic", "cart")) == (
         0.0,
@@ -453,8 +450,6 @@ def test_breakpoints(tmp_path: Path) -> None:
     instants = breakpoints(of)
     assert len(instants) == len(POINTS) + 1
     assert_close(desired_path(np.array(instants[:-1]), of.motion).p, POINTS, 1e-13)
-    cut = of_kind(tmp_path, 2, "points", "septic", "cart", horizon=1.0)
-    assert breakpoints(cut) == (*(t for t in instants if t < 1.0), 1.0)
     x = np.linspace(-0.5, 0.5, MAX_KINKS + 3)
     file = tmp_path / "many.csv"
     file.write_text("\n".join(["x,y", *(f"{a!r},{a * a!r}" for a in x.tolist())]))
@@ -486,10 +481,11 @@ def test_changed_table_is_read_anew(tmp_path: Path) -> None:
             "motion.duration = 1.5",
         ),
         (
-            "t,cart,arm0,arm1\n0,0,0,0\n1.9,1,1,1\n",
+            "t,cart,arm0,arm1\n0,0,0,0\n1,0,1,1\n1.9,1,1,1\n",
             {"law": "septic"},
-            "a column t with motion.law = 'septic': the table has its own times; set motion.law = "
-            "'quintic', the default, or leave out the column",
+            "line 3: a row between two stops with motion.law = 'septic' or limits, by which each "
+            "move runs from stop to stop; repeat the row at a later t to stop there, leave it "
+            "out, or leave out the column t, the law's name and the limits",
         ),
         (
             "arm0,arm1\n0,0\n1,1\n",

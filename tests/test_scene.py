@@ -123,6 +123,10 @@ def test_demo_states_every_other_key():
         "minimum_member",
         "kkt_tolerance",
         "exponent",
+        "acceleration_share",
+        "max_speed",
+        "max_acceleration",
+        "max_jerk",
         "start",
         "end",
         "file",
@@ -227,7 +231,7 @@ def test_integer_stands_for_a_number():
         ("arms.0.name", "left arm_2-b"),
         ("arms.0.name", "2nd"),
         ("motion.flattening", 0),
-        ("motion.horizon", 1.0),  # the motion may be cut short
+        ("motion.horizon", 1.9),  # no rest behind the motion
         ("motion.elbow", 1),
         ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
         ("motion", {"base": "fixed", "base_position": -1.0}),
@@ -504,7 +508,12 @@ BAD_VALUES = [
     ("motion.end", [0.0, math.inf], "[0.0, inf]", "an array of two finite numbers"),
     ("motion.file", 5, "5", "a string"),
     ("motion.file", "absent.csv", '"absent.csv"', "found neither /"),
-    ("motion.law", "cubic", '"cubic"', '"quintic" | "septic"'),
+    ("motion.law", "cubic", '"cubic"', '"quintic" | "septic" | "trapezoidal" | "s-curve"'),
+    ("motion.horizon", 1.0, "1.0", "at least motion.duration = 1.9 [s], the end of the path"),
+    ("motion.acceleration_share", 0.3, "0.3", '0.25, the default, with motion.law = "quintic"'),
+    ("motion.max_speed", 0.0, "0.0", "a number >= 1e-06 and <= 1e+12"),
+    ("motion.max_acceleration", -1.0, "-1.0", "a number >= 1e-06 and <= 1e+12"),
+    ("motion.max_jerk", "fast", '"fast"', "a number >= 1e-06 and <= 1e+12"),
     ("motion.base", "rail", '"rail"', '"cart" | "fixed"'),
     ("motion.base_position", 1, "1", '0.0, the default, with motion.base = "cart"'),
     ("motion.duration", 0.0, "0.0", "a number >= 0.0001 and <= 100000"),
@@ -1090,7 +1099,7 @@ def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
 
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
-    assert len({info.key for info in keys}) == len(keys) == 80
+    assert len({info.key for info in keys}) == len(keys) == 84
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info

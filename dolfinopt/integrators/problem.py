@@ -123,7 +123,8 @@ def first_count(problem: ElasticProblem) -> int:
     stiffness, mass = mechanism.stiffness(), blocks[:, 2 * size :]
     slowest = np.sqrt(1.0 / np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass))).max())
     horizon = problem.breakpoints[-1]
-    smooth = 20 * (len(problem.breakpoints) - 1)
+    pieces = len(problem.breakpoints) - 1
+    smooth = 20 * min(pieces, 4) + 5 * max(pieces - 4, 0)  # many pieces are short ones
     return int(np.clip(8.0 * horizon * slowest / (2.0 * np.pi), smooth, 20_000))
 
 
