@@ -378,7 +378,7 @@ HISTORY = {
     "change": ("largest change of the design [-]", 1.0),
     "kkt": ("Karush-Kuhn-Tucker residual [-]", 1.0),
 }
-SHARES = ("grayness", "volume_fraction")  # from 0 to 1, drawn on a linear scale
+SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
 
 
 def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str, np.ndarray]:
@@ -408,7 +408,7 @@ def _numbers(values: Sequence[float | None]) -> np.ndarray:
 
 def _draw_history_panel(axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str) -> None:
     """Draw one quantity; first and last value stand above it."""
-    linear = label in [HISTORY[name][0] for name in SHARES]
+    linear = label.startswith(SHARES)
     positive = values > 0.0
     if not linear:  # nothing has changed yet at the first row; zero has no logarithm
         values = np.where(positive, values, np.nan) if positive.any() else values
