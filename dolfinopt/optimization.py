@@ -490,12 +490,16 @@ class _Run:
     def _volume(self, designs: Sequence[_Evaluated]) -> tuple[np.ndarray, np.ndarray]:
         """Return the volume constraints and their gradients by x.
 
-        Of robust designs the dilated one carries the limit, chosen anew in every step so that the
-        nominal one meets its own: V_dilated / (V_dilated / V_nominal limit) - 1, the quotient held.
+        Of robust designs with a `minimum_member` the dilated one carries the limit, chosen anew in
+        every step so that the nominal one meets its own: V_dilated / (V_dilated / V_nominal limit)
+        - 1, the quotient held.
         Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
+        The nominal one otherwise: a filter of few cells leaves so few grey ones that, once the
+        projection is sharp, the dilated volume does not see where the nominal one changes (200 x 12
+        cells, radius 1.5 cells, beta 64: the worst compliance climbs from 2.3 to 2.5 N m).
         """
         nominal = self.variables.volume_constraints(designs[-1].x_phys)
-        if len(designs) == 1:
+        if len(designs) == 1 or not self.scene.design.minimum_member:
             return nominal, self.variables.volume_slopes(designs[-1].realised)
         _, dilated, _ = designs
         ratio = (1.0 + nominal) / (1.0 + self.variables.volume_constraints(dilated.x_phys))

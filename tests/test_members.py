@@ -134,9 +134,10 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
         assert gap >= width - cell
 
 
-def test_the_dilated_design_carries_the_volume():
-    """Value of the nominal design, gradient of the dilated one, scaled by their volumes."""
-    scene = do.load_scene(SCENE, (*ROBUST, "design.filter_radius=0.01"))
+@pytest.mark.parametrize("width", [0.012, 0.0])
+def test_which_design_carries_the_volume(width):
+    """With a width the dilated one, scaled so that the nominal one meets its limit; else that."""
+    scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}"))
     share = do.share_arms(WORLD, scene.cell_counts)
     ledger = do.Ledger()
     arms = do.build_arms(scene, share, ledger)
@@ -149,8 +150,9 @@ def test_the_dilated_design_carries_the_volume():
     _, dilated, nominal = (run.variables.volume_constraints(one.x_phys) for one in designs)
     assert value == pytest.approx(nominal)
     assert dilated > nominal
-    expected = run.variables.volume_slopes(designs[1].realised)
-    np.testing.assert_allclose(slopes, expected * (1.0 + nominal) / (1.0 + dilated), rtol=1e-14)
+    expected = run.variables.volume_slopes(designs[1 if width else 2].realised)
+    factor = (1.0 + nominal) / (1.0 + dilated) if width else np.ones(len(nominal))
+    np.testing.assert_allclose(slopes, expected * factor[:, None], rtol=1e-14)
 
 
 @pytest.mark.parametrize(
