@@ -105,5 +105,5 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 
 if __name__ == "__main__":
-    with do.one_ending(MPI.COMM_WORLD):
+    with do.abort_together(MPI.COMM_WORLD):
         main()

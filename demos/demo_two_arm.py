@@ -55,5 +55,5 @@ def main(folder: Path = Path("results/demo_two_arm")) -> do.Result:
 
 
 if __name__ == "__main__":
-    with do.one_ending(MPI.COMM_WORLD):
+    with do.abort_together(MPI.COMM_WORLD):
         main()

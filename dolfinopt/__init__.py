@@ -21,6 +21,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+# Raise it with every change that alters results: of the finite elements, reductions, simulation,
+# gradients or optimiser, beyond rounding; and with every change of the files that are kept of
+# them. What is kept under another number, or another version, is computed anew.
+NUMERICS = 1
 
 if TYPE_CHECKING:
     from dolfinopt.arm import Arm, build_arms
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
     from dolfinopt.files import gather_views
     from dolfinopt.ledger import Ledger
     from dolfinopt.optimization import Result, optimize
-    from dolfinopt.parallel import gather_arms, one_ending, share_arms
+    from dolfinopt.parallel import abort_together, gather_arms, share_arms
     from dolfinopt.scene import Scene, load_scene, scene_from_dict
     from dolfinopt.simulation import Trajectory, simulate
 
@@ -48,7 +52,7 @@ _HOME = {
     "Ledger": "ledger",
     "Result": "optimization",
     "optimize": "optimization",
-    "one_ending": "parallel",
+    "abort_together": "parallel",
     "share_arms": "parallel",
     "Scene": "scene",
     "load_scene": "scene",

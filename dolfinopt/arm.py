@@ -21,7 +21,7 @@ from dolfinopt.filters import HelmholtzFilter
 from dolfinopt.ledger import Ledger
 from dolfinopt.material import Interpolated, interpolate
 from dolfinopt.mesh import arm_mesh
-from dolfinopt.parallel import ArmShare, sum_over_arms
+from dolfinopt.parallel import ArmShare, sum_over_arms, together
 from dolfinopt.projection import Projected, preserving_threshold, project, robust_thresholds
 from dolfinopt.reduction import METHODS, Basis, Options
 from dolfinopt.standard_input import load_body
@@ -186,17 +186,19 @@ class Arm:
         return np.where(self.mesh.passive, 0.0, values)
 
     def set_design(self, x_phys: np.ndarray) -> None:
-        """Take physical densities in [0, 1]; what was made of others is forgotten.
+        """Take physical densities in [0, 1] (collective on the arm).
 
         Raises:
-            InputError: on this rank, see `refusal`.
+            InputError: on the arm's ranks, see `refusal`.
         """
-        if np.array_equal(x_phys, self._x_phys):
+        known = np.array_equal(x_phys, self._x_phys)
+        if self.mesh.comm.allreduce(known, op=MPI.LAND):
             return
-        if reason := self.refusal(x_phys):
-            raise InputError(reason)
         options = self.scene.interpolation
-        self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
+        with together(self.mesh.comm):
+            if reason := self.refusal(x_phys):
+                raise InputError(reason)
+            self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
         self._young = self.solid.young_modulus * self._material.stiffness
         self._density = self.solid.density * self._material.mass
         self._x_phys = x_phys.copy()
@@ -339,7 +341,7 @@ class Arm:
 
 
 def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int, Arm]:
-    """Build this rank's arms, keyed by their index in the scene (collective on `share.comm`).
+    """Build this rank's arms, keyed by their index in the scene (collective on `share.world`).
 
     Only arms with a design of their own: those that share one, rigid arms and those from a file
     need no mesh.
@@ -349,7 +351,8 @@ def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int
             cells than the volume allows.
     """
     check_budget(share.world, scene)
-    arms = {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
+    with together(share.world):
+        arms = {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
     if any(scene.arms[index].mesh is not None for index in scene.cell_counts):
         _check_solid(scene, share, arms)
     return arms

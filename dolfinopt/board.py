@@ -1,7 +1,8 @@
 """One display for many cases on many ranks: a live board on a terminal, plain lines elsewhere.
 
 Every rank tells the root what it does; the root listens whenever it has a moment. Nothing that is
-computed depends on it.
+computed depends on it. A rank that fails tells all others, who give up their work when they next
+speak or listen: see `OthersFailed`.
 """
 
 from __future__ import annotations
@@ -9,14 +10,17 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from dolfinopt.errors import OthersFailed
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
 IDLE = 0.02  # s between two looks
+NEWS, STOP = 1, 2  # kinds of messages
 
 
 @dataclass(frozen=True)
@@ -66,30 +70,64 @@ class Board:
         text: str = "",
         *,
         finished: int = 0,
-        last: bool = False,
     ) -> None:
-        """Say what this rank does; see `News`."""
-        news = News(self.comm.rank, label, done, total, text, finished, last)
+        """Say what this rank does; see `News`.
+
+        Raises:
+            OthersFailed: another rank has.
+        """
+        self._check()
+        self._tell(News(self.comm.rank, label, done, total, text, finished))
+
+    def _tell(self, news: News) -> None:
         if self.comm.rank == 0:
             self._hear(news)
-            self.listen()
+            self._take_in()
             return
         self._sent = [request for request in self._sent if not request.test()[0]]
-        self._sent.append(self.comm.isend(news, dest=0))
+        self._sent.append(self.comm.isend(news, dest=0, tag=NEWS))
 
     def listen(self) -> None:
-        """Take in what has arrived (root; nothing elsewhere)."""
-        while self.comm.rank == 0 and self.comm.iprobe():
-            self._hear(self.comm.recv())
+        """Take in what has arrived.
+
+        Raises:
+            OthersFailed: another rank has.
+        """
+        self._check()
+        self._take_in()
+
+    def stop_others(self) -> None:
+        """Tell all other ranks that this one has failed."""
+        for rank in {*range(self.comm.size)} - {self.comm.rank}:
+            self._sent.append(self.comm.isend(None, dest=rank, tag=STOP))
 
     def wait_for_all(self) -> None:
         """Return when every rank has said its last word (collective)."""
-        self.tell(last=True)
+        self._tell(News(self.comm.rank, last=True))
         while self.comm.rank == 0 and self.ended < self.comm.size:
-            self.listen()
+            self._take_in()
             time.sleep(IDLE)
+
+    def close(self) -> None:
+        """Take in what nobody listened to any more, and free the communicator (collective)."""
+        self.comm.Barrier()
+        with suppress(OthersFailed):
+            self._check()
         for request in self._sent:
             request.wait()
+        self.comm.Free()
+
+    def _take_in(self) -> None:
+        while self.comm.rank == 0 and self.comm.iprobe(tag=NEWS):
+            self._hear(self.comm.recv(tag=NEWS))
+
+    def _check(self) -> None:
+        stopped = False
+        while self.comm.size > 1 and self.comm.iprobe(tag=STOP):
+            self.comm.recv(tag=STOP)
+            stopped = True
+        if stopped:
+            raise OthersFailed("another rank failed")
 
     def _hear(self, news: News) -> None:
         self.finished += news.finished
@@ -100,23 +138,40 @@ class Board:
 
 @contextmanager
 def open_board(world: MPI.Comm, total: int, shown: bool = True) -> Iterator[Board]:
-    """Yield a board for `total` cases (collective).
+    """Yield a board for `total` cases, and wait for all ranks at the block's end (collective).
+
+    What the block raises on one rank is raised on all, see `parallel.together`; the others give
+    up their work.
 
     Args:
         world: all ranks.
         total: cases to do.
         shown: False draws nothing.
     """
+    from dolfinopt.parallel import together
+
     board = Board(world.Dup(), total)
-    if world.rank != 0 or not shown or total == 0:
-        yield board
-    elif sys.stderr.isatty():
-        with _live(board):
-            yield board
-    else:
-        board._show = _print_line
-        yield board
-    board.comm.Free()
+    try:
+        with together(world), _display(board, world.rank == 0 and shown and total > 0):
+            try:
+                yield board
+            except OthersFailed:
+                raise
+            except BaseException:
+                board.stop_others()
+                raise
+            finally:
+                board.wait_for_all()
+    finally:
+        board.close()
+
+
+def _display(board: Board, shown: bool) -> AbstractContextManager[None]:
+    """Show the news on a terminal, or in lines."""
+    if shown and sys.stderr.isatty():
+        return _live(board)
+    board._show = _print_line if shown else None
+    return nullcontext()
 
 
 def _print_line(board: Board, news: News) -> None:

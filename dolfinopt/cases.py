@@ -1,10 +1,10 @@
 """Cached and resumable cases, spread over the ranks: optimisations, simulations, comparisons.
 
-A case is known by what it computes: a hash of the scene's content and of the design, never a name,
-a path or a date. Its results are the usual files in DIR/cases/<key>/; the summary comes last and
-tells that the case is done. Every case runs on one rank alone, so that its bits do not depend on
-how many there are. Ranks take cases by locking their folders: a lock ends with its process, and
-several runs may work on the same DIR.
+A case is known by what it computes: a hash of the scene's content, of the design and of the program
+that computes, never a name, a path or a date. Its results are the usual files in DIR/cases/<key>/;
+the summary comes last and tells that the case is done. Every case runs on one rank alone, so that
+its bits do not depend on how many there are. Ranks take cases by locking their folders: a lock ends
+with its process, and several runs may work on the same DIR.
 
 All that a run asks of one design with one reduction is simulated at once. Such a batch shares its
 steps, which each of its cases depends on within the tolerance: they are kept under the key of case
@@ -29,9 +29,12 @@ from uuid import uuid4
 
 import numpy as np
 
+import dolfinopt
 from dolfinopt.board import IDLE, Board, open_board
 from dolfinopt.contents import file_digest, with_digests
+from dolfinopt.disk import make_folder, writing
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
@@ -93,7 +96,7 @@ class Case:
     @cached_property
     def key(self) -> str:
         """Sixteen hexadecimal digits that stand for everything the case computes."""
-        parts: list[Any] = [self.action, scene_content(self.scene), self.design_key]
+        parts: list[Any] = [program(), self.action, scene_content(self.scene), self.design_key]
         if self.action == "compare":
             parts += [REFERENCE_METHOD, REFERENCE, MODES]
         return _digest(parts)
@@ -228,6 +231,11 @@ class Outcomes:
 # -- keys ------------------------------------------------------------------------------------
 
 
+def program() -> tuple[str, int]:
+    """Return what stands for this program in a key: what others computed is not taken from them."""
+    return dolfinopt.__version__, dolfinopt.NUMERICS
+
+
 def scene_content(scene: Scene) -> dict[str, Any]:
     """Return everything that a scene computes with: its values, and its files' content."""
     data = with_digests(scene.to_dict())
@@ -292,11 +300,13 @@ class _Place:
         folder: of all cases.
         run: what tells this run's failures from those of earlier ones.
         names: every case's folder in it.
+        locked: False where the file system has no locks, and this is the only rank.
     """
 
     folder: Path
     run: str
     names: Mapping[Case, str]
+    locked: bool
 
     def __getitem__(self, case: Case) -> Path:
         return self.folder / self.names[case]
@@ -327,21 +337,21 @@ def run_cases(
     Raises:
         InputError: a scene or design cannot be used; the others stay unfinished.
     """
-    from dolfinopt.parallel import on_root
+    from dolfinopt.parallel import on_root, together
 
     wanted = _with_dependencies(cases)
     batches = _batches(wanted)
     names = {case: name for batch in batches for case, name in batch.names.items()}
     run = on_root(world, lambda: uuid4().hex)
-    place = _Place(folder / CASES, run, names)
+    on_root(world, make_folder, folder / CASES)
+    place = _Place(folder / CASES, run, names, has_locks(folder / CASES, world))
     done = on_root(world, lambda: [_is_done(place[case]) for case in wanted])
     missing = {case for case, there in zip(wanted, done, strict=True) if not there}
     left = [batch for batch in batches if not missing.isdisjoint(batch.cases)]
     with open_board(world, len(missing), shown) as board:
         _work(_jobs(left, world.size), place, board)
-        board.wait_for_all()
-    world.barrier()
-    outcomes = {case: _read(case, place) for case in wanted}
+    with together(world):
+        outcomes = {case: _read(case, place) for case in wanted}
     return Outcomes(outcomes, len(missing))
 
 
@@ -412,7 +422,7 @@ def _do(job: _Job, place: _Place, board: Board) -> bool:
         if not (place[given] / SUMMARY).exists():
             return False
         given = place[given] / "design.npz"
-    with _claim(place[job.first]) as mine:
+    with _claim(place[job.first], place.locked) as mine:
         if not mine:
             return False
         missing = _missing(job, place)
@@ -426,16 +436,19 @@ def _do(job: _Job, place: _Place, board: Board) -> bool:
 
 
 @contextmanager
-def _claim(folder: Path) -> Iterator[bool]:
-    """Yield whether this process has the folder's lock, which ends with the block or with it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / LOCK, "w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
-            return
+def _claim(folder: Path, locked: bool = True) -> Iterator[bool]:
+    """Yield whether this process has the folder's lock, which ends with the block or with it.
+
+    Without locks it always has.
+    """
+    make_folder(folder)
+    if not locked:
         yield True
+        return
+    with writing(folder / LOCK):
+        stream = open(folder / LOCK, "w")
+    with stream:
+        yield try_lock(fcntl.flock, stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 # -- what is done ----------------------------------------------------------------------------
@@ -502,7 +515,7 @@ def _examine(
         if case not in missing:  # it was needed as company
             continue
         folder, wall = place[case], time.perf_counter() - begun
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         if isinstance(found, ConvergenceError):
             _fail(folder, place.run, str(found))
             text = f"failed: {found}"
@@ -673,7 +686,7 @@ def _is_done(folder: Path) -> bool:
 def _fail(folder: Path, run: str, message: str) -> None:
     from dolfinopt.files import write_text
 
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     write_text(folder / FAILURE, json.dumps({"run": run, "message": message}) + "\n")
 
 

@@ -16,7 +16,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
 from dolfinopt.folders import CHECKPOINT, remove_stale
 from dolfinopt.integrators.problem import Solution
-from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root
+from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root, together
 from dolfinopt.scene import Scene
 
 if TYPE_CHECKING:
@@ -80,18 +80,30 @@ def save(
     folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm], memory: Memory
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
+    number = len(scene.arms) + 1
+    with together(share.world):
+        points = {k: _interior_points(arm) for k, arm in arms.items()}
+        known = [
+            {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()} for j in range(number)
+        ]
     columns: dict[str, Mapping[int, Any]] = {
         "centroid": gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()}),
         "cells": gather_cells(share, memory.cells),
         "threshold": gather_arms(share, memory.thresholds),
-        "points": gather_cells(share, {k: _interior_points(arm) for k, arm in arms.items()}),
+        "points": gather_cells(share, points),
     }
-    for j in range(len(scene.arms) + 1):
-        known = {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()}
-        columns[f"modes{j}"] = gather_cells(share, {k: rows for k, (rows, _) in known.items()})
-        columns[f"outboard{j}"] = gather_cells(share, {k: last for k, (_, last) in known.items()})
-    if share.world.rank != 0:
-        return
+    for j, by_arm in enumerate(known):
+        columns[f"modes{j}"] = gather_cells(share, {k: rows for k, (rows, _) in by_arm.items()})
+        columns[f"outboard{j}"] = gather_cells(share, {k: last for k, (_, last) in by_arm.items()})
+    with together(share.world):
+        if share.world.rank == 0:
+            _write(folder, scene, memory, columns)
+
+
+def _write(
+    folder: Path, scene: Scene, memory: Memory, columns: Mapping[str, Mapping[int, Any]]
+) -> None:
+    """Write the file; `columns` holds whole arms (root only)."""
     arrays: dict[str, Any] = {
         "scene": np.array(_scene_text(scene)),
         "iteration": memory.iteration,
@@ -130,6 +142,12 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
     arrays = on_root(share.world, _read, folder, scene)
     if int(arrays["iteration"]) < 0:
         return None
+    with together(share.world):
+        return _memory(arrays, arms)
+
+
+def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
+    """Return the checkpoint's memory, cells and modes of this rank's arms."""
     cells: dict[int, np.ndarray] = {}
     modes: dict[int, list[np.ndarray]] = {}
     for k, arm in arms.items():

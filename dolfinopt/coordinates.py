@@ -17,7 +17,7 @@ from dolfinopt.arm import chain_of
 from dolfinopt.body import ShapeIntegrals, shape_integrals
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.ledger import Ledger
-from dolfinopt.parallel import ArmShare, gather_arms, on_root
+from dolfinopt.parallel import ArmShare, gather_arms, on_root, together
 from dolfinopt.reduction import METHODS, Basis
 from dolfinopt.scenarios import bodies_in, factors
 from dolfinopt.scene import Scene, pose_scenarios
@@ -147,8 +147,9 @@ class _Comparison:
         self.share, self.arms, self.ledger = share, arms, ledger
         self.method = scene.reduction.method
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
-        for k, arm in arms.items():
-            arm.set_design(x_phys[k])
+        with together(share.world):
+            for k, arm in arms.items():
+                arm.set_design(x_phys[k])
         dofs = min((arm.elastic.num_dofs for arm in arms.values()), default=None)
         known = share.world.allgather(dofs)
         self.limit: int = min(one for one in known if one is not None)
@@ -168,32 +169,28 @@ class _Comparison:
             motions = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do
-        both = {k: np.concatenate([b.V, self.bases[k].V], axis=2) for k, b in bases.items()}
-        mine = {k: self.arms[k].elastic.energy_matrix(V) for k, V in both.items()}
+        with together(self.share.world):
+            both = {k: np.concatenate([b.V, self.bases[k].V], axis=2) for k, b in bases.items()}
+            mine = {k: self.arms[k].elastic.energy_matrix(V) for k, V in both.items()}
         energy = gather_arms(self.share, mine)
         return on_root(self.share.world, _largest, self.scenes, motions, self.motions, energy)
 
     def _reduced(self, method: str, count: int) -> dict[int, Basis]:
-        """Return this rank's bases; raise ConvergenceError on all ranks alike."""
-        bases, failure = {}, ""
-        with self.ledger.phase("choice of coordinates"):
-            try:
-                for k, arm in self.arms.items():
-                    if method == RICHER_METHOD and count <= self.richer:
-                        bases[k] = _leading(self.bases[k], count)
-                    else:
-                        bases[k] = METHODS[method].reduce(arm.elastic, arm.options(count), None)
-            except ConvergenceError as error:
-                failure = str(error)
-        failures = [one for one in self.share.world.allgather(failure) if one]
-        if failures:
-            raise ConvergenceError(failures[0])
+        """Return this rank's bases (collective)."""
+        bases = {}
+        with self.ledger.phase("choice of coordinates"), together(self.share.world):
+            for k, arm in self.arms.items():
+                if method == RICHER_METHOD and count <= self.richer:
+                    bases[k] = _leading(self.bases[k], count)
+                else:
+                    bases[k] = METHODS[method].reduce(arm.elastic, arm.options(count), None)
         return bases
 
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
         beta = self.scenes[0].damping.stiffness_proportional
-        mine = {k: shape_integrals(self.arms[k].elastic, b, beta) for k, b in bases.items()}
+        with together(self.share.world):
+            mine = {k: shape_integrals(self.arms[k].elastic, b, beta) for k, b in bases.items()}
         owned = gather_arms(self.share, mine)
         kept: list[Trajectory] = []
         on_root(self.share.world, lambda: kept.extend(_simulate(self.scenes, owned, self.ledger)))

@@ -24,7 +24,7 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.floating import HARMLESS, Connectivity, extremes
 from dolfinopt.ledger import Ledger
 from dolfinopt.mesh import ArmMesh
-from dolfinopt.parallel import direct_solver, obeying_options
+from dolfinopt.parallel import direct_solver, obeying_options, together
 
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Largest error that rounding may make in the stiffness of a design in which solids float, relative.
@@ -80,14 +80,15 @@ def element_operators(
     stress = t / (1 - nu**2) * ((1 - nu) * strain(u) + nu * ufl.tr(strain(u)) * ufl.Identity(2))
     k_form = compat.compile_form(ufl.inner(stress, strain(v)) * ufl.dx)
     m_form = compat.compile_form(t * ufl.inner(p, w) * ufl.dx)
-    coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
-    return ElementOperators(
-        space=vector,
-        cells=compat.cell_nodes(vector, mesh.num_cells),
-        points=vector.tabulate_dof_coordinates()[:, :2].copy(),
-        stiffness=compat.tabulate_cells(k_form, [thickness, poisson_ratio], coordinates),
-        mass=compat.tabulate_cells(m_form, [thickness], coordinates),
-    )
+    with together(mesh.comm):
+        coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
+        return ElementOperators(
+            space=vector,
+            cells=compat.cell_nodes(vector, mesh.num_cells),
+            points=vector.tabulate_dof_coordinates()[:, :2].copy(),
+            stiffness=compat.tabulate_cells(k_form, [thickness, poisson_ratio], coordinates),
+            mass=compat.tabulate_cells(m_form, [thickness], coordinates),
+        )
 
 
 class AffineMatrix:
@@ -225,8 +226,9 @@ class ElasticArm:
         size = len(self.points)
         dofs = np.repeat(2 * operators.cells, 2, axis=1)
         dofs[:, 1::2] += 1
-        self._stiffness = AffineMatrix(dofs, operators.stiffness, 2 * size)
-        self._mass = AffineMatrix(operators.cells, operators.mass, size)
+        with together(self.comm):
+            self._stiffness = AffineMatrix(dofs, operators.stiffness, 2 * size)
+            self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self._number_interior()
         self._K_II: InteriorMatrix | None = None
         self._M_II: InteriorMatrix | None = None

@@ -13,3 +13,17 @@ class ConvergenceError(RuntimeError):
 
     The command line prints the message and ends with status 1.
     """
+
+
+class OutputError(RuntimeError):
+    """A file cannot be written: the message names file, reason and remedy in one line.
+
+    The disk is full, for instance. The command line prints the message and ends with status 1.
+    """
+
+
+class OthersFailed(RuntimeError):
+    """Work given up because another rank failed.
+
+    In `parallel.together` that rank's exception goes first.
+    """

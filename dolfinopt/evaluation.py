@@ -24,7 +24,7 @@ from dolfinopt.objective import (
     objective,
     worst_instants,
 )
-from dolfinopt.parallel import ArmShare, gather_arms, on_root
+from dolfinopt.parallel import ArmShare, gather_arms, on_root, together
 from dolfinopt.scenarios import bodies_in, combined, factors, slopes_back
 from dolfinopt.scene import Scene, pose_scenarios
 from dolfinopt.sensitivity import (
@@ -127,8 +127,9 @@ def evaluate(
         ConvergenceError: on all ranks alike.
     """
     _check_densities(share, arms, x_phys)
-    for index, arm in arms.items():
-        arm.set_design(x_phys[index])
+    with together(share.world):
+        for index, arm in arms.items():
+            arm.set_design(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or scene.objective.simulated:
         owned = _reduced(share, arms, x_phys)
@@ -175,7 +176,8 @@ def evaluate_batch(
                 raise motion
             under = arms
             if not scene.objective.simulated or any(vars(scene.constraints).values()):
-                under = {k: arm.under(scene) for k, arm in arms.items()}
+                with together(share.world):
+                    under = {k: arm.under(scene) for k, arm in arms.items()}
             found.append((_judged(scene, share, under, motion), trajectory))
         except ConvergenceError as error:
             found.append(error)
@@ -184,13 +186,11 @@ def evaluate_batch(
 
 def _check_densities(share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells) -> None:
     """Raise InputError on all ranks where densities of one cannot be those of a design."""
-    mine = [
-        arm.refusal(x_phys[k]) if k in x_phys else f"arm {arm.mesh.name!r}: expected densities"
-        for k, arm in arms.items()
-    ]
-    for reason in share.world.allgather(next(filter(None, mine), "")):
-        if reason:
-            raise InputError(reason)
+    with together(share.world):
+        for k, arm in arms.items():
+            missing = "" if k in x_phys else f"arm {arm.mesh.name!r}: expected densities"
+            if reason := missing or arm.refusal(x_phys[k]):
+                raise InputError(reason)
 
 
 def _judged(scene: Scene, share: ArmShare, arms: Mapping[int, Arm], motion: Motion) -> Evaluation:
@@ -246,16 +246,19 @@ def gradient(
 
     if scene.objective.kind == "static":
         uses = _uses(scene)
-        response = {k: static_response(arm.elastic, _loads(scene)) for k, arm in arms.items()}
-        return {k: uses[k] * static_gradient(arm, response[k]) for k, arm in arms.items()}
+        with together(share.world):
+            response = {k: static_response(arm.elastic, _loads(scene)) for k, arm in arms.items()}
+            return {k: uses[k] * static_gradient(arm, response[k]) for k, arm in arms.items()}
     if scene.objective.kind == "eigenfrequency":
         rows = _period_rows(scene, share, arms, scene.objective.follow)
         return {k: np.sum([row[k] for row in rows], axis=0) for k in arms}
     if scene.objective.gradient == "esl":
         A = on_root(share.world, moments)
-        return {index: esl_gradient(arm, A[index]) for index, arm in arms.items()}
+        with together(share.world):
+            return {index: esl_gradient(arm, A[index]) for index, arm in arms.items()}
     by_body = on_root(share.world, slopes)
-    return {index: exact_gradient(arm, by_body[index]) for index, arm in arms.items()}
+    with together(share.world):
+        return {index: exact_gradient(arm, by_body[index]) for index, arm in arms.items()}
 
 
 def constraint_gradients(
@@ -274,10 +277,12 @@ def constraint_gradients(
     if limits.tip_deflection is not None:
         for owner in scene.cell_counts:
             slopes = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
-            if owner in arms:
-                response = static_response(arms[owner].elastic, _loads(scene))
-                slopes[owner] = deflection_gradient(arms[owner], response, scene.objective.exponent)
-                slopes[owner] /= limits.tip_deflection
+            with together(share.world):
+                if owner in arms:
+                    arm, exponent = arms[owner], scene.objective.exponent
+                    response = static_response(arm.elastic, _loads(scene))
+                    slopes[owner] = deflection_gradient(arm, response, exponent)
+                    slopes[owner] /= limits.tip_deflection
             rows.append(slopes)
     return rows
 
@@ -289,7 +294,9 @@ def _reduced(
     share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells
 ) -> Mapping[int, ShapeIntegrals]:
     """Return the bodies of the arms with a design of their own, on the root (collective)."""
-    return gather_arms(share, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
+    with together(share.world):
+        bodies = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
+    return gather_arms(share, bodies)
 
 
 def _moved(
@@ -436,10 +443,11 @@ def _loads(scene: Scene) -> np.ndarray:
 def _static_compliance(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> float:
     """Return the sum over all arms of their compliance under the unit loads (collective)."""
     uses = _uses(scene)
-    values = {
-        k: uses[k] * static_response(arm.elastic, _loads(scene)).compliance
-        for k, arm in arms.items()
-    }
+    with together(share.world):
+        values = {
+            k: uses[k] * static_response(arm.elastic, _loads(scene)).compliance
+            for k, arm in arms.items()
+        }
     return float(sum(_everywhere(share, values).values()))
 
 
@@ -448,9 +456,10 @@ def _deflections(
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return every design's p-mean deflection under the loads and its largest, m (collective)."""
     values = {}
-    for k, arm in arms.items():
-        response = static_response(arm.elastic, _loads(scene))
-        values[k] = response.deflection(scene.objective.exponent), response.largest
+    with together(share.world):
+        for k, arm in arms.items():
+            response = static_response(arm.elastic, _loads(scene))
+            values[k] = response.deflection(scene.objective.exponent), response.largest
     means, largest = zip(*_everywhere(share, values).values(), strict=True)
     return np.array(means), largest
 
@@ -465,7 +474,9 @@ def _everywhere(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:
 
 def _chain(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> Chain:
     """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
-    owned = _everywhere(share, {k: rigid_integrals(arm.elastic) for k, arm in arms.items()})
+    with together(share.world):
+        mine = {k: rigid_integrals(arm.elastic) for k, arm in arms.items()}
+    owned = _everywhere(share, mine)
 
     def freeze() -> Chain:
         bodies, reach = [], []
@@ -490,7 +501,10 @@ def _chain(scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> Chain:
 
 
 def _modes(arms: Mapping[int, Arm], chain: Chain) -> dict[int, LoadedModes]:
-    """Return the loaded modes of every arm of the chain that has one of this rank's designs."""
+    """Return the loaded modes of every arm of the chain that has one of this rank's designs.
+
+    Within `together`.
+    """
     carried = chain.carried()
     return {
         place: arms[owner].loaded_modes(place, carried[place])
@@ -507,16 +521,16 @@ def _vibration(
     The objective's squared periods, those of the lowest modes whichever one it follows (s2), and
     the first frequencies (Hz).
     """
-    modes = _modes(arms, _chain(scene, share, arms))
-    options = scene.objective
-    mine = {
-        place: (
-            squared_period(one, options.exponent, options.follow)[0],
-            squared_period(one, options.exponent, False)[0],
-            one.frequency,
-        )
-        for place, one in modes.items()
-    }
+    chain, options = _chain(scene, share, arms), scene.objective
+    with together(share.world):
+        mine = {
+            place: (
+                squared_period(one, options.exponent, options.follow)[0],
+                squared_period(one, options.exponent, False)[0],
+                one.frequency,
+            )
+            for place, one in _modes(arms, chain).items()
+        }
     periods, longest, frequencies = zip(*_everywhere(share, mine).values(), strict=True)
     return np.array(periods), np.array(longest), frequencies
 
@@ -529,25 +543,28 @@ def _period_rows(
     What an arm carries depends on the designs outboard of it.
     """
     chain = _chain(scene, share, arms)
-    modes = _modes(arms, chain)
-    slopes = {
-        place: period_gradient(arms[owner], modes[place], scene.objective.exponent, follow)
-        for owner in arms
-        for place in arms[owner].places
-    }
+    with together(share.world):
+        modes = _modes(arms, chain)
+        slopes = {
+            place: period_gradient(arms[owner], modes[place], scene.objective.exponent, follow)
+            for owner in arms
+            for place in arms[owner].places
+        }
     by_carried = _everywhere(share, {place: one.carried for place, one in slopes.items()})
     rows = []
-    for place, matrix in by_carried.items():
-        zero = [np.zeros((3, 3))] * len(scene.arms)
-        by_body = _by_owner(scene, chain.body_slopes([*zero[:place], matrix, *zero[place + 1 :]]))
-        row = {
-            k: np.zeros(arm.mesh.num_cells)  # it is not outboard of this place
-            if by_body[k] == NOTHING
-            else rigid_gradient(arm, by_body[k])
-            for k, arm in arms.items()
-        }
-        owner = scene.owners[place]
-        if owner in row:
-            row[owner] = row[owner] + slopes[place].cells
-        rows.append(row)
+    zero = [np.zeros((3, 3))] * len(scene.arms)
+    with together(share.world):
+        for place, matrix in by_carried.items():
+            carried = [*zero[:place], matrix, *zero[place + 1 :]]
+            by_body = _by_owner(scene, chain.body_slopes(carried))
+            row = {
+                k: np.zeros(arm.mesh.num_cells)  # it is not outboard of this place
+                if by_body[k] == NOTHING
+                else rigid_gradient(arm, by_body[k])
+                for k, arm in arms.items()
+            }
+            owner = scene.owners[place]
+            if owner in row:
+                row[owner] = row[owner] + slopes[place].cells
+            rows.append(row)
     return rows

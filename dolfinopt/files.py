@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -20,9 +18,10 @@ import numpy as np
 from dolfinopt import __version__
 from dolfinopt.arm import fixed_body
 from dolfinopt.body import ShapeIntegrals
+from dolfinopt.disk import append_text, write_atomically
 from dolfinopt.errors import InputError
 from dolfinopt.motion import CART
-from dolfinopt.parallel import ArmShare, gather_cells, on_root
+from dolfinopt.parallel import ArmShare, gather_cells, on_root, together
 from dolfinopt.scene import Scene
 from dolfinopt.units import OBJECTIVES
 
@@ -85,21 +84,6 @@ XDMF_CELLS = {3: 4, 4: 5}  # its numbers of triangles and quadrilaterals, by cor
 # -- writing ---------------------------------------------------------------------------------
 
 
-def write_atomically(path: Path, write: Any) -> None:
-    """Call `write(stream)` on a temporary neighbour and rename it over `path` when complete."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(temporary, "wb") as stream:
-            write(stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-
-
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write an .npz atomically."""
     write_atomically(path, lambda stream: np.savez(stream, **arrays))
@@ -129,8 +113,7 @@ class HistoryWriter:
         """Add one line; the first row brings the header, too."""
         line = _csv_lines([] if self.begun else row.columns, [row.values]).lstrip("\n")
         self.begun = True
-        with open(self.path, "a", encoding="utf-8") as stream:
-            stream.write(line)
+        append_text(self.path, line)
 
 
 def read_history(path: Path) -> list[HistoryRow]:
@@ -273,7 +256,9 @@ def gather_views(
     """Collect every arm on the root (collective); empty list elsewhere."""
 
     def collect(values: Any) -> dict[int, np.ndarray]:
-        return gather_cells(share, {index: values(index, arm) for index, arm in arms.items()})
+        with together(share.world):
+            mine = {index: values(index, arm) for index, arm in arms.items()}
+        return gather_cells(share, mine)
 
     def modes(index: int, arm: Arm) -> np.ndarray:
         cells = arm.elastic.operators.cells
@@ -285,8 +270,22 @@ def gather_views(
     centroids = collect(lambda _, arm: arm.mesh.centroid)
     densities = collect(lambda index, _: x_phys[index])
     shapes = collect(modes)
+    with together(share.world):
+        if share.world.rank == 0:
+            return _views(scene, corners, centroids, densities, shapes)
+        return []
+
+
+def _views(
+    scene: Scene,
+    corners: Mapping[int, np.ndarray],
+    centroids: Mapping[int, np.ndarray],
+    densities: Mapping[int, np.ndarray],
+    shapes: Mapping[int, np.ndarray],
+) -> list[ArmView]:
+    """Return the views of all arms in the chain, given those with a design (root only)."""
     views = []
-    for index, owner in enumerate(scene.owners if share.world.rank == 0 else ()):
+    for index, owner in enumerate(scene.owners):
         name = scene.arms[index].name
         if owner is None:
             views.append(_bar_view(name, scene.arms[index].height, fixed_body(scene, index)))
@@ -367,16 +366,17 @@ def write_gradient(
     """
     centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
     gathered = gather_cells(share, slopes)
-    if share.world.rank != 0:
-        return
-    arrays: dict[str, Any] = {"objective": objective}
-    for index, centroid in centroids.items():
-        order, name = _canonical_order(centroid), scene.arms[index].name
-        arrays[f"{name}/centroid"] = centroid[order]
-        arrays[f"{name}/gradient"] = gathered[index][order]
-    unit = OBJECTIVES[scene.objective.kind][1]  # per physical density, which has none
-    arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
-    write_arrays(path, arrays)
+    with together(share.world):
+        if share.world.rank != 0:
+            return
+        arrays: dict[str, Any] = {"objective": objective}
+        for index, centroid in centroids.items():
+            order, name = _canonical_order(centroid), scene.arms[index].name
+            arrays[f"{name}/centroid"] = centroid[order]
+            arrays[f"{name}/gradient"] = gathered[index][order]
+        unit = OBJECTIVES[scene.objective.kind][1]  # per physical density, which has none
+        arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
+        write_arrays(path, arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -512,16 +512,8 @@ def read_design(path: Path, share: ArmShare, arms: Mapping[int, Arm]) -> dict[in
         InputError: the file is missing, damaged, or made for other arms.
     """
     arrays = on_root(share.world, _load_design, path)
-    fitted, problem = {}, None
-    for index, arm in arms.items():
-        try:
-            fitted[index] = _fit(path, arm, arrays)
-        except InputError as error:
-            problem = str(error)
-    problems = [p for p in share.world.allgather(problem) if p is not None]
-    if problems:
-        raise InputError(problems[0])
-    return fitted
+    with together(share.world):
+        return {index: _fit(path, arm, arrays) for index, arm in arms.items()}
 
 
 def _load_design(path: Path) -> dict[str, np.ndarray]:

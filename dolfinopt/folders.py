@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from dolfinopt.disk import FULL, unwritten
 from dolfinopt.errors import InputError
 
 CHECKPOINT = "checkpoint.npz"
@@ -33,6 +34,7 @@ def prepare_folder(folder: Path) -> None:
 
     Raises:
         InputError: it cannot.
+        OutputError: the disk is full.
     """
     probe = folder / f".write-test-{os.getpid()}"
     try:
@@ -40,6 +42,8 @@ def prepare_folder(folder: Path) -> None:
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as error:
+        if error.errno in FULL:
+            raise unwritten(folder, error) from error
         raise InputError(
             f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
         ) from None

@@ -26,6 +26,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt import scene as scenes
 from dolfinopt.errors import InputError
+from dolfinopt.parallel import together
 from dolfinopt.step import read_shapes
 
 # Physical groups of the model.
@@ -64,11 +65,12 @@ class FlatMesh:
 
 @contextmanager
 def gmsh_on_root(comm: MPI.Comm) -> Iterator[Any]:
-    """Yield the module gmsh, with a session of it on rank 0 of `comm`."""
-    import gmsh
+    """Yield the module gmsh, with a session of it on rank 0 of `comm` (collective)."""
+    with together(comm):
+        import gmsh
 
-    if comm.rank == 0:
-        _begin(gmsh)
+        if comm.rank == 0:
+            _begin(gmsh)
     failed = True
     try:
         yield gmsh

@@ -12,7 +12,7 @@ from dolfinopt import compat
 from dolfinopt import scene as scenes
 from dolfinopt.data import mesh_folder
 from dolfinopt.geometry import INBOARD, OUTBOARD, PASSIVE, build_model, gmsh_on_root, mesh_geo
-from dolfinopt.parallel import on_root
+from dolfinopt.parallel import on_root, together
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +90,12 @@ def structured_arm(
         "Parameters/5 solid length at both ends (m)": passive,
     }
     with gmsh_on_root(comm) as gmsh:
-        if comm.rank == 0:
-            mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
+        with together(comm):
+            if comm.rank == 0:
+                mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
-    return _arm_mesh(comm, name, length, *parts)
+    with together(comm):
+        return _arm_mesh(comm, name, length, *parts)
 
 
 def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
@@ -106,10 +108,11 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         InputError: the file cannot be the arm; on all ranks of `comm`.
     """
     with gmsh_on_root(comm) as gmsh:
-        lines, notes = on_root(comm, build_model, gmsh if comm.rank == 0 else None, arm)
+        lines, notes = on_root(comm, build_model, gmsh, arm)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
-    mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
-    mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
+    with together(comm):
+        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+        mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
     return replace(mesh, notes=notes)
 
 

@@ -23,7 +23,7 @@ from dolfinopt.ledger import Counts, Ledger
 from dolfinopt.limits import Limit, limits_of, violated, worst_limits
 from dolfinopt.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimality import kkt_residual
-from dolfinopt.parallel import ArmShare, on_root, share_arms, sum_over_arms
+from dolfinopt.parallel import ArmShare, on_root, share_arms, sum_over_arms, together
 from dolfinopt.scenarios import worst_of
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
@@ -282,8 +282,9 @@ class _Run:
         elif self.scene.objective.simulated:
             x = self._realised(self.x)
             self.choice = self._choose({k: one[-1].x_phys for k, one in x.items()}, RESERVE)
-        if self.folder is not None and self.share.world.rank == 0:
-            self.writer = HistoryWriter(self.folder / "history.csv", self.history)
+        with together(self.share.world):
+            if self.folder is not None and self.share.world.rank == 0:
+                self.writer = HistoryWriter(self.folder / "history.csv", self.history)
         limit = self.scene.optimizer.max_iterations
         designs = self._evaluate()
         posed = self._posed(designs)
@@ -367,9 +368,10 @@ class _Run:
         design = self.scene.design
         self.sharpness = min(2.0 ** (1.0 / design.continuation) * self.sharpness, design.sharpness)
         x = self.variables.split(self.x)
-        self.thresholds = {
-            k: arm.preserving_threshold(x[k], self.sharpness) for k, arm in self.arms.items()
-        }
+        with together(self.share.world):
+            self.thresholds = {
+                k: arm.preserving_threshold(x[k], self.sharpness) for k, arm in self.arms.items()
+            }
 
     @property
     def _move(self) -> float:
@@ -397,12 +399,13 @@ class _Run:
         return designs
 
     def _realised(self, x: np.ndarray) -> dict[int, tuple[Realised, ...]]:
-        """Return the designs that x stands for, the nominal one last."""
+        """Return the designs that x stands for, the nominal one last (collective)."""
         parts = self.variables.split(x)
-        return {
-            k: arm.realise(parts[k], self.sharpness, self.thresholds[k])
-            for k, arm in self.arms.items()
-        }
+        with together(self.share.world):
+            return {
+                k: arm.realise(parts[k], self.sharpness, self.thresholds[k])
+                for k, arm in self.arms.items()
+            }
 
     def _choose(self, x_phys: Mapping[int, np.ndarray], reserve: float) -> Choice | None:
         return choose_coordinates(
@@ -423,12 +426,12 @@ class _Run:
         )
 
     def _slopes(self, realised: Mapping[int, Realised]) -> _Slopes:
-        """Return the gradients by x of the design evaluated last."""
+        """Return the gradients by x of the design evaluated last (collective)."""
         place = self.scene, self.share, self.arms
-        by_x = self.variables.by_x
-        objective = by_x(gradient(*place, self.trajectory, self.ledger), realised)
-        rows = [by_x(row, realised) for row in constraint_gradients(*place)]
-        return _Slopes(objective, np.array(rows).reshape(len(rows), self.variables.size))
+        slopes = [gradient(*place, self.trajectory, self.ledger), *constraint_gradients(*place)]
+        with together(self.share.world):
+            objective, *rows = (self.variables.by_x(slope, realised) for slope in slopes)
+            return _Slopes(objective, np.array(rows).reshape(len(rows), self.variables.size))
 
     def _objective(self, designs: Sequence[_Evaluated]) -> tuple[float, list[float]]:
         """Return the objective of all designs together, and its slopes by theirs."""
@@ -448,7 +451,7 @@ class _Run:
         return _Posed(
             np.sum([w * s.objective for w, s in zip(weights, slopes, strict=True)], axis=0),
             np.append(volume, constraints),
-            np.vstack([by_volume] + [one.constraints for one in slopes]),
+            np.vstack([by_volume, *(one.constraints for one in slopes)]),
         )
 
     def _residual(self, posed: _Posed) -> float:
@@ -499,11 +502,12 @@ class _Run:
         cells, radius 1.5 cells, beta 64: the worst compliance climbs from 2.3 to 2.5 N m).
         """
         nominal = self.variables.volume_constraints(designs[-1].x_phys)
-        if len(designs) == 1 or not self.scene.design.minimum_member:
-            return nominal, self.variables.volume_slopes(designs[-1].realised)
-        _, dilated, _ = designs
-        ratio = (1.0 + nominal) / (1.0 + self.variables.volume_constraints(dilated.x_phys))
-        return nominal, ratio[:, None] * self.variables.volume_slopes(dilated.realised)
+        alone = len(designs) == 1 or not self.scene.design.minimum_member
+        limited = designs[-1] if alone else designs[1]
+        ratio = (1.0 + nominal) / (1.0 + self.variables.volume_constraints(limited.x_phys))
+        with together(self.share.world):
+            slopes = self.variables.volume_slopes(limited.realised)
+        return nominal, slopes if alone else ratio[:, None] * slopes
 
     def _assess(self, designs: Sequence[_Evaluated]) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate what the iterations left out: motions not simulated, and the crisp design."""
@@ -512,7 +516,8 @@ class _Run:
         # A followed mode is known by those before it: the initial and the crisp design's are not.
         starts = {k: arm.starts for k, arm in self.arms.items()}
         if not self.scene.objective.simulated:
-            initial = {k: arm.uniform(self.scene.design.initial) for k, arm in self.arms.items()}
+            with together(self.share.world):
+                initial = {k: a.uniform(self.scene.design.initial) for k, a in self.arms.items()}
             _, trajectory = self._evaluate_one(initial, simulated=True)
             if trajectory is not None:
                 self.initial_deviation = trajectory.deviation
@@ -546,15 +551,21 @@ class _Run:
             x = nominal.x_phys[k]
             parts[k] = np.array([volume.sum(), volume @ x, volume @ (4.0 * x * (1.0 - x))])
         total, volume, grey = sum_over_arms(self.share, parts)
-        if self.share.world.rank != 0:
-            return
-        self.grayness = float(grey / total)
+        with together(self.share.world):
+            if self.share.world.rank == 0:
+                self._add_row(designs, float(volume / total), float(grey / total))
+
+    def _add_row(
+        self, designs: Sequence[_Evaluated], volume_fraction: float, grayness: float
+    ) -> None:
+        """Make the history's next row, write and report it (root only)."""
+        self.grayness = grayness
         row = HistoryRow(
             iteration=self.iteration,
             objective=self._objective(designs)[0],
-            max_deviation=nominal.evaluation.max_deviation,
-            grayness=self.grayness,
-            volume_fraction=float(volume / total),
+            max_deviation=designs[-1].evaluation.max_deviation,
+            grayness=grayness,
+            volume_fraction=volume_fraction,
             change=self.change,
             seconds=self.earlier + time.perf_counter() - self.begun,
             kkt=self.kkt,

@@ -314,13 +314,15 @@ def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) 
         InputError: the scene does not allow what the paper varies, or DIR cannot be written.
     """
     from dolfinopt.folders import prepare_folder
-    from dolfinopt.parallel import on_root
+    from dolfinopt.parallel import on_root, together
 
     cases = on_root(world, lambda: plan.cases)
     on_root(world, prepare_folder, folder)
     outcomes = run_cases(cases, folder, world, shown=shown)
     measured = on_root(world, measure, plan, outcomes)
-    return Reproduction(plan, outcomes, measured, find(measured), figures(plan, outcomes, measured))
+    with together(world):
+        drawn = figures(plan, outcomes, measured)
+        return Reproduction(plan, outcomes, measured, find(measured), drawn)
 
 
 # -- what is measured ------------------------------------------------------------------------

@@ -1,12 +1,21 @@
-"""Arms on sub-communicators, collection on the root, and one ending for all ranks."""
+"""Arms on sub-communicators, collection on the root, and one ending for all ranks.
+
+An exception on one rank is everybody's. Whatever one rank, or each rank for its own arms, does
+between two collectives of a communicator and may fail, runs in `together(comm)` or `on_root`:
+these agree on the outcome, and raise the same kind of exception on all ranks. What decides by
+numbers that all ranks have, raises on all of them anyway.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
+import pickle
 import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -14,12 +23,15 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.errors import ConvergenceError, InputError, OthersFailed, OutputError
 
 T = TypeVar("T")
 
 # How long a rank that failed waits for the others to fail the same way before it ends them all.
 GRACE = 2.0  # s
+INTERRUPTED = 130  # exit status, as of a shell's command that Ctrl-C has ended
+# Nobody reads standard output any more, or the disk that it goes to is full.
+CLOSED = (errno.EPIPE, errno.ENOSPC)
 
 
 # Arms of fewer cells are faster on one rank than on two (see `share_arms`). One factorisation and
@@ -118,67 +130,189 @@ def gather_cells(share: ArmShare, mine: Mapping[int, np.ndarray]) -> dict[int, n
     return gather_arms(share, whole)
 
 
+# -- one ending for all ranks ------------------------------------------------------------------
+
+
+class RaisedElsewhere(RuntimeError):
+    """The cause of an exception that another rank raised: its number and traceback."""
+
+
+@contextmanager
+def together(comm: MPI.Comm) -> Iterator[None]:
+    """Make an exception that the block raises on any rank of `comm` everybody's (collective).
+
+    The ranks meet at the end of the block, in one reduction of a single integer; on one rank
+    nothing is done. If any failed, all raise: the first one that failed its own exception, the
+    others a copy of it, whose cause tells rank and traceback.
+
+    The rule: the block has no collective on `comm`, which a rank that failed would miss. It may
+    have some on a part of its ranks, as those of an arm that several ranks share; what one of
+    these does alone in between runs in a `together` of the part.
+
+    An exception that cannot be pickled is raised elsewhere as the nearest of its base classes
+    that can, with the same message.
+    """
+    if comm.size == 1:
+        yield
+        return
+    failure: BaseException | None = None
+    try:
+        yield
+    except GeneratorExit:  # the block is left for good, at any time: nobody meets
+        raise
+    except BaseException as error:
+        failure = error
+    failed = np.array([failure is not None], dtype=np.intc)
+    comm.Allreduce(MPI.IN_PLACE, failed, op=MPI.MAX)
+    if not failed[0]:
+        return
+    outcomes = comm.allgather(None if failure is None else _packed(failure, comm.rank))
+    known = [one for one in outcomes if one is not None]
+    chosen = next((one for one in known if not one.gave_up), known[0])
+    if failure is not None and chosen.rank == comm.rank:
+        raise failure
+    raise chosen.exception() from chosen.cause()
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """An exception on its way to other ranks.
+
+    Attributes:
+        rank: where it was raised.
+        pickled: the exception, or its nearest relative that can be pickled.
+        text: its traceback.
+        gave_up: another rank's failure was the reason.
+    """
+
+    rank: int
+    pickled: bytes
+    text: str
+    gave_up: bool
+
+    def exception(self) -> BaseException:
+        error: BaseException = pickle.loads(self.pickled)
+        return error
+
+    def cause(self) -> RaisedElsewhere:
+        return RaisedElsewhere(f"on rank {self.rank}\n\n{self.text}")
+
+
+def _packed(error: BaseException, rank: int) -> _Packed:
+    text = "".join(traceback.format_exception(error))
+    return _Packed(rank, _pickled(error), text, isinstance(error, OthersFailed))
+
+
+def _pickled(error: BaseException) -> bytes:
+    """Pickle an exception, or the nearest of its base classes that can be, with its message."""
+    for kind in type(error).__mro__:
+        try:
+            data = pickle.dumps(error if kind is type(error) else kind(str(error)))
+            if type(pickle.loads(data)) is kind:
+                return data
+        except Exception:  # whatever a foreign class may raise
+            continue
+    return pickle.dumps(RuntimeError(type(error).__name__))
+
+
 def on_root(world: MPI.Comm, action: Any, *arguments: Any) -> Any:
     """Run `action(*arguments)` on the root and hand its result, or its exception, to all ranks."""
-    outcome: tuple[Any, BaseException | None] = (None, None)
-    if world.rank == 0:
-        try:
-            outcome = (action(*arguments), None)
-        except (InputError, ConvergenceError) as error:
-            outcome = (None, error)
-    result, failure = world.bcast(outcome, root=0)
-    if failure is not None:
-        raise failure
+    if world.size == 1:
+        return action(*arguments)
+    if world.rank > 0:
+        outcome = world.bcast(None, root=0)
+        if isinstance(outcome, _Packed):
+            raise outcome.exception() from outcome.cause()
+        return pickle.loads(outcome)
+    try:
+        result = action(*arguments)
+        data = pickle.dumps(result)
+    except BaseException as error:
+        world.bcast(_packed(error, 0), root=0)
+        raise
+    world.bcast(data, root=0)
     return result
 
 
 @contextmanager
-def one_ending(world: MPI.Comm) -> Iterator[None]:
-    """End all ranks together when the block fails on any of them.
+def abort_together(world: MPI.Comm) -> Iterator[None]:
+    """End the processes of all ranks together when the block fails on any of them.
 
-    Status 2 for `InputError`, 1 for everything else. When all ranks fail, the root prints the
-    message and every rank exits; when only some do, those print and abort the rest, which would
-    otherwise wait for ever.
+    For commands and scripts; functions use `together`. All ranks meet at the end of the block.
+    If one failed, its message is printed once and all exit: with status 2 for `InputError`, 130
+    when interrupted, 1 otherwise. A rank that failed while others wait for it elsewhere, and would
+    do so for ever, ends them all after `GRACE`.
     """
     # Its own communicator: the others may be waiting in a collective of `world`.
     roll_call = world.Dup()
+    failure: BaseException | None = None
     try:
         yield
-    except SystemExit:
-        raise
     except BaseException as error:
-        status = 2 if isinstance(error, InputError) else 1
-        everywhere = _all_arrive(roll_call)
-        if world.rank == 0 or not everywhere:
-            _report(error)
-        if not everywhere:
-            world.Abort(status)
-        sys.exit(status)
+        failure = error
+    status = _status(failure)
+    try:
+        statuses = _all_arrive(roll_call, status, None if failure is None else GRACE)
+    except KeyboardInterrupt:  # once more
+        statuses = None
+    if statuses is None:
+        _report(failure)
+        world.Abort(status)
+    elif status and world.rank == int(np.flatnonzero(statuses)[0]):
+        _report(failure)
+    if isinstance(failure, SystemExit):
+        raise failure
+    if statuses is not None and statuses.any():
+        sys.exit(status or int(statuses.max()))
 
 
-def _report(error: BaseException) -> None:
+def _status(failure: BaseException | None) -> int:
+    """Return the exit status that stands for an exception."""
+    if isinstance(failure, SystemExit):
+        code = failure.code
+        return code if isinstance(code, int) else int(code is not None)
+    if isinstance(failure, KeyboardInterrupt):
+        return INTERRUPTED
+    return 2 if isinstance(failure, InputError) else int(failure is not None)
+
+
+def _report(error: BaseException | None) -> None:
     """Print one line for what the user can mend, the whole traceback for what he cannot."""
     if isinstance(error, KeyboardInterrupt):
         print("dolfinopt: interrupted", file=sys.stderr)
-    elif isinstance(error, InputError | ConvergenceError):
+    elif isinstance(error, InputError | ConvergenceError | OutputError):
         print(f"dolfinopt: {error}", file=sys.stderr)
-    else:
+    elif isinstance(error, OSError) and error.errno in CLOSED:
+        _give_up_output()
+        print(f"dolfinopt: standard output: {error.strerror}", file=sys.stderr)
+    elif error is not None and not isinstance(error, SystemExit):
         traceback.print_exception(error)
-    sys.stdout.flush()
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _give_up_output()
     sys.stderr.flush()
 
 
-def _all_arrive(comm: MPI.Comm) -> bool:
-    """Return True when every rank comes here within the grace period."""
+def _give_up_output() -> None:
+    """Send what is left of standard output nowhere: Python would try again when it ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _all_arrive(comm: MPI.Comm, status: int, limit: float | None) -> np.ndarray | None:
+    """Return the statuses (ranks,) of all, or None when some do not come within `limit` seconds."""
+    statuses = np.zeros(comm.size, dtype=np.intc)
+    mine = np.array([status], dtype=np.intc)
     if comm.size == 1:
-        return True
-    request = comm.Ibarrier()
-    limit = time.monotonic() + GRACE
-    while time.monotonic() < limit:
-        if request.Test():
-            return True
+        return mine
+    request = comm.Iallgather(mine, statuses)
+    begun = time.monotonic()
+    while not request.Test():
+        if limit is not None and time.monotonic() - begun > limit:
+            return None
         time.sleep(0.01)
-    return False
+    return statuses
 
 
 @contextmanager

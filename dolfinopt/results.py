@@ -26,7 +26,7 @@ from dolfinopt.files import (
 )
 from dolfinopt.ledger import Ledger
 from dolfinopt.optimization import Result
-from dolfinopt.parallel import ArmShare
+from dolfinopt.parallel import ArmShare, together
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
 from dolfinopt.summary import summarise
@@ -92,7 +92,8 @@ def write_simulation(
         choice=s.choice,
         trajectory=s.trajectory,
     )
-    return _write(folder, views, s.trajectory, None, summary, paraview, pictures, begun)
+    with together(s.share.world):
+        return _write(folder, views, s.trajectory, None, summary, paraview, pictures, begun)
 
 
 def write_result(
@@ -135,7 +136,8 @@ def write_result(
         trajectory=result.trajectory,
     )
     initial = result.initial_deviation
-    return _write(folder, views, result.trajectory, initial, summary, paraview, pictures, begun)
+    with together(result.share.world):
+        return _write(folder, views, result.trajectory, initial, summary, paraview, pictures, begun)
 
 
 def _write(

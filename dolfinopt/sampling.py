@@ -2,8 +2,8 @@
 
 Every sample starts from the nominal scene's solution, which every rank finds for itself: its bits
 depend neither on the number of ranks nor on what was computed before. A chunk is known by the
-scene's content, the design and its samples; its file comes when it is complete. Ranks, and several
-runs, take chunks by locks that end with their process.
+scene's content, the design, its samples and the program; its file comes when it is complete. Ranks,
+and several runs, take chunks by locks that end with their process.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ import numpy as np
 
 from dolfinopt.board import IDLE, Board, open_board
 from dolfinopt.cases import Case, simulate_scenarios
+from dolfinopt.disk import make_folder, writing
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.ledger import Ledger
+from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.objective import worst_instants
 from dolfinopt.scenarios import bodies_in
 from dolfinopt.scene import Scene
@@ -193,7 +195,7 @@ def respond(
     Raises:
         InputError: a scene cannot have a sample's values, or a design does not fit.
     """
-    from dolfinopt.parallel import on_root
+    from dolfinopt.parallel import on_root, together
 
     size = CHUNK if samples.scaling else REDUCED
     count = 1 + len(samples.values)
@@ -205,37 +207,39 @@ def respond(
     place = folder / FOLDER
 
     def look() -> tuple[list[bool], str]:
-        place.mkdir(parents=True, exist_ok=True)
+        make_folder(place)
         return [_read(place, chunk, "") is not None for chunk in chunks], uuid4().hex
 
     done, run = on_root(world, look)
     missing = [chunk for chunk, there in zip(chunks, done, strict=True) if not there]
+    locked = has_locks(place, world)
     with open_board(world, len(missing), shown) as board:
-        _work(missing, place, run, board)
-        board.wait_for_all()
-    world.barrier()
-    found = {chunk: _read(place, chunk, run) for chunk in chunks}
+        _work(missing, place, run, board, locked)
     responses = []
-    for label, design in designs:
-        parts = [(c, found[c]) for c in chunks if (c.label, c.design) == (label, design)]
-        responses.append(_joined(parts))
+    with together(world):
+        found = {chunk: _read(place, chunk, run) for chunk in chunks}
+        for label, design in designs:
+            parts = [(c, found[c]) for c in chunks if (c.label, c.design) == (label, design)]
+            responses.append(_joined(parts))
     return responses, sum(chunk.last - chunk.first for chunk in missing)
 
 
-def _work(chunks: Sequence[_Chunk], place: Path, run: str, board: Board) -> None:
+def _work(chunks: Sequence[_Chunk], place: Path, run: str, board: Board, locked: bool) -> None:
     """Take chunks until none is left; the other ranks do the same."""
     comm = board.comm
     # Every rank begins elsewhere: with several designs each reduces those it needs.
     begin = len(chunks) * comm.rank // comm.size
     left = [*chunks[begin:], *chunks[:begin]]
     nominal: _Nominal | None = None
-    with open(place / LOCK, "a+b") as locks:
+    with writing(place / LOCK):
+        locks = open(place / LOCK, "a+b")
+    with locks:
         while left:
             for chunk in left:
                 if _read(place, chunk, run) is not None:
                     left.remove(chunk)
                     break
-                with _claim(locks, chunk) as mine:
+                with _claim(locks, chunk, locked) as mine:
                     if not mine:
                         continue
                     if _read(place, chunk, run) is None:
@@ -251,16 +255,18 @@ def _work(chunks: Sequence[_Chunk], place: Path, run: str, board: Board) -> None
 
 
 @contextmanager
-def _claim(locks: IO[bytes], chunk: _Chunk) -> Iterator[bool]:
-    """Yield whether this process has the chunk's byte of the lock file, until the block ends."""
+def _claim(locks: IO[bytes], chunk: _Chunk, locked: bool) -> Iterator[bool]:
+    """Yield whether this process has the chunk's byte of the lock file, until the block ends.
+
+    Without locks it always has.
+    """
     place = int(chunk.key[:12], 16)
+    mine = not locked or try_lock(fcntl.lockf, locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
     try:
-        fcntl.lockf(locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
-    except OSError:
-        yield False
-        return
-    yield True
-    fcntl.lockf(locks, fcntl.LOCK_UN, 1, place)
+        yield mine
+    finally:
+        if locked and mine:
+            fcntl.lockf(locks, fcntl.LOCK_UN, 1, place)
 
 
 def _do(chunk: _Chunk, nominal: _Nominal, place: Path, run: str, board: Board) -> None:

@@ -55,12 +55,13 @@ def study(
         InputError: something asked for is not possible; nothing was computed.
     """
     from dolfinopt.folders import prepare_folder
-    from dolfinopt.parallel import on_root
+    from dolfinopt.parallel import on_root, together
 
     plan = on_root(world, _plan, scene, topic, tuple(vary), tuple(designs), reoptimize)
     on_root(world, prepare_folder, folder)
     outcomes = run_cases(plan.cases, folder, world, shown=shown)
-    tables, figures = plan.report(outcomes)
+    with together(world):
+        tables, figures = plan.report(outcomes)
     failures = tuple(f"{o.case.label}: {o.failure}" for o in outcomes.failures)
     return Study(plan.name, tuple(tables), tuple(figures), failures, outcomes.computed)
 

@@ -18,7 +18,7 @@ from dolfinopt.files import drive_units, trajectory_units, versions
 from dolfinopt.ledger import Counts, Ledger
 from dolfinopt.limits import Limit, limits_of, summary_of
 from dolfinopt.members import thinnest
-from dolfinopt.parallel import ArmShare, gather_arms, gather_cells
+from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, together
 from dolfinopt.plausibility import implausible
 from dolfinopt.scene import Scene
 from dolfinopt.simulation import Trajectory
@@ -66,76 +66,78 @@ def summarise(
         limits: the constraints; by default those of `evaluation` and `x_phys`.
         trajectory: of the design, on the root.
     """
-    volumes = gather_arms(share, {k: a.volume_fraction(x_phys[k]) for k, a in arms.items()})
-    sides = gather_arms(share, {k: _cell_size(scene, k, a) for k, a in arms.items()})
-    sizes = gather_arms(share, {k: _volume(scene, k, a) for k, a in arms.items()})
-    notes = gather_arms(share, {k: a.mesh.notes for k, a in arms.items()})
-    greys = gather_arms(share, {k: a.grayness(x_phys[k]) for k, a in arms.items()})
+    with together(share.world):
+        mine = {k: _traits(scene, k, a, x_phys[k]) for k, a in arms.items()}
+    every = gather_arms(share, mine)
+    volumes, sides, sizes, notes, greys = (
+        {k: one[j] for k, one in every.items()} for j in range(5)
+    )
     widths = _widths(share, arms, x_phys)
     seconds = _slowest(share.world, ledger.seconds)
-    mine = (counts or ledger.counts) if share.leads else Counts()
-    counted = share.world.gather(mine, root=0)
+    own = (counts or ledger.counts) if share.leads else Counts()
+    counted = share.world.gather(own, root=0)
     memory = share.world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
     errors = _frequency_errors(share, arms, x_phys, ledger)
-    if counted is None or memory is None:
-        return {}
-    if limits is None:
-        limits = limits_of(scene, evaluation, _limited_fractions(scene, volumes, sizes))
-    return {
-        "name": scene.name,
-        "objective": evaluation.objective,
-        "compliance": evaluation.compliance,
-        "max_deviation": evaluation.max_deviation,
-        "max_deviation_time": evaluation.max_deviation_time,
-        **({} if trajectory is None else _machine(scene, trajectory)),
-        "grayness": float(np.average([greys[k] for k in sizes], weights=list(sizes.values()))),
-        "volume_fraction": {
-            arm.name: volumes[owner]
-            for arm, owner in zip(scene.arms, scene.owners, strict=True)
-            if owner is not None
-        },
-        **_by_arm(scene, "minimum_member_measured", {k: w[0] for k, w in widths.items()}),
-        **_by_arm(scene, "minimum_gap_measured", {k: w[1] for k, w in widths.items()}),
-        "first_frequency": {
-            arm.name: value
-            for arm, value in zip(scene.arms, evaluation.first_frequencies, strict=True)
-            if np.isfinite(value)
-        },
-        "first_frequency_error": {
-            arm.name: errors[owner]
-            for arm, owner in zip(scene.arms, scene.owners, strict=True)
-            if owner in errors
-        },
-        "loaded_frequency": dict(
-            zip(_flexible_names(scene), evaluation.loaded_frequencies, strict=False)
-        ),
-        "constraints": summary_of(limits),
-        "scenarios": [
-            {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
-            for one, motion in zip(scene.scenarios, evaluation.scenarios, strict=True)
-        ],
-        **({} if crisp is None else {"crisp": _figures(crisp)}),
-        "simulation_error_estimate": evaluation.error,
-        "reduction": _reduction(scene, choice),
-        "warnings": [
-            *implausible(scene),
-            *(note for mesh_notes in notes.values() for note in mesh_notes),
-            *_warnings(scene, evaluation),
-            *_too_few(scene, choice),
-            *(_filter_warnings(scene, sides) if iterations else ()),
-        ],
-        "iterations": iterations,
-        "converged": converged,
-        "stop_reason": stop_reason,
-        "kkt": kkt,
-        "seconds": {**seconds, "total": wall},
-        "counts": asdict(sum(counted, Counts())),
-        "peak_memory_mb": max(memory),
-        "ranks": share.world.size,
-        "units": _units(scene, trajectory),
-        "versions": versions(),
-        "scene": scene.to_dict(),
-    }
+    with together(share.world):
+        if counted is None or memory is None:
+            return {}
+        if limits is None:
+            limits = limits_of(scene, evaluation, _limited_fractions(scene, volumes, sizes))
+        return {
+            "name": scene.name,
+            "objective": evaluation.objective,
+            "compliance": evaluation.compliance,
+            "max_deviation": evaluation.max_deviation,
+            "max_deviation_time": evaluation.max_deviation_time,
+            **({} if trajectory is None else _machine(scene, trajectory)),
+            "grayness": float(np.average([greys[k] for k in sizes], weights=list(sizes.values()))),
+            "volume_fraction": {
+                arm.name: volumes[owner]
+                for arm, owner in zip(scene.arms, scene.owners, strict=True)
+                if owner is not None
+            },
+            **_by_arm(scene, "minimum_member_measured", {k: w[0] for k, w in widths.items()}),
+            **_by_arm(scene, "minimum_gap_measured", {k: w[1] for k, w in widths.items()}),
+            "first_frequency": {
+                arm.name: value
+                for arm, value in zip(scene.arms, evaluation.first_frequencies, strict=True)
+                if np.isfinite(value)
+            },
+            "first_frequency_error": {
+                arm.name: errors[owner]
+                for arm, owner in zip(scene.arms, scene.owners, strict=True)
+                if owner in errors
+            },
+            "loaded_frequency": dict(
+                zip(_flexible_names(scene), evaluation.loaded_frequencies, strict=False)
+            ),
+            "constraints": summary_of(limits),
+            "scenarios": [
+                {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
+                for one, motion in zip(scene.scenarios, evaluation.scenarios, strict=True)
+            ],
+            **({} if crisp is None else {"crisp": _figures(crisp)}),
+            "simulation_error_estimate": evaluation.error,
+            "reduction": _reduction(scene, choice),
+            "warnings": [
+                *implausible(scene),
+                *(note for mesh_notes in notes.values() for note in mesh_notes),
+                *_warnings(scene, evaluation),
+                *_too_few(scene, choice),
+                *(_filter_warnings(scene, sides) if iterations else ()),
+            ],
+            "iterations": iterations,
+            "converged": converged,
+            "stop_reason": stop_reason,
+            "kkt": kkt,
+            "seconds": {**seconds, "total": wall},
+            "counts": asdict(sum(counted, Counts())),
+            "peak_memory_mb": max(memory),
+            "ranks": share.world.size,
+            "units": _units(scene, trajectory),
+            "versions": versions(),
+            "scene": scene.to_dict(),
+        }
 
 
 def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
@@ -181,7 +183,7 @@ def _frequency_errors(
     It is not counted: nothing depends on it.
     """
     counts, errors = replace(ledger.counts), {}
-    with ledger.phase("frequency error"):
+    with ledger.phase("frequency error"), together(share.world):
         for index, arm in arms.items():
             if arm.basis is not None:
                 body = arm.reduce(x_phys[index])
@@ -195,18 +197,31 @@ def _widths(
 ) -> dict[int, tuple[float | None, float | None]]:
     """Return the widths of member and gap of the designs cut at one half, m; on the root."""
     corners, solid = {}, {}
-    for k, arm in arms.items():
-        points = compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)[:, :, :2]
-        corners[k] = points[:, [0, 1, 3, 2]] if points.shape[1] == 4 else points
-        solid[k] = x_phys[k] > 0.5
+    with together(share.world):
+        for k, arm in arms.items():
+            points = compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)[:, :, :2]
+            corners[k] = points[:, [0, 1, 3, 2]] if points.shape[1] == 4 else points
+            solid[k] = x_phys[k] > 0.5
     whole, cut = gather_cells(share, corners), gather_cells(share, solid)
-    return {k: thinnest(whole[k], cut[k]) for k in whole}
+    with together(share.world):
+        return {k: thinnest(whole[k], cut[k]) for k in whole}
 
 
 def _by_arm(scene: Scene, name: str, values: Mapping[int, Any]) -> dict[str, dict[str, Any]]:
     """Return a value of every arm that has a design, by the arm's name."""
     pairs = zip(scene.arms, scene.owners, strict=True)
     return {name: {arm.name: values[k] for arm, k in pairs if k is not None}}
+
+
+def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> tuple[Any, ...]:
+    """Return volume fraction, size of a cell, volume, notes and grayness (collective there)."""
+    return (
+        arm.volume_fraction(x_phys),
+        _cell_size(scene, index, arm),
+        _volume(scene, index, arm),
+        arm.mesh.notes,
+        arm.grayness(x_phys),
+    )
 
 
 def _cell_size(scene: Scene, index: int, arm: Arm) -> float:

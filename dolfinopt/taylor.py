@@ -13,7 +13,7 @@ from dolfinopt.evaluation import evaluate, gradient
 from dolfinopt.integrators.radau import AIM
 from dolfinopt.ledger import Ledger
 from dolfinopt.objective import load_cases, objective
-from dolfinopt.parallel import ArmShare, on_root, sum_over_arms
+from dolfinopt.parallel import ArmShare, on_root, sum_over_arms, together
 from dolfinopt.reduction import METHODS
 from dolfinopt.scenarios import combined
 from dolfinopt.scene import Scene
@@ -86,11 +86,13 @@ def taylor_test(
     check_exact(scene)
     exact = _with(scene, gradient="exact")
     x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
-    evaluation, base = evaluate(exact, share, arms, _physical(arms, x), ledger, simulated=False)
-    slope = _by_x(arms, gradient(exact, share, arms, base, ledger), x)
+    x_phys = _physical(share, arms, x)
+    evaluation, base = evaluate(exact, share, arms, x_phys, ledger, simulated=False)
+    slope = _by_x(share, arms, gradient(exact, share, arms, base, ledger), x)
     frozen = None
     if scene.objective.simulated:
-        frozen = _by_x(arms, gradient(_with(scene, gradient="esl"), share, arms, base, ledger), x)
+        esl = _with(scene, gradient="esl")
+        frozen = _by_x(share, arms, gradient(esl, share, arms, base, ledger), x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
     value = _fixed_objective(exact, share, arms, ledger, base)
@@ -139,12 +141,16 @@ def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None 
     return scene.model_copy(update=update)
 
 
-def _physical(arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
-    return {k: arm.physical(x[k]) for k, arm in arms.items()}
+def _physical(share: ArmShare, arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
+    with together(share.world):
+        return {k: arm.physical(x[k]) for k, arm in arms.items()}
 
 
-def _by_x(arms: Mapping[int, Arm], slopes: Cells, x: Cells) -> dict[int, np.ndarray]:
-    return {k: arm.chain(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
+def _by_x(
+    share: ArmShare, arms: Mapping[int, Arm], slopes: Cells, x: Cells
+) -> dict[int, np.ndarray]:
+    with together(share.world):
+        return {k: arm.chain(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
 
 
 def _dot(share: ArmShare, a: Cells, b: Cells) -> float:
@@ -162,7 +168,7 @@ def _fixed_objective(
     start = () if base is None else base.solutions
 
     def value(x: Cells) -> float:
-        x_phys = _physical(arms, x)
+        x_phys = _physical(share, arms, x)
         evaluation, trajectory = evaluate(
             scene, share, arms, x_phys, ledger, start, simulated=False
         )

@@ -18,11 +18,11 @@ import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.parallel import (
     SPLIT_CELLS,
+    abort_together,
     direct_solver,
     gather_arms,
     gather_cells,
     on_root,
-    one_ending,
     share_arms,
     sum_over_arms,
 )
@@ -141,10 +141,10 @@ def test_all_ranks_raise_what_the_root_raised(kind):
 
 
 def test_a_good_end_goes_unnoticed():
-    with one_ending(COMM):
+    with abort_together(COMM):
         passed = True
     assert passed
-    with pytest.raises(SystemExit) as ending, one_ending(COMM):
+    with pytest.raises(SystemExit) as ending, abort_together(COMM):
         sys.exit(7)
     assert ending.value.code == 7  # a status chosen on purpose stays
 
@@ -154,18 +154,18 @@ def test_a_good_end_goes_unnoticed():
     [
         (InputError("scene.toml: no"), 2, "dolfinopt: scene.toml: no\n"),
         (ConvergenceError("stuck"), 1, "dolfinopt: stuck\n"),
-        (KeyboardInterrupt(), 1, "dolfinopt: interrupted\n"),
+        (KeyboardInterrupt(), 130, "dolfinopt: interrupted\n"),
     ],
 )
 def test_what_all_ranks_raise_the_root_reports_in_one_line(error, status, message, capsys):
-    with pytest.raises(SystemExit) as ending, one_ending(COMM):
+    with pytest.raises(SystemExit) as ending, abort_together(COMM):
         raise error
     assert ending.value.code == status
     assert capsys.readouterr().err == (message if COMM.rank == 0 else "")
 
 
 def test_an_internal_error_shows_where(capsys):
-    with pytest.raises(SystemExit) as ending, one_ending(COMM):
+    with pytest.raises(SystemExit) as ending, abort_together(COMM):
         raise ZeroDivisionError("by nothing")
     assert ending.value.code == 1
     err = capsys.readouterr().err
@@ -191,10 +191,10 @@ def test_ranks_end_together(body, status, line):
     script = (
         "from mpi4py import MPI\n"
         "from dolfinopt.errors import InputError\n"
-        "from dolfinopt.parallel import one_ending\n"
+        "from dolfinopt.parallel import abort_together\n"
         "world = MPI.COMM_WORLD\n"
         "assert world.size == 2\n"
-        "with one_ending(world):\n    " + body.replace("\n", "\n    ") + "\n"
+        "with abort_together(world):\n    " + body.replace("\n", "\n    ") + "\n"
     )
     # The environment as it was: MPI has added to this process's since, which misleads mpirun.
     run = subprocess.run(

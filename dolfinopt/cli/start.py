@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.errors import ConvergenceError, InputError, OutputError
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -71,12 +71,12 @@ class Start:
             petsc4py.init(["dolfinopt", "-no_signal_handler"])
             from mpi4py import MPI
 
-            from dolfinopt.parallel import one_ending
+            from dolfinopt.parallel import abort_together
             from dolfinopt.progress import show_slow_work
 
             self._world = MPI.COMM_WORLD
             show_slow_work()
-            self._ending.enter_context(one_ending(self._world))
+            self._ending.enter_context(abort_together(self._world))
             if self._world.rank > 0:
                 self._ending.enter_context(redirect_stdout(StringIO()))
         return self._world
@@ -104,7 +104,7 @@ def end_before_start(error: BaseException) -> int:
         return 0
     if isinstance(error, KeyboardInterrupt):
         print("dolfinopt: interrupted", file=sys.stderr)
-    elif isinstance(error, InputError | ConvergenceError | MissingLibrary):
+    elif isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
         print(f"dolfinopt: {error}", file=sys.stderr)
     else:
         traceback.print_exception(error)

@@ -1,0 +1,84 @@
+"""Writing to disk: whole or not at all, and in one line when it cannot be done."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from dolfinopt.errors import OutputError
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an operating system's error in the block into an `OutputError` about `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritten(path, error) from error
+
+
+def unwritten(path: Path, error: OSError) -> OutputError:
+    """Return what to raise where `error` has kept a file from being written."""
+    remedy = "name a folder you may write with --out"
+    if error.errno in FULL:
+        remedy = "make room, or name a folder on another disk with --out"
+    reason = error.strerror or type(error).__name__
+    return OutputError(f"{path}: cannot be written ({reason}); {remedy}")
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and those above it.
+
+    Raises:
+        OutputError: it cannot be created.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Call `write(stream)`, and put what it wrote into the file `path` when all is on the disk.
+
+    The stream is in memory, so that whoever writes a format never meets an error of the disk.
+
+    Raises:
+        OutputError: the disk is full, for instance; `path` is as it was before.
+    """
+    stream = io.BytesIO()
+    write(stream)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with writing(path):
+        try:
+            with open(temporary, "wb") as file:
+                file.write(stream.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append to a text file, all or nothing.
+
+    Raises:
+        OutputError: it cannot be done; the file is as it was before.
+    """
+    with writing(path):
+        size = path.stat().st_size
+        try:
+            with open(path, "a", encoding="utf-8") as stream:
+                stream.write(text)
+        except BaseException:
+            with suppress(OSError):
+                os.truncate(path, size)
+            raise

@@ -1,0 +1,527 @@
+"""Whatever fails on one rank alone fails on all: none waits for ever, wherever it happens."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt import (
+    arm,
+    cases,
+    checkpoint,
+    compat,
+    coordinates,
+    elasticity,
+    evaluation,
+    files,
+    mesh,
+    optimization,
+    results,
+    sampling,
+    study,
+    summary,
+)
+from dolfinopt.cases import Case, run_cases
+from dolfinopt.data import paper_scene
+from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
+from dolfinopt.parallel import (
+    RaisedElsewhere,
+    _pickled,
+    on_root,
+    share_arms,
+    together,
+)
+from dolfinopt.results import Simulated, write_result, write_simulation
+from dolfinopt.scene import load_scene
+from dolfinopt.taylor import taylor_test
+
+COMM = MPI.COMM_WORLD
+LONE = min(1, COMM.size - 1)  # the rank that fails; with two arms it has one of them
+COARSE = ("arms.cells=[12,3]", "design.filter_radius=0.2", "optimizer.max_iterations=2")
+
+
+class Unusual(Exception):
+    """What no code catches."""
+
+
+class Awkward(ConvergenceError):
+    """Cannot be pickled: its constructor wants two arguments and it holds a function."""
+
+    def __init__(self, text, action):
+        super().__init__(f"{text}!")
+        self.action = action
+
+
+# -- the context itself ----------------------------------------------------------------------
+
+
+def test_nothing_happens_to_good_work():
+    with together(COMM):
+        value = 3
+    assert value == 3
+
+
+@pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("rank", [0, COMM.size - 1])
+def test_one_ranks_exception_is_raised_on_all(kind, rank):
+    with pytest.raises(kind) as raised, together(COMM):
+        if COMM.rank == rank:
+            raise kind(f"on rank {rank}")
+    assert str(raised.value) == f"on rank {rank}"
+    if COMM.rank != rank:
+        assert isinstance(raised.value.__cause__, RaisedElsewhere)
+        assert "test_together.py" in str(raised.value.__cause__)
+    COMM.Barrier()  # all are at the same place: nothing is left over
+
+
+@pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError, KeyboardInterrupt, SystemExit])
+def test_any_exception_of_the_root_is_raised_on_all(kind):
+    def fail():
+        raise kind("at the root")
+
+    with pytest.raises(kind, match=r"^at the root$"):
+        on_root(COMM, fail)
+    COMM.Barrier()
+
+
+def test_a_result_that_cannot_be_sent_is_an_exception_on_all():
+    if COMM.size > 1:  # on one rank nothing is sent
+        with pytest.raises((pickle.PicklingError, AttributeError)):
+            on_root(COMM, lambda: lambda: None)
+    COMM.Barrier()
+
+
+def test_the_first_of_several_is_raised():
+    with pytest.raises(ValueError, match=r"^of rank 0$"), together(COMM):
+        raise ValueError(f"of rank {COMM.rank}")
+
+
+def test_a_failure_goes_before_those_who_gave_up():
+    with pytest.raises(Unusual), together(COMM):
+        raise Unusual("why") if COMM.rank == COMM.size - 1 else OthersFailed("given up")
+
+
+def test_an_exception_that_cannot_be_sent_arrives_as_its_nearest_relative():
+    with pytest.raises(ConvergenceError, match=r"^stuck!$") as raised, together(COMM):
+        if COMM.rank == LONE:
+            raise Awkward("stuck", lambda: None)
+    assert type(raised.value) is (Awkward if COMM.rank == LONE else ConvergenceError)
+
+    class Local(InputError):
+        pass
+
+    assert type(pickle.loads(_pickled(Local("no")))) is InputError
+    assert str(pickle.loads(_pickled(Local("no")))) == "no"
+
+
+def test_parts_of_the_ranks_agree_first():
+    """As an arm's ranks do: the others hear of it at the end of the outer block."""
+    part = COMM.Split(COMM.rank // 2, COMM.rank)
+    after = []
+    with pytest.raises(Unusual, match=r"^lost$"), together(COMM):
+        with together(part):
+            if COMM.rank == LONE:
+                raise Unusual("lost")
+        after.append(part.allreduce(1))  # would wait for ever where one rank is missing
+    assert bool(after) == (COMM.rank // 2 != LONE // 2)
+    part.Free()
+
+
+def test_an_abandoned_generator_does_not_meet_anybody():
+    def numbers():
+        with together(COMM):
+            yield 1
+
+    if COMM.rank == 0:
+        generator = numbers()
+        next(generator)
+        generator.close()
+    COMM.Barrier()
+
+
+# -- every place that can fail on one rank ---------------------------------------------------
+
+
+def fail_on(monkeypatch, rank, owner, name, after=0):
+    """Let a function fail on one rank, from its call number `after` on."""
+    whole, calls = getattr(owner, name), [0]
+
+    def failing(*arguments, **options):
+        calls[0] += 1
+        if COMM.rank == rank and calls[0] > after:
+            raise Unusual(name)
+        return whole(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, failing)
+
+
+class Model:
+    """A coarse two-arm machine, built when first asked for."""
+
+    def __init__(self, *overrides):
+        self.scene = load_scene(paper_scene(), (*COARSE, *overrides))
+        self.share = share_arms(COMM, self.scene.cell_counts)
+        self.ledger = do.Ledger()
+        self.arms = do.build_arms(self.scene, self.share, self.ledger)
+        self.x = {k: one.uniform(0.5) for k, one in self.arms.items()}
+
+    @property
+    def place(self):
+        return self.scene, self.share, self.arms
+
+    def evaluate(self):
+        return do.evaluate(*self.place, self.x, self.ledger)
+
+    def gradient(self, trajectory):
+        return do.gradient(*self.place, trajectory, self.ledger)
+
+
+EVALUATIONS = {
+    "interpolation": (arm, "interpolate", ()),
+    "reduction": (arm, "shape_integrals", ()),
+    "statics": (evaluation, "static_response", ('objective.kind="static"',)),
+    "deflections": (evaluation, "static_response", ("constraints.tip_deflection=1.0",)),
+    "rigid integrals": (evaluation, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
+    "loaded modes": (arm, "loaded_modes", ("constraints.first_frequency=1.0",)),
+    "squared period": (evaluation, "squared_period", ('objective.kind="eigenfrequency"',)),
+}
+
+
+@pytest.mark.parametrize("place", EVALUATIONS)
+def test_evaluation(place, monkeypatch):
+    owner, name, overrides = EVALUATIONS[place]
+    model = Model(*overrides)
+    fail_on(monkeypatch, LONE, owner, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        model.evaluate()
+    COMM.Barrier()
+
+
+@pytest.mark.parametrize("name", ["simulate_batch", "_motion"])
+def test_the_root_simulates(name, monkeypatch):
+    model = Model()
+    fail_on(monkeypatch, 0, evaluation, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        model.evaluate()
+    COMM.Barrier()
+
+
+def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeypatch):
+    model = Model()
+    body = arm.shape_integrals
+
+    def stuck(*arguments):
+        if COMM.rank == LONE:
+            raise ConvergenceError("stuck")
+        return body(*arguments)
+
+    monkeypatch.setattr(arm, "shape_integrals", stuck)
+    found = evaluation.evaluate_batch(
+        [model.scene] * 2, model.share, model.arms, model.x, do.Ledger()
+    )
+    assert [str(one) for one in found] == ["stuck", "stuck"]
+    assert all(isinstance(one, ConvergenceError) for one in found)
+    COMM.Barrier()
+
+
+def test_a_batch_under_other_scenes(monkeypatch):
+    model = Model('objective.kind="static"')
+    fail_on(monkeypatch, LONE, arm.Arm, "under")
+    with pytest.raises(Unusual):
+        evaluation.evaluate_batch([model.scene], model.share, model.arms, model.x, do.Ledger())
+    COMM.Barrier()
+
+
+GRADIENTS = {
+    "frozen loads": (evaluation, "esl_gradient", ()),
+    "moments": (evaluation, "_frozen_moments", ()),
+    "exact": (evaluation, "exact_gradient", ('objective.gradient="exact"',)),
+    "adjoint": (evaluation, "_body_slopes", ('objective.gradient="exact"',)),
+    "statics": (evaluation, "static_gradient", ('objective.kind="static"',)),
+    "period": (evaluation, "period_gradient", ('objective.kind="eigenfrequency"',)),
+    "carried": (evaluation, "rigid_gradient", ('objective.kind="eigenfrequency"',)),
+    "deflection": (evaluation, "deflection_gradient", ("constraints.tip_deflection=1.0",)),
+    "frequency": (evaluation, "period_gradient", ("constraints.first_frequency=1.0",)),
+}
+
+
+@pytest.mark.parametrize("place", GRADIENTS)
+def test_gradient(place, monkeypatch):
+    owner, name, overrides = GRADIENTS[place]
+    model = Model(*overrides)
+    _, trajectory = model.evaluate()
+    fail_on(monkeypatch, 0 if name.startswith("_") else LONE, owner, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        model.gradient(trajectory)
+        evaluation.constraint_gradients(*model.place)
+    COMM.Barrier()
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [(mesh, "mesh_geo"), (mesh, "_arm_mesh"), (arm, "element_operators"), (arm, "ElasticArm")],
+)
+def test_arms_are_built(owner, name, monkeypatch):
+    fail_on(monkeypatch, LONE, owner, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        Model()
+    COMM.Barrier()
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (arm.Arm, "set_design"),
+        (coordinates, "shape_integrals"),
+        (coordinates, "_leading"),
+        (coordinates, "_largest"),
+    ],
+)
+def test_coordinates_are_chosen(owner, name, monkeypatch):
+    model = Model('reduction.coordinates="auto"', "reduction.tolerance=0.1")
+    fail_on(monkeypatch, 0 if name == "_largest" else LONE, owner, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        do.choose_coordinates(*model.place, model.x, model.ledger)
+    COMM.Barrier()
+
+
+OPTIMISATIONS = {
+    "realise": (LONE, arm.Arm, "realise", 0),
+    "chain": (LONE, arm.Arm, "chain", 1),
+    "threshold": (LONE, arm.Arm, "preserving_threshold", 0),
+    "history": (0, optimization, "HistoryWriter", 0),
+    "history row": (0, optimization.HistoryWriter, "append", 1),
+    "checkpoint begun": (0, checkpoint, "write_arrays", 0),
+    "checkpoint": (0, checkpoint, "write_arrays", 1),
+    "checkpoint modes": (LONE, checkpoint, "_rows", 0),
+}
+
+
+@pytest.mark.parametrize("place", OPTIMISATIONS)
+def test_optimisation(place, monkeypatch, shared_tmp_path):
+    rank, owner, name, after = OPTIMISATIONS[place]
+    scene = load_scene(paper_scene(), (*COARSE, 'design.projection="heaviside"'))
+    fail_on(monkeypatch, rank, owner, name, after)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        do.optimize(scene, shared_tmp_path, world=COMM)
+    COMM.Barrier()
+
+
+def test_what_is_told_of_an_iteration():
+    def report(row):
+        if row.iteration == 1:
+            raise Unusual("told")
+
+    with pytest.raises(Unusual, match=r"^told$"):
+        do.optimize(load_scene(paper_scene(), COARSE), world=COMM, report=report)
+    COMM.Barrier()
+
+
+def test_resuming(monkeypatch, shared_tmp_path):
+    scene = load_scene(paper_scene(), COARSE)
+    do.optimize(scene, shared_tmp_path, world=COMM)
+    fail_on(monkeypatch, LONE, checkpoint, "_match")
+    with pytest.raises(Unusual, match=r"^_match$"):
+        do.optimize(scene, shared_tmp_path, resume=True, world=COMM)
+    COMM.Barrier()
+
+
+WRITING = {
+    "views": (LONE, arm.Arm, "volume_fraction"),
+    "bars": (0, files, "_views"),
+    "design": (0, results, "write_design"),
+    "trajectory": (0, results, "write_trajectory"),
+    "summary": (0, summary, "versions"),
+    "summary file": (0, results, "write_summary"),
+}
+
+
+@pytest.mark.parametrize("place", WRITING)
+def test_results_are_written(place, monkeypatch, shared_tmp_path):
+    rank, owner, name = WRITING[place]
+    model = Model()
+    evaluated, trajectory = model.evaluate()
+    fail_on(monkeypatch, rank, owner, name)
+    simulated = Simulated(*model.place, model.x, evaluated, trajectory, model.ledger)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        write_simulation(shared_tmp_path, simulated, 1.0)
+    COMM.Barrier()
+
+
+def test_optimised_designs_are_written(monkeypatch, shared_tmp_path):
+    scene = load_scene(paper_scene(), COARSE)
+    result = do.optimize(scene, world=COMM)
+    fail_on(monkeypatch, 0, results, "write_fields")
+    with pytest.raises(Unusual):
+        write_result(scene, shared_tmp_path, result, 1.0)
+    COMM.Barrier()
+
+
+def test_gradients_are_written(monkeypatch, shared_tmp_path):
+    model = Model()
+    fail_on(monkeypatch, 0, files, "write_arrays")
+    with pytest.raises(Unusual):
+        files.write_gradient(shared_tmp_path / "gradient.npz", *model.place, model.x, 1.0)
+    COMM.Barrier()
+
+
+def test_designs_are_read(monkeypatch, shared_tmp_path):
+    model = Model()
+    files_ = do.gather_views(*model.place, model.x)
+    if COMM.rank == 0:
+        files.write_design(shared_tmp_path, files_)
+    COMM.Barrier()
+    fail_on(monkeypatch, LONE, files, "_fit")
+    with pytest.raises(Unusual):
+        files.read_design(shared_tmp_path / "design.npz", model.share, model.arms)
+    COMM.Barrier()
+
+
+@pytest.mark.parametrize("name", ["physical", "chain"])
+def test_taylor_test(name, monkeypatch):
+    model = Model()
+    fail_on(monkeypatch, LONE, arm.Arm, name)
+    with pytest.raises(Unusual):
+        taylor_test(*model.place, model.x, model.ledger)
+    COMM.Barrier()
+
+
+# -- arms that several ranks share -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (mesh, "mesh_geo"),
+        (mesh, "_arm_mesh"),
+        (compat, "tabulate_cells"),
+        (elasticity, "AffineMatrix"),
+        (arm, "interpolate"),
+    ],
+)
+def test_a_shared_arm(owner, name, monkeypatch):
+    """The ranks of an arm meet in between: none is left in a collective of the arm."""
+    monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)
+    # The last rank shares its arm with others from three ranks on; Gmsh runs on the first.
+    fail_on(monkeypatch, 0 if name == "mesh_geo" else COMM.size - 1, owner, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        Model("arms.1.rigid=true").evaluate()
+    COMM.Barrier()
+
+
+# -- studies ---------------------------------------------------------------------------------
+
+
+def payloads(*overrides):
+    scenes = (
+        load_scene(paper_scene(), (*COARSE, *overrides, f"payload.mass={m}")) for m in (4, 5, 6)
+    )
+    return [Case(scene, "optimize", label=f"{k}") for k, scene in enumerate(scenes)]
+
+
+@pytest.mark.parametrize("name", ["_optimise", "_read"])
+def test_cases(name, monkeypatch, shared_tmp_path):
+    """A rank that fails ends the others' work, too; what they have finished stays."""
+    fail_on(monkeypatch, LONE, cases, name)
+    with pytest.raises(Unusual, match=f"^{name}$"):
+        run_cases(payloads(), shared_tmp_path, COMM, shown=False)
+    COMM.Barrier()
+    monkeypatch.undo()
+    assert not run_cases(payloads(), shared_tmp_path, COMM, shown=False).failures
+
+
+def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
+    """An optimisation that would go on for long ends in the iteration in which it hears of it."""
+    if COMM.size == 1:
+        pytest.skip("needs two ranks")
+    long = payloads("optimizer.max_iterations=100000", "optimizer.tolerance=1e-300")
+    fail_on(monkeypatch, LONE, cases, "_optimise")
+    with pytest.raises(Unusual):
+        run_cases(long, shared_tmp_path, COMM, shown=False)
+    COMM.Barrier()
+
+
+def test_samples(monkeypatch, shared_tmp_path):
+    scene = load_scene(paper_scene(), COARSE)
+    samples = sampling.Samples(scene, ("payload.mass",), np.linspace(4.0, 6.0, 60)[:, None])
+    fail_on(monkeypatch, LONE, sampling, "_do")
+    with pytest.raises(Unusual, match=r"^_do$"):
+        sampling.respond(samples, [("initial", None)], shared_tmp_path, COMM, shown=False)
+    COMM.Barrier()
+
+
+def test_tables(monkeypatch, shared_tmp_path):
+    from dolfinopt import sweeps
+
+    scene = load_scene(paper_scene(), COARSE)
+    fail_on(monkeypatch, LONE, sweeps._Sweep, "report")
+    with pytest.raises(Unusual, match=r"^report$"):
+        study.study(scene, None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
+    COMM.Barrier()
+
+
+# -- as a command ----------------------------------------------------------------------------
+
+COMMANDS = {
+    "reduction": ("dolfinopt.arm", "shape_integrals", 1, "simulate"),
+    "mesh": ("dolfinopt.mesh", "mesh_geo", 1, "simulate"),
+    "simulation": ("dolfinopt.evaluation", "simulate_batch", 0, "simulate"),
+    "writing": ("dolfinopt.results", "write_summary", 0, "simulate"),
+    "checkpoint": ("dolfinopt.checkpoint", "write_arrays", 0, "optimize"),
+}
+SCRIPT = """
+import sys
+from importlib import import_module
+sys.argv = {arguments!r}
+module = import_module({module!r})
+from mpi4py import MPI
+def fail(*arguments, **options):
+    raise {error}
+if MPI.COMM_WORLD.rank == {rank}:
+    module.{name} = fail
+from dolfinopt.cli import main
+main()
+"""
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
+@pytest.mark.parametrize("kind", ["ConvergenceError", "ZeroDivisionError"])
+@pytest.mark.parametrize("place", COMMANDS)
+def test_commands(place, kind, tmp_path):
+    """All ranks end by themselves, with one message: nobody has to be aborted."""
+    module, name, rank, command = COMMANDS[place]
+    arguments = [
+        "dolfinopt",
+        command,
+        str(paper_scene()),
+        "--no-plots",
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    for text in COARSE:
+        arguments += ["--set", text]
+    error = f"__import__('dolfinopt').{kind}('lost')" if "Conv" in kind else f"{kind}('lost')"
+    script = SCRIPT.format(arguments=arguments, module=module, name=name, rank=rank, error=error)
+    run = subprocess.run(
+        ["mpirun", "-n", "2", sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=dict(os.environ),
+    )
+    assert run.returncode == 1, run.stderr
+    assert "MPI_ABORT" not in run.stderr, run.stderr
+    line = "dolfinopt: lost" if "Conv" in kind else "ZeroDivisionError: lost"
+    own = [one for one in run.stderr.splitlines() if one == line]
+    assert len(own) >= 1 and (len(own) == 1 or "Conv" not in kind)
+    assert not list(Path(tmp_path / "o").glob(".*"))
