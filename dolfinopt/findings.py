@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ import numpy as np
 from dolfinopt.scene import Scene
 
 Cell = str | int | float
+LONGEST = 120  # characters of a study's name, which file names begin with
 
 
 @dataclass(frozen=True)
@@ -219,16 +222,29 @@ class Study:
         return "\n".join(table.markdown() for table in self.tables)
 
 
-def write_study(study: Study, folder: Path) -> None:
-    """Write all tables as CSV and Markdown, and the curves as CSV (root only)."""
+def write_study(study: Study, folder: Path) -> list[Path]:
+    """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
     from dolfinopt.files import write_text
 
-    for table in (*study.tables, *study.data):
-        write_text(folder / f"{joined(study.name, table.name)}.csv", table.csv())
+    texts = {
+        f"{joined(study.name, table.name)}.csv": table.csv()
+        for table in (*study.tables, *study.data)
+    }
     for figure in study.figures:
         if isinstance(figure, LineFigure):
-            write_text(folder / f"{joined(study.name, figure.name)}_curves.csv", figure.csv())
-    write_text(folder / f"{study.name}.md", study.markdown())
+            texts[f"{joined(study.name, figure.name)}_curves.csv"] = figure.csv()
+    texts[f"{study.name}.md"] = study.markdown()
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def file_name(*parts: str) -> str:
+    """Return parts of a file's name with _ between them, cut to what file systems take."""
+    name = re.sub(r"[^A-Za-z0-9_.-]", "-", joined(*parts))
+    if len(name) <= LONGEST:
+        return name
+    return f"{name[: LONGEST - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def joined(*parts: str) -> str:

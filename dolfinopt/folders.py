@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from dolfinopt.disk import FULL, unwritten
 from dolfinopt.errors import InputError
@@ -108,3 +110,48 @@ def write_new(texts: Mapping[Path, str], replaced: Mapping[Path, str]) -> None:
         for done in written:
             done.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+# -- studies: many questions may be answered in one folder, each under a name of its own ----------
+
+
+def check_question(folder: Path, name: str, question: Mapping[str, Any]) -> None:
+    """Raise InputError if the folder's files of this name answer another question.
+
+    Args:
+        folder: need not exist.
+        name: of the study's files.
+        question: JSON data by topic ("scene", "designs").
+    """
+    known = _record(folder, name).get("question")
+    question = json.loads(json.dumps(question))
+    if known is None or known == question:
+        return
+    parts = [part for part in question if known.get(part) != question[part]]
+    what = f"other {' and '.join(parts)}".replace("other scene", "another scene")
+    raise InputError(
+        f"{folder}: {name}.* there belong to {what}; --overwrite to replace them, or another --out"
+    )
+
+
+def remove_listed(folder: Path, name: str) -> None:
+    """Remove what a study of this name has written before."""
+    for file in _record(folder, name).get("files", ()):
+        if Path(file).name == file:
+            (folder / file).unlink(missing_ok=True)
+
+
+def write_question(
+    folder: Path, name: str, question: Mapping[str, Any], files: Sequence[str]
+) -> None:
+    """Write what a study asked, and its files, as FOLDER/NAME.json."""
+    text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
+    (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _record(folder: Path, name: str) -> dict[str, Any]:
+    try:
+        record = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}

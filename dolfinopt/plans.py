@@ -69,7 +69,7 @@ def _check_designs(scene: Scene, designs: Sequence[Path]) -> None:
 
     for path in designs:
         if not path.is_file():
-            raise InputError(f"{path}: --designs: no such file; give design.npz files")
+            raise InputError(f"{path}: --design: no such file; give design.npz files")
     share = share_arms(MPI.COMM_SELF, scene.cell_counts)
     arms = build_arms(scene, share, Ledger())
     for path in designs:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from pydantic.fields import FieldInfo
@@ -23,10 +23,12 @@ from dolfinopt.findings import (
     ScatterFigure,
     Study,
     Table,
+    file_name,
 )
 from dolfinopt.plans import given_designs
 from dolfinopt.sampling import Responses, Samples, posed, respond
 from dolfinopt.scene import Scene
+from dolfinopt.scene_keys import without_none
 from dolfinopt.scene_messages import allowed_words, field_at
 from dolfinopt.uncertainty import (
     CONFIDENCE,
@@ -125,13 +127,18 @@ def study_random(
     made = run_cases(cases, folder, world, shown=shown)
     if made.failures:
         failures = tuple(f"{o.case.label}: {o.failure}" for o in made.failures)
-        return Study(NAME, (), (), failures, made.computed)
+        return Study(random_name(random), (), (), failures, made.computed)
     paths = [
         (label, made[design].design if isinstance(design, Case) else design)
         for label, design in asked.designs
     ]
     found, computed = respond(asked.samples, paths, folder, world, shown=shown)
-    return on_root(world, _report, asked, found, made.computed + computed)
+    return on_root(world, _report, random_name(random), asked, found, made.computed + computed)
+
+
+def random_name(random: Sequence[str]) -> str:
+    """Return the name of the files of a study: the keys that are random."""
+    return file_name(NAME, *(text.partition("=")[0].strip() for text in random))
 
 
 # -- what is asked ---------------------------------------------------------------------------
@@ -230,10 +237,16 @@ def _field(key: str) -> FieldInfo:
     return field_at(("arms", 0, parts[-1]) if parts[0] == "arms" else tuple(parts))
 
 
+def _rules(field: FieldInfo) -> list[Any]:
+    """Return the bounds of a field, also where it may be left out (`T | None`)."""
+    inner = get_args(without_none(field.annotation))[1:]
+    return [*field.metadata, *(rule for one in inner for rule in getattr(one, "metadata", ()))]
+
+
 def _range(key: str) -> tuple[float, float]:
     """Return the least and the largest value of a key."""
     low, high = -math.inf, math.inf
-    for rule in _field(key).metadata:
+    for rule in _rules(_field(key)):
         low = max([low, *(getattr(rule, name) for name in ("gt", "ge") if hasattr(rule, name))])
         high = min([high, *(getattr(rule, name) for name in ("lt", "le") if hasattr(rule, name))])
     return low, high
@@ -242,7 +255,7 @@ def _range(key: str) -> tuple[float, float]:
 # -- what comes out --------------------------------------------------------------------------
 
 
-def _report(asked: _Asked, found: Sequence[Responses], computed: int) -> Study:
+def _report(name: str, asked: _Asked, found: Sequence[Responses], computed: int) -> Study:
     """Return tables and figures (root only)."""
     labels = [label for label, _ in asked.designs]
     columns = list(zip(labels, found, strict=True))
@@ -266,7 +279,7 @@ def _report(asked: _Asked, found: Sequence[Responses], computed: int) -> Study:
             figures.append(_index_bars(asked, labels, indices))
         figures.append(_scatter(asked, columns, used))
     data = (_sample_table(asked, columns),)
-    return Study(NAME, tuple(tables), tuple(figures), tuple(failures), computed, data)
+    return Study(name, tuple(tables), tuple(figures), tuple(failures), computed, data)
 
 
 def _statistics_count(asked: _Asked) -> int:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dolfinopt.cases import run_cases
 from dolfinopt.errors import InputError
-from dolfinopt.findings import Study
+from dolfinopt.findings import Study, file_name
 from dolfinopt.plans import Plan
 from dolfinopt.scene import Scene
 from dolfinopt.sweeps import sweep_plan
@@ -82,15 +82,20 @@ def _plan(
     if topic in ("objective", "reduction", "coordinates"):
         return _fixed_plan(scene, topic, asked, designs, reoptimize)
     if topic is None and not asked:
-        raise InputError(
-            "study: name a topic (payload, flattening, coordinates, objective, reduction) or what "
-            "to --vary"
-        )
+        raise InputError("sweep: name a topic (payload, flattening, coordinates) or what to --vary")
     if topic is not None:
         own = parse_vary(RANGES[topic])
         if own.key not in keys:
             asked.insert(0, own)
-    return sweep_plan(scene, topic or "vary", asked, designs, reoptimize)
+    return sweep_plan(scene, sweep_name(topic, vary), asked, designs, reoptimize)
+
+
+def sweep_name(topic: Topic | None, vary: Sequence[str]) -> str:
+    """Return the name of a sweep's files: the topic, and the keys that it varies besides."""
+    own = RANGES.get(topic or "", "=").partition("=")[0]
+    own = COORDINATES if topic == "coordinates" else own
+    keys = [text.partition("=")[0].strip() for text in vary]
+    return file_name(*([topic] if topic else []), *(key for key in keys if key != own))
 
 
 def _fixed_plan(
@@ -104,20 +109,21 @@ def _fixed_plan(
     for one in asked:
         if topic == "objective" or one.key != COORDINATES:
             only = "none" if topic == "objective" else f"only {COORDINATES}"
-            raise InputError(f"--vary {one.text}: expected {only} with study {topic}")
+            raise InputError(f"--vary {one.text}: expected {only} with {_command(topic)}")
     if topic in ("objective", "reduction") and designs:
-        raise InputError(f"--designs: expected none with study {topic}, which makes its own")
+        raise InputError(f"--design: expected none with {_command(topic)}, which makes its own")
     if reoptimize:
-        raise InputError(
-            f"--reoptimize: not with study {topic}"
-            + ("; study reduction does that" if topic == "coordinates" else ", which always does")
-        )
+        raise InputError(f"--reoptimize: not with {_command(topic)}; see compare reductions")
     if topic == "objective":
         return objective_plan(scene)
     counts = [_whole(value, asked[0]) for value in asked[0].values] if asked else None
     if topic == "coordinates":
         return coordinates_plan(scene, topic, designs, counts)
     return reduction_plan(scene, counts)
+
+
+def _command(topic: Topic) -> str:
+    return f"sweep {topic}" if topic == "coordinates" else f"compare {topic}s"
 
 
 def _whole(value: str, vary: Vary) -> int:

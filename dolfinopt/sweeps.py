@@ -243,7 +243,7 @@ def sweep_plan(
     if resized and (designs or not reoptimize):
         raise InputError(
             f"--vary {resized[0].text}: no given design fits arms of several sizes; "
-            + ("leave out --designs" if reoptimize else "add --reoptimize to optimise one for each")
+            + ("leave out --design" if reoptimize else "add --reoptimize to optimise one for each")
         )
     given = (("initial design", None),) if resized else given_designs(scene, designs)
 

@@ -175,7 +175,9 @@ def test_launcher_runs_a_script(tmp_path, ranks):
     ready = subprocess.run(["bash", "-c", stamp], capture_output=True).stdout  # as when set up
     (tmp_path / ".venv" / "ready").write_bytes(ready)
     script = tmp_path / "my script.py"
-    script.write_text("import os, sys\nprint(sys.argv[1:], os.environ['OMP_NUM_THREADS'])\n")
+    script.write_text(
+        "import os, sys\nsys.stdout.write(f'{sys.argv[1:]} {os.environ[\"OMP_NUM_THREADS\"]}\\n')\n"
+    )
     line = ["bash", str(launcher), *(["-n", str(ranks)] if ranks else []), "python"]
     environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
     options = {"capture_output": True, "text": True, "env": environment, "timeout": 60}

@@ -38,9 +38,9 @@ def scene(*overrides):
     return do.load_scene(SCENE, [*SMALL, *overrides])
 
 
-def run(*arguments):
+def run(*arguments, command="sweep"):
     """Run the command on all ranks."""
-    commands.main(["study", *map(str, arguments)], standalone_mode=False, obj=WORLD)
+    commands.main([command, *map(str, arguments)], standalone_mode=False, obj=WORLD)
     WORLD.barrier()
 
 
@@ -116,16 +116,15 @@ BAD = {
     "no integer": (["--vary", "reduction.coordinates=4,4.5"], "integer"),
     "twice": (["--vary", "payload.mass=1,2", "--vary", "payload.mass=3,4"], "twice"),
     "out of reach": (["--vary", "motion.radius=1,5"], "from the shoulder"),
-    "no design": (["payload", "--designs", "nowhere.npz"], "nowhere.npz"),
-    "design of other arms": (["payload", "--designs", "OTHER.npz"], "OTHER.npz: missing key"),
+    "no design": (["payload", "--design", "nowhere.npz"], "nowhere.npz"),
+    "design of other arms": (["payload", "--design", "OTHER.npz"], "OTHER.npz: missing key"),
     "given designs do not change": (["--vary", "design.volume_fraction=0.4,0.6"], "--reoptimize"),
     "arms of another size": (["--vary", "arms.arm2.length=0.9,1"], "--reoptimize"),
-    "objective varied": (["objective", "--vary", "payload.mass=1,2"], "none"),
     "coordinates of another key": (["coordinates", "--vary", "payload.mass=1,2"], "only"),
     "broken coordinates": (["coordinates", "--vary", "reduction.coordinates=4,4.5"], "whole"),
     "too many coordinates": (["coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
-    "designs that are made": (["reduction", "--designs", str(SCENE)], "--designs"),
-    "always reoptimised": (["objective", "--reoptimize"], "--reoptimize"),
+    "a file that looks like a topic": (["--design", "a.npz", "b.npz"], "b.npz"),
+    "several times reoptimised": (["coordinates", "--reoptimize"], "compare reductions"),
 }
 
 
@@ -275,12 +274,97 @@ def test_arms_of_several_sizes(folder):
     assert table.rows[0][1] < table.rows[1][1]  # the initial design, N m
 
 
+# -- names and folders -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("topic", "vary", "name"),
+    [
+        ("payload", [], "payload"),
+        ("payload", ["payload.mass=4,8"], "payload"),
+        ("payload", ["motion.duration=1,2"], "payload_motion.duration"),
+        ("coordinates", ["reduction.coordinates=4,8"], "coordinates"),
+        (None, ["material.density=2600:2800:5"], "material.density"),
+        (
+            None,
+            [" payload.mass = 4", "arms.my arm.height=1"],
+            "payload.mass_arms.my-arm.height",
+        ),
+    ],
+)
+def test_files_are_named_after_what_varies(topic, vary, name):
+    assert study.sweep_name(topic, vary) == name
+
+
+def test_long_names_stay_apart():
+    keys = [f"arms.{'a' * 60}{i}.thickness=1,2" for i in range(2)]
+    names = {study.sweep_name(None, [keys[0], keys[1]]), study.sweep_name(None, keys[::-1])}
+    assert len(names) == 2 and max(map(len, names)) <= 120
+
+
+def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
+    """Each has its files; a sweep that grows computes what is new; another scene is refused."""
+    folder = shared_tmp_path / "o"
+    quick = [*SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder]
+
+    def computed(*arguments):
+        run(SCENE, *arguments, *quick)
+        said = capsys.readouterr().out
+        return int(re.search(r"(\d+) cases computed", said)[1]) if WORLD.rank == 0 else None
+
+    def files():
+        WORLD.barrier()
+        return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+    first = computed("--vary", "payload.mass=4,8")
+    before = files()
+    names = {f"payload.mass{end}" for end in (".csv", ".md", ".json", ".png", "_curves.csv")}
+    assert set(before) == names
+    computed("--vary", "motion.duration=1.9,2.1", "--no-plots")
+    after = files()
+    assert {name: after[name] for name in names} == before
+    others = {f"motion.duration{end}" for end in (".csv", ".md", ".json", "_curves.csv")}
+    assert set(after) == names | others
+    grown = computed("--vary", "payload.mass=4,8,12", "--no-plots")
+    if WORLD.rank == 0:
+        # Two designs by value, all values in one batch; the optimised design is made once.
+        assert (first, grown) == (1 + 4, 6)
+    assert "payload.mass.png" not in files()  # it showed two values
+    assert len(rows_of(folder / "payload.mass.csv")) == 3
+    before = files()
+    other = ["--vary", "payload.mass=4,8", "--set", "motion.horizon=2.5"]
+    with pytest.raises(InputError, match=r"payload\.mass\.\* there belong to another scene"):
+        computed(*other)
+    assert files() == before
+    computed(*other, "--overwrite", "--no-plots")
+    assert files()["payload.mass.csv"] != before["payload.mass.csv"]
+
+
+@pytest.mark.parametrize(
+    ("words", "word"),
+    [
+        (["compare", SCENE], "what"),
+        (["compare", SCENE, "designs"], "objectives"),
+        (["compare", SCENE, "objectives", "--coordinates", "4"], "--coordinates"),
+        (["compare", SCENE, "reductions", "--coordinates", "100000"], "100000"),
+        (["study", SCENE, "payload", "--designs", "a.npz"], "sweep"),
+    ],
+)
+def test_bad_comparison_is_one_line(words, word, shared_tmp_path):
+    more = [] if words[0] == "study" else [*SETTINGS, "--out", shared_tmp_path / "o"]
+    with pytest.raises((InputError, click.UsageError), match=word) as caught:
+        run(*words[1:], *more, command=words[0])
+    assert "\n" not in str(caught.value)
+    assert not (shared_tmp_path / "o").exists()
+
+
 # -- objectives and reductions ---------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_objective(folder):
-    run(SCENE, "objective", *SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder)
+    run(SCENE, "objectives", *SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder,
+        command="compare")  # fmt: skip
     rows = rows_of(folder / "objective.csv")
     names = [row["objective"] for row in rows]
     assert names[0] == "initial design" and len(names) == 11
@@ -319,8 +403,8 @@ def test_reduction(folder, monkeypatch):
     monkeypatch.setattr(variants, "REFERENCE", 8)
     monkeypatch.setattr(cases, "REFERENCE", 8)
     run(
-        SCENE, "reduction", "--vary", "reduction.coordinates=4", *SETTINGS, "--set",
-        "optimizer.max_iterations=1", "--out", folder,
+        SCENE, "reductions", "--coordinates", 4, *SETTINGS, "--set",
+        "optimizer.max_iterations=1", "--out", folder, command="compare",
     )  # fmt: skip
     main = {row["method"]: row for row in rows_of(folder / "reduction.csv")}
     assert list(main) == list(variants.METHODS)
@@ -392,7 +476,7 @@ def test_failures_end_with_status_one(folder, monkeypatch):
 def test_killed_study_goes_on(tmp_path, ranks):
     """Killed after some cases, the next call does the rest and ends the same."""
     overrides = [*SETTINGS, "--set", "optimizer.max_iterations=5", "--no-plots"]
-    words = ["study", SCENE, "payload", "--vary", "payload.mass=4:8:4", "--reoptimize", *overrides]
+    words = ["sweep", SCENE, "payload", "--vary", "payload.mass=4:8:4", "--reoptimize", *overrides]
     line = [sys.executable, "-m", "dolfinopt", *map(str, words), "--out"]
     if ranks > 1:
         line = ["mpirun", "-n", str(ranks), *line]

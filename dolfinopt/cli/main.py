@@ -12,6 +12,7 @@ import click
 
 from dolfinopt import __version__
 from dolfinopt.cli.bench import bench
+from dolfinopt.cli.compare import compare
 from dolfinopt.cli.export import export
 from dolfinopt.cli.gradient import gradient
 from dolfinopt.cli.init import init
@@ -22,7 +23,8 @@ from dolfinopt.cli.reproduce import reproduce
 from dolfinopt.cli.schema import schema
 from dolfinopt.cli.simulate import simulate
 from dolfinopt.cli.start import Start, end_before_start
-from dolfinopt.cli.study import study
+from dolfinopt.cli.sweep import sweep
+from dolfinopt.cli.uncertainty import uncertainty
 from dolfinopt.errors import InputError
 
 
@@ -94,6 +96,17 @@ def commands(ctx: click.Context) -> None:
 
 
 STARTING = (init, keys, schema)
-WORKING = (optimize, simulate, gradient, export, study, reproduce, bench, plot)
-for command in (*STARTING, *WORKING):
+WORKING = (optimize, simulate, gradient, export, plot)
+STUDYING = (sweep, compare, uncertainty, reproduce, bench)
+for command in (*STARTING, *WORKING, *STUDYING):
     commands.add_command(command)
+
+
+@commands.command(hidden=True, context_settings={"ignore_unknown_options": True})
+@click.argument("words", nargs=-1, type=click.UNPROCESSED)
+def study(words: tuple[str, ...]) -> None:
+    """Name the commands that took the place of this one."""
+    raise InputError(
+        "study: now sweep (values, --vary), compare (objectives, reductions) and uncertainty "
+        "(--random); --designs is --design, once for every file"
+    )
