@@ -220,11 +220,11 @@ def _time_motion(
             pass  # what the duration is, validation will say
         elif stated < least * (1.0 - SAME_TIME):
             where = blamed(source, changes, (("motion", "duration"),))
-            keys = " and ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
+            keys = ", ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
             raise input_error(
                 where,
-                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s], which "
-                f"{keys} need; leave it out to have just that, or raise the limits",
+                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s] by the "
+                f"limits ({keys}); leave it out to have just that, or raise them",
             )
     duration = motion.get("duration")
     default = Motion.model_fields["horizon"].default

@@ -9,10 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import assert_close
+from mpi4py import MPI
 from scipy.integrate import quad
 
+import dolfinopt as do
 from dolfinopt.errors import InputError
+from dolfinopt.evaluation import evaluate_batch
 from dolfinopt.laws import Law, Limits, law_for
+from dolfinopt.ledger import Ledger
 from dolfinopt.motion import breakpoints, check_motion, desired_path, rigid_motion
 from dolfinopt.scene import Scene, load_scene, scene_from_dict
 
@@ -289,3 +293,21 @@ def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
     check_motion(posed(path="points", file=str(file), law="s-curve", max_speed=6.0))
     with pytest.raises(InputError, match=r"expected none with motion\.path = \"joints\""):
         posed(path="joints", file=str(file), max_speed=1.0)
+
+
+def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:
+    """Several payloads at once, steps ending at every jump: what each of them does alone."""
+    file = tmp_path / "pick.csv"
+    file.write_text("t,x,y\n0,-0.4,0.1\n0.5,0.3,0.2\n0.7,0.3,0.2\n1.3,0.5,0.6\n")
+    motion = {"path": "points", "file": str(file), "law": "trapezoidal", "horizon": 1.5}
+    of = posed(**motion)
+    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 2.0, 3.0)]
+    ledger = Ledger()
+    share = do.share_arms(MPI.COMM_SELF, of.cell_counts)
+    arms = do.build_arms(of, share, ledger)
+    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
+    together = evaluate_batch(scenes, share, arms, x, ledger)
+    for scene, both in zip(scenes, together, strict=True):
+        assert isinstance(both, tuple)
+        alone = do.evaluate(scene, share, arms, x, ledger)[0]
+        assert_close(both[0].max_deviation, alone.max_deviation, 2e-4)

@@ -632,14 +632,19 @@ def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arms", "path", "base"),
-    [(1, "joints in time", "fixed"), (1, "line", "cart"), (3, "points", "cart")],
+    ("arms", "path", "law", "base"),
+    [
+        (1, "joints in time", "quintic", "fixed"),
+        (1, "line", "trapezoidal", "cart"),
+        (3, "points", "quintic", "cart"),
+        (3, "line", "s-curve", "fixed"),
+    ],
 )
 def test_exact_gradient_of_one_and_three_arms(
-    tmp_path: Path, arms: int, path: str, base: str
+    tmp_path: Path, arms: int, path: str, law: str, base: str
 ) -> None:
     """Taylor remainders of the complete chain fall with the square of the step."""
-    motion = dict(of_kind(tmp_path, arms, path, "quintic", base).to_dict()["motion"], horizon=2.2)
+    motion = dict(of_kind(tmp_path, arms, path, law, base).to_dict()["motion"], horizon=2.2)
     lengths = {1: (1.0,), 3: (0.7, 0.7, 0.7)}[arms]
     tables = {"payload": {"mass": 1.0}, "objective": {"load_cases": 5}}
     of = scene(lengths, tables, **motion)
