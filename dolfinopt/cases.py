@@ -29,9 +29,8 @@ from uuid import uuid4
 
 import numpy as np
 
-import dolfinopt
 from dolfinopt.board import IDLE, Board, open_board
-from dolfinopt.contents import file_digest, with_digests
+from dolfinopt.contents import file_digest, program, with_digests
 from dolfinopt.disk import make_folder, writing
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.locks import has_locks, try_lock
@@ -229,11 +228,6 @@ class Outcomes:
 
 
 # -- keys ------------------------------------------------------------------------------------
-
-
-def program() -> tuple[str, int]:
-    """Return what stands for this program in a key: what others computed is not taken from them."""
-    return dolfinopt.__version__, dolfinopt.NUMERICS
 
 
 def scene_content(scene: Scene) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.contents import DIGEST, with_digests
+from dolfinopt.contents import DIGEST, program, with_digests
 from dolfinopt.coordinates import Choice
 from dolfinopt.errors import InputError
 from dolfinopt.files import HistoryRow, write_arrays
@@ -68,7 +68,12 @@ def _scene_text(scene: Scene) -> str:
 def begin(folder: Path, scene: Scene) -> None:
     """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
     remove_stale(folder)
-    write_arrays(folder / NAME, {"scene": np.array(_scene_text(scene)), "iteration": -1})
+    write_arrays(folder / NAME, {**_stamp(scene), "iteration": -1})
+
+
+def _stamp(scene: Scene) -> dict[str, np.ndarray]:
+    """Return what a run must share with a checkpoint to go on from it."""
+    return {"scene": np.array(_scene_text(scene)), "program": np.array(json.dumps(program()))}
 
 
 def reopen(folder: Path) -> None:
@@ -105,7 +110,7 @@ def _write(
 ) -> None:
     """Write the file; `columns` holds whole arms (root only)."""
     arrays: dict[str, Any] = {
-        "scene": np.array(_scene_text(scene)),
+        **_stamp(scene),
         "iteration": memory.iteration,
         "multipliers": memory.multipliers,
         "history": np.array([row.values for row in memory.history]),
@@ -226,6 +231,11 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
             f"{path}: --resume cannot read this checkpoint ({type(error).__name__}); start "
             "without --resume"
         ) from None
+    if "program" not in arrays or json.loads(str(arrays["program"])) != program():
+        raise InputError(
+            f"{path}: --resume: another version of dolfinopt wrote this checkpoint and would go on "
+            "to another design; start without --resume"
+        )
     difference = _difference(theirs, json.loads(_scene_text(scene)))
     if difference:
         raise InputError(

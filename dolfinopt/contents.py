@@ -10,11 +10,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import dolfinopt
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene_keys import FILE_KEYS
 
 DIGEST = "sha256:"  # what a digest in place of a path begins with
+
+
+def program() -> list[str | int]:
+    """Return what stands for this program: results that others kept are not its own."""
+    return [dolfinopt.__version__, dolfinopt.NUMERICS]
 
 
 def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:

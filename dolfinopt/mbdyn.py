@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.body import ShapeIntegrals
+from dolfinopt.disk import write_atomically
 from dolfinopt.errors import InputError
 from dolfinopt.standard_input import SpatialMoments
 
@@ -142,7 +143,7 @@ def modal_element(
 
 def write_fem(path: Path, element: ModalElement) -> None:
     """Write the file; `read_fem` gets the same numbers back."""
-    path.write_text(fem_text(element), encoding="ascii")
+    write_atomically(path, lambda stream: stream.write(fem_text(element).encode("ascii")))
 
 
 def fem_text(element: ModalElement) -> str:

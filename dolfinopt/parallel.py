@@ -24,12 +24,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed, OutputError
+from dolfinopt.interrupt import INTERRUPTED
 
 T = TypeVar("T")
 
 # How long a rank that failed waits for the others to fail the same way before it ends them all.
 GRACE = 2.0  # s
-INTERRUPTED = 130  # exit status, as of a shell's command that Ctrl-C has ended
 # Nobody reads standard output any more, or the disk that it goes to is full.
 CLOSED = (errno.EPIPE, errno.ENOSPC)
 

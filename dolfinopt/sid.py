@@ -36,6 +36,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from dolfinopt.disk import write_atomically
 from dolfinopt.errors import InputError
 
 T = TypeVar("T")
@@ -183,7 +184,7 @@ _HEADER = ("order", "nrow", "ncol", "nq", "nqn", "structure")
 
 def write_sid(path: Path, data: StandardInputData) -> None:
     """Write the text file; `read_sid` gets the same bits back."""
-    path.write_text(sid_text(data), encoding="utf-8")
+    write_atomically(path, lambda stream: stream.write(sid_text(data).encode()))
 
 
 def sid_text(data: StandardInputData) -> str:
@@ -540,9 +541,8 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
 
 def write_sid_npz(path: Path, data: StandardInputData) -> None:
     """Write `sid_arrays` to a file."""
-    with open(path, "wb") as stream:
-        arrays: dict[str, Any] = dict(sid_arrays(data))
-        np.savez(stream, **arrays)
+    arrays: dict[str, Any] = dict(sid_arrays(data))
+    write_atomically(path, lambda stream: np.savez(stream, **arrays))
 
 
 def read_sid_npz(path: Path) -> StandardInputData:

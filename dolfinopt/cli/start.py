@@ -6,10 +6,8 @@ them. A launcher's ranks then know one another only by the environment.
 
 from __future__ import annotations
 
-import os
 import sys
 import traceback
-from collections.abc import Mapping
 from contextlib import ExitStack, redirect_stdout
 from importlib.util import find_spec
 from io import StringIO
@@ -18,26 +16,16 @@ from typing import TYPE_CHECKING
 import click
 
 from dolfinopt.errors import ConvergenceError, InputError, OutputError
+from dolfinopt.interrupt import INTERRUPTED, end_at_once, launched_rank, raise_again
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-# What Open MPI, PMIx, and MPICH with its relatives tell a rank.
-RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
 NEEDED = ("petsc4py", "slepc4py", "mpi4py", "dolfinx", "gmsh")
 
 
 class MissingLibrary(RuntimeError):
     """A library that does not come with pip is not installed."""
-
-
-def launched_rank(environment: Mapping[str, str] = os.environ) -> int | None:
-    """Return this process's rank as a launcher (mpirun) states it, None without one."""
-    for name in RANK_VARIABLES:
-        text = environment.get(name, "")
-        if text.isdigit():
-            return int(text)
-    return None
 
 
 class Start:
@@ -76,6 +64,8 @@ class Start:
 
             self._world = MPI.COMM_WORLD
             show_slow_work()
+            if raise_again():
+                self._ending.callback(end_at_once)
             self._ending.enter_context(abort_together(self._world))
             if self._world.rank > 0:
                 self._ending.enter_context(redirect_stdout(StringIO()))
@@ -104,7 +94,8 @@ def end_before_start(error: BaseException) -> int:
         return 0
     if isinstance(error, KeyboardInterrupt):
         print("dolfinopt: interrupted", file=sys.stderr)
-    elif isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
+        return INTERRUPTED
+    if isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
         print(f"dolfinopt: {error}", file=sys.stderr)
     else:
         traceback.print_exception(error)

@@ -1,0 +1,49 @@
+"""Ctrl-C while nothing is at work yet, or no more: one line, and an end at once.
+
+A `KeyboardInterrupt` would come out of any of hundreds of imports as a traceback, or be swallowed
+by one of them. Commands that compute take it as an exception, see `parallel.abort_together`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping
+from typing import Any
+
+INTERRUPTED = 130  # exit status, as of a shell's command that Ctrl-C has ended
+# What Open MPI, PMIx, and MPICH with its relatives tell a rank.
+RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
+PATIENCE = 0.5  # s that other ranks leave the first to speak: a launcher kills all when one ends
+
+
+def launched_rank(environment: Mapping[str, str] = os.environ) -> int | None:
+    """Return this process's rank as a launcher (mpirun) states it, None without one."""
+    for name in RANK_VARIABLES:
+        text = environment.get(name, "")
+        if text.isdigit():
+            return int(text)
+    return None
+
+
+def end_at_once() -> None:
+    """From now on Ctrl-C ends the process, unless it is ignored or somebody else's."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+
+
+def raise_again() -> bool:
+    """Let Ctrl-C raise KeyboardInterrupt if it ended the process; return whether it did."""
+    ended = signal.getsignal(signal.SIGINT) is _end
+    if ended:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    return ended
+
+
+def _end(number: int, frame: Any) -> None:
+    if launched_rank():
+        time.sleep(PATIENCE)
+    else:
+        os.write(2, b"dolfinopt: interrupted\n")
+    os._exit(INTERRUPTED)

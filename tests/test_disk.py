@@ -1,0 +1,225 @@
+"""Disks that are full, and file systems without locks: one line, and nothing half-written."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt
+from dolfinopt import checkpoint, disk, locks
+from dolfinopt.cases import Case, run_cases
+from dolfinopt.data import paper_scene
+from dolfinopt.disk import append_text, make_folder, write_atomically
+from dolfinopt.errors import InputError, OutputError
+from dolfinopt.files import write_arrays, write_text
+from dolfinopt.locks import has_locks, try_lock
+from dolfinopt.sampling import Samples, respond
+from dolfinopt.scene import load_scene
+
+COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
+COARSE = ("arms.cells=[12,3]", "design.filter_radius=0.2", "optimizer.max_iterations=2")
+
+
+def full(*arguments, **options):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def small_files():
+    """Let files of this process grow to no more than 4 kB, as on a disk with no more room."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+# -- writing ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_text(path, 5000 * "x"),
+        lambda path: write_arrays(path, {"a": np.arange(5000.0)}),
+        lambda path: append_text(path, 5000 * "x"),
+    ],
+    ids=["text", "arrays", "append"],
+)
+def test_what_does_not_fit_leaves_what_was_there(write, tmp_path, small_files):
+    path = tmp_path / "file"
+    write_text(path, "before\n")
+    with pytest.raises(OutputError, match=r"file: cannot be written \(File too large\); make room"):
+        write(path)
+    assert path.read_text() == "before\n"
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_errors_of_a_format_are_not_the_disks(tmp_path):
+    def write(stream):
+        raise OSError("no such format")
+
+    with pytest.raises(OSError, match="no such format"):
+        write_atomically(tmp_path / "picture", write)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folders(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(
+        OutputError, match=r"a: cannot be written \(Not a directory\); name a folder"
+    ):
+        make_folder(tmp_path / "file" / "a")
+
+
+@pytest.mark.parametrize("step", ["open", "fsync", "replace"])
+def test_every_step_of_writing(step, tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    write_text(path, "before\n")
+    if step == "open":
+        monkeypatch.setattr(disk, "open", full, raising=False)
+    else:
+        monkeypatch.setattr(os, step, full)
+    with pytest.raises(OutputError, match="No space left on device"):
+        write_text(path, "after\n")
+    monkeypatch.undo()
+    assert path.read_text() == "before\n" and len(list(tmp_path.iterdir())) == 1
+
+
+FULL_DISK = """
+import os, sys
+from dolfinopt import disk
+sync, calls = os.fsync, [0]
+def fsync(number):
+    calls[0] += 1
+    if calls[0] > {after}:
+        raise OSError({errno}, os.strerror({errno}))
+    sync(number)
+disk.os.fsync = fsync
+sys.argv = {arguments!r}
+from dolfinopt.cli import main
+main()
+"""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("after", [0, 2, 3, 5])
+def test_a_full_disk_ends_a_run_in_one_line(after, tmp_path):
+    """Whichever file does not fit: status 1, no temporary file, and a checkpoint one can go on."""
+    arguments = ["dolfinopt", "optimize", str(paper_scene()), "--out", str(tmp_path), "--no-plots"]
+    for text in COARSE:
+        arguments += ["--set", text]
+    script = FULL_DISK.format(after=after, errno=errno.ENOSPC, arguments=arguments)
+    run = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == 1
+    lines = [one for one in run.stderr.splitlines() if one.startswith("dolfinopt: ")]
+    (line,) = [one for one in lines if not one.startswith("dolfinopt: warning: ")]
+    assert "cannot be written (No space left on device); make room" in line
+    assert "Traceback" not in run.stderr
+    assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
+    assert not (tmp_path / "summary.json").exists()
+    if after > 0:
+        checkpoint.check(tmp_path, load_scene(paper_scene(), COARSE))
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+def test_standard_output_without_room(tmp_path):
+    command = [sys.executable, "-m", "dolfinopt", "simulate", str(paper_scene()), "--no-plots"]
+    command += ["--out", str(tmp_path), "--set", COARSE[0], "--set", COARSE[1]]
+    with open("/dev/full", "w") as nowhere:
+        run = subprocess.run(
+            command, stdout=nowhere, stderr=subprocess.PIPE, text=True, timeout=120
+        )
+    assert run.returncode == 1
+    assert run.stderr.splitlines()[-1] == "dolfinopt: standard output: No space left on device"
+    assert "Traceback" not in run.stderr
+
+
+# -- locks -----------------------------------------------------------------------------------
+
+
+def without(number):
+    def lock(*arguments):
+        raise OSError(number, os.strerror(number))
+
+    return lock
+
+
+@pytest.mark.parametrize("number", locks.HELD)
+def test_held_by_another(number):
+    assert try_lock(without(number)) is False
+
+
+@pytest.mark.parametrize("number", [*locks.ABSENT, errno.EIO])
+def test_no_lock_is_not_one_that_another_holds(number):
+    with pytest.raises(OSError, match=os.strerror(number)):
+        try_lock(without(number))
+
+
+@pytest.mark.parametrize("name", ["flock", "lockf"])
+@pytest.mark.parametrize("number", locks.ABSENT)
+def test_a_file_system_without_locks_is_told(name, number, shared_tmp_path, monkeypatch, capsys):
+    assert has_locks(shared_tmp_path, COMM)
+    assert capsys.readouterr().err == ""
+    COMM.Barrier()
+    monkeypatch.setattr(fcntl, name, without(number))
+    if COMM.size > 1:
+        with pytest.raises(InputError, match=r"has no locks.*use one rank"):
+            has_locks(shared_tmp_path, COMM)
+    else:
+        assert not has_locks(shared_tmp_path, COMM)
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"has no locks ({os.strerror(number)}); going on without" in line
+    assert not list(shared_tmp_path.iterdir())
+
+
+def test_other_errors_of_locks_are_errors(tmp_path, monkeypatch):
+    monkeypatch.setattr(fcntl, "flock", without(errno.EIO))
+    with pytest.raises(OutputError, match="Input/output error"):
+        has_locks(tmp_path, SELF)
+
+
+def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
+    """It hung: a lock that is missing was taken for one that somebody holds."""
+    monkeypatch.setattr(fcntl, "flock", without(errno.ENOLCK))
+    monkeypatch.setattr(fcntl, "lockf", without(errno.ENOTSUP))
+    scene = load_scene(paper_scene(), COARSE)
+    outcomes = run_cases([Case(scene)], tmp_path, SELF, shown=False)
+    assert outcomes.computed == 1 and not outcomes.failures
+    samples = Samples(scene, ("payload.mass",), np.array([[5.0], [7.0]]))
+    _, computed = respond(samples, [("initial", None)], tmp_path, SELF, shown=False)
+    assert computed == 3
+    assert capsys.readouterr().err.count("going on without") == 2
+
+
+# -- what other programs have computed -------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "value"), [("NUMERICS", -1), ("__version__", "0.0.0")])
+def test_results_of_another_program_are_computed_anew(name, value, tmp_path, monkeypatch):
+    scene = load_scene(paper_scene(), COARSE)
+    samples = Samples(scene, ("payload.mass",), np.array([[5.0]]))
+
+    def computed():
+        cases = run_cases([Case(scene)], tmp_path, SELF, shown=False).computed
+        return cases, respond(samples, [("initial", None)], tmp_path, SELF, shown=False)[1]
+
+    assert computed() == (1, 2)
+    assert computed() == (0, 0)
+    with monkeypatch.context() as other:
+        other.setattr(dolfinopt, name, value)
+        assert computed() == (1, 2)
+        checkpoint.begin(tmp_path, scene)
+    with pytest.raises(InputError, match="another version of dolfinopt wrote this checkpoint"):
+        checkpoint.check(tmp_path, scene)
+    assert computed() == (0, 0)  # those of this program are still there

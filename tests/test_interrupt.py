@@ -1,0 +1,81 @@
+"""Ctrl-C at any moment of a command: one line, status 130."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from dolfinopt import interrupt
+from dolfinopt.data import paper_scene
+
+# Interrupts this process when a module is first imported, or when MPI is left.
+SCRIPT = """
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+        return None
+sys.meta_path.insert(0, Interrupting())
+sys.argv = {arguments!r}
+import runpy
+runpy.run_module("dolfinopt", run_name="__main__", alter_sys=True)
+"""
+MOMENTS = ["dolfinopt.cli", "click", "pydantic", "petsc4py", "mpi4py.MPI", "dolfinopt.parallel"]
+MOMENTS += ["dolfinx", "dolfinopt.evaluation", "dolfinopt.summary"]
+
+
+def run(module, tmp_path, *launcher):
+    arguments = ["dolfinopt", "simulate", str(paper_scene()), "--out", str(tmp_path / "out")]
+    arguments += ["--no-plots", "--set", "arms.cells=[12,3]", "--set", "design.filter_radius=0.2"]
+    script = SCRIPT.format(module=module, arguments=arguments)
+    return subprocess.run(
+        [*launcher, sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=dict(os.environ),
+    )
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("module", MOMENTS)
+def test_alone(module, tmp_path):
+    done = run(module, tmp_path)
+    lines = [one for one in done.stderr.splitlines() if one and "warning" not in one]
+    assert lines == ["dolfinopt: interrupted"]
+    assert done.returncode == 130 and done.stdout == ""
+    assert not (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.serial
+@pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
+@pytest.mark.parametrize("module", ["click", "mpi4py.MPI", "dolfinx"])
+def test_under_mpirun(module, tmp_path):
+    done = run(module, tmp_path, "mpirun", "-n", "2")
+    assert done.stderr.splitlines().count("dolfinopt: interrupted") == 1
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 130
+
+
+def test_a_signal_that_is_somebody_elses_is_left_alone():
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        for handler in (signal.SIG_IGN, lambda *arguments: None):
+            signal.signal(signal.SIGINT, handler)
+            interrupt.end_at_once()
+            assert signal.getsignal(signal.SIGINT) is handler
+            assert not interrupt.raise_again()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        interrupt.end_at_once()
+        assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        assert interrupt.raise_again()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
