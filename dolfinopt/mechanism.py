@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from dolfinopt.body import ShapeIntegrals
-from dolfinopt.motion import RigidMotion
+from dolfinopt.motion import FEW, RigidMotion, repeated
 
 # One number, or one at each of the n instants that a function is given.
 PerInstant = float | np.ndarray
@@ -29,7 +30,7 @@ class Scale:
     stiffness: PerInstant = 1.0
     damping: PerInstant = 1.0
 
-    def __getitem__(self, part: slice) -> Scale:
+    def __getitem__(self, part: slice | np.ndarray) -> Scale:
         """Return it at some of the instants."""
         return Scale(*(_at(x, part) for x in (self.mass, self.stiffness, self.damping)))
 
@@ -129,7 +130,7 @@ class Mechanism:
         """Every body's constants as the equations of motion use them."""
         return tuple(_shapes(body) for body in self.bodies)
 
-    def __getitem__(self, part: slice) -> Mechanism:
+    def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
         """Return it at some of the instants."""
         if not self.scales and not isinstance(self.payload_mass, np.ndarray):
             return self
@@ -154,7 +155,13 @@ class Mechanism:
         return K
 
 
-def _at(x: PerInstant, part: slice) -> PerInstant:
+def _several(mechanism: Mechanism, motion: RigidMotion, *fields: np.ndarray) -> tuple[Any, ...]:
+    """Return the arguments at `FEW` instants, see there: the last one as often as it takes."""
+    every = repeated(len(fields[0]))
+    return mechanism[every], motion[every], *(x[every] for x in fields)
+
+
+def _at(x: PerInstant, part: slice | np.ndarray) -> PerInstant:
     return x[part] if isinstance(x, np.ndarray) else x
 
 
@@ -251,6 +258,9 @@ def inverse_dynamics(
         Elastic rows (n, N), zero when the equations of motion hold, and the forces of cart and
         joints (n, 1 + arms), N and N m, that drive the rigid coordinates.
     """
+    if 0 < len(q) < FEW:
+        rows, forces = inverse_dynamics(*_several(mechanism, motion, q, qd, qdd))
+        return rows[: len(q)], forces[: len(q)]
     rows, (force, drives) = _inward(mechanism, motion, (q, qd, qdd), driven=True)
     cart = (motion.swings[0] * force).real
     return rows, np.stack([cart, *drives], axis=1)
@@ -260,6 +270,8 @@ def elastic_rows(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
     """Return the elastic rows (n, N) of `inverse_dynamics`, without what only drives need."""
+    if 0 < len(q) < FEW:
+        return elastic_rows(*_several(mechanism, motion, q, qd, qdd))[: len(q)]
     return _inward(mechanism, motion, (q, qd, qdd), driven=False)[0]
 
 
@@ -504,6 +516,8 @@ def linearise(
         mechanism, motion, q, qd, qdd: as for `inverse_dynamics`.
         keep: ascending coordinates by which to differentiate; all by default.
     """
+    if 0 < len(q) < FEW:
+        return linearise(*_several(mechanism, motion, q, qd, qdd), keep).window(0, len(q))
     keep = np.arange(mechanism.coordinates) if keep is None else keep
     frames, tip = _outward(mechanism, motion, q, qd, qdd)
     ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
@@ -636,6 +650,8 @@ def _body_load(
 
 def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
+    if 0 < len(q) < FEW:
+        return end_effector(*_several(mechanism, motion, q))[: len(q)]
     place = motion.q[:, 0] + 1j * mechanism.joint_height
     swing = np.ones(len(q), dtype=complex)
     for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
@@ -666,6 +682,11 @@ def end_effector_slopes(
     Returns:
         By q (n, N), and by every body's outboard modes (3, q).
     """
+    if 0 < len(q) < FEW:
+        several = _several(mechanism, motion, q, weights)
+        several[-1][len(q) :] = 0.0
+        by_q, by_outboard = end_effector_slopes(*several)
+        return by_q[: len(q)], by_outboard
     w = weights[:, 0] + 1j * weights[:, 1]
     swings, levers = [], []
     swing = np.ones(len(q), dtype=complex)
@@ -727,6 +748,10 @@ def body_slopes(
         mechanism, motion, q, qd, qdd: as for `inverse_dynamics`; n instants.
         multipliers: (n, N).
     """
+    if 0 < len(q) < FEW:
+        several = _several(mechanism, motion, q, qd, qdd, multipliers)
+        several[-1][len(q) :] = 0.0
+        return body_slopes(*several)
     frames, tip = _outward(mechanism, motion, q, qd, qdd)
     moves, (tip_p, tip_turn) = _virtual_motion(mechanism, frames, multipliers)
     outer = _Outer(

@@ -40,6 +40,17 @@ MAX_KINKS = 20
 SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
 
 
+# Fewer instants are computed as so many. On processors with AVX-512, NumPy 1.24 multiplies complex
+# arrays of less than 64 bytes in one of two ways that round differently, and chooses by how far the
+# arrays lie from each other in memory: equal runs would end in different bits.
+FEW = 4
+
+
+def repeated(count: int) -> np.ndarray:
+    """Return indices that make `count` instants `FEW`, the last one repeated."""
+    return np.minimum(np.arange(FEW), count - 1)
+
+
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
     """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
@@ -54,7 +65,7 @@ class RigidMotion:
     qd: np.ndarray
     qdd: np.ndarray
 
-    def __getitem__(self, part: slice) -> RigidMotion:
+    def __getitem__(self, part: slice | np.ndarray) -> RigidMotion:
         """Return it at some of the instants."""
         return RigidMotion(self.q[part], self.qd[part], self.qdd[part])
 
@@ -89,6 +100,8 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
         InputError: the path leaves the arms' reach or passes a singular position, names the time
             and the distance; or the table cannot be used.
     """
+    if 0 < len(t) < FEW:
+        return rigid_motion(t[repeated(len(t))], scene)[: len(t)]
     motion = scene.motion
     if motion.path == "joints":
         return _tabulated_joints(t, scene)

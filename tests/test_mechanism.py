@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from bodies import Chain, assert_close, derivative, random_cloud
@@ -9,13 +11,17 @@ from bodies import Chain, assert_close, derivative, random_cloud
 from dolfinopt.body import ShapeIntegrals, plane_body
 from dolfinopt.mechanism import (
     Mechanism,
+    body_slopes,
     compliance,
     deviation,
+    elastic_rows,
     end_effector,
+    end_effector_slopes,
     inverse_dynamics,
     tangent,
 )
-from dolfinopt.motion import RigidMotion
+from dolfinopt.motion import RigidMotion, rigid_motion
+from dolfinopt.scene import load_scene
 
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
 ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
@@ -227,3 +233,72 @@ def test_compliance_is_twice_the_elastic_energy(rng: np.random.Generator) -> Non
     parts = compliance(mechanism.bodies, mechanism.slices, alone)
     assert not parts[:, [0, 2]].any()
     assert_close(parts[:, 1], found[:, 1], 1e-14)
+
+
+# -- places in memory ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_instants_do_not_depend_on_memory(rng: np.random.Generator, count: int) -> None:
+    """The same bits wherever the arrays lie; NumPy 1.24 multiplies short complex arrays two ways.
+
+    Arrays of all small sizes that come and go make the allocator choose other places every time.
+    """
+    model = chain(rng, 3)
+    mechanism, r = model.mechanism(), model.rigid
+    scene = load_scene(Path(__file__).parents[1] / "demos" / "three_arm.toml")
+    y, yd, ydd = states(rng, model, count)
+    weights = rng.normal(size=(count, 2))
+    t = np.linspace(0.2, 0.7, count)
+    found = set()
+    for k in range(60):
+        order = np.random.default_rng(k)
+        kept = [np.empty(n, dtype=complex) for n in order.integers(1, 9, 1500)]
+        for place in order.permutation(1500)[:700]:
+            kept[place] = kept[0]
+        motion = RigidMotion(y[:, :r].copy(), yd[:, :r].copy(), ydd[:, :r].copy())
+        q, qd, qdd = y[:, r:], yd[:, r:], ydd[:, r:]
+        slopes = body_slopes(mechanism, motion, q, qd, qdd, qd)
+        by_q, by_outboard = end_effector_slopes(mechanism, motion, q, weights)
+        arrays = [
+            *inverse_dynamics(mechanism, motion, q, qd, qdd),
+            elastic_rows(mechanism, motion, q, qd, qdd),
+            tangent(mechanism, motion, q, qd, qdd),
+            end_effector(mechanism, motion, q),
+            *(value for one in slopes for value in (one.w, one.W, one.K, one.outboard)),
+            *(by_q, *by_outboard),
+            *vars(rigid_motion(t, scene)).values(),
+        ]
+        found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) -> None:
+    """Values and sums at up to three instants, which are computed as four."""
+    model = chain(rng, 2)
+    mechanism, r = model.mechanism(), model.rigid
+    y, yd, ydd = states(rng, model, 8)
+    many = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
+    rates, weights = (y[:, r:], yd[:, r:], ydd[:, r:]), rng.normal(size=(8, 2))
+    first = slice(count)
+    few = tuple(x[first] for x in rates)
+    for function in (inverse_dynamics, elastic_rows, tangent):
+        whole, part = function(mechanism, many, *rates), function(mechanism, many[first], *few)
+        if not isinstance(whole, tuple):
+            whole, part = (whole,), (part,)
+        for a, b in zip(whole, part, strict=True):
+            assert len(b) == count
+            np.testing.assert_allclose(b, a[first], rtol=1e-12, atol=1e-12)
+    # What is summed over the instants: weights of none at the others.
+    weights[count:] = 0.0
+    multipliers = np.where(np.arange(8)[:, None] < count, rates[1], 0.0)
+    by_q, by_outboard = end_effector_slopes(mechanism, many[first], few[0], weights[first])
+    whole_q, whole_outboard = end_effector_slopes(mechanism, many, rates[0], weights)
+    np.testing.assert_allclose(by_q, whole_q[first], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(by_outboard[0], whole_outboard[0], rtol=1e-12, atol=1e-12)
+    part = body_slopes(mechanism, many[first], *few, multipliers[first])
+    whole = body_slopes(mechanism, many, *rates, multipliers)
+    for a, b in zip(whole, part, strict=True):
+        np.testing.assert_allclose(b.W, a.W, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(b.K, a.K, rtol=1e-12, atol=1e-12)
