@@ -517,7 +517,8 @@ def linearise(
         keep: ascending coordinates by which to differentiate; all by default.
     """
     if 0 < len(q) < FEW:
-        return linearise(*_several(mechanism, motion, q, qd, qdd), keep).window(0, len(q))
+        several = _several(mechanism, motion, q, qd, qdd)
+        return linearise(*several, keep=keep).window(0, len(q))
     keep = np.arange(mechanism.coordinates) if keep is None else keep
     frames, tip = _outward(mechanism, motion, q, qd, qdd)
     ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
@@ -685,8 +686,8 @@ def end_effector_slopes(
     if 0 < len(q) < FEW:
         several = _several(mechanism, motion, q, weights)
         several[-1][len(q) :] = 0.0
-        by_q, by_outboard = end_effector_slopes(*several)
-        return by_q[: len(q)], by_outboard
+        by_several, by_bodies = end_effector_slopes(*several)
+        return by_several[: len(q)], by_bodies
     w = weights[:, 0] + 1j * weights[:, 1]
     swings, levers = [], []
     swing = np.ones(len(q), dtype=complex)
