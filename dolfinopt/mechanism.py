@@ -517,8 +517,8 @@ def linearise(
         keep: ascending coordinates by which to differentiate; all by default.
     """
     if 0 < len(q) < FEW:
-        several = _several(mechanism, motion, q, qd, qdd)
-        return linearise(*several, keep=keep).window(0, len(q))
+        several, at, *rates = _several(mechanism, motion, q, qd, qdd)
+        return linearise(several, at, rates[0], rates[1], rates[2], keep).window(0, len(q))
     keep = np.arange(mechanism.coordinates) if keep is None else keep
     frames, tip = _outward(mechanism, motion, q, qd, qdd)
     ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
