@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -66,7 +67,7 @@ class FlatMesh:
 @contextmanager
 def gmsh_on_root(comm: MPI.Comm) -> Iterator[Any]:
     """Yield the module gmsh, with a session of it on rank 0 of `comm` (collective)."""
-    with together(comm):
+    with together(comm), _interrupts_kept():
         import gmsh
 
         if comm.rank == 0:
@@ -77,9 +78,29 @@ def gmsh_on_root(comm: MPI.Comm) -> Iterator[Any]:
         failed = False
     finally:
         if comm.rank == 0:
-            gmsh.finalize()
-            if failed:
-                _finish_reading(gmsh)
+            with _interrupts_kept():
+                gmsh.finalize()
+                if failed:
+                    _finish_reading(gmsh)
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """Keep what Ctrl-C does: Gmsh would have it kill the process without a word.
+
+    4.8 from its import, which takes 0.2 s, until a session ends, which only the root has; later
+    ones during a session.
+    """
+    change = signal.signal
+
+    def keep(number: int, handler: Any) -> Any:
+        return signal.getsignal(number) if number == signal.SIGINT else change(number, handler)
+
+    signal.signal = keep  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        signal.signal = change
 
 
 def _begin(gmsh: Any) -> None:

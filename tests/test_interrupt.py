@@ -9,9 +9,11 @@ import subprocess
 import sys
 
 import pytest
+from mpi4py import MPI
 
 from dolfinopt import interrupt
 from dolfinopt.data import paper_scene
+from dolfinopt.geometry import gmsh_on_root
 
 # Interrupts this process when a module is first imported, or when MPI is left.
 SCRIPT = """
@@ -28,7 +30,7 @@ import runpy
 runpy.run_module("dolfinopt", run_name="__main__", alter_sys=True)
 """
 MOMENTS = ["dolfinopt.cli", "click", "pydantic", "petsc4py", "mpi4py.MPI", "dolfinopt.parallel"]
-MOMENTS += ["dolfinx", "dolfinopt.evaluation", "dolfinopt.summary"]
+MOMENTS += ["dolfinx", "gmsh", "dolfinopt.evaluation", "dolfinopt.summary"]
 
 
 def run(module, tmp_path, *launcher):
@@ -79,3 +81,11 @@ def test_a_signal_that_is_somebody_elses_is_left_alone():
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_gmsh_leaves_interrupts_alone():
+    """On no rank does Ctrl-C kill without a word, during a session or after it."""
+    before = signal.getsignal(signal.SIGINT)
+    with gmsh_on_root(MPI.COMM_WORLD):
+        assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is before
