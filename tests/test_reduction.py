@@ -621,7 +621,12 @@ def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
             basis.start,
         )
 
-    short = ["motion.horizon=0.2", "objective.load_cases=5", f"simulation.integrator={integrator}"]
+    short = [
+        "motion.duration=0.9",
+        "motion.horizon=0.9",
+        "objective.load_cases=5",
+        f"simulation.integrator={integrator}",
+    ]
     short += ["reduction.method=krylov", "simulation.tolerance=1e-3"]
     *_, plain, slopes = simulated(*short)
     monkeypatch.setitem(METHODS, "krylov", Method(mixed, None))
@@ -641,7 +646,7 @@ def test_exact_gradient_of_krylov(q, shifts):
     """Central differences of the complete chain, loads and basis included."""
     overrides = ["objective.kind=compliance", "objective.gradient=exact", "payload.mass=1"]
     overrides += [f"reduction.coordinates={q}", "reduction.method=krylov"]
-    overrides += [f"reduction.shifts={shifts}", "motion.horizon=0.2", "simulation.tolerance=1e-6"]
+    overrides += [f"reduction.shifts={shifts}", "motion.horizon=0.9", "simulation.tolerance=1e-6"]
     scene, share, arms, x, _, slopes = simulated(*overrides)
     direction = {k: np.cos(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
 
