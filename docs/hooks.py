@@ -1,0 +1,139 @@
+"""What mkdocs makes anew with every build: references from the code, pictures, formulas.
+
+The scene reference comes from the keys' own descriptions, the command reference from the commands'
+own help, so that neither can differ from the program.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+from typing import Any
+
+import click
+from latex2mathml.converter import convert
+from mkdocs.structure.files import File, Files
+
+from dolfinopt.cli import commands
+from dolfinopt.scene import describe_keys
+
+ROOT = Path(__file__).parents[1]
+TABLES = {
+    "": "Top level",
+    "material": "Material of all arms that state none of their own.",
+    "interpolation": "How stiffness and mass follow from the density x of a cell.",
+    "arms": "An array of tables, one `[[arms]]` an arm, from the base outwards. "
+    "A key that an arm leaves out has the value of the arm before it.",
+    "motion": "What the machine does.",
+    "payload": "What the end of the last arm carries.",
+    "damping": "Damping of the arms.",
+    "reduction": "The reduced model of every arm.",
+    "simulation": "Integration in time.",
+    "objective": "What is minimised.",
+    "constraints": "Limits besides that of the volume.",
+    "design": "The design variables, their filter and projection.",
+    "optimizer": "The optimiser and when it ends.",
+    "scenarios": "An array of tables, one `[[scenarios]]` a use of the machine that the design "
+    "must serve besides the others.",
+}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the generated pages and the pictures of demos/pictures."""
+    for path, text in {
+        "reference/scene.md": scene_reference(),
+        "reference/commands.md": command_reference(),
+    }.items():
+        files.append(File.generated(config, path, content=text))
+    for picture in sorted((ROOT / "demos" / "pictures").iterdir()):
+        source = str(picture)
+        files.append(File.generated(config, f"pictures/{picture.name}", abs_src_path=source))
+    return files
+
+
+def on_page_content(page_html: str, **_: Any) -> str:
+    """Turn the formulas that arithmatex has marked into MathML."""
+    pattern = r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>'
+    return re.sub(pattern, _formula, page_html, flags=re.DOTALL)
+
+
+def _formula(match: re.Match[str]) -> str:
+    display = "inline" if match[2] == "(" else "block"
+    # The converter wants braces around what a font applies to.
+    pattern = r"\\(math[a-z]+|boldsymbol)(?:\s+|(?=\\))(\\[a-zA-Z]+|\w)"
+    tex = re.sub(pattern, r"\\\1{\2}", html.unescape(match[3]))
+    return convert(tex, display=display)
+
+
+def scene_reference() -> str:
+    """Return the page of all keys, table by table."""
+    lines = [
+        "# Scene reference\n",
+        "A scene is a TOML file. This page is made from how the program describes its keys;",
+        "`dolfinopt keys` prints the same in a terminal. A key without default is required.",
+        "Whatever is not listed here, or out of range, is refused with the name of the key.\n",
+        "All quantities are in SI units, angles in radians. Another consistent set of units",
+        "(millimetre, tonne, newton, second) gives the same designs.\n",
+    ]
+    known: set[str] = set()
+    for info in describe_keys():
+        table, _, key = info.key.rpartition(".")
+        if table not in known:
+            known.add(table)
+            array = table in ("arms", "scenarios")
+            title = f"`[[{table}]]`" if array else f"`[{table}]`" if table else TABLES[""]
+            lines += [f"\n## {title} {{#{table or 'top'}}}\n"]
+            lines += [f"{TABLES.get(table, '')}\n"] if table else []
+            lines += ["| key | meaning | unit | default | allowed |", "|---|---|---|---|---|"]
+        meaning, unit = _with_unit(info.description)
+        default = f"`{info.default}`" if info.default else "required"
+        default = "none" if info.default == "none" else default
+        allowed = info.allowed.replace(" | ", " or ")
+        lines.append(f"| `{key}` | {_cell(meaning)} | {unit} | {default} | {_cell(allowed)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _with_unit(description: str) -> tuple[str, str]:
+    match = re.fullmatch(r"(.*) \[([^\]]*)\]", description, flags=re.DOTALL)
+    return (match[1], "" if match[2] == "-" else match[2]) if match else (description, "")
+
+
+def _cell(text: str) -> str:
+    """Return a text that may stand in a table of Markdown."""
+    return text.replace("|", "&#124;").replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_")
+
+
+def command_reference() -> str:
+    """Return the page of all commands with their arguments and options."""
+    lines = [
+        "# Command reference\n",
+        "This page is made from the commands' own help: `dolfinopt COMMAND --help`. Where the",
+        "program was set up by its launcher, `./dolfinopt.sh COMMAND` is the same, and",
+        "`./dolfinopt.sh -n RANKS COMMAND` runs it on several processes; elsewhere",
+        "`mpirun -n RANKS dolfinopt COMMAND` does.\n",
+        "Exit status: 0, done; 1, failed to converge, a design that does not meet a constraint, or",
+        "an internal error; 2, bad input. One line says what and where.\n",
+    ]
+    for name in commands.list_commands(click.Context(commands)):
+        command = commands.commands[name]
+        context = click.Context(command, info_name=f"dolfinopt {name}")
+        lines += [f"\n## `{name}`\n", "```text", context.get_usage(), "```\n"]
+        lines += [_paragraphs(command.help or ""), ""]
+        options = [one for one in command.params if isinstance(one, click.Option)]
+        if rows := [row for one in options if (row := one.get_help_record(context))]:
+            lines += ["| option | meaning |", "|---|---|"]
+            lines += [f"| <code>{_cell(a)}</code> | {_cell(b)} |" for a, b in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _paragraphs(text: str) -> str:
+    """Return a help text as Markdown: paragraphs flow, \\b blocks stay as they are."""
+    parts = re.split(r"\n\s*\n", text.strip())
+    done = []
+    for part in parts:
+        if part.startswith("\b"):
+            done.append("```text\n" + part.lstrip("\b\n") + "\n```")
+        else:
+            done.append(" ".join(part.split()).replace("<", "&lt;"))
+    return "\n\n".join(done)
