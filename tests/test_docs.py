@@ -36,6 +36,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "pages"
 TESTED = [
     ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
     *sorted((PAGES / "tutorials").glob("*.md")),
     *sorted((PAGES / "howto").glob("*.md")),
 ]
@@ -45,7 +46,7 @@ SETTINGS = {  # of every scene that a page simulates, so that it takes a fractio
     "mesh_size": "0.01",
     "load_cases": "4",
 }
-SUFFIXES = (".npz", ".gif", ".csv", ".vtu", ".xdmf", ".png", ".json", ".toml", ".py")
+SUFFIXES = (".npz", ".md", ".gif", ".csv", ".vtu", ".xdmf", ".png", ".json", ".toml", ".py")
 
 
 class Block(NamedTuple):
