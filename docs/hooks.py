@@ -6,6 +6,7 @@ own help, so that neither can differ from the program.
 
 from __future__ import annotations
 
+import ast
 import html
 import re
 from pathlib import Path
@@ -15,6 +16,7 @@ import click
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
+import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.scene import describe_keys
 
@@ -44,6 +46,8 @@ def on_files(files: Files, config: Any) -> Files:
     for path, text in {
         "reference/scene.md": scene_reference(),
         "reference/commands.md": command_reference(),
+        "reference/python.md": python_reference(),
+        "develop/modules.md": module_list(),
     }.items():
         files.append(File.generated(config, path, content=text))
     for picture in sorted((ROOT / "demos" / "pictures").iterdir()):
@@ -137,3 +141,45 @@ def _paragraphs(text: str) -> str:
         else:
             done.append(" ".join(part.split()).replace("<", "&lt;"))
     return "\n\n".join(done)
+
+
+def python_reference() -> str:
+    """Return the page of all public names, described by their docstrings."""
+    first = ["Model", "load_scene", "scene_from_dict", "optimize", "evaluate", "gradient"]
+    names = [name for name in dolfinopt.__all__ if name != "__version__"]
+    names.sort(key=lambda name: (first.index(name) if name in first else len(first), name))
+    lines = [
+        "# Python\n",
+        "What `import dolfinopt` offers; everything else may change. Functions marked collective",
+        "are called by all MPI processes together. Arrays and their shapes are described with",
+        "`n` for a number and `q` for that of elastic coordinates; units are SI.\n",
+    ]
+    for title, chosen in (
+        ("Functions and classes", [name for name in names if not name.endswith("Error")]),
+        ("Errors", [name for name in names if name.endswith("Error")]),
+    ):
+        lines += [f"\n## {title}\n", *(f"::: dolfinopt.{name}\n" for name in chosen)]
+    return "\n".join(lines)
+
+
+def module_list() -> str:
+    """Return the page of all subpackages and modules with what each is for."""
+    package = ROOT / "dolfinopt"
+    rooms = sorted(path.parent for path in package.glob("*/**/__init__.py"))
+    lines = ["# Modules\n", "What each module is for, by its own first line.\n"]
+    for room in [package, *rooms]:
+        modules = sorted(path for path in room.glob("[!_]*.py"))
+        rows = [f"| `{path.stem}` | {_cell(_docstring(path)[0])} |" for path in modules]
+        name = "Top level" if room == package else f"`{'.'.join(room.relative_to(package).parts)}`"
+        lines += [f"\n## {name}\n"]
+        lines += (
+            [_cell(" ".join(_docstring(room / "__init__.py"))) + "\n"] if name[0] == "`" else []
+        )
+        lines += ["| module | |", "|---|---|", *rows] if rows else []
+    return "\n".join(lines) + "\n"
+
+
+def _docstring(path: Path) -> list[str]:
+    """Return the lines of a module's docstring up to the first blank one."""
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return text.split("\n\n")[0].splitlines() or [""]

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import pytest
 from mpi4py import MPI
 
+import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.scene import describe_keys
@@ -226,6 +227,19 @@ def test_command_reference_has_every_option(site):
         for option in command.params:
             for flag in option.opts:
                 assert not flag.startswith("--") or flag in section, (name, flag)
+
+
+def test_python_reference_has_every_public_name(site):
+    page = (site / "reference" / "python.html").read_text()
+    for name in dolfinopt.__all__:
+        assert name == "__version__" or re.search(rf'id="dolfinopt[a-z_.]*\.{name}"', page), name
+
+
+def test_every_module_is_listed(site):
+    page = (site / "develop" / "modules.html").read_text()
+    for path in (ROOT / "dolfinopt").glob("**/[!_]*.py"):
+        if (path.parent / "__init__.py").exists():
+            assert f"<code>{path.stem}</code>" in page, path
 
 
 def test_formulas_are_set(site):
