@@ -197,6 +197,7 @@ run_tests() {
   check "ruff check" "$python" -m ruff check .
   check "ruff format" "$python" -m ruff format --check .
   check "mypy" "$python" -m mypy
+  check "imports" "$venv/bin/lint-imports" --no-cache
   check "pytest" "$python" -m pytest "$@"
   # What takes long need not take it twice; a -m among the arguments wins.
   check "pytest, $ranks ranks" /usr/bin/mpirun -n "$ranks" "$python" -m pytest -m "not slow" "$@"

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt.material import LAWS, SWITCH
+from dolfinopt.density.interpolation import LAWS, SWITCH
 
 HERE = Path(__file__).parent
 VOIDS = (1e-3, 1e-2)  # physical density of the windows

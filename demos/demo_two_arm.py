@@ -8,7 +8,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt import plots
+from dolfinopt.plots import figures as plots
 
 HERE = Path(__file__).parent
 ITERATIONS = 30

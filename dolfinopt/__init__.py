@@ -20,45 +20,42 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
-# Raise it with every change that alters results: of the finite elements, reductions, simulation,
-# gradients or optimiser, beyond rounding; and with every change of the files that are kept of
-# them. What is kept under another number, or another version, is computed anew.
-NUMERICS = 1
+from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
-    from dolfinopt.arm import Arm, build_arms
-    from dolfinopt.coordinates import choose_coordinates
+    from dolfinopt.arms.arm import Arm, build_arms
+    from dolfinopt.dynamics.simulation import Trajectory, simulate
     from dolfinopt.errors import ConvergenceError, InputError
-    from dolfinopt.evaluation import Evaluation, evaluate, gradient
-    from dolfinopt.files import gather_views
-    from dolfinopt.ledger import Ledger
-    from dolfinopt.optimization import Result, optimize
+    from dolfinopt.optimization.loop import Result
+    from dolfinopt.output.files import gather_views
+    from dolfinopt.output.run import optimize
     from dolfinopt.parallel import abort_together, gather_arms, share_arms
-    from dolfinopt.scene import Scene, load_scene, scene_from_dict
-    from dolfinopt.simulation import Trajectory, simulate
+    from dolfinopt.profiling import Ledger
+    from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
+    from dolfinopt.responses.order_selection import choose_coordinates
+    from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
 _HOME = {
-    "Arm": "arm",
-    "build_arms": "arm",
-    "choose_coordinates": "coordinates",
+    "Arm": "arms.arm",
+    "build_arms": "arms.arm",
+    "choose_coordinates": "responses.order_selection",
     "ConvergenceError": "errors",
     "InputError": "errors",
-    "Evaluation": "evaluation",
-    "evaluate": "evaluation",
-    "gradient": "evaluation",
-    "gather_views": "files",
+    "Evaluation": "responses.evaluation",
+    "evaluate": "responses.evaluation",
+    "gradient": "responses.evaluation",
+    "gather_views": "output.files",
     "gather_arms": "parallel",
-    "Ledger": "ledger",
-    "Result": "optimization",
-    "optimize": "optimization",
+    "Ledger": "profiling",
+    "Result": "optimization.loop",
+    "optimize": "output.run",
     "abort_together": "parallel",
     "share_arms": "parallel",
-    "Scene": "scene",
-    "load_scene": "scene",
-    "scene_from_dict": "scene",
-    "Trajectory": "simulation",
-    "simulate": "simulation",
+    "Scene": "scene.load",
+    "load_scene": "scene.load",
+    "scene_from_dict": "scene.load",
+    "Trajectory": "dynamics.simulation",
+    "simulate": "dynamics.simulation",
 }
 
 __all__ = [*sorted(_HOME), "__version__"]

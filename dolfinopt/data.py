@@ -16,14 +16,14 @@ def paper_scene() -> Path:
 
     In a source tree it is a link to `demos/two_arm.toml`.
     """
-    return Path(__file__).parent / "scenes" / "two_arm.toml"
+    return Path(__file__).parent / "paper" / "two_arm.toml"
 
 
 def template_folder() -> Path:
     """Return the folder of the scenes that `dolfinopt init` starts from."""
-    return Path(__file__).parent / "templates"
+    return Path(__file__).parent / "scene" / "templates"
 
 
 def page_folder() -> Path:
     """Return the folder of the templates that make report.html."""
-    return Path(__file__).parent / "pages"
+    return Path(__file__).parent / "paper" / "pages"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dolfinopt.body import ShapeIntegrals, plane_body
-from dolfinopt.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt.arm import Arm
+from dolfinopt.arms.arm import Arm
 from dolfinopt.parallel import ArmShare, sum_over_arms
-from dolfinopt.scene import Scene
+from dolfinopt.scene.load import Scene
 
 SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 Cells = Mapping[int, np.ndarray]

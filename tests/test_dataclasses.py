@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import dolfinopt as do
-from dolfinopt.motion import RigidMotion
+from dolfinopt.multibody.motion import RigidMotion
 
 OPTIONAL = {"bench"}  # imports programs that a plain installation does not have
 

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-import dolfinopt
-from dolfinopt import checkpoint, disk, locks
-from dolfinopt.cases import Case, run_cases
+from dolfinopt import disk, locks
 from dolfinopt.data import paper_scene
 from dolfinopt.disk import append_text, make_folder, write_atomically
 from dolfinopt.errors import InputError, OutputError
-from dolfinopt.files import write_arrays, write_text
 from dolfinopt.locks import has_locks, try_lock
-from dolfinopt.sampling import Samples, respond
-from dolfinopt.scene import load_scene
+from dolfinopt.output import checkpoint
+from dolfinopt.output.files import write_arrays, write_text
+from dolfinopt.scene.load import load_scene
+from dolfinopt.study.sampling import Samples, respond
+from dolfinopt.study.store import Case, run_cases
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 COARSE = ("arms.cells=[12,3]", "design.filter_radius=0.2", "optimizer.max_iterations=2")
@@ -217,7 +217,7 @@ def test_results_of_another_program_are_computed_anew(name, value, tmp_path, mon
     assert computed() == (1, 2)
     assert computed() == (0, 0)
     with monkeypatch.context() as other:
-        other.setattr(dolfinopt, name, value)
+        other.setattr(f"dolfinopt.version.{name}", value)
         assert computed() == (1, 2)
         checkpoint.begin(tmp_path, scene)
     with pytest.raises(InputError, match="another version of dolfinopt wrote this checkpoint"):

@@ -24,7 +24,7 @@ from mpi4py import MPI
 import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene import describe_keys
+from dolfinopt.scene.load import describe_keys
 
 if sys.version_info >= (3, 11):
     import tomllib

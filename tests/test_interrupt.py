@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from dolfinopt import interrupt
 from dolfinopt.data import paper_scene
-from dolfinopt.geometry import gmsh_on_root
+from dolfinopt.mesh.geometry import gmsh_on_root
 
 # Interrupts this process when a module is first imported, or when MPI is left.
 SCRIPT = """
@@ -30,7 +30,7 @@ import runpy
 runpy.run_module("dolfinopt", run_name="__main__", alter_sys=True)
 """
 MOMENTS = ["dolfinopt.cli", "click", "pydantic", "petsc4py", "mpi4py.MPI", "dolfinopt.parallel"]
-MOMENTS += ["dolfinx", "gmsh", "dolfinopt.evaluation", "dolfinopt.summary"]
+MOMENTS += ["dolfinx", "gmsh", "dolfinopt.responses.evaluation", "dolfinopt.output.summary"]
 
 
 def run(module, tmp_path, *launcher):

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dolfinopt.arm import build_arms
-from dolfinopt.body import first_frequency
-from dolfinopt.evaluation import evaluate, gradient
-from dolfinopt.ledger import Ledger
-from dolfinopt.objective import load_cases
+from dolfinopt.arms.arm import build_arms
+from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.parallel import gather_arms, share_arms
-from dolfinopt.scene import load_scene
-from dolfinopt.sensitivity import esl_gradient
+from dolfinopt.profiling import Ledger
+from dolfinopt.responses.evaluation import evaluate, gradient
+from dolfinopt.responses.objective import load_cases
+from dolfinopt.responses.sensitivity import esl_gradient
+from dolfinopt.scene.load import load_scene
 
 COMM = MPI.COMM_WORLD
 TWO_ARM = Path(__file__).parents[1] / "demos" / "two_arm.toml"

@@ -25,13 +25,13 @@ import pytest
 from mpi4py import MPI
 from remainders import build, wave
 
-from dolfinopt import results
-from dolfinopt.arm import chain_of
+from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
-from dolfinopt.mechanism import inverse_dynamics, linearise
-from dolfinopt.motion import rigid_motion
+from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.multibody.mechanism import inverse_dynamics, linearise
+from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.output import run_folder as results
 from dolfinopt.parallel import gather_arms
-from dolfinopt.simulation import build_mechanism
 
 SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
@@ -338,7 +338,12 @@ def test_completion_needs_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.serial
 def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     """Nor anything of other commands: statistics, studies, exports."""
-    others = {"scipy.stats", "dolfinopt.plots", "dolfinopt.study", "dolfinopt.mbdyn"}
+    others = {
+        "scipy.stats",
+        "dolfinopt.plots.figures",
+        "dolfinopt.study.studies",
+        "dolfinopt.multibody.mbdyn",
+    }
     line = ["optimize", SCENE, "--no-plots", "--out", tmp_path / "out"]
     for override in (*QUICK, "optimizer.max_iterations=1"):
         line += ["--set", override]

@@ -14,25 +14,17 @@ import pytest
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt import (
-    arm,
-    cases,
-    checkpoint,
-    compat,
-    coordinates,
-    elasticity,
-    evaluation,
-    files,
-    mesh,
-    optimization,
-    results,
-    sampling,
-    study,
-    summary,
-)
-from dolfinopt.cases import Case, run_cases
+from dolfinopt.arms import arm
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
+from dolfinopt.fem import elasticity
+from dolfinopt.mesh import arm_mesh as mesh
+from dolfinopt.mesh import compat
+from dolfinopt.optimization import loop as optimization
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.output import checkpoint, files, summary
+from dolfinopt.output import run_folder as results
+from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import (
     RaisedElsewhere,
     _pickled,
@@ -40,9 +32,13 @@ from dolfinopt.parallel import (
     share_arms,
     together,
 )
-from dolfinopt.results import Simulated, write_result, write_simulation
-from dolfinopt.scene import load_scene
-from dolfinopt.taylor import taylor_test
+from dolfinopt.responses import evaluation
+from dolfinopt.responses import order_selection as coordinates
+from dolfinopt.scene.load import load_scene
+from dolfinopt.study import sampling
+from dolfinopt.study import store as cases
+from dolfinopt.study import studies as study
+from dolfinopt.study.store import Case, run_cases
 
 COMM = MPI.COMM_WORLD
 LONE = min(1, COMM.size - 1)  # the rank that fails; with two arms it has one of them
@@ -299,7 +295,7 @@ OPTIMISATIONS = {
     "chain": (LONE, arm.Arm, "chain", 1),
     "threshold": (LONE, arm.Arm, "preserving_threshold", 0),
     "history": (0, optimization, "HistoryWriter", 0),
-    "history row": (0, optimization.HistoryWriter, "append", 1),
+    "history row": (0, files.HistoryWriter, "append", 1),
     "checkpoint begun": (0, checkpoint, "write_arrays", 0),
     "checkpoint": (0, checkpoint, "write_arrays", 1),
     "checkpoint modes": (LONE, checkpoint, "_rows", 0),
@@ -460,7 +456,7 @@ def test_samples(monkeypatch, shared_tmp_path):
 
 
 def test_tables(monkeypatch, shared_tmp_path):
-    from dolfinopt import sweeps
+    from dolfinopt.study import sweep as sweeps
 
     scene = load_scene(paper_scene(), COARSE)
     fail_on(monkeypatch, LONE, sweeps._Sweep, "report")
@@ -472,11 +468,11 @@ def test_tables(monkeypatch, shared_tmp_path):
 # -- as a command ----------------------------------------------------------------------------
 
 COMMANDS = {
-    "reduction": ("dolfinopt.arm", "shape_integrals", 1, "simulate"),
-    "mesh": ("dolfinopt.mesh", "mesh_geo", 1, "simulate"),
-    "simulation": ("dolfinopt.evaluation", "simulate_batch", 0, "simulate"),
-    "writing": ("dolfinopt.results", "write_summary", 0, "simulate"),
-    "checkpoint": ("dolfinopt.checkpoint", "write_arrays", 0, "optimize"),
+    "reduction": ("dolfinopt.arms.arm", "shape_integrals", 1, "simulate"),
+    "mesh": ("dolfinopt.mesh.arm_mesh", "mesh_geo", 1, "simulate"),
+    "simulation": ("dolfinopt.responses.evaluation", "simulate_batch", 0, "simulate"),
+    "writing": ("dolfinopt.output.run_folder", "write_summary", 0, "simulate"),
+    "checkpoint": ("dolfinopt.output.checkpoint", "write_arrays", 0, "optimize"),
 }
 SCRIPT = """
 import sys

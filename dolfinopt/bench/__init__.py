@@ -11,8 +11,8 @@ from time import perf_counter
 
 from dolfinopt.bench import mesh, peers, reduction, solvers, time, tolerance, whole
 from dolfinopt.bench.common import Diagram, Goal, Plan, Tell, measured, write_diagram
-from dolfinopt.files import write_text
-from dolfinopt.findings import Table
+from dolfinopt.output.files import write_text
+from dolfinopt.study.tables import Table
 
 QUICKLY = ("arms.cells=[100,6]",)
 

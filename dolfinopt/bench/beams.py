@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.motion import rigid_motion
-from dolfinopt.scene import Scene
+from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.scene.load import Scene
 
 SPECTRAL_RADIUS = 0.8
 # Of the residuals, N and m: Exudyn's 1e-10 is below what the axial stiffness of short beams, times

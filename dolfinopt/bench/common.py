@@ -18,17 +18,17 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.arm import Arm, build_arms, chain_of
-from dolfinopt.body import ShapeIntegrals
-from dolfinopt.files import write_text
-from dolfinopt.findings import Cell, Line, LineFigure, Panel, Table
-from dolfinopt.ledger import Ledger
-from dolfinopt.optimization import optimize
+from dolfinopt.arms.arm import Arm, build_arms, chain_of
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.output.files import write_text
+from dolfinopt.output.run import optimize
 from dolfinopt.parallel import share_arms
-from dolfinopt.scene import Scene
-from dolfinopt.study_plots import line_figure
-from dolfinopt.style import save
-from dolfinopt.variants import changed
+from dolfinopt.plots.style import save
+from dolfinopt.profiling import Ledger
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.figures import line_figure
+from dolfinopt.study.tables import Cell, Line, LineFigure, Panel, Table
+from dolfinopt.study.variants import changed
 
 if TYPE_CHECKING:
     from matplotlib.axis import Axis

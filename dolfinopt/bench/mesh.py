@@ -10,16 +10,16 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, curves, tidy, timed
-from dolfinopt.body import ShapeIntegrals, first_frequency, shape_integrals
-from dolfinopt.compat import cell_coordinates, local_cell_counts
-from dolfinopt.elasticity import ElasticArm, ElementOperators, element_operators
-from dolfinopt.findings import Panel
-from dolfinopt.ledger import Ledger
-from dolfinopt.mesh import ArmMesh
+from dolfinopt.dynamics.simulation import simulate
+from dolfinopt.fem.elasticity import ElasticArm, ElementOperators, element_operators
+from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.mesh.compat import cell_coordinates, local_cell_counts
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency, shape_integrals
+from dolfinopt.profiling import Ledger
 from dolfinopt.reduction import METHODS, Options
-from dolfinopt.scene import Scene
-from dolfinopt.simulation import simulate
-from dolfinopt.variants import changed
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Panel
+from dolfinopt.study.variants import changed
 
 CELLS = (50, 3), (100, 6), (200, 12), (400, 24), (800, 48), (1600, 96)
 QUICK = (50, 3), (100, 6), (200, 12)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arm import Arm
+from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.beams import exudyn_available, exudyn_tip
 from dolfinopt.bench.common import (
     Diagram,
@@ -25,19 +25,19 @@ from dolfinopt.bench.common import (
 from dolfinopt.bench.mesh import FINER, Element
 from dolfinopt.bench.statics import Iteration, StaticArm, dolfinx_iteration, pymoto_iteration
 from dolfinopt.bench.whole import mpirun, run_worker
-from dolfinopt.body import shape_integrals
-from dolfinopt.elasticity import ElasticArm
+from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.files import HistoryRow
-from dolfinopt.findings import Panel
-from dolfinopt.ledger import Ledger
-from dolfinopt.mechanism import end_effector
-from dolfinopt.motion import rigid_motion
-from dolfinopt.optimization import optimize
+from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.multibody.mechanism import end_effector
+from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.multibody.shape_integrals import shape_integrals
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.output.run import optimize
+from dolfinopt.profiling import Ledger
 from dolfinopt.reduction import METHODS, Options
-from dolfinopt.scene import Scene
-from dolfinopt.simulation import Trajectory, simulate
-from dolfinopt.variants import changed
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Panel
+from dolfinopt.study.variants import changed
 
 ITERATION, MOTION = "iteration", "motion"
 DYNAMIC = "dolfinopt, dynamic iteration of two arms"

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.arm import Arm
+from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, bodies_of, curves, designs, timed
+from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.findings import Panel
-from dolfinopt.ledger import Ledger
+from dolfinopt.profiling import Ledger
 from dolfinopt.reduction import METHODS
-from dolfinopt.scene import Scene
-from dolfinopt.simulation import simulate
-from dolfinopt.variants import changed, reduced
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Panel
+from dolfinopt.study.variants import changed, reduced
 
 COUNTS = 3, 4, 5, 6, 8, 12, 16, 24, 32, 48
 # More coordinates than any method that is judged has, and of the kind that converges surely.

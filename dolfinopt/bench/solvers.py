@@ -19,9 +19,9 @@ import numpy as np
 from petsc4py import PETSc
 
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, arms_of, tidy
-from dolfinopt.findings import Line, Panel
-from dolfinopt.scene import Scene, scene_from_dict
-from dolfinopt.variants import changed
+from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.study.tables import Line, Panel
+from dolfinopt.study.variants import changed
 
 CELLS = (100, 6), (200, 12), (400, 24), (800, 48), (1600, 96)
 QUICK = (100, 6), (200, 12), (400, 24)

@@ -12,8 +12,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt import compat
 from dolfinopt.bench.mesh import grid_arm
+from dolfinopt.mesh import compat
 
 PENALTY, FLOOR = 3.0, 1e-6
 

@@ -21,21 +21,21 @@ from dolfinopt.bench.common import (
     designs,
     timed,
 )
-from dolfinopt.errors import ConvergenceError
-from dolfinopt.findings import Panel
-from dolfinopt.integrators import generalized_alpha, radau
-from dolfinopt.integrators.modes import modes_of
-from dolfinopt.integrators.problem import (
+from dolfinopt.dynamics import generalized_alpha, radau
+from dolfinopt.dynamics.modal_coordinates import modes_of
+from dolfinopt.dynamics.problem import (
     ElasticProblem,
     even_steps,
     relative_error,
     static_start,
 )
-from dolfinopt.ledger import Ledger
-from dolfinopt.mechanism import deviation, inverse_dynamics, tangent
-from dolfinopt.motion import breakpoints, rigid_motion
-from dolfinopt.simulation import build_mechanism
-from dolfinopt.variants import reduced
+from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.mechanism import deviation, inverse_dynamics, tangent
+from dolfinopt.multibody.motion import breakpoints, rigid_motion
+from dolfinopt.profiling import Ledger
+from dolfinopt.study.tables import Panel
+from dolfinopt.study.variants import reduced
 
 # One stage more than the methods that are judged: of order 11, theirs is 9 at most.
 REFERENCE_STAGES, REFERENCE_TOLERANCE = 6, 1e-8

@@ -13,24 +13,24 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr
 
-from dolfinopt.arm import Arm
+from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, arms_of, bodies_of, timed
 from dolfinopt.bench.time import scipy_motion
-from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.findings import Line, Panel
-from dolfinopt.integrators import radau
-from dolfinopt.integrators.modes import modes_of
-from dolfinopt.integrators.problem import (
+from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.modal_coordinates import modes_of
+from dolfinopt.dynamics.problem import (
     ElasticProblem,
     Solution,
     even_steps,
     relative_error,
 )
-from dolfinopt.ledger import Ledger
-from dolfinopt.motion import breakpoints, rigid_motion
-from dolfinopt.scene import Scene
-from dolfinopt.simulation import build_mechanism
-from dolfinopt.variants import changed, reduced
+from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.multibody.motion import breakpoints, rigid_motion
+from dolfinopt.profiling import Ledger
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Line, Panel
+from dolfinopt.study.variants import changed, reduced
 
 SEED, CASES, QUICK_CASES = 3, 50, 8
 CELLS = 48, 6

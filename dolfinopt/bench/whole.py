@@ -15,9 +15,9 @@ import numpy as np
 
 from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, fitted_exponent
 from dolfinopt.bench.worker import Iteration
-from dolfinopt.findings import Line, Panel
-from dolfinopt.scene import Scene
-from dolfinopt.variants import changed
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Line, Panel
+from dolfinopt.study.variants import changed
 
 CELLS = (200, 12), (400, 24), (800, 48), (1600, 96)
 QUICK = (200, 12), (400, 24)

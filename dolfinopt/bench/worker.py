@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.files import HistoryRow
-from dolfinopt.optimization import optimize
-from dolfinopt.scene import Scene, scene_from_dict
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.output.run import optimize
+from dolfinopt.scene.load import Scene, scene_from_dict
 
 # Phases of the ledger that stand for themselves; the others are parts of `bodies`.
 BODIES = "assembly", "reduction", "inertia integrals"

@@ -31,7 +31,7 @@ def bench(out: Path | None, quick: bool) -> None:
     from dolfinopt.bench import QUICKLY, Plan, diagrams
     from dolfinopt.bench import bench as run
     from dolfinopt.bench.progress import live_diagrams
-    from dolfinopt.paper import load_paper
+    from dolfinopt.paper.reproduction import load_paper
 
     begun = time.perf_counter()
     folder = out or Path("results") / "bench"

@@ -47,7 +47,7 @@ def compare(
     if coordinates and what == "objectives":
         raise InputError("--coordinates: expected only with compare SCENE reductions")
     world, loaded = load(scene, overrides)
-    from dolfinopt.study import study
+    from dolfinopt.study.studies import study
 
     topic: Any = TOPICS[what]
     folder = folder_of(scene, out)

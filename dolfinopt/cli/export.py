@@ -17,7 +17,7 @@ from dolfinopt.cli.options import (
 from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 
 if TYPE_CHECKING:
-    from dolfinopt.arm import Arm
+    from dolfinopt.arms.arm import Arm
 
 
 KINDS = (".sid", ".sid.npz", ".fem")
@@ -39,12 +39,12 @@ def export(
     """Write the reduced arms of SCENE for other multibody codes: SID, .npz of it, MBDyn's .fem."""
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
-    from dolfinopt.coordinates import choose_coordinates
-    from dolfinopt.files import write_arrays, write_text
-    from dolfinopt.ledger import Ledger
-    from dolfinopt.mbdyn import fem_text
+    from dolfinopt.exchange.sid import sid_arrays, sid_text
+    from dolfinopt.multibody.mbdyn import fem_text
+    from dolfinopt.output.files import write_arrays, write_text
     from dolfinopt.parallel import gather_arms
-    from dolfinopt.sid import sid_arrays, sid_text
+    from dolfinopt.profiling import Ledger
+    from dolfinopt.responses.order_selection import choose_coordinates
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
     claim(world, folder, overwrite, names)
@@ -71,8 +71,8 @@ def export(
 
 def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
-    from dolfinopt.mbdyn import lumped_nodes, modal_element
-    from dolfinopt.standard_input import spatial_moments, to_sid
+    from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
+    from dolfinopt.multibody.standard_input import spatial_moments, to_sid
 
     body = arm.reduce(x_phys)
     assert arm.basis is not None

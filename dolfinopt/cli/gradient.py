@@ -16,9 +16,9 @@ from dolfinopt.units import OBJECTIVES
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.arm import Arm
+    from dolfinopt.arms.arm import Arm
     from dolfinopt.parallel import ArmShare
-    from dolfinopt.scene import Scene
+    from dolfinopt.scene.load import Scene
 
 
 @click.command()
@@ -54,12 +54,12 @@ def gradient(
     if kind is not None:
         overrides = (*overrides, f'objective.gradient="{kind}"')
     world, loaded = load(scene, overrides)
-    from dolfinopt.coordinates import choose_coordinates
-    from dolfinopt.evaluation import evaluate
-    from dolfinopt.evaluation import gradient as slopes
-    from dolfinopt.files import write_gradient
-    from dolfinopt.ledger import Ledger
-    from dolfinopt.taylor import check_exact
+    from dolfinopt.optimization.gradient_check import check_exact
+    from dolfinopt.output.files import write_gradient
+    from dolfinopt.profiling import Ledger
+    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.evaluation import gradient as slopes
+    from dolfinopt.responses.order_selection import choose_coordinates
 
     claim(world, out.parent, overwrite, [out.name])
     if check:
@@ -89,7 +89,7 @@ def _check_gradient(
     ledger: Any,
 ) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
-    from dolfinopt.taylor import PASSES, STEPS, taylor_test
+    from dolfinopt.optimization.gradient_check import PASSES, STEPS, taylor_test
 
     test = taylor_test(scene, share, arms, x, ledger)
     if world.rank == 0:

@@ -28,9 +28,9 @@ TEMPLATES = {
     "--template", type=click.Choice(list(TEMPLATES)), default="two-arm", help="what to start from"
 )
 def init(name: Path, template: str) -> None:
-    from dolfinopt.folders import write_new
-    from dolfinopt.scene_keys import Refusal, check_scene_name
-    from dolfinopt.scene_schema import SCHEMA_FILE, scene_schema
+    from dolfinopt.output.folders import write_new
+    from dolfinopt.scene.json_schema import SCHEMA_FILE, scene_schema
+    from dolfinopt.scene.schema import Refusal, check_scene_name
 
     path = name if name.suffix == ".toml" else name.with_name(f"{name.name}.toml")
     try:

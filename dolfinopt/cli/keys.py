@@ -13,7 +13,7 @@ import click
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
-    from dolfinopt.scene_messages import KeyInfo
+    from dolfinopt.scene.messages import KeyInfo
 
 WIDTH = 92
 
@@ -25,7 +25,7 @@ def keys(pattern: str | None) -> None:
 
     PATTERN is a part of the key (payload, mass) or has wildcards ("arms.*"); default: all keys.
     """
-    from dolfinopt.scene import describe_keys
+    from dolfinopt.scene.load import describe_keys
 
     known = describe_keys()
     found = [info for info in known if _fits(info.key, pattern)]

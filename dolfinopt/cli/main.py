@@ -10,7 +10,6 @@ from typing import Any
 
 import click
 
-from dolfinopt import __version__
 from dolfinopt.cli.bench import bench
 from dolfinopt.cli.compare import compare
 from dolfinopt.cli.export import export
@@ -26,6 +25,7 @@ from dolfinopt.cli.start import Start, end_before_start
 from dolfinopt.cli.sweep import sweep
 from dolfinopt.cli.uncertainty import uncertainty
 from dolfinopt.errors import InputError
+from dolfinopt.version import __version__
 
 
 def main() -> None:

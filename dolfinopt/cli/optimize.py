@@ -19,9 +19,9 @@ from dolfinopt.cli.shared import claim, conclude, draw, elapsed, load, prepare, 
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from dolfinopt.files import ArmView
-    from dolfinopt.optimization import Result
-    from dolfinopt.scene import Scene
+    from dolfinopt.optimization.loop import Result
+    from dolfinopt.output.files import ArmView
+    from dolfinopt.scene.load import Scene
 
 
 @click.command()
@@ -46,8 +46,8 @@ def optimize(
         raise InputError("--resume, --overwrite: expected only one of them")
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / scene.stem
-    from dolfinopt import checkpoint
-    from dolfinopt.optimization import optimize as run
+    from dolfinopt.output import checkpoint
+    from dolfinopt.output.run import optimize as run
     from dolfinopt.parallel import on_root
 
     if resume:
@@ -66,7 +66,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
     Raises:
         ConvergenceError: the design does not meet a constraint; everything is written.
     """
-    from dolfinopt.results import write_result
+    from dolfinopt.output.run_folder import write_result
 
     def pictures(views: list[ArmView]) -> None:
         assert result.trajectory is not None

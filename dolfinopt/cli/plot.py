@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 def plot(folder: Path, animation: bool) -> None:
     """Draw the pictures of a finished run in DIR anew."""
     world = start()
-    from dolfinopt.evaluation import evaluate
-    from dolfinopt.files import gather_views, read_history, read_initial_deviation
-    from dolfinopt.ledger import Ledger
+    from dolfinopt.output.files import gather_views, read_history, read_initial_deviation
     from dolfinopt.parallel import on_root
+    from dolfinopt.profiling import Ledger
+    from dolfinopt.responses.evaluation import evaluate
 
     loaded = on_root(world, scene_of, folder)
     ledger = Ledger()

@@ -34,11 +34,11 @@ def reproduce(
     interrupted goes on.
     """
     world = start()
-    from dolfinopt.claims import broken
-    from dolfinopt.paper import Plan, load_paper
-    from dolfinopt.paper import reproduce as run
+    from dolfinopt.paper.checks import broken
+    from dolfinopt.paper.page import write_reproduction
+    from dolfinopt.paper.reproduction import Plan, load_paper
+    from dolfinopt.paper.reproduction import reproduce as run
     from dolfinopt.parallel import on_root
-    from dolfinopt.report import write_reproduction
 
     folder = out or Path("results") / "paper"
     done = run(Plan(on_root(world, load_paper, coarse, overrides)), folder, world)

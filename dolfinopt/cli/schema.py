@@ -10,6 +10,6 @@ import click
 @click.command()
 def schema() -> None:
     """Print the JSON schema of scene files, from which editors complete and check keys."""
-    from dolfinopt.scene_schema import scene_schema
+    from dolfinopt.scene.json_schema import scene_schema
 
     click.echo(json.dumps(scene_schema(), indent=2))

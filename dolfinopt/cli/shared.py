@@ -16,18 +16,19 @@ import click
 
 from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
-from dolfinopt.folders import RUN_FILES, check_unused, prepare_folder
+from dolfinopt.output.folders import RUN_FILES, check_unused, prepare_folder
 from dolfinopt.units import NOT_MET, OBJECTIVES
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.arm import Arm
-    from dolfinopt.coordinates import Choice
-    from dolfinopt.files import ArmView, HistoryRow
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.optimization.history import HistoryRow
+    from dolfinopt.output.files import ArmView
     from dolfinopt.parallel import ArmShare
-    from dolfinopt.scene import Scene
-    from dolfinopt.simulation import Trajectory
+    from dolfinopt.responses.order_selection import Choice
+    from dolfinopt.scene.load import Scene
 
 
 def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
@@ -35,7 +36,7 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
 
     A process alone finds a wrong key before MPI and the solvers are loaded.
     """
-    from dolfinopt.scene import load_scene
+    from dolfinopt.scene.load import load_scene
 
     if alone():
         load_scene(path, overrides)
@@ -43,20 +44,20 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
-        from dolfinopt.motion import check_motion
-        from dolfinopt.plausibility import implausible
+        from dolfinopt.multibody.motion import check_motion
+        from dolfinopt.scene.plausibility import implausible
 
         scene = load_scene(path, overrides)
         check_motion(scene)
         for index, arm in enumerate(scene.arms):
             if arm.sid is not None:
-                from dolfinopt.arm import fixed_body
+                from dolfinopt.arms.arm import fixed_body
 
                 fixed_body(scene, index)
         warn(implausible(scene))
         return scene
 
-    from dolfinopt.budget import check_budget
+    from dolfinopt.mesh.budget import check_budget
 
     scene = on_root(world, load)
     check_budget(world, scene)
@@ -97,8 +98,8 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 def scene_of(folder: Path) -> Scene:
     """Return the scene of a run, with the coordinates that "auto" came to."""
-    from dolfinopt.contents import found_again
-    from dolfinopt.scene import scene_from_dict
+    from dolfinopt.scene.contents import found_again
+    from dolfinopt.scene.load import scene_from_dict
 
     path = folder / "summary.json"
     try:
@@ -119,8 +120,8 @@ def design_of(
     world: MPI.Comm, scene: Scene, design: Path | None, ledger: Any
 ) -> tuple[ArmShare, dict[int, Arm], dict[int, Any]]:
     """Build the arms and return them with the physical densities of a file or the initial ones."""
-    from dolfinopt.arm import build_arms
-    from dolfinopt.files import read_design
+    from dolfinopt.arms.arm import build_arms
+    from dolfinopt.output.files import read_design
     from dolfinopt.parallel import share_arms
 
     share = share_arms(world, scene.cell_counts)
@@ -141,8 +142,8 @@ def draw(
     animation: bool = False,
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
-    from dolfinopt import plots
-    from dolfinopt.files import designed
+    from dolfinopt.output.files import designed
+    from dolfinopt.plots import figures as plots
 
     label = "{} [{}]".format(*OBJECTIVES[scene.objective.kind])
     plots.draw_design(folder / "design.png", designed(views), scene.name)
@@ -207,7 +208,7 @@ def progress(
     """Return a live line on the root's terminal, lines every few seconds where it has none."""
     if world.rank != 0:
         return nullcontext(None)
-    from dolfinopt.progress import live_line, plain_lines
+    from dolfinopt.cli.live_line import live_line, plain_lines
 
     shown = live_line if sys.stderr.isatty() else plain_lines
     return shown(scene.optimizer.max_iterations)

@@ -21,7 +21,7 @@ from dolfinopt.cli.shared import claim, conclude, design_of, draw, elapsed, load
 if TYPE_CHECKING:
     pass
 
-    from dolfinopt.files import ArmView
+    from dolfinopt.output.files import ArmView
 
 
 @click.command()
@@ -44,12 +44,12 @@ def simulate(
     """Simulate SCENE with a given design and report compliance and deviation."""
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
-    from dolfinopt.coordinates import choose_coordinates
-    from dolfinopt.evaluation import evaluate
-    from dolfinopt.folders import remove_stale
-    from dolfinopt.ledger import Ledger
+    from dolfinopt.output.folders import remove_stale
+    from dolfinopt.output.run_folder import Simulated, write_simulation
     from dolfinopt.parallel import on_root
-    from dolfinopt.results import Simulated, write_simulation
+    from dolfinopt.profiling import Ledger
+    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.order_selection import choose_coordinates
 
     claim(world, folder, overwrite)
     ledger = Ledger()

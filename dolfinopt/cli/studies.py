@@ -14,8 +14,8 @@ from dolfinopt.errors import ConvergenceError
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.findings import Study
-    from dolfinopt.scene import Scene
+    from dolfinopt.scene.load import Scene
+    from dolfinopt.study.tables import Study
 
 designs_option = click.option(
     "--design",
@@ -55,9 +55,9 @@ def carry_out(
         InputError: the folder answers another question under this name.
         ConvergenceError: a case failed; all others are written.
     """
-    from dolfinopt.findings import write_study
-    from dolfinopt.folders import check_question, remove_listed, write_question
+    from dolfinopt.output.folders import check_question, remove_listed, write_question
     from dolfinopt.parallel import on_root
+    from dolfinopt.study.tables import write_study
 
     if not overwrite:
         on_root(world, check_question, folder, name, question)
@@ -66,7 +66,7 @@ def carry_out(
         remove_listed(folder, name)
         written = write_study(done, folder)
         if plots:
-            from dolfinopt.study_plots import draw_study
+            from dolfinopt.study.figures import draw_study
 
             written += draw_study(done, folder)
         write_question(folder, name, question, [path.name for path in written])
@@ -79,8 +79,8 @@ def carry_out(
 
 def asked_of(world: MPI.Comm, scene: Scene, designs: Sequence[Path]) -> dict[str, Any]:
     """Return what tells one study from another: scene and designs, files by their content."""
-    from dolfinopt.contents import file_digest, with_digests
     from dolfinopt.parallel import on_root
+    from dolfinopt.scene.contents import file_digest, with_digests
 
     def digests() -> dict[str, Any]:
         known = [file_digest(path) if path.is_file() else str(path) for path in designs]

@@ -54,7 +54,7 @@ def sweep(
             "(see dolfinopt sweep --help)"
         )
     world, loaded = load(scene, overrides)
-    from dolfinopt.study import study, sweep_name
+    from dolfinopt.study.studies import study, sweep_name
 
     folder = folder_of(scene, out)
     run = partial(study, loaded, topic, vary, designs, folder, world, reoptimize=reoptimize)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
 from dolfinopt.reduction.compare import BasisErrors, basis_errors, mac
 from dolfinopt.reduction.craig_bampton import craig_bampton, craig_bampton_adjoint

@@ -9,8 +9,8 @@ import numpy as np
 from petsc4py import PETSc
 from slepc4py import SLEPc
 
-from dolfinopt.elasticity import ElasticArm
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import obeying_options
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import Basis
 from dolfinopt.reduction.subspace import dot, ritz
 

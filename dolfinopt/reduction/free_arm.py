@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from dolfinopt.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import ElasticArm
 
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (3, k) outboard rows
 

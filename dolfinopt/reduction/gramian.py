@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import Basis, Options
 from dolfinopt.reduction.free_arm import (
     FreeArm,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
 from dolfinopt.reduction.free_arm import FreeArm, Rows, frame_loads, interface_loads
 from dolfinopt.reduction.subspace import Expansion, combine, dot, orthonormalise, ritz, solve_at

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import (
     AdjointFields,
     Basis,

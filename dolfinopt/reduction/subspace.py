@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.elasticity import ElasticArm
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import Basis, orient
 from dolfinopt.reduction.free_arm import FreeArm, Rows
 

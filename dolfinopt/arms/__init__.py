@@ -1,0 +1,1 @@
+"""One arm of the scene: design variables in, reduced body out."""

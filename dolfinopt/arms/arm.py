@@ -1,0 +1,415 @@
+"""One flexible arm of the scene: design variables in, floating body out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, loaded_modes
+from dolfinopt.density.filter import HelmholtzFilter
+from dolfinopt.density.interpolation import Interpolated, interpolate
+from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
+from dolfinopt.density.symmetry import AxisSymmetry
+from dolfinopt.errors import InputError
+from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.mesh.budget import check_budget
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar, shape_integrals
+from dolfinopt.multibody.standard_input import load_body
+from dolfinopt.parallel import ArmShare, sum_over_arms, together
+from dolfinopt.profiling import Ledger
+from dolfinopt.reduction import METHODS, Basis, Options
+from dolfinopt.scene import load as scenes
+
+THRESHOLDS = 0.25, 0.75
+
+# How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
+CLIPPED = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Realised:
+    """One design that design variables stand for.
+
+    Attributes:
+        x_phys: (n_cells,) physical densities.
+        projected: the way back through the projection, None where there is none.
+        clipped: (n_cells,) True where the filter left [0, 1], None where it did nowhere.
+    """
+
+    x_phys: np.ndarray
+    projected: Projected | None
+    clipped: np.ndarray | None = None
+
+
+class Arm:
+    """Owns what lives as long as the run: mesh, element operators, filter, factorisation.
+
+    Cell arrays are (n_cells,) over this rank's owned cells.
+
+    Attributes:
+        mesh: see `ArmMesh`.
+        solid: the arm's solid material.
+        coordinates: number q that `reduce` keeps; None until `take`, where the scene says "auto".
+        basis: of the current design; None before `reduce`.
+        start: (owned rows, k) eigenvectors from which the next `reduce` sets out, or None.
+        loaded_starts: the same for every `loaded_modes`, by the place in the chain.
+        places: of the arms in the chain that have this design.
+    """
+
+    def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, ledger: Ledger):
+        """Mesh arm number `index` on the ranks of `comm` (collective there)."""
+        arm = scene.arms[index]
+        self._x_phys = np.empty(0)
+        self._material: Interpolated | None = None
+        self._young = self._density = np.empty(0)  # of every cell of the current design, Pa, kg/m3
+        self.scene = scene
+        self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
+        self.solid = scene.material_of(index)
+        with ledger.phase("mesh"):
+            self.mesh = arm_mesh(comm, arm)
+            self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
+        with ledger.phase("element operators"):
+            operators = element_operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
+            self._elastic = ElasticArm(self.mesh, operators, ledger)
+            design = scene.design
+            # A member along an edge would be half as thin if the filter mirrored it there.
+            self.filter = HelmholtzFilter(self.mesh, design.radius, design.minimum_member > 0.0)
+        self.coordinates = scene.reduction.count or None
+        # Of a mesh file known only now.
+        if self.coordinates is not None and self.coordinates > self.elastic.num_dofs:
+            raise InputError(
+                f"{scene.source}: reduction.coordinates = {self.coordinates}: expected "
+                f"at most {self.elastic.num_dofs}, the degrees of freedom of arm {arm.name!r}"
+            )
+        self.ledger = ledger
+        self.basis: Basis | None = None
+        self.start: np.ndarray | None = None
+        self.loaded_starts: dict[int, np.ndarray] = {}
+        self._body: ShapeIntegrals | None = None
+        self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
+
+    @property
+    def elastic(self) -> ElasticArm:
+        """Stiffness and mass of the current design.
+
+        Arms `under` other scenes share them: they hold the design of the one that is asked.
+        """
+        if self._material is not None:
+            self._elastic.set_design(self._young, self._density)
+        return self._elastic
+
+    def physical(self, x: np.ndarray) -> np.ndarray:
+        """Return the physical densities of design variables x: filtered, passive cells solid."""
+        return self.filtered(x).x_phys
+
+    def filtered(self, x: np.ndarray) -> Realised:
+        """Return the design of design variables x without projection.
+
+        Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
+        what is cut off there has no derivative, and `chain` knows.
+        """
+        x = np.where(self.mesh.passive, 1.0, x)
+        with self.ledger.phase("filter"):
+            if self.symmetry is not None:
+                x = self.symmetry.forward(x)
+            x_filtered = self.filter.forward(x)
+        clipped = None
+        if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
+            clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
+        x_phys = np.where(self.mesh.passive, 1.0, np.clip(x_filtered, 0.0, 1.0))
+        return Realised(x_phys, None, clipped)
+
+    def uniform(self, density: float) -> np.ndarray:
+        """Return the physical densities of the same design variable in every cell."""
+        return self.physical(np.full(self.mesh.num_cells, density))
+
+    def realise(self, x: np.ndarray, sharpness: float, threshold: float) -> tuple[Realised, ...]:
+        """Return the designs that x stands for.
+
+        One; or eroded, dilated and nominal with the robust projection, the nominal one last.
+
+        Args:
+            x: (n_cells,) design variables.
+            sharpness: beta of the scene's projection.
+            threshold: its eta.
+        """
+        filtered = self.filtered(x)
+        kind = self.scene.design.projection
+        if not kind:
+            return (filtered,)
+        thresholds: Sequence[float] = (threshold,)
+        if kind == "robust":
+            eroded, nominal, dilated = robust_thresholds(self.scene.design.erosion)
+            thresholds = (eroded, dilated, nominal)
+        projected = [project(filtered.x_phys, sharpness, eta) for eta in thresholds]
+        return tuple(
+            Realised(np.where(self.mesh.passive, 1.0, p.value), p, filtered.clipped)
+            for p in projected
+        )
+
+    def preserving_threshold(self, x: np.ndarray, sharpness: float) -> float:
+        """Return the projection's threshold that keeps the volume of x (collective on the arm).
+
+        Within `THRESHOLDS`: where all that is left between void and solid is nearly void, the
+        volume alone would choose a threshold among the void cells.
+        """
+        area = self._active(self.mesh.area)
+        eta = preserving_threshold(self.physical(x), area, sharpness, self.mesh.comm)
+        return float(np.clip(eta, *THRESHOLDS))
+
+    def chain(self, slope: np.ndarray, realised: Realised | None = None) -> np.ndarray:
+        """Return the derivative with respect to x from that with respect to x_phys.
+
+        Args:
+            slope: (n_cells,).
+            realised: what `realise` or `filtered` made of x; None: neither projected nor clipped.
+        """
+        if realised is not None and realised.projected is not None:
+            slope = realised.projected.backward(self._active(slope))
+        if realised is not None and realised.clipped is not None:
+            slope = np.where(realised.clipped, 0.0, slope)
+        with self.ledger.phase("filter"):
+            slope = self.filter.backward(self._active(slope))
+            if self.symmetry is not None:
+                slope = self.symmetry.backward(slope)
+            return self._active(slope)
+
+    def _active(self, values: np.ndarray) -> np.ndarray:
+        return np.where(self.mesh.passive, 0.0, values)
+
+    def set_design(self, x_phys: np.ndarray) -> None:
+        """Take physical densities in [0, 1] (collective on the arm).
+
+        Raises:
+            InputError: on the arm's ranks, see `refusal`.
+        """
+        known = np.array_equal(x_phys, self._x_phys)
+        if self.mesh.comm.allreduce(known, op=MPI.LAND):
+            return
+        options = self.scene.interpolation
+        with together(self.mesh.comm):
+            if reason := self.refusal(x_phys):
+                raise InputError(reason)
+            self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
+        self._young = self.solid.young_modulus * self._material.stiffness
+        self._density = self.solid.density * self._material.mass
+        self._x_phys = x_phys.copy()
+        self.basis = self._body = None
+        self._loaded = {}
+
+    def refusal(self, x_phys: np.ndarray) -> str:
+        """Return why these cannot be physical densities of this rank's cells, "" if they can."""
+        name, shape = self.mesh.name, np.shape(x_phys)
+        if shape != (self.mesh.num_cells,):
+            return (
+                f"arm {name!r}: densities of shape {shape}: expected ({self.mesh.num_cells},), one "
+                "of every cell of this rank"
+            )
+        wrong = np.flatnonzero(~((x_phys >= 0.0) & (x_phys <= 1.0)))  # nan, too
+        if len(wrong):
+            return (
+                f"arm {name!r}: density {x_phys[wrong[0]]:.4g} of cell {wrong[0]}: expected a "
+                "number >= 0 and <= 1 (0 is void, 1 solid)"
+            )
+        return ""
+
+    def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
+        """Return the floating body of physical densities in [0, 1] (collective on the arm).
+
+        The modes found before are where the search for the new ones starts. Nothing is done
+        twice for the same densities.
+        """
+        self.set_design(x_phys)
+        if self._body is not None:
+            return self._body
+        with self.ledger.phase("reduction"):
+            reduce = METHODS[self.scene.reduction.method].reduce
+            self.basis = reduce(self.elastic, self.reduction_options, self.start)
+        self.start = self.basis.start
+        with self.ledger.phase("inertia integrals"):
+            damping = self.scene.damping.stiffness_proportional
+            self._body = shape_integrals(self.elastic, self.basis, damping)
+        return self._body
+
+    def take(self, coordinates: int) -> None:
+        """Reduce to so many coordinates from now on."""
+        if coordinates != self.coordinates:
+            self.basis = self._body = self.start = None
+        self.coordinates = coordinates
+
+    def under(self, scene: scenes.Scene) -> Arm:
+        """Return this arm in a scene that differs in what it does, not in what it is.
+
+        Mesh, element matrices, filter and the current design's factorisation are shared; so is
+        the basis unless the reduction differs. Each has a design of its own from then on: while
+        the two differ, using both in turn factorises anew each time.
+
+        Args:
+            scene: with the same arms, material, interpolation and design options.
+        """
+        other = copy(self)
+        other.scene = scene
+        other._loaded, other.loaded_starts = {}, {}
+        old, new = self.scene, scene
+        # The Gramian knows the damping, other bases do not.
+        same_basis = old.reduction == new.reduction and (
+            old.damping == new.damping or new.reduction.method != "balanced"
+        )
+        if old.reduction != new.reduction:
+            other.coordinates = scene.reduction.count or None
+        if not same_basis or self.basis is None:
+            other.basis = other._body = other.start = None
+        elif old.damping != new.damping:
+            damping = scene.damping.stiffness_proportional
+            other._body = shape_integrals(other.elastic, self.basis, damping)
+        return other
+
+    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
+        """Return the current design's modes with what is carried (collective on the arm).
+
+        Args:
+            place: of the arm in the chain; several arms may share this design.
+            carried: about the outboard point.
+        """
+        known = self._loaded.get(place)
+        if known is None or known[0] != carried:
+            count, start = self.scene.objective.modes, self.loaded_starts.get(place)
+            with self.ledger.phase("vibration"):
+                known = carried, loaded_modes(self.elastic, carried, count, start)
+            self._loaded[place] = known
+            self.loaded_starts[place] = known[1].start
+        return known[1]
+
+    @property
+    def starts(self) -> list[np.ndarray]:
+        """`start` and every place's `loaded_starts`; without columns where there is none yet."""
+        empty = np.empty((self.elastic.num_interior, 0))
+        loaded = [self.loaded_starts.get(place, empty) for place in self.places]
+        return [empty if self.start is None else self.start, *loaded]
+
+    @starts.setter
+    def starts(self, starts: Sequence[np.ndarray]) -> None:
+        self.start = starts[0] if starts[0].shape[1] else None
+        loaded = zip(self.places, starts[1:], strict=True)
+        self.loaded_starts = {place: one for place, one in loaded if one.shape[1]}
+
+    @property
+    def reduction_options(self) -> Options:
+        """What the reduction method is told.
+
+        Raises:
+            InputError: the number of coordinates is "auto", and nobody has chosen one.
+        """
+        if self.coordinates is None:
+            raise InputError(
+                f'{self.scene.source}: reduction.coordinates = "auto": expected a number here, or '
+                "choose_coordinates() before the first evaluation"
+            )
+        return self.options(self.coordinates)
+
+    def options(self, coordinates: int) -> Options:
+        """Return what the scene tells the reduction method, with so many coordinates."""
+        options = self.scene.reduction
+        damping = self.scene.damping.stiffness_proportional
+        return Options(coordinates, options.shifts, options.band, damping)
+
+    @property
+    def material(self) -> Interpolated:
+        """Interpolated stiffness and mass of the current design."""
+        assert self._material is not None
+        return self._material
+
+    def volume_fraction(self, x_phys: np.ndarray) -> float:
+        """Return sum x V / sum V over the whole arm (collective on the arm)."""
+        parts = np.array([self.mesh.area @ x_phys, self.mesh.area.sum()])
+        volume, total = self.mesh.comm.allreduce(parts)
+        return float(volume / total)
+
+    def grayness(self, x_phys: np.ndarray) -> float:
+        """Return 4 mean x (1 - x) over the arm's area: 0 is crisp, 1 all grey; eq. (12)."""
+        parts = np.array([self.mesh.area @ (4.0 * x_phys * (1.0 - x_phys)), self.mesh.area.sum()])
+        grey, total = self.mesh.comm.allreduce(parts)
+        return float(grey / total)
+
+
+def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int, Arm]:
+    """Build this rank's arms, keyed by their index in the scene (collective on `share.world`).
+
+    Only arms with a design of their own: those that share one, rigid arms and those from a file
+    need no mesh.
+
+    Raises:
+        InputError: the meshes exceed the memory; a mesh file cannot be an arm, or holds more solid
+            cells than the volume allows.
+    """
+    check_budget(share.world, scene)
+    with together(share.world):
+        arms = {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
+    if any(scene.arms[index].mesh is not None for index in scene.cell_counts):
+        _check_solid(scene, share, arms)
+    return arms
+
+
+def _check_solid(scene: scenes.Scene, share: ArmShare, arms: Mapping[int, Arm]) -> None:
+    """Raise InputError if solid cells exceed the volume limit, which a scene cannot know.
+
+    Collective on `share.world`.
+    """
+    owners = list(scene.cell_counts)
+    parts = {}
+    for k, arm in arms.items():
+        weight = scene.owners.count(k) * scene.arms[k].thickness
+        parts[k] = np.zeros((len(owners), 2))
+        parts[k][owners.index(k)] = [
+            weight * arm.mesh.area @ arm.mesh.passive,
+            weight * arm.mesh.area.sum(),
+        ]
+    volumes = sum_over_arms(share, parts)
+    names = [f"arm {scene.arms[k].name!r}" for k in owners]
+    if scene.design.shared_volume:
+        volumes, names = volumes.sum(axis=0, keepdims=True), ["all arms together"]
+    limit, least = scene.design.volume_fraction, scene.design.minimum
+    for name, (solid, total) in zip(names, volumes, strict=True):
+        fraction = solid / total
+        if fraction + (1.0 - fraction) * least > limit:
+            raise InputError(
+                f"{scene.source}: design.volume_fraction = {limit}: the solid cells are "
+                f"{fraction:.4g} of the volume of {name}, more than that with design.minimum = "
+                f"{least} between them; make group passive smaller, shorten arms.passive or raise "
+                "the volume"
+            )
+
+
+def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[ShapeIntegrals]:
+    """Return the bodies from the cart outwards.
+
+    Args:
+        scene: says which arm has its own design, shares one, is rigid or comes from a file.
+        owned: bodies of the arms with a design of their own, by their index.
+    """
+    return [
+        fixed_body(scene, index) if owner is None else owned[owner]
+        for index, owner in enumerate(scene.owners)
+    ]
+
+
+@cache
+def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
+    """Read a body once for every state of its file: 4 ms, as long as the rest of an evaluation."""
+    return load_body(Path(sid), length)
+
+
+def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
+    """Return the body of an arm that is not designed here: rigid, or from a file."""
+    arm = scene.arms[index]
+    if arm.sid is not None:
+        return _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
+    return rigid_bar(arm.length, arm.height, arm.thickness, scene.material_of(index).density)

@@ -1,0 +1,1 @@
+"""From design variables to stiffness and mass: filter, projection, interpolation, symmetry."""

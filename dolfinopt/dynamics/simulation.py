@@ -1,0 +1,237 @@
+"""Scene + floating bodies -> the simulated motion, sampled evenly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from dolfinopt.dynamics import batch, generalized_alpha, radau
+from dolfinopt.dynamics.problem import ElasticProblem, Solution
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.mechanism import Mechanism, compliance, deviation, inverse_dynamics
+from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.profiling import Ledger
+from dolfinopt.scene.load import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A simulated motion; samples are taken from the integrator's own interpolant.
+
+    Attributes:
+        problem: what moved, and how.
+        scene: its scene.
+        solution: the integrator's.
+        t: (n,) sample instants, s.
+        scenarios: the same design under the scene's scenarios.
+    """
+
+    problem: ElasticProblem
+    scene: Scene
+    solution: Solution
+    t: np.ndarray
+    scenarios: tuple[Trajectory, ...] = ()
+
+    @property
+    def solutions(self) -> tuple[Solution, ...]:
+        """Its own and the scenarios'."""
+        return (self.solution, *(one.solution for one in self.scenarios))
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """What moved."""
+        return self.problem.mechanism
+
+    @cached_property
+    def q_e(self) -> np.ndarray:
+        """Elastic coordinates (n, N)."""
+        return self.solution.sample(self.t, 0)
+
+    @cached_property
+    def q_r(self) -> np.ndarray:
+        """Rigid coordinates (n, 1 + arms): m, rad."""
+        return self.motion.q
+
+    @cached_property
+    def deviation(self) -> np.ndarray:
+        """Flexible minus rigid end-effector (n, 2), m."""
+        return deviation(self.mechanism, self.motion, self.q_e)
+
+    @cached_property
+    def compliance(self) -> np.ndarray:
+        """q' K q of every arm (n, arms), N m."""
+        return compliance(self.mechanism.bodies, self.mechanism.slices, self.q_e)
+
+    @cached_property
+    def deflections(self) -> np.ndarray:
+        """Largest outboard deflection of every arm in its own frame, over its length (arms,)."""
+        largest = []
+        for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
+            u = self.q_e[:, part] @ body.outboard[:2].T
+            largest.append(np.hypot(u[:, 0], u[:, 1]).max() / np.hypot(*body.outboard_point))
+        return np.array(largest)
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
+        parts = zip(self.mechanism.slices, self.mechanism.bodies, strict=True)
+        return np.array([np.abs(self.q_e[:, s] @ body.outboard[2]).max() for s, body in parts])
+
+    @cached_property
+    def joint_forces(self) -> np.ndarray:
+        """Drive forces of cart (N) and joints (N m), (n, 1 + arms).
+
+        A fixed base bears the cart's as the horizontal force on the first joint.
+        """
+        qd, qdd = self.solution.sample(self.t, 1), self.solution.sample(self.t, 2)
+        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+
+    @cached_property
+    def motion(self) -> RigidMotion:
+        """Rigid coordinates at the samples."""
+        return rigid_motion(self.t, self.scene)
+
+    @property
+    def settling(self) -> float:
+        """Largest deviation after the motion has ended, t >= motion.duration, m.
+
+        With a horizon that ends with the motion, the deviation at its end.
+        """
+        distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
+        after = self.t >= self.scene.motion.duration - 1e-9 * self.scene.motion.horizon
+        after[-1] = True
+        return float(distance[after].max())
+
+    @property
+    def drives(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest absolute value and root mean square over time of `joint_forces` (1 + arms,)."""
+        forces = self.joint_forces
+        if len(self.t) == 1:
+            return np.abs(forces[0]), np.abs(forces[0])
+        steps = np.diff(self.t)[:, None]
+        squares = 0.5 * steps * (forces[1:] ** 2 + forces[:-1] ** 2)
+        return np.abs(forces).max(axis=0), np.sqrt(squares.sum(axis=0) / steps.sum())
+
+    @property
+    def max_deviation(self) -> tuple[float, float]:
+        """Largest distance between flexible and rigid end-effector, m, and its instant, s."""
+        distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
+        worst = int(np.argmax(distance))
+        return float(distance[worst]), float(self.t[worst])
+
+
+def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
+    """Put the bodies on the scene's cart, with its payload."""
+    return Mechanism(
+        bodies=tuple(bodies),
+        payload_mass=scene.payload.mass,
+        payload_inertia=scene.payload.inertia,
+        gravity=scene.motion.gravity,
+        joint_height=scene.motion.joint_height,
+    )
+
+
+def simulate(
+    scene: Scene, bodies: list[ShapeIntegrals], ledger: Ledger, start: Solution | None = None
+) -> Trajectory:
+    """Integrate the elastic coordinates over the horizon to `simulation.tolerance`.
+
+    Args:
+        scene: motion, payload, damping and integrator.
+        bodies: from the cart outwards.
+        ledger: counts the simulation.
+        start: solution of a nearby design, or None.
+
+    Raises:
+        ConvergenceError: the integrator gave up; the message says what to try.
+    """
+    options = scene.simulation
+    problem = ElasticProblem(
+        build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), breakpoints(scene)
+    )
+    with ledger.phase("simulation"):
+        if options.integrator == "radau":
+            solution = radau.integrate(problem, options.tolerance, options.stages, ledger, start)
+        else:
+            solution = generalized_alpha.integrate(
+                problem, options.tolerance, options.rho_inf, ledger
+            )
+    ledger.counts.simulations += 1
+    return _trajectory(problem, scene, solution)
+
+
+def simulate_batch(
+    scenes: Sequence[Scene],
+    bodies: Sequence[list[ShapeIntegrals]],
+    ledger: Ledger,
+    starts: Sequence[Solution | None] = (),
+    *,
+    differentiated: bool = False,
+) -> list[Trajectory | ConvergenceError]:
+    """Integrate the same design in many scenes at once, each to its `simulation.tolerance`.
+
+    Scenes may differ in payload, motion, gravity, damping and, by the factors of `body.scaled`, in
+    material; whatever else differs is simulated by itself. The common steps are those of the scene
+    that needs most, so that a trajectory depends on the other scenes within the tolerance, not on
+    their order.
+
+    Args:
+        scenes: any number of them.
+        bodies: of each, from the cart outwards.
+        ledger: counts the simulations.
+        starts: solution of a nearby design for each, or None.
+        differentiated: whether slopes are asked of the trajectories: Newton's method then leaves
+            1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
+
+    Returns:
+        In the scenes' order; of one that fails its error, see `simulate`.
+    """
+    starts = [*starts, *[None] * (len(scenes) - len(starts))]
+    problems = _problems(scenes, bodies)
+    found: list[Trajectory | ConvergenceError | None] = [None] * len(scenes)
+    groups: dict[tuple[float, int], list[int]] = {}
+    for i, (scene, own) in enumerate(zip(scenes, bodies, strict=True)):
+        options = scene.simulation
+        if len(scenes) > 1 and options.integrator == "radau":
+            groups.setdefault((options.tolerance, options.stages), []).append(i)
+            continue
+        try:
+            found[i] = simulate(scene, own, ledger, starts[i])
+        except ConvergenceError as error:
+            found[i] = error
+    for (tolerance, stages), group in groups.items():
+        with ledger.phase("simulation"):
+            goal = radau.GOAL if differentiated else batch.GOAL
+            own, begun = [problems[i] for i in group], [starts[i] for i in group]
+            solutions = batch.integrate(own, tolerance, stages, ledger, begun, goal)
+        for i, one in zip(group, solutions, strict=True):
+            if isinstance(one, ConvergenceError):
+                found[i] = one
+                continue
+            found[i] = _trajectory(problems[i], scenes[i], one)
+            ledger.counts.simulations += 1
+    return [one for one in found if one is not None]
+
+
+def _problems(
+    scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]
+) -> list[ElasticProblem]:
+    """Return what moves in every scene; scenes of one motion share it."""
+    motions: dict[object, Callable[[np.ndarray], RigidMotion]] = {}
+    problems = []
+    for scene, own in zip(scenes, bodies, strict=True):
+        key = (scene.motion, tuple((arm.name, arm.length) for arm in scene.arms))
+        motion = motions.setdefault(key, partial(rigid_motion, scene=scene))
+        problems.append(ElasticProblem(build_mechanism(scene, own), motion, breakpoints(scene)))
+    return problems
+
+
+def _trajectory(problem: ElasticProblem, scene: Scene, solution: Solution) -> Trajectory:
+    """Return a solution with its sample instants."""
+    horizon, sample = scene.motion.horizon, scene.simulation.sample
+    t = np.arange(round(horizon / sample) + 1) * sample
+    return Trajectory(problem, scene, solution, t[t <= horizon * (1 + 1e-12)])

@@ -1,0 +1,1 @@
+"""File formats of other multibody programs, as plain data."""

@@ -1,0 +1,1 @@
+"""Finite elements of one arm: element matrices, assembly, factorisation, constraint modes."""

@@ -1,0 +1,179 @@
+"""Gmsh model -> the distributed mesh of one arm, with its interfaces and solid cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.data import mesh_folder
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.geometry import INBOARD, OUTBOARD, PASSIVE, build_model, gmsh_on_root, mesh_geo
+from dolfinopt.parallel import on_root, together
+from dolfinopt.scene import load as scenes
+
+
+@dataclass(frozen=True, eq=False)
+class ArmMesh:
+    """One arm's mesh on its communicator; every array holds this rank's part.
+
+    Attributes:
+        name: the arm's name in the scene.
+        comm: ranks that share this arm.
+        mesh: DOLFINx mesh; the body frame is the mesh's frame, origin on the inboard joint axis.
+        centroid: (n_cells, 2) of the owned cells, m.
+        area: (n_cells,) of the owned cells, m2.
+        passive: (n_cells,) True where the cell stays solid.
+        inboard_facets, outboard_facets: facets of the interfaces, local numbers.
+        outboard_point: (2,) reference point of the outboard interface, m.
+        notes: what is doubtful about its file, a sentence each.
+    """
+
+    name: str
+    comm: MPI.Comm
+    mesh: Any
+    centroid: np.ndarray
+    area: np.ndarray
+    passive: np.ndarray
+    inboard_facets: np.ndarray
+    outboard_facets: np.ndarray
+    outboard_point: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def num_cells(self) -> int:
+        """Number of cells this rank owns."""
+        return len(self.area)
+
+
+def arm_mesh(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    """Mesh an arm of a scene: its mesh file if it names one, a grid of `cells` otherwise.
+
+    Args:
+        comm: ranks that share the arm.
+        arm: its keys.
+
+    Raises:
+        InputError: the mesh file cannot be the arm.
+    """
+    if arm.mesh is not None:
+        return file_arm(comm, arm)
+    assert arm.cells is not None
+    return structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, arm.solid_ends)
+
+
+def structured_arm(
+    comm: MPI.Comm,
+    name: str,
+    length: float,
+    height: float,
+    cells: tuple[int, int],
+    passive: float = 0.0,
+) -> ArmMesh:
+    """Mesh a rectangular arm with `cells` (along, across) quadrilaterals from meshes/arm.geo.
+
+    Args:
+        comm: ranks that share the arm.
+        name: the arm's name.
+        length: joint axis to joint axis, m.
+        height: in the plane of motion, m.
+        cells: number along and across.
+        passive: length kept solid at both ends, m.
+    """
+    parameters = {
+        "Parameters/1 length (m)": length,
+        "Parameters/2 height (m)": height,
+        "Parameters/3 cells along": cells[0],
+        "Parameters/4 cells across": cells[1],
+        "Parameters/5 solid length at both ends (m)": passive,
+    }
+    with gmsh_on_root(comm) as gmsh:
+        with together(comm):
+            if comm.rank == 0:
+                mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
+    with together(comm):
+        return _arm_mesh(comm, name, length, *parts)
+
+
+def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    """Mesh an arm from its .geo, .msh or .step file.
+
+    Solid are the cells of group "passive" and those with centroids nearer to an interface than
+    `arm.solid_ends`; a .geo file with a parameter for that length sees to it in its geometry.
+
+    Raises:
+        InputError: the file cannot be the arm; on all ranks of `comm`.
+    """
+    with gmsh_on_root(comm) as gmsh:
+        lines, notes = on_root(comm, build_model, gmsh, arm)
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
+    with together(comm):
+        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+        mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
+    return replace(mesh, notes=notes)
+
+
+def _arm_mesh(
+    comm: MPI.Comm, name: str, length: float, mesh: Any, cell_tags: Any, facet_tags: Any
+) -> ArmMesh:
+    owned, _ = compat.local_cell_counts(mesh)
+    corners = compat.cell_coordinates(mesh, owned)[:, :, :2]
+    solid = np.zeros(owned, dtype=bool)
+    tagged = cell_tags.indices[cell_tags.values == PASSIVE]
+    solid[tagged[tagged < owned]] = True
+    return ArmMesh(
+        name=name,
+        comm=comm,
+        mesh=mesh,
+        centroid=corners.mean(axis=1),
+        area=_cell_area(corners),
+        passive=solid,
+        inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
+        outboard_facets=facet_tags.indices[facet_tags.values == OUTBOARD],
+        outboard_point=np.array([length, 0.0]),
+    )
+
+
+def _distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of points (n, 2) from the nearest of lines (m, 2, 2)."""
+    nearest = np.full(len(points), np.inf)
+    for a, b in lines:
+        along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+        distance = np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
+        np.minimum(nearest, distance, out=nearest)
+    return nearest
+
+
+def _cell_area(corners: np.ndarray) -> np.ndarray:
+    """Return the area (n,) of straight triangles or quadrilaterals in DOLFINx's corner order."""
+    if corners.shape[1] == 3:
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    else:  # tensor-product order: 0-3 and 1-2 are the diagonals
+        first, second = corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]
+    return 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+
+def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the facets between two cells this rank knows, ghost cells included.
+
+    Returns:
+        Local numbers of the two cells, the facet's length and the distance of the cells'
+        centroids, each (n_facets,); m.
+    """
+    owned, ghosts = compat.local_cell_counts(mesh)
+    nodes = compat.cell_geometry_nodes(mesh, owned + ghosts)
+    corners = mesh.geometry.x[nodes][:, :, :2]
+    # DOLFINx's corner order: a tensor product for quadrilaterals.
+    sides = ((0, 1), (0, 2), (1, 2)) if nodes.shape[1] == 3 else ((0, 1), (0, 2), (1, 3), (2, 3))
+    ends = np.concatenate([np.sort(nodes[:, side], axis=1) for side in sides])
+    cell = np.tile(np.arange(len(nodes)), len(sides))
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    twice = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
+    first, second = cell[order[twice]], cell[order[twice + 1]]
+    a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
+    centroid = corners.mean(axis=1)
+    length = np.linalg.norm(a - b, axis=1)
+    return first, second, length, np.linalg.norm(centroid[first] - centroid[second], axis=1)

@@ -1,0 +1,133 @@
+"""What a scene's meshes cost in memory and time, told before anything is meshed."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from pathlib import Path
+
+from mpi4py import MPI
+
+from dolfinopt.errors import InputError
+from dolfinopt.parallel import share_arms
+from dolfinopt.scene.schema import Arm, Scene
+
+# Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
+# quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm (`_bytes`, `_seconds`):
+#   n =   9 600:  265 MB,  0.38 s;      n =  38 400:  648 MB,  2.4 s
+#   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
+# Fill-in of a nested dissection makes both grow faster than n.
+PROCESS = 0.2e9  # bytes of a rank without cells
+CELL, FILL, AT = 6.9e3, 0.2e3, 38_400  # bytes a cell, more for every doubling, measured at
+CELL_SECONDS, GROWTH = 32e-6, 0.33  # s a cell at AT, and the power of n with which it grows
+FEW = 100_000  # cells of all arms, 1 GB: not worth a look
+CELLS_ACROSS = 12  # of a STEP file without mesh_size, see `geometry.py`
+
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def check_budget(world: MPI.Comm, scene: Scene) -> None:
+    """Raise InputError, on all ranks, if the meshes need more memory than is free (collective).
+
+    A mesh file without mesh_size says too little to be judged; cases that other processes compute
+    at the same time are not seen.
+    """
+    cells = {index: estimated_cells(scene.arms[index]) for index in scene.cell_counts}
+    if sum(cells.values()) <= FEW:
+        return
+    share = share_arms(world, scene.cell_counts)
+    mine = sum(_bytes(cells[k]) for k in share.arms) / share.comm.size + PROCESS
+    seconds = sum(_seconds(cells[k]) for k in share.arms) / share.comm.size
+    share.comm.Free()
+    ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
+    needed: dict[str, float] = defaultdict(float)
+    free: dict[str, float] = {}
+    for machine, need, found, _ in ranks:
+        needed[machine] += need
+        free[machine] = min(found, free.get(machine, math.inf))
+    machine = max(needed, key=lambda name: needed[name] / max(free[name], 1.0))
+    if needed[machine] <= free[machine]:
+        return
+    where = f" on {machine}" if len(needed) > 1 else ""
+    raise InputError(
+        f"{scene.source}: about {sum(cells.values()):.3g} cells need {_gigabytes(needed[machine])} "
+        f"of memory{where}, where {_gigabytes(free[machine])} are free, and "
+        f"{_spoken(max(row[-1] for row in ranks))} for every iteration; take fewer arms.cells or "
+        "a larger arms.mesh_size"
+    )
+
+
+def estimated_cells(arm: Arm) -> int:
+    """Return how many cells an arm has or may get, 0 where nothing tells."""
+    if arm.n_cells or arm.mesh is None or Path(arm.mesh).suffix.lower() not in (".step", ".stp"):
+        return arm.n_cells
+    return arm.model_copy(update={"mesh_size": arm.height / CELLS_ACROSS}).n_cells
+
+
+def free_memory(proc: Path = Path("/proc"), cgroup: Path = _CGROUP) -> float:
+    """Return the bytes this process may still take, infinite where the system does not say.
+
+    The least of what the machine has available and what every control group (version 1 or 2) above
+    this process leaves. Files that the kernel only keeps in memory as long as nobody needs it
+    count as free.
+    """
+    least = math.inf
+    try:
+        for line in (proc / "meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                least = 1024.0 * int(line.split()[1])
+        groups = (proc / "self" / "cgroup").read_text().splitlines()
+    except OSError:
+        return least
+    for line in groups:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            names = cgroup, "memory.max", "memory.current", "inactive_file"
+        elif "memory" in controllers.split(","):
+            names = (
+                cgroup / "memory",
+                "memory.limit_in_bytes",
+                "memory.usage_in_bytes",
+                "total_inactive_file",
+            )
+        else:
+            continue
+        # In a container the path may be the host's, and the mount already the group's own.
+        inner = Path(path.lstrip("/"))
+        for folder in (inner, *inner.parents):
+            least = min(least, _left(names[0] / folder, *names[1:]))
+    return least
+
+
+def _left(folder: Path, limit: str, usage: str, reclaimable: str) -> float:
+    """Return what a control group leaves of its memory, infinite where it sets no limit."""
+    try:
+        total = (folder / limit).read_text().strip()
+        if total == "max":
+            return math.inf
+        used = int((folder / usage).read_text())
+        statistics = dict(
+            line.split(maxsplit=1) for line in (folder / "memory.stat").read_text().splitlines()
+        )
+        return max(int(total) - used + int(statistics.get(reclaimable, 0)), 0)
+    except (OSError, ValueError):
+        return math.inf
+
+
+def _bytes(cells: int) -> float:
+    return cells * (CELL + FILL * max(math.log2(max(cells, 1) / AT), 0.0))
+
+
+def _seconds(cells: int) -> float:
+    return CELL_SECONDS * cells * (cells / AT) ** GROWTH
+
+
+def _gigabytes(amount: float) -> str:
+    return f"{amount / 1e9:.3g} GB"
+
+
+def _spoken(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds > 2.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"

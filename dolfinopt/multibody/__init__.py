@@ -1,0 +1,1 @@
+"""Reduced bodies and the mechanism they make: shape integrals, inverse dynamics, motions."""

@@ -1,0 +1,486 @@
+"""Desired path -> rigid coordinates and their derivatives, for any number of arms.
+
+The end-effector follows an arc, a line or a table of points, or a table prescribes the joints.
+Plane vectors are complex numbers, v = v_x + i v_y, where arms are turned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from dolfinopt.errors import InputError
+from dolfinopt.paths.tables import (
+    TIME,
+    Curve,
+    Table,
+    curve_by_chord,
+    curve_by_laws,
+    curve_in_time,
+    moves,
+    read_table,
+)
+from dolfinopt.scene.duration import (
+    POINT,
+    SAME_TIME,
+    file_stamp,
+    known_law,
+    limits_of,
+    time_law,
+    too_short,
+)
+from dolfinopt.scene.load import Motion, Scene
+
+# Nearer to a singular position than this share of the largest arm, joint speeds lose their
+# digits: accelerations grow with the inverse cube of sin(elbow angle).
+SINGULAR = 1e-6
+# Instants of the whole motion at which its reach is checked and its angles are told apart.
+DENSE = 2001
+CART = "cart"  # first column of a table of joints
+# With more rows a table's kinks are many and small; the integrator's steps need not end there.
+MAX_KINKS = 20
+
+
+# Fewer instants are computed as so many. On processors with AVX-512, NumPy 1.24 multiplies complex
+# arrays of less than 64 bytes in one of two ways that round differently, and chooses by how far the
+# arrays lie from each other in memory: equal runs would end in different bits.
+FEW = 4
+
+
+def repeated(count: int) -> np.ndarray:
+    """Return indices that make `count` instants `FEW`, the last one repeated."""
+    return np.minimum(np.arange(FEW), count - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidMotion:
+    """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
+
+    Attributes:
+        q, qd, qdd: (n, 1 + arms); m and rad, per s, per s2. The first angle is measured from +x,
+            each further one from the deformed outboard tangent of the arm before. On a fixed base
+            x_cart is its constant position.
+    """
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+
+    def __getitem__(self, part: slice | np.ndarray) -> RigidMotion:
+        """Return it at some of the instants."""
+        return RigidMotion(self.q[part], self.qd[part], self.qdd[part])
+
+    @cached_property
+    def swings(self) -> tuple[np.ndarray, ...]:
+        """Return exp(i angle) (n,) of every joint."""
+        return tuple(np.exp(1j * self.q[:, k]) for k in range(1, self.q.shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Points of a path at n instants with time derivatives, all (n, 2); m, m/s, m/s2."""
+
+    p: np.ndarray
+    pd: np.ndarray
+    pdd: np.ndarray
+
+
+def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
+    """Return the rigid coordinates that follow the scene's path, or its table of joints, exactly.
+
+    The cart follows x_cart = cart_follow * x, or the shoulder stands on a fixed base. Of two and
+    more arms all elbows bend by the same angle, see `Bend`; the one arm of a cart keeps its
+    angle's cosine on the side of `elbow`, and the cart goes where the path is then. Angles are
+    continuous functions of time, whichever instants are asked for.
+
+    Args:
+        t: (n,) instants, s.
+        scene: motion and lengths of the arms.
+
+    Raises:
+        InputError: the path leaves the arms' reach or passes a singular position, names the time
+            and the distance; or the table cannot be used.
+    """
+    if 0 < len(t) < FEW:
+        return rigid_motion(t[repeated(len(t))], scene)[: len(t)]
+    motion = scene.motion
+    if motion.path == "joints":
+        return _tabulated_joints(t, scene)
+    path = desired_path(t, motion)
+    if len(scene.arms) == 1:
+        return _one_arm(t, path, scene)
+    bare = _chain(t, path, scene)
+    # Both angles of a direction, whole turns apart, are right; the dense motion tells which.
+    times, reference = _continuous_shoulder(scene, file_stamp(motion))
+    turns = np.round((np.interp(t, times, reference) - bare.q[:, 1]) / (2.0 * np.pi))
+    bare.q[:, 1] += 2.0 * np.pi * turns
+    return bare
+
+
+def check_motion(scene: Scene) -> None:
+    """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
+    rigid_motion(np.linspace(0.0, scene.motion.duration, DENSE), scene)
+
+
+def breakpoints(scene: Scene) -> tuple[float, ...]:
+    """Return the instants between which the motion is smooth, first 0, last the horizon; s.
+
+    They are the end of the path, where the law's phases end, beginnings and ends of stops, and the
+    rows of a short table without times: there the third derivative of the cubic spline jumps.
+    """
+    motion = scene.motion
+    kinks, timed = np.zeros(0), False
+    if motion.path in ("points", "joints"):
+        curve, timed = _curve(motion, _columns(scene), file_stamp(motion))
+        kinks = np.array(curve.kinks)
+    if not timed:
+        rows = _when(kinks, motion) if 0 < len(kinks) <= MAX_KINKS else []
+        kinks = np.concatenate([rows, time_law(motion).knots * motion.duration])
+    instants = np.sort(np.append(kinks, motion.duration))
+    apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
+    apart &= instants < motion.horizon * (1.0 - SAME_TIME)
+    return (0.0, *instants[apart].tolist(), motion.horizon)
+
+
+def _when(s: np.ndarray, motion: Motion) -> list[float]:
+    """Return the instants at which the time law reaches s, in (0, 1), by bisection."""
+    law = time_law(motion)
+    low, high = np.zeros_like(s), np.full_like(s, motion.duration)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        late = law(middle, motion.duration)[0] >= s
+        low, high = np.where(late, low, middle), np.where(late, middle, high)
+    return [float(t) for t in high]
+
+
+# -- paths --------------------------------------------------------------------------------------
+
+
+def desired_path(t: np.ndarray, motion: Motion) -> Path:
+    """Return where the end-effector should be: on an arc, a line or a curve through points."""
+    if motion.path == "arc":
+        return arc(t, motion)
+    if motion.path == "line":
+        return line(t, motion)
+    return Path(*_along(t, motion, POINT))
+
+
+def arc(t: np.ndarray, motion: Motion) -> Path:
+    """Return the flattened semicircle about the origin, from (-r, 0) over the top to (r, 0).
+
+    p = r (cos phi, flattening sin phi), phi from pi to 0 with the time law.
+    """
+    s, sd, sdd = time_law(motion)(t, motion.duration)
+    phi, phid, phidd = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
+    c, z = np.cos(phi), np.sin(phi)
+    scale = motion.radius * np.array([1.0, motion.flattening])
+    p = np.stack([c, z], axis=1)
+    tangent = np.stack([-z, c], axis=1)
+    pd = tangent * phid[:, None]
+    pdd = tangent * phidd[:, None] - p * (phid**2)[:, None]
+    return Path(scale * p, scale * pd, scale * pdd)
+
+
+def line(t: np.ndarray, motion: Motion) -> Path:
+    """Return the straight line p = start + s (end - start), s from 0 to 1 with the time law."""
+    start, end = np.array(motion.start), np.array(motion.end)
+    s, sd, sdd = (value[:, None] for value in time_law(motion)(t, motion.duration))
+    return Path(start + s * (end - start), sd * (end - start), sdd * (end - start))
+
+
+def _along(
+    t: np.ndarray, motion: Motion, columns: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a table's curve (n, k) and two time derivatives, in its own time or by the law."""
+    curve, timed = _curve(motion, columns, file_stamp(motion))
+    if timed:
+        return curve(t)
+    s, sd, sdd = (value[:, None] for value in time_law(motion)(t, motion.duration))
+    value, first, second = curve(s[:, 0])
+    return value, first * sd, second * sd**2 + first * sdd
+
+
+@lru_cache(maxsize=64)  # the integrator asks for the motion dozens of times
+def _curve(motion: Motion, columns: tuple[str, ...], stamp: int) -> tuple[Curve, bool]:
+    """Return the curve through the scene's table, and whether its parameter is time."""
+    assert motion.file is not None
+    table = read_table(motion.file, columns)
+    if table.t is None:
+        return curve_by_chord(table), False
+    last = table.t[-1]
+    if abs(last - motion.duration) > 1e-9 * motion.duration:
+        raise InputError(
+            f"{motion.file}: line {table.lines[-1]}, column t = {last:g}: expected "
+            f"motion.duration = {motion.duration:g} [s] in the last row; set motion.duration = "
+            f"{last:g}"
+        )
+    limits, default = limits_of(motion), Motion.model_fields["law"].default
+    if motion.law == default and not limits.any:
+        return curve_in_time(table), True
+    return _stop_to_stop(motion, table), True
+
+
+def _stop_to_stop(motion: Motion, table: Table) -> Curve:
+    """Return the motion through a table with times that runs straight by the law between stops.
+
+    Raises:
+        InputError: a row between two stops, or the limits need more time; names file and line.
+    """
+    assert table.t is not None
+    laws = []
+    for line, i, j in ((table.lines[j], i, j) for i, j in moves(table.rows)):
+        if j - i > 1:
+            raise InputError(
+                f"{table.file}: line {table.lines[i + 1]}: a row between two stops with motion.law "
+                f"= {motion.law!r} or limits, by which each move runs from stop to stop; repeat "
+                f"the row at a later {TIME} to stop there, leave it out, or leave out the column "
+                f"{TIME}, the law's name and the limits"
+            )
+        length = float(np.linalg.norm(table.rows[j] - table.rows[i]))
+        law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
+        time = float(table.t[j] - table.t[i])
+        if time < law.least * (1.0 - SAME_TIME):
+            raise InputError(
+                f"{table.file}: line {line}, column {TIME} = {table.t[j]:g}: {time:g} s for this "
+                f"move: {too_short(law)}"
+            )
+        laws.append((i, j, law))
+    return curve_by_laws(table, laws)
+
+
+# -- inverse kinematics ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A chain of two and more arms whose elbows all bend by the same angle beta.
+
+    z(beta) = sum_k L_k exp(i k beta) is its end, seen from the first arm; the distance |z| falls
+    from the stretched chain, beta = 0, to the first angle where it is least. Its square is a
+    polynomial in u = cos(beta), sum_m c_m T_m(u) in Chebyshev's, c_0 = sum_k L_k^2,
+    c_m = 2 sum_k L_k L_{k+m}; for two arms this is the cosine rule.
+    """
+
+    lengths: tuple[float, ...]
+
+    @cached_property
+    def series(self) -> np.ndarray:
+        """Coefficients c of |z|^2 (arms,), m2."""
+        products = np.correlate(self.lengths, self.lengths, mode="full")[len(self.lengths) - 1 :]
+        return np.append(products[:1], 2.0 * products[1:])
+
+    @cached_property
+    def least(self) -> float:
+        """Cosine of the angle at the end of the range, -1 for two arms."""
+        roots = chebyshev.chebroots(chebyshev.chebder(self.series))
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (np.abs(roots.real) < 1.0)]
+        return float(real.max(initial=-1.0))
+
+    @cached_property
+    def reach(self) -> tuple[float, float]:
+        """Least and largest distance |z|, m."""
+        if len(self.lengths) == 2:
+            return abs(self.lengths[0] - self.lengths[1]), sum(self.lengths)
+        return float(np.sqrt(np.maximum(self.square(np.array(self.least)), 0.0))), sum(self.lengths)
+
+    def square(self, u: np.ndarray) -> np.ndarray:
+        """Return |z|^2 by the cosine of beta."""
+        return chebyshev.chebval(u, self.series)
+
+    @cached_property
+    def _guess(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ascending |z|^2 and the cosines there, dense towards both ends."""
+        u = self.least + (1.0 - self.least) * np.sin(np.linspace(0.0, np.pi / 2.0, 101)) ** 2
+        return self.square(u), u
+
+    def cosine(self, square: np.ndarray) -> np.ndarray:
+        """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding.
+
+        Newton's method, halving the bracket instead where a step would leave it.
+        """
+        if len(self.lengths) == 2:
+            return (square - self.series[0]) / self.series[1]
+        u = np.interp(square, *self._guess)
+        low, high = np.full_like(u, self.least), np.ones_like(u)
+        slopes = chebyshev.chebder(self.series)
+        for _ in range(60):  # halving alone would need as many
+            excess = self.square(u) - square
+            if np.abs(excess).max(initial=0.0) <= 4.0 * np.finfo(float).eps * self.reach[1] ** 2:
+                break
+            low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
+            slope = chebyshev.chebval(u, slopes)
+            u = u - excess / np.where(slope > 0.0, slope, np.inf)
+            u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
+        return u
+
+    def lever(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return z and its two derivatives by beta (n,), complex."""
+        order = np.arange(len(self.lengths))
+        turned = np.exp(1j * np.outer(beta, order)) * self.lengths
+        return turned.sum(axis=1), turned @ (1j * order), turned @ (-1.0 * order**2)
+
+
+@lru_cache(maxsize=64)
+def _bend(lengths: tuple[float, ...]) -> Bend:
+    return Bend(lengths)
+
+
+def _chain(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
+    """Return the motion of two and more arms, the shoulder's angle up to whole turns.
+
+    With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
+    accelerations from its derivatives, two real equations each for the rates of alpha and beta.
+    """
+    motion, bend = scene.motion, _bend(tuple(arm.length for arm in scene.arms))
+    cart = _cart(path, motion)
+    r, rd, rdd = (
+        p[:, 0] - x + 1j * p[:, 1] for p, x in zip((path.p, path.pd, path.pdd), cart, strict=True)
+    )
+    r = r - 1j * motion.joint_height
+    distance = np.abs(r)
+    _check_distance(t, distance, bend, scene)
+    beta = motion.elbow * np.arccos(bend.cosine(distance**2))
+    z, z_b, z_bb = bend.lever(beta)
+    alpha = np.angle(r) - np.angle(z)
+    singular = (np.conj(z) * z_b).real  # zero where the distance does not change with beta
+
+    def rates(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Solve i z a + z_b b = v for real a, b by Cramer's rule."""
+        return (np.conj(z_b) * v).imag / singular, (np.conj(z) * v).real / singular
+
+    back = np.exp(-1j * alpha)
+    alpha_d, beta_d = rates(back * rd)
+    turning = -(alpha_d**2) * z + 2j * alpha_d * beta_d * z_b + beta_d**2 * z_bb
+    alpha_dd, beta_dd = rates(back * rdd - turning)
+    elbows = len(scene.arms) - 1
+    return RigidMotion(
+        *(
+            np.column_stack([x, a, *(elbows * [b])])
+            for x, a, b in zip(
+                cart,
+                (alpha, alpha_d, alpha_dd),
+                (beta, beta_d, beta_dd),
+                strict=True,
+            )
+        )
+    )
+
+
+def _cart(path: Path, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the shoulder's x and its derivatives (n,): of the cart, or of the fixed base."""
+    if motion.base == "fixed":
+        rest = np.zeros(len(path.p))
+        return rest + motion.base_position, rest, rest
+    follow = motion.cart_follow
+    return follow * path.p[:, 0], follow * path.pd[:, 0], follow * path.pdd[:, 0]
+
+
+def _one_arm(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
+    """Return the motion of one arm: L sin(alpha) is the path's height, and the cart below it.
+
+    The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
+    """
+    motion, length = scene.motion, scene.arms[0].length
+    height = path.p[:, 1] - motion.joint_height
+    _check_height(t, height, length, scene)
+    lean = np.arcsin(height / length)
+    alpha = lean if motion.elbow == 1 else np.pi - lean
+    c, z = length * np.cos(alpha), length * np.sin(alpha)
+    alpha_d = path.pd[:, 1] / c
+    alpha_dd = (path.pdd[:, 1] + z * alpha_d**2) / c
+    return RigidMotion(
+        q=np.column_stack([path.p[:, 0] - c, alpha]),
+        qd=np.column_stack([path.pd[:, 0] + z * alpha_d, alpha_d]),
+        qdd=np.column_stack([path.pdd[:, 0] + z * alpha_dd + c * alpha_d**2, alpha_dd]),
+    )
+
+
+def _tabulated_joints(t: np.ndarray, scene: Scene) -> RigidMotion:
+    """Return the joint coordinates of the scene's table."""
+    motion = scene.motion
+    joints = _along(t, motion, _columns(scene))
+    if motion.base == "cart":
+        return RigidMotion(*joints)
+    places = (motion.base_position, 0.0, 0.0)
+    return RigidMotion(
+        *(np.insert(value, 0, place, axis=1) for value, place in zip(joints, places, strict=True))
+    )
+
+
+def _columns(scene: Scene) -> tuple[str, ...]:
+    """Return the columns of the scene's table."""
+    if scene.motion.path == "points":
+        return POINT
+    names = tuple(arm.name for arm in scene.arms)
+    for reserved in (TIME, CART):
+        if reserved in names:
+            raise InputError(
+                f"{scene.source}: motion.path = 'joints' with an arm named {reserved!r}, which "
+                "means another column of the table; give the arm another name"
+            )
+    return names if scene.motion.base == "fixed" else (CART, *names)
+
+
+# -- continuity and reach --------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def _continuous_shoulder(scene: Scene, stamp: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return dense instants and the first arm's angle there without jumps, rad."""
+    motion = scene.motion
+    t = np.linspace(0.0, motion.duration, DENSE)
+    alpha = _chain(t, desired_path(t, motion), scene).q[:, 1]
+    return t, np.unwrap(alpha)
+
+
+def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, scene: Scene) -> None:
+    """Raise when the shoulder's distance to the path leaves the reach of the arms."""
+    margin = SINGULAR * max(bend.lengths)
+    near, far = bend.reach
+    if len(distance) == 0 or (distance.min() >= near + margin and distance.max() <= far - margin):
+        return
+    for right, limit, word in (
+        (distance <= far - margin, far, "stretched or out of reach"),
+        (distance >= near + margin, near, "folded or too near"),
+    ):
+        if not right.all():  # not a number, from an overflow, is not right
+            wrong = np.flatnonzero(~right)
+            worst = wrong[np.argmax(np.abs(distance[wrong] - limit))]
+            arms = " and ".join(", ".join(f"{a:g} m" for a in bend.lengths).rsplit(", ", 1))
+            bent = ", all elbows bent alike," if len(bend.lengths) > 2 else ""
+            raise InputError(
+                f"{scene.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
+                f"{distance[worst]:.6g} m from the shoulder, {word}: arms of {arms}{bent} need a "
+                f"distance between {near:g} m and {far:g} m; change {_remedies(scene)}"
+            )
+
+
+def _check_height(t: np.ndarray, height: np.ndarray, length: float, scene: Scene) -> None:
+    """Raise when the path is higher or lower than one arm reaches."""
+    wrong = np.flatnonzero(~(np.abs(height) <= (1.0 - SINGULAR) * length))
+    if wrong.size:
+        worst = wrong[np.argmax(np.abs(height[wrong]))]
+        side = "below" if height[worst] < 0.0 else "above"
+        raise InputError(
+            f"{scene.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
+            f"{abs(height[worst]):.6g} m {side} the shoulder, upright or out of reach: one arm of "
+            f"{length:g} m needs less than {length:g} m; change {_remedies(scene)}"
+        )
+
+
+def _remedies(scene: Scene) -> str:
+    """Return the keys that move the path or the shoulder."""
+    motion = scene.motion
+    keys = {
+        "arc": ["motion.radius", "motion.flattening"],
+        "line": ["motion.start", "motion.end"],
+        "points": ["the table motion.file"],
+    }[motion.path]
+    if motion.base == "fixed":
+        keys.append("motion.base_position")
+    elif len(scene.arms) > 1:
+        keys.append("motion.cart_follow")
+    return f"{', '.join(keys)}, motion.joint_height or the arms' length"

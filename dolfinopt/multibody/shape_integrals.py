@@ -1,0 +1,370 @@
+"""The inertia shape integrals (standard input data) of one flexible body, in the plane or in space.
+
+With reference positions X and modes Phi of d components the point p of a body is p = N eta with
+N = [X, Phi_1 ... Phi_q] and eta = (1, q). All that its inertia needs are integrals over the mass
+
+    m = int 1,   w_a = int N_a,   W_c = int N' E_c N
+
+with the matrices E_c that a frame's angular velocity and acceleration are made of: the identity and
+the rotation by 90 degrees in the plane, the nine units in space. What every integral is multiplied
+by in a denser, stiffer or more damped material, and which of its axes run over the coordinates,
+stands beside it in one table: scaling, change of basis, addition and gradients follow from it.
+Source: Wallrapp (1994), doi:10.1080/08905459408905214; Schwertassek & Wallrapp (1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from dolfinopt.fem.elasticity import ElasticArm
+    from dolfinopt.reduction import Basis
+
+# E_c of plane motion: A = wd S - w^2 I, and twice Omega = 2 w S.
+PLANE = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]]])
+# E_ab has a one at (a, b): W_ab = int N_a' N_b.
+SPACE = np.eye(9).reshape(9, 3, 3)
+
+
+@dataclass(frozen=True)
+class Integral:
+    """What one field of `ShapeIntegrals` is.
+
+    Attributes:
+        name: of the field.
+        scale: "mass", "stiffness" or "damping", which it is proportional to; None: geometry.
+        modes: axes that run over the q coordinates.
+        rigid: those axes have 1 + q entries, the first one for the reference position.
+    """
+
+    name: str
+    scale: str | None = None
+    modes: tuple[int, ...] = ()
+    rigid: bool = False
+
+
+# A further integral is a field of `ShapeIntegrals` and a line here.
+TABLE = (
+    Integral("mass", "mass"),
+    Integral("w", "mass", modes=(1,), rigid=True),
+    Integral("W", "mass", modes=(1, 2), rigid=True),
+    Integral("K", "stiffness", modes=(0, 1)),
+    Integral("D", "damping", modes=(0, 1)),
+    Integral("outboard", modes=(1,)),
+    Integral("outboard_point"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeIntegrals:
+    """One body reduced to q elastic coordinates in its tangent frame at the inboard joint.
+
+    d is 2 and g, the number of E_c, 2 in the plane; 3 and 9 in space. The derivatives of a scalar
+    by these integrals are kept in the same form (`Mechanism`'s adjoint): entry by entry, so that
+    the sum of products with a change of the integrals is the change of the scalar.
+
+    Attributes:
+        mass: m, kg.
+        w: (d, 1 + q) int N_a; kg m for X in m.
+        W: (g, 1 + q, 1 + q) int N' E_c N; kg m2.
+        K: (q, q) stiffness Phi' K Phi.
+        D: (q, q) damping.
+        outboard: (3, q) in the plane, (6, q) in space: displacement and rotation of the outboard
+            interface in each mode.
+        outboard_point: (d,) its reference position, m.
+    """
+
+    mass: float
+    w: np.ndarray
+    W: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    outboard: np.ndarray
+    outboard_point: np.ndarray
+
+    @property
+    def num_modes(self) -> int:
+        """Number q of elastic coordinates."""
+        return len(self.K)
+
+    def __add__(self, other: ShapeIntegrals) -> ShapeIntegrals:
+        """Return the sum of derivatives, integral by integral."""
+        return ShapeIntegrals(*(getattr(self, i.name) + getattr(other, i.name) for i in TABLE))
+
+    # -- as the equations of plane motion name them ----------------------------------------------
+
+    @cached_property
+    def moment(self) -> np.ndarray:
+        """First moment c = int X (d,), kg m."""
+        return np.ascontiguousarray(self.w[:, 0])
+
+    @cached_property
+    def C(self) -> np.ndarray:
+        """Int Phi (d, q)."""
+        return np.ascontiguousarray(self.w[:, 1:])
+
+    @cached_property
+    def inertia(self) -> float:
+        """J = int X . X, kg m2; plane bodies."""
+        return float(self.W[0, 0, 0])
+
+    @cached_property
+    def j(self) -> np.ndarray:
+        """Int X . Phi_k (q,); plane bodies."""
+        return np.ascontiguousarray(self.W[0, 0, 1:])
+
+    @cached_property
+    def r(self) -> np.ndarray:
+        """Int (S X) . Phi_k (q,); plane bodies."""
+        return np.ascontiguousarray(self.W[1, 1:, 0])
+
+    @cached_property
+    def M(self) -> np.ndarray:
+        """Int Phi_k . Phi_l (q, q); plane bodies."""
+        return np.ascontiguousarray(self.W[0, 1:, 1:])
+
+    @cached_property
+    def G(self) -> np.ndarray:
+        """Int Phi_k . (S Phi_l) (q, q), skew; plane bodies."""
+        return np.ascontiguousarray(self.W[1, 1:, 1:])
+
+
+def plane_body(
+    mass: float,
+    moment: np.ndarray,
+    inertia: float,
+    C: np.ndarray,
+    j: np.ndarray,
+    r: np.ndarray,
+    M: np.ndarray,
+    G: np.ndarray,
+    K: np.ndarray,
+    D: np.ndarray,
+    outboard: np.ndarray,
+    outboard_point: np.ndarray,
+) -> ShapeIntegrals:
+    """Return a plane body from its integrals by name, see `ShapeIntegrals`."""
+    q = len(K)
+    W = np.zeros((2, 1 + q, 1 + q))
+    W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
+    W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
+    w = np.column_stack([moment, C])
+    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point)
+
+
+# -- what follows from the table -------------------------------------------------------------
+
+
+def scaled(body: ShapeIntegrals, mass: float, stiffness: float, damping: float) -> ShapeIntegrals:
+    """Return a body (or derivatives) with every integral times the factor of its kind."""
+    factors = {"mass": mass, "stiffness": stiffness, "damping": damping}
+    changed = {i.name: factors[i.scale] * getattr(body, i.name) for i in TABLE if i.scale}
+    return replace(body, **changed)
+
+
+def of_material(
+    body: ShapeIntegrals, mass: float, stiffness: float, damping: float
+) -> ShapeIntegrals:
+    """Return the body of a denser, stiffer material.
+
+    Args:
+        body: reduced; its basis is that of the other material, too.
+        mass, stiffness: factors.
+        damping: beta in D = beta K of the result, s.
+    """
+    other = scaled(body, mass, stiffness, 1.0)
+    return replace(other, D=damping * other.K)
+
+
+def in_basis(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
+    """Return the body in the coordinates z with q = T z; T is (q, q')."""
+    changed: dict[str, Any] = {}
+    for one in TABLE:
+        if one.modes:
+            first = 1 if one.rigid else 0
+            changed[one.name] = _transformed(getattr(body, one.name), T, len(one.modes), first)
+    return replace(body, **changed)
+
+
+def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.ndarray:
+    """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay."""
+    q = T.shape[1]
+    out = np.empty((*value.shape[:-rank], *(first + q,) * rank))
+    if rank == 1:
+        out[..., :first], out[..., first:] = value[..., :first], value[..., first:] @ T
+        return out
+    out[..., :first, :first] = value[..., :first, :first]
+    out[..., :first, first:] = value[..., :first, first:] @ T
+    out[..., first:, :first] = (value[..., first:, :first].swapaxes(-1, -2) @ T).swapaxes(-1, -2)
+    out[..., first:, first:] = T.T @ value[..., first:, first:] @ T
+    return out
+
+
+def proportional(
+    body: ShapeIntegrals, other: ShapeIntegrals, scale: str
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the integrals of both that `scale` multiplies, as arrays."""
+    names = [one.name for one in TABLE if one.scale == scale]
+    here, there = ([np.asarray(getattr(x, name)) for name in names] for x in (body, other))
+    return here, there
+
+
+def same_geometry(body: ShapeIntegrals, other: ShapeIntegrals) -> bool:
+    """Return whether number of coordinates, outboard modes and point are equal."""
+    names = [one.name for one in TABLE if one.scale is None]
+    return body.num_modes == other.num_modes and all(
+        np.array_equal(getattr(body, name), getattr(other, name)) for name in names
+    )
+
+
+# -- from finite elements --------------------------------------------------------------------
+
+
+def augmented(points: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """Return the nodal fields N = [X, V] (n_nodes, d, 1 + q)."""
+    return np.concatenate([points[:, :, None], V], axis=2)
+
+
+def generators(dimension: int) -> np.ndarray:
+    """Return the matrices E_c (g, d, d) of the plane or of space."""
+    return PLANE if dimension == 2 else SPACE
+
+
+def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float) -> ShapeIntegrals:
+    """Integrate the body's inertia over its current design (collective on the arm's ranks).
+
+    Args:
+        arm: with its design set.
+        basis: of that design.
+        stiffness_proportional: beta in D = beta K, s.
+    """
+    X, V, MV = arm.points, basis.V, basis.MV
+    d, q = X.shape[1], V.shape[2]
+    E = generators(d)
+    rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))  # M [1, X], per component
+    MX, MV_flat = rigid[:, :, 1], MV.reshape(-1, q)
+    EX = np.einsum("cab,nb->cna", E, X)
+    EV = np.einsum("cab,nbl->cnal", E, V).reshape(len(E), -1, q)
+    parts = (
+        rigid[:, 0, 0].sum(),
+        MX.sum(axis=0),
+        MV.sum(axis=0),
+        np.array([np.sum(one * MX) for one in EX]),
+        np.array([np.einsum("ni,nik->k", one, MV) for one in EX]),
+        MV_flat.T @ EV,
+    )
+    packed = np.concatenate([np.ravel(part) for part in parts])
+    if arm.comm.size > 1:  # one reduction for all integrals
+        packed = arm.comm.allreduce(packed)
+    pieces = np.split(packed, np.cumsum([np.size(part) for part in parts])[:-1])
+    mass, moment, C, second, first, modes = (
+        piece.reshape(np.shape(part)) for piece, part in zip(pieces, parts, strict=True)
+    )
+    return ShapeIntegrals(
+        mass=float(mass),
+        w=np.column_stack([moment, C]),
+        W=_assembled(E, second, first, modes),
+        K=basis.stiffness,
+        D=stiffness_proportional * basis.stiffness,
+        outboard=basis.outboard,
+        outboard_point=arm.mesh.outboard_point,
+    )
+
+
+def _assembled(
+    E: np.ndarray, second: np.ndarray, first: np.ndarray, modes: np.ndarray
+) -> np.ndarray:
+    """Return W (g, 1 + q, 1 + q) of int X' E_c X, int Phi' E_c X and int Phi' E_c Phi.
+
+    The integral with E_c' is the transposed one: exactly, so that rounding goes.
+    """
+    partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
+    q = first.shape[1]
+    W = np.empty((len(E), 1 + q, 1 + q))
+    W[:, 0, 0] = 0.5 * (second + partners @ second)
+    W[:, 1:, 0] = first
+    W[:, 0, 1:] = partners @ first
+    W[:, 1:, 1:] = 0.5 * (modes + np.tensordot(partners, modes.swapaxes(1, 2), 1))
+    return W
+
+
+@dataclass(frozen=True, eq=False)
+class MassPartners:
+    """Nodal fields through which a function of the integrals feels the mass matrix; n nodes.
+
+    With dJ = sum_k left_k . dM right_k and, by the modes, dJ = sum_k (M by_modes)_k . dV_k.
+
+    Attributes:
+        left, right: (n, d, 2 + q).
+        by_modes: (n, d, q).
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    by_modes: np.ndarray
+
+
+def mass_partners(points: np.ndarray, V: np.ndarray, by: ShapeIntegrals) -> MassPartners:
+    """Return the fields that carry derivatives by the integrals to the mass of the cells.
+
+    Of sum_c Wbar_c,kl int N_k . E_c N_l the left factor is Y_l = sum_c,k E_c' N_k Wbar_c,kl.
+
+    Args:
+        points: (n, d) nodes, m.
+        V: (n, d, q) modes.
+        by: derivatives by the integrals.
+    """
+    N, E = augmented(points, V), generators(points.shape[1])
+    unit = np.zeros_like(N[:, :, :1])
+    unit[:, 0] = 1.0  # m = int 1_x . 1_x
+    quadratic = np.einsum("cab,nak,ckl->nbl", E, N, by.W, optimize=True)
+    transposed = np.einsum("cab,nbk,clk->nal", E, N, by.W, optimize=True)
+    left = np.concatenate([quadratic + by.w, by.mass * unit], axis=2)
+    return MassPartners(
+        left=left,
+        right=np.concatenate([N, unit], axis=2),
+        by_modes=(quadratic + transposed + by.w)[:, :, 1:],
+    )
+
+
+# -- single bodies ---------------------------------------------------------------------------
+
+
+def rigid_body(
+    mass: float, moment: np.ndarray, inertia: float, outboard_point: np.ndarray
+) -> ShapeIntegrals:
+    """Return a plane body without elastic coordinates, or the derivatives by one.
+
+    Args:
+        mass: kg.
+        moment: (2,) first moment about the frame's origin, kg m.
+        inertia: about it, kg m2.
+        outboard_point: (2,) m.
+    """
+    none, square = np.zeros(0), np.zeros((0, 0))
+    modes, outboard = np.zeros((2, 0)), np.zeros((3, 0))
+    return plane_body(
+        mass, moment, inertia, modes, none, none, square, square, square, square, outboard,
+        outboard_point,
+    )  # fmt: skip
+
+
+def rigid_bar(length: float, height: float, thickness: float, density: float) -> ShapeIntegrals:
+    """Return a solid bar without elastic coordinates; m, kg/m3."""
+    mass = density * length * height * thickness
+    inertia = mass * (length**2 / 3.0 + height**2 / 12.0)
+    return rigid_body(mass, np.array([0.5 * mass * length, 0.0]), inertia, np.array([length, 0.0]))
+
+
+def first_frequency(body: ShapeIntegrals) -> float:
+    """Return the lowest natural frequency of the reduced clamped-free body, Hz; inf if rigid."""
+    if body.num_modes == 0:
+        return float("inf")
+    lower = np.linalg.cholesky(body.M)
+    inverse = np.linalg.inv(lower)
+    values = np.linalg.eigvalsh(inverse @ body.K @ inverse.T)
+    return float(np.sqrt(max(values[0], 0.0)) / (2.0 * np.pi))

@@ -1,0 +1,408 @@
+"""A plane body as standard input data of the spatial format, and back.
+
+Motion is in x-y, rotation about z. What the planar equations know goes into its places in the
+spatial matrices bit by bit, so that body -> SID -> body is exact. What only a spatial code asks for
+(rotation about x and y, centrifugal forces of such rotation) comes from `SpatialMoments`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.sid import (
+    DIAGONAL,
+    GENERAL,
+    SYMMETRIC,
+    UNIT,
+    ZERO,
+    Node,
+    StandardInputData,
+    read_sid,
+    taylor,
+)
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+
+if TYPE_CHECKING:
+    from dolfinopt.fem.elasticity import ElasticArm
+    from dolfinopt.reduction import Basis
+
+# What may stand where a body in plane motion has zeros, relative to the matrix's largest entry:
+# finite elements leave 1e-12, files with six digits 1e-6.
+PLANAR = 1e-6
+# How far the centrifugal matrix may be from -Me, relative to Me: lumped masses reach 5 %,
+# geometric stiffening by rotation about z makes its diagonal positive for slender bodies.
+CENTRIFUGAL = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialMoments:
+    """Integrals over the mass of a plate of constant thickness about its middle plane z = 0.
+
+    Attributes:
+        second: (2, 2) int X X', kg m2.
+        depth: int z^2, kg m2.
+        first: (2, 2, q) int X_i Phi_jk.
+        mixed: (2, 2, q, q) int Phi_ik Phi_jl.
+    """
+
+    second: np.ndarray
+    depth: float
+    first: np.ndarray
+    mixed: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneNode:
+    """A further node of the body.
+
+    Attributes:
+        name: other than "1" and "2".
+        point: (2,) reference position, m.
+        motion: (3, q) u_x, u_y, theta by each coordinate.
+    """
+
+    name: str
+    point: np.ndarray
+    motion: np.ndarray
+
+
+def spatial_moments(arm: ElasticArm, basis: Basis, thickness: float) -> SpatialMoments:
+    """Integrate over the arm's current design (collective on the arm's ranks).
+
+    Args:
+        arm: with its design set.
+        basis: of that design.
+        thickness: t, m; int z^2 = m t^2 / 12.
+    """
+    X, V, MV = arm.points, basis.V, basis.MV
+    q = V.shape[2]
+    rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))
+    # The mass matrix treats x and y alike: its product with (x, y) has M x and M y as components.
+    parts = (
+        rigid[:, 0, 0].sum(),
+        np.einsum("ni,nj->ij", X, rigid[:, :, 1]),
+        np.einsum("ni,njk->ijk", X, MV),
+        np.einsum("nik,njl->ijkl", V, MV),
+    )
+    packed = np.concatenate([np.ravel(part) for part in parts])
+    if arm.comm.size > 1:
+        packed = arm.comm.allreduce(packed)
+    mass, second, first, mixed = np.split(packed, np.cumsum([1, 4, 4 * q]))
+    return SpatialMoments(
+        second=second.reshape(2, 2),
+        depth=float(mass[0]) * thickness**2 / 12.0,
+        first=first.reshape(2, 2, q),
+        mixed=mixed.reshape(2, 2, q, q),
+    )
+
+
+def slender_moments(body: ShapeIntegrals) -> SpatialMoments:
+    """Return a guess from the planar integrals alone: all mass on the x axis, moving across it.
+
+    int y^2 = int z^2 = int y Phi = int Phi_x Phi_x = 0, the rest as the planar integrals have it:
+    the same motion in the plane, and out of it that of a thin bar.
+    """
+    q = body.num_modes
+    first, mixed = np.zeros((2, 2, q)), np.zeros((2, 2, q, q))
+    first[0, 0], first[0, 1] = body.j, body.r
+    mixed[1, 1] = body.M
+    mixed[0, 1], mixed[1, 0] = -0.5 * body.G, 0.5 * body.G
+    return SpatialMoments(np.diag([body.inertia, 0.0]), 0.0, first, mixed)
+
+
+# -- to SID ----------------------------------------------------------------------------------
+
+
+def to_sid(
+    body: ShapeIntegrals,
+    moments: SpatialMoments | None = None,
+    further: Sequence[PlaneNode] = (),
+    comment: str = "",
+) -> StandardInputData:
+    """Return a plane body as standard input data.
+
+    The first node, "1", is the inboard joint, the last one, "2", the outboard interface. A
+    coordinate's name holds sqrt(K_kk / M_kk) in Hz, as other programs expect.
+
+    Args:
+        body: tangent frame at the inboard joint.
+        moments: for spatial codes; by default those of `slender_moments`.
+        further: nodes between the two.
+        comment: for the file's first line.
+    """
+    q = body.num_modes
+    held = PlaneNode("1", np.zeros(2), np.zeros((3, q)))
+    nodes = (held, *further, PlaneNode("2", body.outboard_point, body.outboard))
+    frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
+    names = tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1))
+    moments = moments or slender_moments(body)
+    none = np.zeros((q, 1))
+    return StandardInputData(
+        mass=body.mass,
+        names=names,
+        nodes=tuple(_node(node, q) for node in nodes),
+        comment=comment,
+        Me=taylor(body.M, nq=q, structure=SYMMETRIC),
+        ksigma=taylor(none, nq=q, structure=ZERO),
+        Ke=taylor(body.K, nq=q, structure=SYMMETRIC),
+        De=taylor(body.D, nq=q, structure=_structure(body.D)),
+        **_rigid_matrices(body, moments),
+        **_elastic_matrices(body, moments),
+    )
+
+
+def _structure(matrix: np.ndarray) -> int:
+    if np.array_equal(matrix, np.diag(np.diag(matrix))):
+        return DIAGONAL
+    return SYMMETRIC if np.array_equal(matrix, matrix.T) else GENERAL
+
+
+def _node(node: PlaneNode, q: int) -> Node:
+    origin, phi, psi = np.zeros((3, 1)), np.zeros((3, q)), np.zeros((3, q))
+    origin[:2, 0], phi[:2], psi[2] = node.point, node.motion[:2], node.motion[2]
+    turn = np.zeros((3, q, 3))  # tilde(psi_k)
+    turn[0, :, 1], turn[1, :, 0] = 0.0 - psi[2], psi[2]
+    return Node(
+        name=node.name,
+        rframe="body ref",
+        origin=taylor(origin, phi[:, :, None].copy(), nq=q, structure=GENERAL),
+        phi=taylor(phi, nq=q, structure=GENERAL),
+        psi=taylor(psi, nq=q, structure=GENERAL),
+        AP=taylor(np.eye(3), turn, nq=q, structure=GENERAL if turn.any() else UNIT),
+    )
+
+
+def _rigid_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
+    """Return what moves the frame: mdCM, J and Gr."""
+    q, (xx, yy) = body.num_modes, np.diag(moments.second)
+    centre, centre_q = np.zeros((3, 1)), np.zeros((3, q, 1))
+    centre[:2, 0], centre_q[:2, :, 0] = body.moment, body.C
+    inertia, inertia_q = np.zeros((6, 1)), np.zeros((6, q, 1))
+    xy = moments.second[0, 1]
+    inertia[:4, 0] = yy + moments.depth, xx + moments.depth, body.inertia, 0.0 - xy
+    first = moments.first
+    inertia_q[:4, :, 0] = (
+        2.0 * first[1, 1],
+        2.0 * first[0, 0],
+        2.0 * body.j,
+        0.0 - (first[0, 1] + first[1, 0]),
+    )
+    # -2 int tilde(r) tilde(Phi_k) = 2 int (r . Phi_k) I - Phi_k r', and the same with r = Phi_l.
+    gyroscopic = np.zeros((3, q, 3))  # row, k, column
+    gyroscopic_q = np.zeros((3, q, q, 3))  # row, l, k, column
+    mixed = moments.mixed
+    for i, other in ((0, 1), (1, 0)):
+        gyroscopic[i, :, i] = 2.0 * first[other, other]
+        gyroscopic[i, :, other] = 0.0 - 2.0 * first[other, i]
+        gyroscopic_q[i, :, :, i] = 2.0 * mixed[other, other]
+        gyroscopic_q[i, :, :, other] = 0.0 - 2.0 * mixed[other, i]
+    gyroscopic[2, :, 2] = 2.0 * body.j
+    gyroscopic_q[2, :, :, 2] = 2.0 * body.M
+    return {
+        "mdCM": taylor(centre, centre_q, nq=q, structure=GENERAL),
+        "J": taylor(inertia, inertia_q, nq=q, structure=GENERAL),
+        "Gr": taylor(
+            gyroscopic.reshape(3, 3 * q),
+            gyroscopic_q.reshape(3, q, 3 * q),
+            nq=q,
+            structure=GENERAL,
+        ),
+    }
+
+
+def _elastic_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
+    """Return what moves the coordinates: Ct, Cr, Ge and Oe."""
+    q, first, mixed = body.num_modes, moments.first, moments.mixed
+    push = np.zeros((q, 3))
+    push[:, :2] = body.C.T
+    turn, turn_q = np.zeros((q, 3)), np.zeros((q, q, 3))
+    turn[:, 2], turn_q[:, :, 2] = body.r, body.G
+    coriolis = np.zeros((q, q, 3))  # row, block, column
+    coriolis[:, :, 2] = 2.0 * body.G
+    # int (Phi.w)(w.r) - w^2 (Phi.r), and the same with r = Phi_l.
+    centrifugal, centrifugal_q = np.zeros((q, 6)), np.zeros((q, q, 6))
+    columns = (first[1, 1], first[0, 0], body.j)
+    columns_q = (mixed[1, 1], mixed[0, 0], body.M)
+    for c in range(3):
+        centrifugal[:, c] = 0.0 - columns[c]
+        centrifugal_q[:, :, c] = 0.0 - columns_q[c]
+    centrifugal[:, 3] = first[0, 1] + first[1, 0]
+    centrifugal_q[:, :, 3] = mixed[0, 1] + mixed[1, 0]
+    return {
+        "Ct": taylor(push, nq=q, structure=GENERAL),
+        "Cr": taylor(turn, turn_q, nq=q, structure=GENERAL),
+        "Ge": taylor(coriolis.reshape(q, 3 * q), nq=q, structure=GENERAL),
+        "Oe": taylor(centrifugal, centrifugal_q, nq=q, structure=GENERAL),
+    }
+
+
+# -- from SID --------------------------------------------------------------------------------
+
+
+def load_body(path: Path, length: float | None = None) -> ShapeIntegrals:
+    """Read an SID file and return its plane body, see `from_sid`.
+
+    Args:
+        path: of the file; its first node is the inboard, its last one the outboard node.
+        length: joint axis to joint axis, m, with which the file must agree.
+
+    Raises:
+        InputError: the file is damaged, its body is not of that kind or of another length.
+    """
+    body = from_sid(read_sid(path), source=str(path))
+    if length is not None:
+        x, y = body.outboard_point
+        if np.hypot(x - length, y) > PLANAR * length:
+            raise InputError(
+                f"{path}: the outboard node is at ({x:.7g}, {y:.7g}) m, but the arm's length is "
+                f"{length:.7g} m; it must be at (length, 0)"
+            )
+    return body
+
+
+def from_sid(
+    data: StandardInputData,
+    inboard: str | None = None,
+    outboard: str | None = None,
+    source: str = "SID",
+) -> ShapeIntegrals:
+    """Return the plane body of standard input data.
+
+    The frame must be the tangent frame at the inboard node, all motion in x-y. Entries that plane
+    motion does not feel (J about x and y, ...) are dropped.
+
+    Args:
+        data: of any program.
+        inboard: name of the inboard node, by default the first.
+        outboard: name of the outboard node, by default the last.
+        source: what messages call the data.
+
+    Raises:
+        InputError: one line: no such node, a frame that is not held at the inboard node, motion
+            out of the plane, initial stresses or geometric stiffening, matrices that are no
+            mechanical body's.
+    """
+    first, last = _ends(data, inboard, outboard, source)
+    _check_nodes(data, first, last, source)
+    _check_plane(data, source)
+    _check_definite(data, source)
+    _check_stiffening(data, source)
+    G, M = 0.5 * data.Ge.M0[:, 2::3], data.Me.M0
+    if np.abs(G + G.T).max() > PLANAR * np.abs(M).max():
+        raise InputError(f"{source}: the columns 3, 6, ... of Ge must be a skew matrix")
+    return plane_body(
+        mass=data.mass,
+        moment=data.mdCM.M0[:2, 0].copy(),
+        inertia=float(data.inertia(np.zeros(data.coordinates))[2, 2]),
+        C=data.Ct.M0[:, :2].T.copy(),
+        j=0.0 - data.Oe.M0[:, 2],
+        r=data.Cr.M0[:, 2].copy(),
+        M=0.5 * (M + M.T),
+        G=0.5 * (G - G.T),
+        K=0.5 * (data.Ke.M0 + data.Ke.M0.T),
+        D=data.De.M0.copy(),
+        outboard=np.vstack([last.phi.M0[:2], last.psi.M0[2]]),
+        outboard_point=last.origin.M0[:2, 0].copy(),
+    )
+
+
+def _ends(
+    data: StandardInputData, inboard: str | None, outboard: str | None, source: str
+) -> tuple[Node, Node]:
+    """Return the two interface nodes."""
+    names = [node.name for node in data.nodes]
+    if len(names) < 2:
+        raise InputError(
+            f"{source}: lacks an outboard node, its nodes are: {', '.join(names) or 'none'}; an "
+            "arm needs an inboard node at the origin and an outboard node"
+        )
+    for side, name in (("inboard", inboard), ("outboard", outboard)):
+        if name is not None and name not in names:
+            raise InputError(f"{source}: no {side} node {name!r}; it has {', '.join(names)}")
+    first = data.nodes[0 if inboard is None else names.index(inboard)]
+    last = data.nodes[-1 if outboard is None else names.index(outboard)]
+    if first is last:
+        raise InputError(f"{source}: node {first.name} cannot be both inboard and outboard")
+    return first, last
+
+
+def _check_nodes(data: StandardInputData, first: Node, last: Node, source: str) -> None:
+    """Check that the frame is held at the first node, and that the last moves in the plane."""
+    reach = np.abs(last.origin.M0).max()
+    if not reach > 0.0:
+        raise InputError(f"{source}: the outboard node {last.name} is at the origin")
+    push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
+    # Of the two scales the other follows over the arm's length.
+    push, turn = max(push, reach * turn), max(turn, push / reach)
+    checks = [
+        (first, "origin", first.origin.M0, reach, "at the origin"),
+        (first, "phi", first.phi.M0, push, "held in the frame"),
+        (first, "psi", first.psi.M0, turn, "held in the frame"),
+        (last, "origin", last.origin.M0[2], reach, "in the plane z = 0"),
+        (last, "phi", last.phi.M0[2], push, "in the plane"),
+        (last, "psi", last.psi.M0[:2], turn, "in the plane"),
+    ]
+    checks += [(node, "AP", node.AP.M0 - np.eye(3), 1.0, "parallel") for node in (first, last)]
+    for node, name, values, scale, must in checks:
+        if np.abs(values).max() > PLANAR * scale:
+            raise InputError(
+                f"{source}: {name} of node {node.name} deviates by {np.abs(values).max():.3g}; the "
+                f"{'inboard' if node is first else 'outboard'} node must be {must}"
+            )
+
+
+def _check_plane(data: StandardInputData, source: str) -> None:
+    """Check that plane motion stays in the plane."""
+    inertia = data.inertia(np.zeros(data.coordinates))
+    spatial: Iterable[tuple[str, np.ndarray, np.ndarray]] = (
+        ("row 3 of mdCM", data.mdCM.M0[2], data.mdCM.M0),
+        ("J(1, 3), J(2, 3)", inertia[:2, 2], inertia),
+        ("column 3 of Ct", data.Ct.M0[:, 2], data.Ct.M0),
+        ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
+    )
+    for name, values, whole in spatial:
+        if np.abs(values).max() > PLANAR * np.abs(whole).max():
+            raise InputError(
+                f"{source}: {name} reach(es) {np.abs(values).max():.3g}; an arm must move in the "
+                "x-y plane only"
+            )
+
+
+def _check_definite(data: StandardInputData, source: str) -> None:
+    """Check that a mechanical body may have these masses and stiffnesses."""
+    inertia = data.inertia(np.zeros(data.coordinates))[2, 2]
+    for name, number in (("mass", data.mass), ("J(3, 3)", inertia)):
+        if not number > 0.0:
+            raise InputError(f"{source}: {name} = {number:g} must be > 0")
+    for name, matrix in (("Me", data.Me.M0), ("Ke", data.Ke.M0)):
+        if np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] <= 0.0:
+            raise InputError(
+                f"{source}: {name} must be positive definite; the body must be held at its inboard "
+                "node and its coordinates be independent"
+            )
+
+
+def _check_stiffening(data: StandardInputData, source: str) -> None:
+    """Check that there are no initial stresses and no geometric stiffening."""
+    zero = {
+        "ksigma": data.ksigma.M0,
+        "m1 of Ct": data.Ct.M1,
+        "m1 of Ke": data.Ke.M1,
+        **{f"m1 of phi of node {node.name}": node.phi.M1 for node in data.nodes},
+    }
+    present = [name for name, values in zero.items() if values.any()]
+    if data.Oe.order > 0:
+        excess = np.abs(data.Oe.M1[:, :, 2] + data.Me.M0).max()
+        if excess > CENTRIFUGAL * np.abs(data.Me.M0).max():
+            present.append("m1 of Oe beyond -Me")
+    if present:
+        raise InputError(
+            f"{source}: {present[0]} holds initial stresses or geometric stiffening, which arms do "
+            "not have here; write the file without"
+        )

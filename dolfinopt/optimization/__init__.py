@@ -1,0 +1,1 @@
+"""The optimisation loop, the method of moving asymptotes, and the gradient check."""

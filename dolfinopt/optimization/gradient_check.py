@@ -1,0 +1,221 @@
+"""Taylor test of the exact gradient along the complete chain, and how far frozen loads are off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.dynamics.radau import AIM
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.errors import InputError
+from dolfinopt.parallel import ArmShare, on_root, sum_over_arms, together
+from dolfinopt.profiling import Ledger
+from dolfinopt.reduction import METHODS
+from dolfinopt.responses.evaluation import evaluate, gradient
+from dolfinopt.responses.objective import load_cases, objective
+from dolfinopt.responses.scenarios import combined
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+FALL = 4.0  # from one step to the next
+STEPS = tuple(0.01 / FALL**k for k in range(5))  # of the design variable
+MARGIN = 0.05  # design variables are drawn this far inside [0, 1]: the steps must not leave it
+ROUNDING = 1e-10  # of the objective: what Newton's tolerance leaves of it
+PASSES = 1.9  # least rate; 2 is exact
+
+Cells = Mapping[int, np.ndarray]
+
+
+@dataclass(frozen=True)
+class TaylorRow:
+    """Remainders |J(x + h d) - J(x) - h g . d| along one direction d.
+
+    Attributes:
+        direction: its name.
+        slope: g . d with the exact gradient; unit of the objective.
+        slope_frozen: the same with the ESL gradient; nan where there is none.
+        remainders: for every h of `STEPS`.
+        rate: order in h of the two finest remainders above rounding; 2 when g is the gradient,
+            inf when J is linear to rounding.
+    """
+
+    direction: str
+    slope: float
+    slope_frozen: float
+    remainders: tuple[float, ...]
+    rate: float
+
+
+@dataclass(frozen=True)
+class TaylorTest:
+    """The rows, and the ESL gradient beside the exact one: angle in degrees, ratio of norms.
+
+    The latter are nan where the objective has no loads to freeze.
+    """
+
+    rows: tuple[TaylorRow, ...]
+    angle: float
+    ratio: float
+
+    @property
+    def passed(self) -> bool:
+        """True when every direction's rate says that the gradient is one."""
+        return all(row.rate >= PASSES for row in self.rows)
+
+
+def taylor_test(
+    scene: Scene, share: ArmShare, arms: Mapping[int, Arm], x: Cells, ledger: Ledger
+) -> TaylorTest:
+    """Test the gradient by the design variables x: filter, reduction, simulation, objective.
+
+    The instants of the objective and the time steps are those of x throughout; with them the
+    objective is smooth. Variables are moved `MARGIN` inside their bounds first.
+
+    Args:
+        scene, share, arms, ledger: as for `evaluate`.
+        x: (n_cells,) design variables of this rank's arms, in [0, 1].
+
+    Raises:
+        InputError: the scene's objective has no exact gradient.
+    """
+    check_exact(scene)
+    exact = _with(scene, gradient="exact")
+    x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
+    x_phys = _physical(share, arms, x)
+    evaluation, base = evaluate(exact, share, arms, x_phys, ledger, simulated=False)
+    slope = _by_x(share, arms, gradient(exact, share, arms, base, ledger), x)
+    frozen = None
+    if scene.objective.simulated:
+        esl = _with(scene, gradient="esl")
+        frozen = _by_x(share, arms, gradient(esl, share, arms, base, ledger), x)
+        error = max(one.error for one in (evaluation, *evaluation.scenarios))
+        exact = _with(exact, tolerance=min(error / AIM, 0.1))
+    value = _fixed_objective(exact, share, arms, ledger, base)
+    here = value(x)
+    rows = []
+    for name, direction in _directions(scene, arms).items():
+        along = _dot(share, slope, direction)
+        frozen_along = np.nan if frozen is None else _dot(share, frozen, direction)
+        remainders = tuple(
+            abs(value({k: x[k] + h * direction[k] for k in x}) - here - h * along) for h in STEPS
+        )
+        rows.append(TaylorRow(name, along, frozen_along, remainders, _rate(remainders, here)))
+    if frozen is None:
+        return TaylorTest(tuple(rows), np.nan, np.nan)
+    lengths = [np.sqrt(_dot(share, g, g)) for g in (slope, frozen)]
+    cosine = _dot(share, slope, frozen) / (lengths[0] * lengths[1])
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return TaylorTest(tuple(rows), angle, lengths[1] / lengths[0])
+
+
+def check_exact(scene: Scene) -> None:
+    """Raise InputError, of one line, where the objective has no exact gradient to test."""
+    if not scene.objective.simulated:
+        return
+    method, integrator = scene.reduction.method, scene.simulation.integrator
+    if METHODS[method].adjoint is None:
+        known = " | ".join(f'"{name}"' for name, one in METHODS.items() if one.adjoint is not None)
+        raise InputError(
+            f'{scene.source}: reduction.method = "{method}": --check tests the exact gradient, '
+            f"and this basis has no adjoint; expected {known}"
+        )
+    if integrator != "radau":
+        raise InputError(
+            f'{scene.source}: simulation.integrator = "{integrator}": --check tests the exact '
+            'gradient, and only the trajectory of "radau" has an adjoint; expected "radau"'
+        )
+
+
+def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None = None) -> Scene:
+    """Return the scene with another gradient or tolerance."""
+    update: dict[str, object] = {}
+    if gradient is not None:
+        update["objective"] = scene.objective.model_copy(update={"gradient": gradient})
+    if tolerance is not None:
+        update["simulation"] = scene.simulation.model_copy(update={"tolerance": tolerance})
+    return scene.model_copy(update=update)
+
+
+def _physical(share: ArmShare, arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
+    with together(share.world):
+        return {k: arm.physical(x[k]) for k, arm in arms.items()}
+
+
+def _by_x(
+    share: ArmShare, arms: Mapping[int, Arm], slopes: Cells, x: Cells
+) -> dict[int, np.ndarray]:
+    with together(share.world):
+        return {k: arm.chain(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
+
+
+def _dot(share: ArmShare, a: Cells, b: Cells) -> float:
+    return float(sum_over_arms(share, {k: np.array(a[k] @ b[k]) for k in a}))
+
+
+def _fixed_objective(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    ledger: Ledger,
+    base: Trajectory | None,
+) -> Callable[[Cells], float]:
+    """Return J(x), of a motion with the load cases and time steps of `base`."""
+    start = () if base is None else base.solutions
+
+    def value(x: Cells) -> float:
+        x_phys = _physical(share, arms, x)
+        evaluation, trajectory = evaluate(
+            scene, share, arms, x_phys, ledger, start, simulated=False
+        )
+        if not scene.objective.simulated:
+            return evaluation.objective
+
+        def at_base_instants() -> float:
+            assert trajectory is not None and base is not None
+            pairs = zip(trajectory.scenarios, base.scenarios, strict=True)
+            values = [objective(one, one.scene, load_cases(at, one.scene)) for one, at in pairs]
+            if values:
+                return combined(scene, values)[0]
+            return objective(trajectory, scene, load_cases(base, scene))
+
+        return on_root(share.world, at_base_instants)
+
+    return value
+
+
+def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
+    """Return directions of largest entry 1: random, smooth, and boxes at both ends of the chain.
+
+    They are functions of the place, the same on any partition. First and last are among the arms
+    with a design of their own.
+    """
+    designed = list(scene.cell_counts)
+
+    def along(k: int) -> np.ndarray:
+        return arms[k].mesh.centroid[:, 0] / arms[k].mesh.outboard_point[0]
+
+    def noise(k: int) -> np.ndarray:
+        x, y = arms[k].mesh.centroid.T * 1e3
+        return 2.0 * np.modf(np.abs(np.sin(12.9898 * x + 78.233 * y + k) * 43758.5453))[0] - 1.0
+
+    chosen: dict[str, Callable[[int], np.ndarray]] = {
+        "random": noise,
+        "smooth": lambda k: np.sin(3.0 * np.pi * along(k) + k),
+        "root of the first arm": lambda k: ((along(k) < 0.1) & (k == designed[0])).astype(float),
+        "tip of the last arm": lambda k: ((along(k) > 0.9) & (k == designed[-1])).astype(float),
+    }
+    return {
+        name: {k: np.where(arm.mesh.passive, 0.0, field(k)) for k, arm in arms.items()}
+        for name, field in chosen.items()
+    }
+
+
+def _rate(remainders: tuple[float, ...], value: float) -> float:
+    """Return the order of the finest remainders in h; those at rounding level say nothing."""
+    known = [r for r in remainders if r > ROUNDING * abs(value)]
+    return float(np.log(known[-2] / known[-1]) / np.log(FALL)) if len(known) > 1 else np.inf

@@ -1,0 +1,1 @@
+"""What a run leaves in its folder: fields, histories, summary, checkpoint."""

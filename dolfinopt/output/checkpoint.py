@@ -1,0 +1,238 @@
+"""The optimiser's whole memory in one file, so that a resumed run ends in the same bits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.dynamics.problem import Solution
+from dolfinopt.errors import InputError
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.memory import Memory
+from dolfinopt.output.files import write_arrays
+from dolfinopt.output.folders import CHECKPOINT, remove_stale
+from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root, together
+from dolfinopt.responses.order_selection import Choice
+from dolfinopt.scene.contents import DIGEST, program, with_digests
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+NAME = CHECKPOINT
+SOLUTION = ("edges", "nodes", "q", "qd", "a")
+# Keys a resumed run may change: they say when to stop, not what is computed.
+MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance")
+
+
+def _scene_text(scene: Scene) -> str:
+    """Return the scene as JSON; its files by their content, so that a project can be moved."""
+    return json.dumps(with_digests(scene.to_dict()), sort_keys=True)
+
+
+def begin(folder: Path, scene: Scene) -> None:
+    """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
+    remove_stale(folder)
+    write_arrays(folder / NAME, {**_stamp(scene), "iteration": -1})
+
+
+def _stamp(scene: Scene) -> dict[str, np.ndarray]:
+    """Return what a run must share with a checkpoint to go on from it."""
+    return {"scene": np.array(_scene_text(scene)), "program": np.array(json.dumps(program()))}
+
+
+def reopen(folder: Path) -> None:
+    """Remove what a run that goes on will write anew, so that nothing old stands beside it."""
+    remove_stale(folder, keep=(NAME, "history.csv"))
+
+
+def save(
+    folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm], memory: Memory
+) -> None:
+    """Replace the checkpoint atomically (collective)."""
+    number = len(scene.arms) + 1
+    with together(share.world):
+        points = {k: _interior_points(arm) for k, arm in arms.items()}
+        known = [
+            {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()} for j in range(number)
+        ]
+    columns: dict[str, Mapping[int, Any]] = {
+        "centroid": gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()}),
+        "cells": gather_cells(share, memory.cells),
+        "threshold": gather_arms(share, memory.thresholds),
+        "points": gather_cells(share, points),
+    }
+    for j, by_arm in enumerate(known):
+        columns[f"modes{j}"] = gather_cells(share, {k: rows for k, (rows, _) in by_arm.items()})
+        columns[f"outboard{j}"] = gather_cells(share, {k: last for k, (_, last) in by_arm.items()})
+    with together(share.world):
+        if share.world.rank == 0:
+            _write(folder, scene, memory, columns)
+
+
+def _write(
+    folder: Path, scene: Scene, memory: Memory, columns: Mapping[str, Mapping[int, Any]]
+) -> None:
+    """Write the file; `columns` holds whole arms (root only)."""
+    arrays: dict[str, Any] = {
+        **_stamp(scene),
+        "iteration": memory.iteration,
+        "multipliers": memory.multipliers,
+        "history": np.array([row.values for row in memory.history]),
+        "history_columns": np.array(memory.history[0].columns),
+        "initial_deviation": memory.initial_deviation,
+        "finished": np.array(memory.finished),
+        "sharpness": memory.sharpness,
+    }
+    if memory.choice is not None:
+        arrays["coordinates"] = memory.choice.coordinates
+        arrays["tried"] = np.array(memory.choice.tried)
+    for k, solution in enumerate(memory.solutions):
+        for field in (*SOLUTION, "error"):
+            arrays[f"solution{k}/{field}"] = getattr(solution, field)
+    for key, by_arm in columns.items():
+        for k, value in by_arm.items():
+            arrays[f"arm{k}/{key}"] = value
+    write_arrays(folder / NAME, arrays)
+
+
+def check(folder: Path, scene: Scene) -> None:
+    """Raise `InputError` unless the folder holds a checkpoint of this scene (root only)."""
+    _read(folder, scene)
+
+
+def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> Memory | None:
+    """Return the memory of an interrupted run, or None when it had only begun (collective).
+
+    Rows go to the cells and nodes at the same place, on any number of ranks.
+
+    Raises:
+        InputError: no checkpoint, a damaged one, or one of another scene.
+    """
+    arrays = on_root(share.world, _read, folder, scene)
+    if int(arrays["iteration"]) < 0:
+        return None
+    with together(share.world):
+        return _memory(arrays, arms)
+
+
+def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
+    """Return the checkpoint's memory, cells and modes of this rank's arms."""
+    cells: dict[int, np.ndarray] = {}
+    modes: dict[int, list[np.ndarray]] = {}
+    for k, arm in arms.items():
+        rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
+        cells[k] = arrays[f"arm{k}/cells"][rows]
+        rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
+        rows = (2 * rows[:, None] + [0, 1]).ravel()
+        last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
+        modes[k] = []
+        for j in range(len(arm.starts)):
+            interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
+            modes[k].append(np.vstack([interior[rows], outboard if last else outboard[:0]]))
+    solutions: list[Solution] = []
+    while f"solution{len(solutions)}/error" in arrays:
+        of = f"solution{len(solutions)}"
+        parts = {field: arrays[f"{of}/{field}"] for field in SOLUTION}
+        solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
+    columns = arrays["history_columns"].tolist()
+    history = [HistoryRow.from_values(columns, row.tolist()) for row in arrays["history"]]
+    choice = None
+    if "coordinates" in arrays:
+        tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
+        count = int(arrays["coordinates"])
+        choice = Choice(count, dict(tried)[count], tried)
+    return Memory(
+        iteration=int(arrays["iteration"]),
+        cells=cells,
+        modes=modes,
+        multipliers=arrays["multipliers"],
+        solutions=tuple(solutions),
+        history=history,
+        initial_deviation=arrays["initial_deviation"],
+        finished=str(arrays["finished"]),
+        sharpness=float(arrays["sharpness"]),
+        thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in arms},
+        choice=choice,
+    )
+
+
+def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
+    inner = arm.elastic.num_interior
+    whole = modes[j] if j < len(modes) else np.empty((inner, 0))
+    return whole[:inner], whole[inner:]
+
+
+def _interior_points(arm: Arm) -> np.ndarray:
+    return arm.elastic.points[arm.elastic.interior_nodes]
+
+
+def _match(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return for each wanted point the row of the same point among the known ones."""
+    from scipy.spatial import cKDTree
+
+    if len(wanted) == 0:
+        return np.zeros(0, dtype=int)
+    return cKDTree(known).query(wanted)[1]
+
+
+def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
+    """Read and verify the checkpoint."""
+    path = folder / NAME
+    if not path.is_file():
+        raise InputError(
+            f"{path}: --resume finds no checkpoint here; start without --resume, or name the "
+            "folder of the interrupted run with --out"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        theirs = json.loads(str(arrays["scene"]))
+        if int(arrays["iteration"]) >= 0:
+            arrays["history_columns"]  # those of earlier versions have none
+    except Exception as error:  # whatever a foreign or damaged file may raise
+        raise InputError(
+            f"{path}: --resume cannot read this checkpoint ({type(error).__name__}); start "
+            "without --resume"
+        ) from None
+    if "program" not in arrays or json.loads(str(arrays["program"])) != program():
+        raise InputError(
+            f"{path}: --resume: another version of dolfinopt wrote this checkpoint and would go on "
+            "to another design; start without --resume"
+        )
+    difference = _difference(theirs, json.loads(_scene_text(scene)))
+    if difference:
+        raise InputError(
+            f"{path}: --resume: the checkpoint is of another scene: {difference}; start without "
+            "--resume, or give the scene it was made for"
+        )
+    return arrays
+
+
+def _difference(theirs: Any, ours: Any, key: str = "") -> str:
+    """Describe the first difference between two scenes; empty when they compute the same."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for name in [*ours, *(k for k in theirs if k not in ours)]:
+            if key == "optimizer" and name in MAY_CHANGE:
+                continue
+            path = f"{key}.{name}" if key else name
+            found = _difference(theirs.get(name), ours.get(name), path)
+            if found:
+                return found
+        return ""
+    if isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
+        for k, (a, b) in enumerate(zip(theirs, ours, strict=True)):
+            found = _difference(a, b, f"{key}.{k}")
+            if found:
+                return found
+        return ""
+    if theirs == ours:
+        return ""
+    if all(isinstance(one, str) and one.startswith(DIGEST) for one in (theirs, ours)):
+        return f"the content of the file {key} has changed"
+    return f"{key} = {theirs!r} there, {ours!r} here"

@@ -1,0 +1,89 @@
+"""An optimisation in a folder: history and checkpoint as it goes, and going on from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mpi4py import MPI
+
+from dolfinopt.optimization import loop
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.loop import Report, Result
+from dolfinopt.optimization.memory import Memory
+from dolfinopt.output import checkpoint
+from dolfinopt.output.files import HistoryWriter
+from dolfinopt.parallel import ArmShare, on_root, share_arms, together
+from dolfinopt.profiling import Ledger
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+
+class FolderRecorder:
+    """Writes history.csv and checkpoint.npz, see `loop.Recorder`."""
+
+    def __init__(self, folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
+        """Take the folder, which exists, and what the checkpoint describes."""
+        self.folder, self.scene, self.share, self.arms = folder, scene, share, arms
+        self._writer: HistoryWriter | None = None
+
+    def begin(self, rows: Sequence[HistoryRow]) -> None:
+        """Write the history anew with the rows known so far (collective)."""
+        with together(self.share.world):
+            if self.share.world.rank == 0:
+                self._writer = HistoryWriter(self.folder / "history.csv", rows)
+
+    def append(self, row: HistoryRow) -> None:
+        """Add a line to the history (root only)."""
+        if self._writer is not None:
+            self._writer.append(row)
+
+    def save(self, memory: Memory) -> None:
+        """Replace the checkpoint (collective)."""
+        checkpoint.save(self.folder, self.scene, self.share, self.arms, memory)
+
+
+def optimize(
+    scene: Scene,
+    folder: Path | None = None,
+    *,
+    resume: bool = False,
+    world: MPI.Comm | None = None,
+    report: Report | None = None,
+) -> Result:
+    """Optimise the scene's arms (collective on `world`).
+
+    An iteration: filter -> reduce -> simulate -> load cases -> gradient -> MMA.
+
+    Args:
+        scene: what to optimise.
+        folder: for history.csv and the checkpoint; what an earlier run left there is removed. None
+            keeps everything in memory.
+        resume: go on from the folder's checkpoint.
+        world: all ranks; default MPI.COMM_WORLD.
+        report: called on the root with every row of the history.
+
+    Raises:
+        InputError: `resume` without a matching checkpoint.
+        ConvergenceError: a simulation failed; the checkpoint keeps what was reached.
+    """
+    world = MPI.COMM_WORLD if world is None else world
+    if folder is not None and not resume:
+        on_root(world, checkpoint.begin, folder, scene)
+    # Only now, so that a run killed while DOLFINx is imported can be resumed like any other.
+    from dolfinopt.arms.arm import build_arms
+
+    ledger = Ledger()
+    share = share_arms(world, scene.cell_counts)
+    arms = build_arms(scene, share, ledger)
+    memory, recorder = None, None
+    if resume:
+        assert folder is not None
+        memory = checkpoint.load(folder, scene, share, arms)
+        on_root(world, checkpoint.reopen, folder)
+    if folder is not None:
+        recorder = FolderRecorder(folder, scene, share, arms)
+    return loop.run(scene, share, arms, ledger, memory=memory, recorder=recorder, report=report)

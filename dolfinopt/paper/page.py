@@ -1,0 +1,539 @@
+"""What was reproduced as files: figures, their data, and a page that explains them.
+
+The page is one file without anything from elsewhere: pictures are inside, it opens offline.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.data import page_folder
+from dolfinopt.paper.checks import Ends, Finding, Made, Measured, Swept, mm, percent
+from dolfinopt.paper.reproduction import INITIAL, OPTIMUM, Numbered, Reproduction
+from dolfinopt.study.tables import Cell, DesignFigure, LineFigure, Table
+
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.output.files import ArmView
+    from dolfinopt.scene.load import Scene
+    from dolfinopt.study.store import Case, Outcome
+
+WIDTH = 900  # px of a picture of the longest arm
+FRAMES = 121  # of the animation
+SLOWER = 2.0  # than the motion itself
+# Headings of the page and the paper's figures that belong under each.
+SECTIONS = (
+    ("What the arms are made stiff for", (3, 4)),
+    ("How the arms are reduced", (5, 6)),
+    ("How many coordinates it takes", (7, 8)),
+    ("Designs made with modes", (9,)),
+    ("Another payload", (10, 11)),
+    ("Another path", (12, 13, 14, 15)),
+)
+
+
+def write_reproduction(done: Reproduction, folder: Path, *, plots: bool = True) -> None:
+    """Write figNN.csv and .png, measured.json and report.html into the folder (root only).
+
+    Args:
+        done: what was reproduced.
+        folder: exists.
+        plots: False leaves out pictures and page.
+    """
+    from dolfinopt.output.files import write_text
+    from dolfinopt.plots.style import save
+    from dolfinopt.study.figures import column_figure, common_looks, draw
+
+    styles = common_looks(numbered.figure for numbered in done.figures)
+    write_text(folder / "measured.json", done.measured.json())
+    for numbered in done.figures:
+        write_text(folder / f"{numbered.name}.csv", numbered.csv())
+        if plots:
+            figure = numbered.figure
+            if isinstance(figure, LineFigure):
+                drawn = column_figure(figure, styles)
+            else:
+                drawn = draw(figure, styles)
+            save(drawn, folder / f"{numbered.name}.png")
+    if plots:
+        write_text(folder / "report.html", page(done, folder))
+
+
+def page(done: Reproduction, folder: Path) -> str:
+    """Return report.html; the figures' pictures lie in the folder."""
+    gallery = _Gallery(done)
+    used = {number for _, numbers in SECTIONS for number in numbers}
+    assert used == {numbered.number for numbered in done.figures}
+    return _template("report.html").substitute(
+        style=_text("report.css"),
+        machine=escape(done.measured.setting.machine),
+        headline=_headline(done),
+        player=_player(done),
+        summary=_summary(done.findings),
+        sections="\n".join(
+            _section(title, numbers, done, gallery, folder) for title, numbers in SECTIONS
+        ),
+        method=_method(done),
+    )
+
+
+def _template(name: str) -> Template:
+    return Template(_text(name))
+
+
+def _text(name: str) -> str:
+    return (page_folder() / name).read_text(encoding="utf-8")
+
+
+# -- words and tables ------------------------------------------------------------------------
+
+
+def _headline(done: Reproduction) -> str:
+    """Return the figures one looks for first."""
+    initial, best = _ends(done.measured)
+    holds = sum(finding.holds for finding in done.findings)
+    cards = (
+        ("compliance", f"{initial.compliance:.4g} → {best.compliance:.4g} N m"),
+        ("largest deviation", f"{1e3 * initial.deviation:.3g} → {1e3 * best.deviation:.3g} mm"),
+        ("material", percent(done.plan.scene.design.volume_fraction).replace(".0 %", " %")),
+        ("of the paper’s statements hold", f"{holds} of {len(done.findings)}"),
+    )
+    items = (f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in cards)
+    return f'<dl class="cards">{"".join(items)}</dl>'
+
+
+def _ends(measured: Measured) -> tuple[Made, Made]:
+    """Return the initial design and the paper's optimised one."""
+    return measured.objectives[0], next(m for m in measured.objectives if m.kind == "esl")
+
+
+def _verdict(finding: Finding) -> str:
+    word, kind = ("holds", "yes") if finding.holds else ("does not hold", "no")
+    return f'<strong class="{kind}">{word}</strong>'
+
+
+def _summary(findings: Iterable[Finding]) -> str:
+    """Return the table of all findings."""
+    rows = (
+        f'<tr><td>{_numbers(f.figures)}</td><td><a href="#{_anchor(f)}">{escape(f.statement)}</a>'
+        f"</td><td>{_verdict(f)}</td><td>{escape(f.paper)}</td><td>{escape(f.ours)}</td></tr>"
+        for f in findings
+    )
+    head = "<tr><th>figure</th><th>the paper finds</th><th></th><th>paper</th><th>here</th></tr>"
+    return _scrolling(
+        f'<table class="words"><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table>',
+        "all findings",
+    )
+
+
+def _numbers(numbers: Sequence[int]) -> str:
+    first, last = numbers[0], numbers[-1]
+    return str(first) if first == last else f"{first}–{last}"
+
+
+def _anchor(finding: Finding) -> str:
+    return "".join(c if c.isalnum() else "-" for c in finding.name)
+
+
+def _scrolling(content: str, name: str) -> str:
+    """Return a box of its own that scrolls where the content is wider than the page."""
+    label = escape(name, quote=True)
+    return f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">{content}</div>'
+
+
+def _table(table: Table) -> str:
+    """Return a table of figures."""
+    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in table.columns)
+    rows = (
+        "<tr>" + "".join(f"<td>{escape(_shown(cell))}</td>" for cell in row) + "</tr>"
+        for row in table.rows
+    )
+    caption = f"<caption><span>{escape(table.title)}</span></caption>"
+    content = (
+        f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    )
+    return _scrolling(content, table.title)
+
+
+def _shown(cell: Cell) -> str:
+    if isinstance(cell, float):
+        return "–" if math.isnan(cell) else f"{cell:.4g}"
+    return str(cell)
+
+
+# -- sections --------------------------------------------------------------------------------
+
+
+def _section(
+    title: str, numbers: Sequence[int], done: Reproduction, gallery: _Gallery, folder: Path
+) -> str:
+    """Return one part of the paper: its findings, our figures, tables and designs."""
+    findings = [f for f in done.findings if set(f.figures) <= set(numbers)]
+    shown = [numbered for numbered in done.figures if numbered.number in numbers]
+    parts = [_finding(f) for f in findings]
+    plots = [_picture(n, folder) for n in shown if not isinstance(n.figure, DesignFigure)]
+    parts.append(f'<div class="plots">{"".join(plots)}</div>')
+    parts += [_table(n.table) for n in shown if n.table is not None]
+    parts += _extras(numbers, done, gallery)
+    return f"<section><h2>{escape(title)}</h2>{''.join(parts)}</section>"
+
+
+def _finding(finding: Finding) -> str:
+    return (
+        f'<article class="finding" id="{_anchor(finding)}">'
+        f"<h3>{escape(finding.statement)} <small>(figure {_numbers(finding.figures)})</small></h3>"
+        f'<dl class="pair"><div><dt>paper</dt><dd>{escape(finding.paper)}</dd></div>'
+        f"<div><dt>here</dt><dd>{escape(finding.ours)}</dd></div></dl>"
+        f"<p>{_verdict(finding)} {escape(finding.reason if not finding.holds else '')}</p>"
+        f'<p class="criterion">Holds if: {escape(finding.criterion)}.</p></article>'
+    )
+
+
+def _picture(numbered: Numbered, folder: Path) -> str:
+    """Return a figure with its picture inside."""
+    data = (folder / f"{numbered.name}.png").read_bytes()
+    about = numbered.title
+    if isinstance(numbered.figure, LineFigure):
+        panels = [panel for row in numbered.figure.rows for panel in row]
+        curves = dict.fromkeys(line.label for panel in panels for line in panel.lines)
+        about = f"{about}: {panels[0].y_label} over {panels[0].x_label} of {', '.join(curves)}"
+    return (
+        f"<figure>{_image(data, about)}<figcaption><b>Figure {numbered.number}.</b> "
+        f"{escape(numbered.title)}.</figcaption></figure>"
+    )
+
+
+def _image(data: bytes, alt: str) -> str:
+    """Return a PNG as part of the page."""
+    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # of its header
+    text = base64.b64encode(data).decode()
+    return (
+        f'<img src="data:image/png;base64,{text}" width="{width}" height="{height}" '
+        f'alt="{escape(alt, quote=True)}">'
+    )
+
+
+def _extras(numbers: Sequence[int], done: Reproduction, gallery: _Gallery) -> list[str]:
+    """Return the designs and tables that a section has beside its figures."""
+    plan = done.plan
+    if 4 in numbers:
+        designs = gallery.show("Designs by objective", (plan.initial, *plan.objectives))
+        return [designs, _table(_ends_table(done.measured.ends))]
+    if 5 in numbers:
+        designs = gallery.show("Designs by reduction", plan.reductions)
+        return [_table(_reduction_table(done.measured)), designs]
+    if 10 in numbers:
+        return [_table(_loss_table(done.measured.payload))]
+    if 12 in numbers:
+        return [gallery.show("Designs by path", plan.paths)]
+    return []
+
+
+def _reduction_table(measured: Measured) -> Table:
+    columns = ("made with", "coordinates", "compliance, own model [N m]", "compliance [N m]",
+               "maximal deviation [mm]", "cells on the other side of one half [%]",
+               "iterations")  # fmt: skip
+    rows = tuple(
+        (r.method, r.coordinates, r.own, r.compliance, 1e3 * r.deviation, 100.0 * r.apart,
+         r.iterations)
+        for r in measured.reductions
+    )  # fmt: skip
+    finest = measured.reductions[-1].coordinates
+    title = f"Designs by reduction, all simulated with {finest} Craig-Bampton coordinates"
+    return Table("", title, columns, rows)
+
+
+def _ends_table(ends: Ends) -> Table:
+    """Return all designs with solid ends, by what they were made for and with."""
+    initial = ends.objectives[0].deviation
+    columns = ("made for or with", "compliance [N m]", "maximal deviation [mm]",
+               "of the initial design's [%]")  # fmt: skip
+    made = [(m.label, m.compliance, m.deviation) for m in ends.objectives]
+    made += [(f"{r.method} {r.coordinates}", r.compliance, r.deviation) for r in ends.reductions]
+    rows = tuple((name, c, 1e3 * d, 100.0 * d / initial) for name, c, d in made)
+    return Table("", f"{ends.words}; nothing else differs", columns, rows)
+
+
+def _loss_table(sweep: Swept) -> Table:
+    labels = [f"{used.made_for:g}" for used in sweep.optima]
+    columns = [f"made for {sweep.axis}"]
+    columns += [f"{q} lost at {at} [%]" for q in ("compliance", "deviation") for at in labels]
+    losses = [100.0 * sweep.loss(quantity) for quantity in ("compliance", "deviation")]
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (label, *map(float, losses[0][i]), *map(float, losses[1][i]))
+        for i, label in enumerate(labels)
+    )
+    return Table("", "Loss against the design made for the payload", tuple(columns), rows)
+
+
+def _method(done: Reproduction) -> str:
+    """Return what was computed, and what the paper leaves open."""
+    scene, outcomes = done.plan.scene, done.outcomes
+    failures = "".join(
+        f"<li>{escape(o.case.label)}: {escape(o.failure)}</li>" for o in outcomes.failures
+    )
+    failed = f"<p>Without result:</p><ul>{failures}</ul>" if failures else ""
+    optimised = [o for c, o in outcomes.by_case.items() if c.action == "optimize"]
+    seconds = sum(o.seconds for o in optimised if not o.failure)
+    cells = " x ".join(map(str, done.measured.cells)) or "a mesh of"
+    m = scene.motion
+    return (
+        f"<p>{len(outcomes.by_case)} cases: {len(optimised)} optimisations of at most "
+        f"{scene.optimizer.max_iterations} iterations, which took {seconds:.0f} s of one core "
+        f"together, and {len(outcomes.by_case) - len(optimised)} simulations; {cells} cells an "
+        f"arm. The paper does not state everything. Fixed here: duration {m.duration:g} s, the "
+        f"cart follows {m.cart_follow:g} of the end-effector’s x, shoulder at "
+        f"y = {m.joint_height:g} m, damping {scene.damping.stiffness_proportional:g} s times the "
+        f"stiffness, {scene.objective.load_cases} load cases in {m.horizon:g} s. Nothing was tuned "
+        f"towards the paper’s figures. Where several of its figures show one thing, which of them "
+        f"shows what is our choice.</p>{_overridden(scene)}{failed}"
+    )
+
+
+def _overridden(scene: Scene) -> str:
+    """Say where the scene is another than the paper's, which every figure here is compared with."""
+    from dolfinopt.paper.reproduction import load_paper
+
+    theirs, ours = _flat(load_paper().to_dict()), _flat(scene.to_dict())
+    changed = [
+        f"{key} = {ours.get(key)} in place of {theirs.get(key)}"
+        for key in dict.fromkeys([*theirs, *ours])
+        if theirs.get(key) != ours.get(key)
+    ]
+    if not changed:
+        return ""
+    return f"<p>Not as in the paper’s scene: {escape('; '.join(changed))}.</p>"
+
+
+def _flat(data: Any, key: str = "") -> dict[str, Any]:
+    """Return nested tables as one, keys dotted."""
+    if isinstance(data, list) and data and isinstance(data[0], dict):
+        data = {str(k): row for k, row in enumerate(data)}
+    if not isinstance(data, dict):
+        return {key: data}
+    found: dict[str, Any] = {}
+    for name, value in data.items():
+        found |= _flat(value, f"{key}.{name}" if key else name)
+    return found
+
+
+# -- designs ---------------------------------------------------------------------------------
+
+
+class _Gallery:
+    """Pictures of designs; owns the arms, which are built once."""
+
+    def __init__(self, done: Reproduction) -> None:
+        from mpi4py import MPI
+
+        from dolfinopt.arms.arm import build_arms
+        from dolfinopt.parallel import share_arms
+        from dolfinopt.profiling import Ledger
+
+        self.outcomes, self.scene = done.outcomes, done.plan.scene
+        self.share = share_arms(MPI.COMM_SELF, self.scene.cell_counts)
+        self.arms = build_arms(self.scene, self.share, Ledger())
+
+    def views(self, outcome: Outcome) -> Sequence[ArmView]:
+        """Return the arms of a design."""
+        from dolfinopt.output.files import designed, gather_views, read_design
+
+        x_phys = read_design(outcome.design, self.share, self.arms)
+        return designed(gather_views(self.scene, self.share, self.arms, x_phys))
+
+    def show(self, title: str, cases: Iterable[Case]) -> str:
+        """Return the designs below each other, all to one scale."""
+        items = []
+        for case in dict.fromkeys(cases):
+            outcome = self.outcomes[case]
+            if outcome.failure:
+                continue
+            views = self.views(outcome)
+            longest = max(float(np.ptp(view.corners[..., 0])) for view in views)
+            arms = "".join(_arm(view, longest, case.label) for view in views)
+            figures = f"{outcome.compliance:.4g} N m, {mm(outcome.max_deviation)}"
+            items.append(
+                f'<figure class="design"><figcaption>{escape(case.label)} '
+                f'<span class="figures">{figures}</span></figcaption>'
+                f'<div class="arms">{arms}</div></figure>'
+            )
+        return (
+            f'<h3>{escape(title)}</h3><p class="criterion">Dark is solid, light is void; to scale, '
+            f"the joint towards the cart on the left. Compliance and largest deviation as the "
+            f'design’s own model sees them.</p><div class="gallery">{"".join(items)}</div>'
+        )
+
+
+def _arm(view: ArmView, longest: float, design: str) -> str:
+    share = float(np.ptp(view.corners[..., 0])) / longest
+    image = _image(arm_picture(view, round(WIDTH * share)), f"{view.name} of the {design}")
+    return f'<div style="width:{100.0 * share:.4g}%">{image}</div>'
+
+
+def arm_picture(view: ArmView, width: int) -> bytes:
+    """Return an arm's densities as PNG, to scale.
+
+    Args:
+        view: of the arm.
+        width: px.
+    """
+    from matplotlib import colormaps
+    from PIL import Image, ImageDraw
+
+    from dolfinopt.plots.style import COLOURS
+
+    low = view.corners.min(axis=(0, 1))
+    size = view.corners.max(axis=(0, 1)) - low
+    scale = width / size[0]
+    picture = Image.new("RGB", (width, max(1, round(scale * size[1]))), "white")
+    brush = ImageDraw.Draw(picture)
+    colours = (255.0 * colormaps[COLOURS](view.density)[:, :3]).astype(int)
+    points = scale * (view.corners - low)
+    points[..., 1] = picture.height - points[..., 1]
+    for corners, colour in zip(points, colours, strict=True):
+        brush.polygon([(float(x), float(y)) for x, y in corners], fill=tuple(map(int, colour)))
+    stream = io.BytesIO()
+    picture.convert("P", palette=Image.Palette.ADAPTIVE).save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+# -- the animation ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """A moving design as paths of SVG, one a frame.
+
+    Attributes:
+        arms: centre lines of all arms.
+        tips: (n, 2) m, the end-effector.
+        carts: (n,) m.
+        deviation: (n,) mm, not magnified.
+    """
+
+    arms: list[str]
+    tips: np.ndarray
+    carts: np.ndarray
+    deviation: np.ndarray
+
+
+def strip(trajectory: Trajectory, at: np.ndarray, magnification: float) -> Strip:
+    """Return the frames of a trajectory.
+
+    Between its interfaces an arm is drawn as the cubic that has their places and directions,
+    which is how a beam bends without loads between its ends.
+
+    Args:
+        trajectory: sampled.
+        at: (n,) samples to show.
+        magnification: of the deformation.
+    """
+    from dolfinopt.plots.figures import chain
+
+    mechanism = trajectory.mechanism
+    q = magnification * trajectory.q_e[at]
+    place, swing = chain(mechanism, trajectory.q_r[at], q)
+    parts = []
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        turn = swing[:, k] * np.exp(1j * (q[:, part] @ body.outboard[2]))
+        third = np.abs(place[:, k + 1] - place[:, k]) / 3.0
+        parts.append(
+            (place[:, k] + third * swing[:, k], place[:, k + 1] - third * turn, place[:, k + 1])
+        )
+    arms = []
+    for n in range(len(at)):
+        curves = "".join(f"C{' '.join(_point(part[n]) for part in three)}" for three in parts)
+        arms.append(f"M{_point(place[n, 0])}{curves}")
+    tips = np.stack([place[:, -1].real, place[:, -1].imag], axis=1)
+    return Strip(arms, tips, place[:, 0].real, 1e3 * np.hypot(*trajectory.deviation[at].T))
+
+
+def _point(place: complex) -> str:
+    return f"{place.real:.4f},{place.imag:.4f}"
+
+
+def _player(done: Reproduction) -> str:
+    """Return the moving mechanism, initial and optimised design together."""
+    from dolfinopt.plots.figures import round_magnification
+    from dolfinopt.study.store import simulate_scenarios
+
+    optimum = done.outcomes[done.plan.optimum]
+    if optimum.failure:
+        return ""
+    moved = []
+    for design in (None, optimum.design):
+        simulated = next(iter(simulate_scenarios([done.plan.scene], design)))
+        if isinstance(simulated, Exception) or simulated.trajectory is None:
+            return ""
+        moved.append(simulated.trajectory)
+    t = moved[0].t
+    at = np.unique(np.round(np.linspace(0, len(t) - 1, FRAMES)).astype(int))
+    reach = sum(float(np.hypot(*body.outboard_point)) for body in moved[0].mechanism.bodies)
+    largest = float(np.hypot(*moved[0].deviation.T).max())
+    magnification = round_magnification(largest, reach)
+    before, after = (strip(one, at, magnification) for one in moved)
+    rigid = strip(moved[1], at, 0.0)
+    return _svg(t[at], before, after, rigid, magnification, moved[0].mechanism.joint_height)
+
+
+def _svg(
+    t: np.ndarray, before: Strip, after: Strip, rigid: Strip, magnification: float, joint: float
+) -> str:
+    """Return the player: complete without its script, which only moves it."""
+    places = np.concatenate([s.tips for s in (before, after, rigid)])
+    left = float(min(places[:, 0].min(), rigid.carts.min())) - 0.16
+    right = float(max(places[:, 0].max(), rigid.carts.max())) + 0.16
+    low, high = joint - 0.14, float(places[:, 1].max()) + 0.1
+    width, height = right - left, high - low
+    here = int(np.argmax(before.deviation))
+    frames = {
+        "t": [round(float(v), 3) for v in t],
+        "cart": [round(float(v), 4) for v in rigid.carts],
+        "before": before.arms,
+        "after": after.arms,
+        "tips": [[round(float(v), 4) for v in (*b, *a)] for b, a in zip(before.tips, after.tips)],
+        "mm": [
+            [round(float(v), 2) for v in pair] for pair in zip(before.deviation, after.deviation)
+        ],
+        "delay": 1e3 * SLOWER * float(t[-1] - t[0]) / (len(t) - 1),
+    }
+    path = "M" + "L".join(_point(complex(x, y)) for x, y in rigid.tips)
+    return _template("player.html").substitute(
+        script=_text("player.js"),
+        box=f"{left:.3f} {-high:.3f} {width:.3f} {height:.3f}",
+        left=f"{left:.3f}",
+        right=f"{right:.3f}",
+        ground=f"{joint - 0.075:.3f}",
+        cart_y=f"{joint - 0.06:.3f}",
+        cart=f"{rigid.carts[here]:.4f}",
+        path=path,
+        before=before.arms[here],
+        after=after.arms[here],
+        bx=f"{before.tips[here, 0]:.4f}",
+        by=f"{before.tips[here, 1]:.4f}",
+        ax=f"{after.tips[here, 0]:.4f}",
+        ay=f"{after.tips[here, 1]:.4f}",
+        last=len(t) - 1,
+        here=here,
+        said=_said(float(t[here]), float(before.deviation[here]), float(after.deviation[here])),
+        magnification=f"{magnification:g}",
+        slower=f"{SLOWER:g}",
+        frames=json.dumps(frames, separators=(",", ":")),
+        initial=INITIAL,
+        optimised=OPTIMUM,
+    )
+
+
+def _said(t: float, before: float, after: float) -> str:
+    return f"{t:.2f} s: {before:.1f} mm, {after:.1f} mm"

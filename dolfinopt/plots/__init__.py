@@ -1,0 +1,1 @@
+"""Pictures: designs, curves, animation, studies."""

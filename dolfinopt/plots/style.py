@@ -1,0 +1,224 @@
+"""How pictures look: colours and lines by name, labels at line ends, figures and their files.
+
+One name has one look in all pictures that belong together, and every curve has the same width.
+Matplotlib is imported where it is used: most commands draw nothing.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.output.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = "YlGnBu"  # void is light, solid is dark, lightness falls evenly between
+DENSITY = "physical density [-]"
+# Okabe and Ito's colours, told apart by colour-blind readers too.
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9")
+# Seven colours and four dashes have no common divisor: 28 looks, and neighbours differ in both, so
+# that of curves which coincide the lower one shows through the gaps of the upper one.
+DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 1.6, 1.2, 1.6)))
+MARKERS = "osD^vPX"
+LINE_WIDTH, MARKER_SIZE = 1.6, 5.0  # points
+BLUE, ORANGE, GREY = PALETTE[0], PALETTE[1], "#6e6e6e"
+INITIAL, OPTIMISED = "initial design", "optimised design"
+KNOWN = {OPTIMISED: 0, INITIAL: 1}  # the same in all pictures of all runs
+LOOKS = len(PALETTE) * len(DASHES)
+LABEL_SIZE = 9.0  # points, at line ends
+SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
+
+PathLike = str | os.PathLike[str]
+
+
+def look_numbers(groups: Iterable[Sequence[str]]) -> dict[str, int]:
+    """Return a number for every label: the same wherever it occurs, its own as long as any is left.
+
+    Args:
+        groups: the labels that are seen together in one figure; a figure's labels get different
+            colours where they can.
+    """
+    numbers: dict[str, int] = {}
+    for group in groups:
+        labels = list(dict.fromkeys(group))
+        here = {numbers.get(label, KNOWN.get(label)) for label in labels} - {None}
+        for label in labels:
+            if label in numbers:
+                continue
+            number = KNOWN.get(label)
+            if number is None:
+                number = _free_number(set(numbers.values()) | set(KNOWN.values()), here)
+            numbers[label] = number
+            here.add(number)
+    return numbers
+
+
+def _free_number(taken: set[int], here: set[Any]) -> int:
+    """Return the first number that is not taken, of a colour that is not here if there is one."""
+    free = [n for n in range(LOOKS) if n not in taken]
+    free = free or [n for n in range(LOOKS) if n not in here] or list(range(LOOKS))
+    colours = {n % len(PALETTE) for n in here}
+    return next((n for n in free if n % len(PALETTE) not in colours), free[0])
+
+
+def look(number: int) -> dict[str, Any]:
+    """Return colour, dashes, marker and order of a curve; all have one width and marker size."""
+    return {
+        "color": PALETTE[number % len(PALETTE)],
+        "linestyle": DASHES[number % len(DASHES)],
+        "marker": MARKERS[number % len(MARKERS)],
+        "markersize": MARKER_SIZE,
+        "linewidth": LINE_WIDTH,
+        "zorder": 2.0 + 0.1 * (number % len(DASHES)),  # what has gaps lies above what has none
+    }
+
+
+def looks(groups: Iterable[Sequence[str]]) -> dict[str, dict[str, Any]]:
+    """Return how the curve of every label looks, see `look_numbers`."""
+    return {label: look(number) for label, number in look_numbers(groups).items()}
+
+
+# -- labels at line ends ---------------------------------------------------------------------
+
+
+def spread(places: Sequence[float], gap: float, high: float = 1.0) -> np.ndarray:
+    """Return places at least `gap` apart, in the same order, close to the given ones.
+
+    None lies above `high` unless they need more room than there is above zero.
+    """
+    wanted = np.asarray(places, dtype=float)
+    order = np.argsort(wanted, kind="stable")
+    found = wanted[order]
+    for k in range(1, len(found)):
+        found[k] = max(found[k], found[k - 1] + gap)
+    high = max(high, gap * (len(found) - 1))
+    for k in range(len(found) - 1, -1, -1):
+        found[k] = min(found[k], high - gap * (len(found) - 1 - k))
+    result = np.empty_like(found)
+    result[order] = found
+    return result
+
+
+def ends_right(axes: Axes) -> bool:
+    """Return whether all curves end near the right edge: there is the place of their names."""
+    ends = [end for line in axes.lines if (end := _last_point(axes, line)) is not None]
+    return bool(ends) and min(x for x, _ in ends) > 0.9
+
+
+def label_ends(axes: Axes, height: float, names: Iterable[str] | None = None) -> None:
+    """Write the curves' names to the right of where they end, in their colours.
+
+    Args:
+        axes: with final limits.
+        height: of the axes, about, inches.
+        names: of the curves; default all.
+    """
+    wanted = None if names is None else set(names)
+    ends = []
+    for line in axes.lines:
+        place = _last_point(axes, line)
+        if place is not None and (wanted is None or line.get_label() in wanted):
+            ends.append((line, place))
+    places = spread([y for _, (_, y) in ends], 1.3 * LABEL_SIZE / 72.0 / height)
+    for (line, (x, y)), at in zip(ends, places, strict=True):
+        axes.annotate(
+            str(line.get_label()),
+            xy=(x, y),
+            xytext=(1.04, at),
+            xycoords="axes fraction",
+            textcoords="axes fraction",
+            va="center",
+            fontsize=LABEL_SIZE,
+            color=line.get_color(),
+            annotation_clip=False,
+            parse_math=False,
+            arrowprops={
+                "arrowstyle": "-",
+                "relpos": (0.0, 0.5),  # from the first letter, not through the words
+                "color": line.get_color(),
+                "linewidth": 0.7,
+                "shrinkA": 1.0,
+                "shrinkB": 3.0,
+            },
+        )
+
+
+def _last_point(axes: Axes, line: Any) -> tuple[float, float] | None:
+    """Return where a curve ends, as shares of the axes; None where it has no finite value."""
+    points = np.column_stack([np.asarray(v, dtype=float) for v in line.get_data()])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    last = points[np.argmax(points[:, 0])]
+    x, y = (axes.transScale + axes.transLimits).transform(last)
+    return float(x), float(y)
+
+
+# -- scales ----------------------------------------------------------------------------------
+
+
+def spans_decade(values: np.ndarray) -> bool:
+    """Return whether positive values differ by more than a factor of ten: drawn on a log scale."""
+    return bool(np.min(values) > 0.0 and np.max(values) > 10.0 * np.min(values))
+
+
+def log_scale(axes: Axes, values: np.ndarray) -> None:
+    """Make y logarithmic for positive values, labelled with plain numbers or powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_yscale("log")
+    ratio = float(np.max(values)) / float(np.min(values))
+    # A short axis would otherwise have one number, or none.
+    subs = (
+        tuple(np.arange(1.0, 10.0)) if ratio < 3.0 else (1.0, 2.0, 5.0) if ratio < 50.0 else (1.0,)
+    )
+    axes.yaxis.set_major_locator(LogLocator(subs=subs))
+    if ratio < 1e4:
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def log2_scale(axes: Axes) -> None:
+    """Make x logarithmic with powers of two in full: numbers that are doubled, not added to."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    axes.set_xscale("log", base=2)
+    axes.xaxis.set_major_locator(LogLocator(base=2.0))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+# -- figures and files -----------------------------------------------------------------------
+
+
+def new_figure(width: float, height: float, dpi: int = 110, *, laid_out: bool = True) -> Figure:
+    """Return an empty figure, inches, that no global state knows of.
+
+    Args:
+        width, height: inches.
+        dpi: px per inch.
+        laid_out: let Matplotlib place the axes.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=dpi)
+    if laid_out:
+        figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: PathLike) -> Path:
+    """Write a figure as PNG; return its path."""
+    target = Path(path)
+    write_atomically(target, lambda stream: figure.savefig(stream, format="png"))
+    return target

@@ -1,0 +1,1 @@
+"""What a design does: objectives and constraints, their values and gradients."""

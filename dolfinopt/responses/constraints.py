@@ -1,0 +1,133 @@
+"""What a design must keep: every constraint by name, with its value, limit and unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from dolfinopt.responses.evaluation import Evaluation
+from dolfinopt.scene.load import Scene
+
+# Relative violation up to which a constraint counts as met: MMA meets an active one to a fraction
+# of its last change.
+EXCESS = 1e-3
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One constraint and what a design makes of it.
+
+    Attributes:
+        quantity: "volume_fraction", "first_frequency" or "tip_deflection".
+        arm: whose; "" of all together.
+        value, limit: in `unit`.
+        unit: "-", "Hz" or "m".
+        least: whether the limit is a lower one.
+    """
+
+    quantity: str
+    arm: str
+    value: float
+    limit: float
+    unit: str
+    least: bool = False
+
+    @property
+    def name(self) -> str:
+        """Its column in history.csv and its key in summary.json, e.g. "first_frequency_arm2"."""
+        return f"{self.quantity}_{self.arm}".rstrip("_") if self.arm else self.quantity
+
+    @property
+    def excess(self) -> float:
+        """Relative violation; at most 0 where the constraint is met."""
+        gap = self.limit - self.value if self.least else self.value - self.limit
+        return gap / self.limit
+
+    @property
+    def met(self) -> bool:
+        """Whether the value keeps the limit, to `EXCESS` of it."""
+        return self.excess <= EXCESS
+
+    @property
+    def sentence(self) -> str:
+        """E.g. "first frequency of arm2: 60.4 Hz, at least 80 Hz asked"."""
+        what = self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
+        unit = "" if self.unit == "-" else f" {self.unit}"
+        value, limit = distinct(self.value, self.limit)
+        bound = "at least" if self.least else "at most"
+        return f"{what}: {value}{unit}, {bound} {limit}{unit} asked"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry of summary.json."""
+        return {
+            "value": self.value,
+            "limit": self.limit,
+            "unit": self.unit,
+            "bound": "least" if self.least else "largest",
+            "met": self.met,
+        }
+
+
+def distinct(value: float, limit: float) -> tuple[str, str]:
+    """Return both numbers with three digits, or as many as it takes to tell them apart."""
+    for digits in range(3, 17):
+        texts = f"{value:.{digits}g}", f"{limit:g}"
+        if float(texts[0]) != limit:
+            break
+    return texts
+
+
+def limits_of(
+    scene: Scene, evaluation: Evaluation, volume_fractions: Sequence[float]
+) -> tuple[Limit, ...]:
+    """Return every constraint of the scene and its value.
+
+    Args:
+        scene: with the limits.
+        evaluation: of the design.
+        volume_fractions: of every designed arm, or of all together with `design.shared_volume`.
+    """
+    designed = [scene.arms[owner].name for owner in scene.cell_counts]
+    flexible = [arm.name for arm in scene.arms if arm.flexible]
+    names = [""] if scene.design.shared_volume else designed
+    limit = scene.design.volume_fraction
+    limits = [
+        Limit("volume_fraction", name, float(value), limit, "-")
+        for name, value in zip(names, volume_fractions, strict=True)
+    ]
+    if (least := scene.constraints.first_frequency) is not None:
+        limits += [
+            Limit("first_frequency", name, float(value), least, "Hz", least=True)
+            for name, value in zip(flexible, evaluation.loaded_frequencies, strict=False)
+        ]
+    if (largest := scene.constraints.tip_deflection) is not None:
+        limits += [
+            Limit("tip_deflection", name, float(value), largest, "m")
+            for name, value in zip(designed, evaluation.tip_deflections, strict=True)
+        ]
+    return tuple(limits)
+
+
+def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
+    """Return each constraint as the worst of several variants of a design has it.
+
+    The volume is that of the last variant, the nominal one.
+    """
+    worst = []
+    for limit, *others in zip(*reversed(variants), strict=True):
+        values = [limit.value, *(one.value for one in others)]
+        extreme = min(values) if limit.least else max(values)
+        kept = limit.value if limit.quantity == "volume_fraction" else extreme
+        worst.append(replace(limit, value=kept))
+    return tuple(worst)
+
+
+def violated(limits: Sequence[Limit]) -> str:
+    """Return the sentences of all constraints that are not met, in one line; "" if all are."""
+    return "; ".join(one.sentence for one in limits if not one.met)
+
+
+def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:
+    """Return the constraints by name, for summary.json."""
+    return {one.name: one.to_dict() for one in limits}

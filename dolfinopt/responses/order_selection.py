@@ -1,0 +1,277 @@
+"""How many coordinates an arm needs: the fewest whose estimated error meets a tolerance.
+
+The error of a number of coordinates is that of the motion simulated with it against the motion
+with a richer basis, at least twice as many Craig-Bampton coordinates: vibrations near resonance
+count as they are, and so does what a basis without constraint modes misses of the statics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.arms.arm import chain_of
+from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
+from dolfinopt.parallel import ArmShare, gather_arms, on_root, together
+from dolfinopt.profiling import Ledger
+from dolfinopt.reduction import METHODS, Basis
+from dolfinopt.responses.scenarios import bodies_in, factors
+from dolfinopt.scene.load import Scene, pose_scenarios
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+# What the motion is compared with: at least so many coordinates, and so many times those tried.
+RICHER_METHOD, RICHER, TIMES = "craig-bampton", 24, 2
+MOST = 48  # coordinates of an arm that are tried
+# Time steps may add this share of the tolerance to a motion.
+TIME_SHARE = 0.03
+# An arm that nearly rests beside the others is measured against this share of the largest.
+RESTING = 1e-3
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What "auto" has chosen.
+
+    Attributes:
+        coordinates: of every arm.
+        error: estimated relative error that they make: of the displacements, energy norm, largest
+            in time over the largest value, of the worst arm and scenario.
+        tried: numbers of coordinates and their errors, ascending; inf where one is not possible.
+    """
+
+    coordinates: int
+    error: float
+    tried: tuple[tuple[int, float], ...]
+
+
+def choose_coordinates(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    ledger: Ledger,
+    *,
+    reserve: float = 1.0,
+) -> Choice | None:
+    """Let the arms reduce to the fewest coordinates that meet `reduction.tolerance` (collective).
+
+    Numbers are tried upwards in growing steps, then bisected: the one below the chosen one does
+    not meet the tolerance. Where the scene states a number nothing is done.
+
+    Args:
+        scene, share, arms, ledger: as for `evaluate`.
+        x_phys: the design that decides.
+        reserve: how many times less than the tolerance the estimate must be.
+
+    Returns:
+        The choice; None where the scene states a number.
+
+    Raises:
+        ConvergenceError: no number up to `MOST` meets the tolerance; on all ranks alike.
+    """
+    if scene.reduction.coordinates != "auto":
+        return None
+    comparison = _Comparison(scene, share, arms, x_phys, ledger)
+    least, goal = scene.reduction.fewest, scene.reduction.tolerance / reserve
+    most = min(max(MOST, least), comparison.limit)
+    tried: dict[int, float] = {}
+    low, high = least - 1, least
+    while (error := comparison.error(high)) > goal:
+        tried[high] = error
+        if high >= most:
+            raise _none_found(scene, tried, goal)
+        low, high = high, min(high + max(1, high - least), most)
+    tried[high] = error
+    while high - low > 1:
+        middle = (low + high) // 2
+        tried[middle] = comparison.error(middle)
+        low, high = (low, middle) if tried[middle] <= goal else (middle, high)
+    for arm in arms.values():
+        arm.take(high)
+    return Choice(high, tried[high], tuple(sorted(tried.items())))
+
+
+def estimated_error(
+    scene: Scene,
+    share: ArmShare,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    coordinates: int,
+    ledger: Ledger,
+) -> float:
+    """Return the error that so many coordinates make, see `Choice`; inf where they are none.
+
+    Collective; the arms keep what they have.
+
+    Args:
+        scene, share, arms, x_phys, ledger: as for `evaluate`.
+        coordinates: of every arm.
+
+    Raises:
+        ConvergenceError: the motion cannot be simulated with the richer basis; on all ranks.
+    """
+    return _Comparison(scene, share, arms, x_phys, ledger).error(coordinates)
+
+
+def _none_found(scene: Scene, tried: Mapping[int, float], goal: float) -> ConvergenceError:
+    method = scene.reduction.method
+    other = "" if method == RICHER_METHOD else f', reduction.method = "{RICHER_METHOD}"'
+    tolerance = f"reduction.tolerance = {scene.reduction.tolerance:g}"
+    if goal < scene.reduction.tolerance:
+        tolerance = f"the {goal:.2g} that {tolerance} asks of the initial design"
+    return ConvergenceError(
+        f'{scene.source}: reduction.coordinates = "auto": with up to {max(tried)} coordinates the '
+        f"estimated error is {min(tried.values()):.2g} at best, above {tolerance}; give a larger "
+        f"one{other}, or a number"
+    )
+
+
+class _Comparison:
+    """Owns the richer motion that others are compared with."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        share: ArmShare,
+        arms: Mapping[int, Arm],
+        x_phys: Mapping[int, np.ndarray],
+        ledger: Ledger,
+    ):
+        self.share, self.arms, self.ledger = share, arms, ledger
+        self.method = scene.reduction.method
+        self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
+        with together(share.world):
+            for k, arm in arms.items():
+                arm.set_design(x_phys[k])
+        dofs = min((arm.elastic.num_dofs for arm in arms.values()), default=None)
+        known = share.world.allgather(dofs)
+        self.limit: int = min(one for one in known if one is not None)
+        self.richer = 0  # coordinates
+        self.bases: dict[int, Basis] = {}
+        self.motions: list[Trajectory] = []
+
+    def error(self, count: int) -> float:
+        """Return the error that `count` coordinates make (collective)."""
+        richer = min(max(RICHER, TIMES * count), self.limit)
+        if richer > self.richer:
+            self.bases = self._reduced(RICHER_METHOD, richer)
+            self.motions = self._moved(self.bases)
+            self.richer = richer
+        try:
+            bases = self._reduced(self.method, count)
+            motions = self._moved(bases)
+        except ConvergenceError:
+            return np.inf  # further ones may do
+        with together(self.share.world):
+            both = {k: np.concatenate([b.V, self.bases[k].V], axis=2) for k, b in bases.items()}
+            mine = {k: self.arms[k].elastic.energy_matrix(V) for k, V in both.items()}
+        energy = gather_arms(self.share, mine)
+        return on_root(self.share.world, _largest, self.scenes, motions, self.motions, energy)
+
+    def _reduced(self, method: str, count: int) -> dict[int, Basis]:
+        """Return this rank's bases (collective)."""
+        bases = {}
+        with self.ledger.phase("choice of coordinates"), together(self.share.world):
+            for k, arm in self.arms.items():
+                if method == RICHER_METHOD and count <= self.richer:
+                    bases[k] = _leading(self.bases[k], count)
+                else:
+                    bases[k] = METHODS[method].reduce(arm.elastic, arm.options(count), None)
+        return bases
+
+    def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
+        """Return the root's motions of the scene and its scenarios (collective)."""
+        beta = self.scenes[0].damping.stiffness_proportional
+        with together(self.share.world):
+            mine = {k: shape_integrals(self.arms[k].elastic, b, beta) for k, b in bases.items()}
+        owned = gather_arms(self.share, mine)
+        kept: list[Trajectory] = []
+        on_root(self.share.world, lambda: kept.extend(_simulate(self.scenes, owned, self.ledger)))
+        return kept
+
+
+def _timed(scene: Scene) -> Scene:
+    """Return the scene simulated so well that time steps do not matter to the comparison."""
+    tolerance = min(scene.simulation.tolerance, TIME_SHARE * scene.reduction.tolerance)
+    # The estimate is of the bases: with the quick integrator whatever the scene's.
+    update = {"tolerance": tolerance, "integrator": "radau"}
+    simulation = scene.simulation.model_copy(update=update)
+    return scene.model_copy(update={"simulation": simulation})
+
+
+def _leading(basis: Basis, count: int) -> Basis:
+    """Return the first Craig-Bampton coordinates: fixed-interface modes stand behind three."""
+    part = slice(count)
+    return Basis(
+        basis.V[:, :, part],
+        basis.MV[:, :, part],
+        basis.stiffness[part, part],
+        basis.outboard[:, part],
+        basis.start[:, : count - 3],
+    )
+
+
+def _simulate(
+    scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals], ledger: Ledger
+) -> list[Trajectory]:
+    """Simulate a scene and its scenarios."""
+    scene, *others = scenes
+    bodies = [chain_of(scene, owned), *(bodies_in(scene, other, owned) for other in others)]
+    found = []
+    for one in simulate_batch(scenes, bodies, ledger):
+        if isinstance(one, ConvergenceError):
+            raise one
+        found.append(one)
+    return found
+
+
+def _largest(
+    scenes: Sequence[Scene],
+    few: Sequence[Trajectory],
+    many: Sequence[Trajectory],
+    energy: Mapping[int, np.ndarray],
+) -> float:
+    """Return the error of the worst scenario.
+
+    Args:
+        scenes: the scene and its scenarios.
+        few, many: their motions.
+        energy: of every design V' K V of both bases, one behind the other.
+    """
+    return max(_distance(scenes[0], *pair, energy) for pair in zip(few, many, strict=True))
+
+
+def _distance(
+    scene: Scene, few: Trajectory, many: Trajectory, energy: Mapping[int, np.ndarray]
+) -> float:
+    """Return max_t |u_few - u_many| / max_t |u_many| of the worst arm, |u|^2 = u' K u."""
+    errors, sizes = [], []
+    parts = zip(few.mechanism.slices, many.mechanism.slices, strict=True)
+    for place, (a, b) in enumerate(parts):
+        q, richer = few.q_e[:, a], many.q_e[:, b]
+        owner = scene.owners[place]
+        if owner is None:  # rigid, or from a file: the same body in both
+            K = many.mechanism.bodies[place].K
+            errors.append(_norm(K, q - richer))
+            sizes.append(_norm(K, richer))
+            continue
+        # A scenario's material scales both.
+        K = factors(scene, many.scene, owner).stiffness * energy[owner]
+        errors.append(_norm(K, np.hstack([q, -richer])))
+        sizes.append(_norm(K, np.hstack([np.zeros_like(q), richer])))
+    size = np.maximum(sizes, RESTING * max(sizes))
+    if not size.any():
+        return 0.0
+    return float((np.array(errors) / size).max())
+
+
+def _norm(K: np.ndarray, q: np.ndarray) -> float:
+    """Return the largest sqrt(q' K q) over the instants; q is (n, k)."""
+    return float(np.sqrt(max(np.einsum("nk,nk->n", q @ K, q).max(initial=0.0), 0.0)))

@@ -1,0 +1,137 @@
+"""Gradients of the objective with respect to the physical densities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, squared_period
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, mass_partners, rigid_body
+from dolfinopt.reduction import METHODS, frame_fields
+from dolfinopt.responses.statics import StaticResponse
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+
+# Directions of A below this share of its largest are rounding.
+RANK_TOLERANCE = 1e-14
+
+
+def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
+    """Return the derivative by x_phys of one arm with the equivalent static loads frozen.
+
+    dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
+    coordinates at most, however many load cases. For the compliance lambda_j = q_j.
+    Source: Seifried, Moghadasi & Held (2015), eq. (11), doi:10.1016/j.piutam.2015.01.018.
+
+    Args:
+        arm: with the design reduced.
+        A: (q, q) see `objective.frozen_moments`.
+
+    Returns:
+        (n_cells,) over this rank's cells.
+    """
+    assert arm.basis is not None
+    with arm.ledger.phase("gradient"):
+        left, values, right = np.linalg.svd(A)
+        keep = values > RANK_TOLERANCE * values[0]
+        energies = arm.elastic.cell_stiffness_products(
+            arm.basis.V @ (left[:, keep] * values[keep]), arm.basis.V @ right[keep].T
+        )
+        return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
+
+
+def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
+    """Return the derivative by x_phys of one arm of a function of its floating body.
+
+    Every integral is a product u . M v or u . K v of modes and rigid motions, so its derivative
+    has a part by M and K, cell by cell, and one by the modes V; the latter goes through
+    `Method.adjoint`. Exact for the discrete model.
+
+    Args:
+        arm: with the design reduced.
+        slopes: of the function by the body's constants; those of D go to K.
+
+    Returns:
+        (n_cells,) over this rank's cells.
+    """
+    assert arm.basis is not None
+    with arm.ledger.phase("gradient"):
+        elastic, V = arm.elastic, arm.basis.V
+        damping = arm.scene.damping.stiffness_proportional
+        by_K = slopes.K + damping * slopes.D
+        partners = mass_partners(elastic.points, V, slopes)
+        by_V = elastic.mass_times(partners.by_modes)
+        by_V += elastic.stiffness_times(V @ (by_K + by_K.T))
+        interior, outboard = elastic.restrict(by_V)
+        method = METHODS[arm.scene.reduction.method]
+        assert method.adjoint is not None  # the scene refuses the others
+        fields = method.adjoint(
+            elastic, arm.basis, arm.reduction_options, interior, outboard + slopes.outboard
+        )
+        energies = elastic.cell_stiffness_products(V @ by_K.T - fields.stiffness, V)
+        partners.left[:, :, 1:-1] += fields.mass
+        masses = elastic.cell_mass_products(partners.left, partners.right)
+        if fields.frame is not None:
+            masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
+        slope = arm.solid.young_modulus * arm.material.stiffness_slope * energies
+        return slope + arm.solid.density * arm.material.mass_slope * masses
+
+
+def static_gradient(arm: Arm, response: StaticResponse) -> np.ndarray:
+    """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads."""
+    return _static_slope(arm, response.tip, response.tip)
+
+
+def deflection_gradient(arm: Arm, response: StaticResponse, exponent: float) -> np.ndarray:
+    """Return d deflection / dx_phys (n_cells,), by one adjoint load a case."""
+    by_tip = response.deflection_slope(exponent)
+    adjoint = np.linalg.solve(arm.elastic.constraint_modes().stiffness, by_tip)
+    return _static_slope(arm, adjoint, response.tip)
+
+
+def _static_slope(arm: Arm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard displacements (3, k)."""
+    with arm.ledger.phase("gradient"):
+        field = arm.elastic.constraint_modes().field
+        energies = arm.elastic.cell_stiffness_products(field @ left, field @ right)
+        return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodGradient:
+    """Slopes of one arm's squared period.
+
+    Attributes:
+        cells: (n_cells,) by its own physical densities, what it carries held.
+        carried: (3, 3) by the matrix of what it carries.
+    """
+
+    cells: np.ndarray
+    carried: np.ndarray
+
+
+def period_gradient(arm: Arm, modes: LoadedModes, exponent: float, follow: bool) -> PeriodGradient:
+    """Differentiate `squared_period`: d lambda = phi' (dK - lambda dM) phi, phi of unit mass."""
+    with arm.ledger.phase("gradient"):
+        _, by_values = squared_period(modes, exponent, follow)
+        weighted = modes.field * by_values
+        energies = arm.elastic.cell_stiffness_products(weighted, modes.field)
+        masses = arm.elastic.cell_mass_products(weighted * modes.values, modes.field)
+        cells = arm.solid.young_modulus * arm.material.stiffness_slope * energies
+        cells -= arm.solid.density * arm.material.mass_slope * masses
+        carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
+        return PeriodGradient(cells, carried)
+
+
+def rigid_gradient(arm: Arm, by_rigid: RigidIntegrals) -> np.ndarray:
+    """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,)."""
+    moment = np.array([by_rigid.moment.real, by_rigid.moment.imag])
+    points = arm.elastic.points
+    by = rigid_body(by_rigid.mass, moment, by_rigid.inertia, np.zeros(2))
+    partners = mass_partners(points, np.empty((*points.shape, 0)), by)
+    masses = arm.elastic.cell_mass_products(partners.left, partners.right)
+    return arm.solid.density * arm.material.mass_slope * masses

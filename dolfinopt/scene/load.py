@@ -1,0 +1,428 @@
+"""From a TOML file, or plain data, and overrides to a scene.
+
+`load_scene` reads a file, `scene_from_dict` plain data; both return a `Scene` or raise one
+`InputError` of one line that names file, key, value and remedy. The keys themselves stand in
+`scene_keys.py`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
+from dolfinopt.scene.messages import (
+    Override,
+    allowed_words,
+    arm_name,
+    blamed,
+    describe_keys,
+    dotted,
+    field_at,
+    first_problem,
+    model_at,
+    unknown_key,
+)
+from dolfinopt.scene.schema import (
+    FILE_KEYS,
+    MAX_CELLS,
+    Arm,
+    Law,
+    Loc,
+    Motion,
+    Reduction,
+    Refusal,
+    Scene,
+    WorstBy,
+    check_scene_name,
+)
+from dolfinopt.scene.spelling import cut, input_error, shown
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = [
+    "FILE_KEYS",
+    "MAX_CELLS",
+    "Arm",
+    "Law",
+    "Motion",
+    "Reduction",
+    "Scene",
+    "WorstBy",
+    "describe_keys",
+    "load_scene",
+    "pose_scenarios",
+    "resolve_file",
+    "scene_from_dict",
+]
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
+    """Read, complete and validate the scene file `path` (TOML, UTF-8).
+
+    `overrides` are strings "key.path=value" as given to --set. The value is read as TOML, or else
+    taken as a bare string. `arms.length` means all arms, `arms.0.length` and `arms.arm2.length`
+    one of them; they apply after arms have taken missing keys from the arm before, so that an
+    override changes what it names and nothing else.
+
+    Raises:
+        InputError: one line that names file, key, value and what is allowed.
+    """
+    source = os.fspath(path)
+    return _build(_read_toml(source), source, overrides, _default_name(source))
+
+
+def scene_from_dict(
+    data: Mapping[str, Any], source: str = "<scene>", overrides: Iterable[str] = ()
+) -> Scene:
+    """Complete and validate a scene given as nested dictionaries and lists, left unchanged.
+
+    `source` stands for the file in messages; `overrides` as in `load_scene`.
+
+    Raises:
+        InputError: one line that names source, key, value and what is allowed.
+    """
+    if not isinstance(data, Mapping):
+        raise input_error(source, f"expected a table of scene keys, found {shown(data)}")
+    return _build(data, source, overrides, _default_name(source))
+
+
+def _default_name(source: str) -> str:
+    """Return the file's name without extension, "scene" where it cannot be a title."""
+    try:
+        return check_scene_name(Path(source).stem.strip("<>"))
+    except Refusal:
+        return "scene"
+
+
+def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name: str) -> Scene:
+    """Complete `data`, apply `overrides`, validate; `name` is the default of the scene's name."""
+    tree = _copy_tables(data)
+    tree.setdefault("name", name)
+    tree.setdefault("material", {})  # so that the message names the first key missing in it
+    inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
+    changes = [_override(tree, text, source) for text in overrides]
+    for change in changes:
+        inherited.difference_update(change.locs[:1])
+        inherited.update(change.locs[1:])
+    # An override may have supplied what the first arm lacked; otherwise it changes what it names.
+    required = [key for key, field in Arm.model_fields.items() if field.is_required()]
+    inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
+    _resolve_files(tree, source, changes)
+    _measure_bodies(tree, inherited)
+    derived = _time_motion(tree, source, changes)
+    try:
+        scene = Scene.model_validate(tree)
+    except ValidationError as error:
+        message = first_problem(error, tree, inherited, source, changes)
+        raise InputError(message) from None
+    scene._source = source
+    scene._derived = derived
+    pose_scenarios(scene)
+    return scene
+
+
+@lru_cache(maxsize=16)
+def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
+    """Return the scene as each of its scenarios changes it.
+
+    Raises:
+        InputError: a change names no key, or a value that it cannot have.
+    """
+    if not scene.scenarios:
+        return ()
+    plain = scene.to_tree() | {"scenarios": []}
+    return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
+
+
+def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
+    """Put absolute paths in place of the files that `tree` names.
+
+    What is no string and keys that a table does not have are left for validation to refuse.
+    """
+    for table, key in FILE_KEYS:
+        model, node = model_at((table,)), tree.get(table)
+        if model is None or key not in model.model_fields:
+            continue
+        for i, row in enumerate(node if isinstance(node, list) else [node]):
+            value = row.get(key) if isinstance(row, dict) else None
+            if not isinstance(value, str):
+                continue
+            loc = (table, i, key) if isinstance(node, list) else (table, key)
+            where = blamed(source, changes, (loc,))
+            row[key] = resolve_file(source, value, dotted(loc, tree), where)
+
+
+def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
+    """Take the length of arms with standard input data from their files, unless it is stated.
+
+    Height and thickness are only drawn then: a twentieth of the length unless stated.
+    """
+    arms = tree.get("arms")
+    for i, arm in enumerate(arms if isinstance(arms, list) else []):
+        if not isinstance(arm, dict) or not isinstance(arm.get("sid"), str):
+            continue
+        from dolfinopt.exchange.sid import read_sid  # NumPy, which other scenes do not need
+
+        x, y = read_sid(Path(arm["sid"])).nodes[-1].origin.M0.ravel()[:2]
+        length = math.hypot(x, y)
+        if ("arms", i, "length") in inherited or "length" not in arm:
+            arm["length"] = length
+        for key in ("height", "thickness"):
+            arm.setdefault(key, length / 20.0)
+        # What a mesh would need says nothing about a body from a file.
+        for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
+            if loc[2] in ("passive", *MESH_KEYS):
+                arm.pop(loc[2], None)
+
+
+def _time_motion(
+    tree: dict[str, Any], source: str, changes: list[Override]
+) -> tuple[tuple[str, str], ...]:
+    """Complete duration and horizon of the motion where they follow from other values.
+
+    Returns:
+        The keys that do, as (table, key).
+
+    Raises:
+        InputError: a stated duration is too short for the limits.
+    """
+    motion = tree.get("motion")
+    if not isinstance(motion, dict):
+        return ()
+    asked = ("file", "max_speed", "max_acceleration", "max_jerk")
+    derived: list[tuple[str, str]] = []
+    if any(motion.get(key) is not None for key in asked):
+        from dolfinopt.scene.duration import (  # NumPy, which others do not need
+            SAME_TIME,
+            least_duration,
+        )
+
+        rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
+        try:
+            least, limited = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
+        except (ValidationError, InputError):  # told where the scene is checked, or its motion
+            least, limited = None, False
+        stated = motion.get("duration")
+        if stated is None and least is not None:
+            motion["duration"] = least
+            derived.append(("motion", "duration"))
+        if not (limited and isinstance(stated, (int, float)) and least is not None):
+            pass  # what the duration is, validation will say
+        elif stated < least * (1.0 - SAME_TIME):
+            where = blamed(source, changes, (("motion", "duration"),))
+            keys = ", ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
+            raise input_error(
+                where,
+                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s] by the "
+                f"limits ({keys}); leave it out to have just that, or raise them",
+            )
+    duration = motion.get("duration")
+    default = Motion.model_fields["horizon"].default
+    if "horizon" not in motion and isinstance(duration, (int, float)) and duration > default:
+        motion["horizon"] = duration
+        derived.append(("motion", "horizon"))
+    return tuple(derived)
+
+
+def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
+    """Return the absolute path of the file that the scene `source` names as `value`.
+
+    A relative path is looked for from the scene's folder, then from the working directory, and
+    "meshes/..." at last among the package's own. `key` and `where` (default `source`) stand in
+    the message.
+
+    Raises:
+        InputError: there is no such file; names the key and all places.
+    """
+    folders = [Path(source).parent, Path()]
+    if Path(value).parts[:1] == (mesh_folder().name,):
+        folders.append(mesh_folder().parent)
+    paths = list(dict.fromkeys(os.path.abspath(folder / value) for folder in folders))
+    for path in paths:
+        if os.path.isfile(path):
+            return path
+    tried = "neither " if len(paths) > 1 else "not "
+    tried += " nor ".join(paths)
+    raise input_error(
+        where or source,
+        f"{key} = {shown(value)}: expected the path of a file, from the scene's folder or the "
+        f"working directory; found {tried}",
+    )
+
+
+def _read_toml(source: str) -> dict[str, Any]:
+    """Return the data of the TOML file `source`; raise InputError if there is none."""
+    text = _read_text(source)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise input_error(source, "not a scene: arrays nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
+        raise input_error(source, _syntax_error(str(error), text)) from None
+
+
+def _read_text(source: str) -> str:
+    """Return the text of the file `source`; raise InputError if it cannot be read."""
+    remedy = "give the path of a scene file (TOML)"
+    try:
+        return Path(source).read_bytes().decode("utf-8-sig")  # editors may add a byte order mark
+    except FileNotFoundError:
+        reason = f"no such file; {remedy}"
+    except IsADirectoryError:
+        reason = f"is a directory; {remedy}"
+    except PermissionError:
+        reason = "permission denied; make the file readable"
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror}); {remedy}"
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        reason = f"line {line}: not UTF-8; save the file as UTF-8"
+    except ValueError:  # a zero byte in the path
+        reason = f"not a file name; {remedy}"
+    raise input_error(source, reason)
+
+
+def _syntax_error(message: str, text: str) -> str:
+    """Move the place in the parser's message to its front: "line 3, column 5: not valid ..."."""
+    found = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
+    if not found:
+        return f"not valid TOML: {message}"
+    line, column = found.groups()
+    if line is None:
+        line, column = text.count("\n") + 1, len(text) - text.rfind("\n")
+    return f"line {line}, column {column}: not valid TOML: {message[: found.start()]}"
+
+
+def _copy_tables(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy the scene's tables, which completion changes; values are shared with `data`."""
+    tree: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            value = dict(value)
+        elif isinstance(value, (list, tuple)):
+            value = [dict(item) if isinstance(item, Mapping) else item for item in value]
+        tree[key] = value
+    return tree
+
+
+# What an arm is, is its own; sizes and material are taken from the arm before.
+# What an arm is meshed from: an arm that states one of the first two takes none of the others.
+MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
+OWN_KEYS = ("name", "design", "rigid", "sid")
+
+
+def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
+    """Fill each arm's missing `keys` from the arm before; return their paths."""
+    arms = tree.get("arms")
+    inherited: set[Loc] = set()
+    if not isinstance(arms, list):
+        return inherited
+    for i in range(1, len(arms)):
+        before, arm = arms[i - 1], arms[i]
+        if not (isinstance(before, dict) and isinstance(arm, dict)):
+            continue
+        taken = MESH_KEYS if any(key in arm for key in MESH_KEYS[:2]) else ()
+        for key in keys:
+            if key in before and key not in arm and key not in taken:
+                arm[key] = before[key]
+                inherited.add(("arms", i, key))
+    return inherited
+
+
+# --- overrides -------------------------------------------------------------------------------
+
+
+def _override(tree: dict[str, Any], text: str, source: str) -> Override:
+    """Apply one "key.path=value" to `tree`; raise InputError if there is no such key."""
+    where = f"{source} with --set {cut(text)}"
+    path, equals, value = text.partition("=")
+    parts = tuple(part.strip() for part in path.split("."))
+    if not equals or not all(parts):
+        raise input_error(where, "expected key.path=value, for example payload.mass=4.0")
+    locs = _override_locs(tree, parts, where)
+    for loc in locs:
+        if loc[0] == "arms" and loc[2:] in (("cells",), ("mesh",)):
+            _drop_mesh(tree, loc)
+        _store(tree, loc, _parse_value(value.strip()))
+    return Override(text, locs)
+
+
+def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
+    """Let `cells` or `mesh` at `loc` take the place of what the arm is meshed from so far."""
+    arm = tree["arms"][loc[1]]
+    if not isinstance(arm, dict):
+        return
+    others = MESH_KEYS if loc[2] == "cells" else ("cells",)
+    for key in others:
+        arm.pop(key, None)
+
+
+def _parse_value(text: str) -> Any:
+    """Read `text` as a TOML value; what is none is a bare string."""
+    try:
+        data = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return data["value"] if set(data) == {"value"} else text
+
+
+def _override_locs(tree: dict[str, Any], parts: tuple[str, ...], where: str) -> tuple[Loc, ...]:
+    """Return the paths that the dotted key `parts` means; raise InputError if there are none."""
+    locs: tuple[Loc, ...] = (parts,)
+    if parts[0] == "arms" and len(parts) > 1:
+        arms = tree.get("arms")
+        if not isinstance(arms, list):  # validation will say so
+            return ()
+        if len(parts) == 2 and parts[1] in Arm.model_fields:
+            locs = tuple(("arms", i, parts[1]) for i in range(len(arms)))
+        else:
+            numbers = {str(i): i for i in range(len(arms))}
+            names = {arm_name(tree, i): i for i in numbers.values()}
+            index = numbers.get(parts[1], names.get(parts[1]))
+            if index is None:
+                known = [*numbers, *filter(None, names)]
+                known += Arm.model_fields if len(parts) == 2 else []
+                raise input_error(where, unknown_key(("arms",), parts[1], known, tree))
+            locs = (("arms", index, *parts[2:]),)
+    for loc in locs[:1]:
+        _check_known(tree, loc, where)
+    return locs
+
+
+def _check_known(tree: dict[str, Any], loc: Loc, where: str) -> None:
+    """Raise InputError unless `loc` is the path of a key or a table of a scene."""
+    for depth in range(1, len(loc) + 1):
+        above, key = loc[: depth - 1], loc[depth - 1]
+        parent = model_at(above)
+        if isinstance(key, int):
+            continue
+        if parent is None:
+            remedy = f"set {dotted(above, tree)} as a whole: {allowed_words(field_at(above))}"
+            raise input_error(where, f"unknown key {dotted(loc, tree)}; {remedy}")
+        if key not in parent.model_fields:
+            raise input_error(where, unknown_key(above, key, parent.model_fields, tree))
+
+
+def _store(tree: dict[str, Any], loc: Loc, value: Any) -> None:
+    """Set the value at `loc`; do nothing where the file has no table, which validation reports."""
+    node: Any = tree
+    for part in loc[:-1]:
+        if isinstance(node, dict):
+            node = node.setdefault(part, {})
+        elif isinstance(node, list) and isinstance(part, int):
+            node = node[part]
+    if isinstance(node, dict) or (isinstance(node, list) and isinstance(loc[-1], int)):
+        node[loc[-1]] = value

@@ -1,0 +1,252 @@
+"""What is wrong with a scene, in one line; what may stand in one, as documentation lists it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from dolfinopt.scene.schema import Arm, Loc, Refusal, Scene, Table, check_arm_name, without_none
+from dolfinopt.scene.spelling import cut, key_text, one_line, shown
+
+
+@dataclass(frozen=True)
+class Override:
+    """One --set: its text, and the paths of the keys it changed."""
+
+    text: str
+    locs: tuple[Loc, ...]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """One rejected key: what to print, and the paths of all keys involved, reported one first."""
+
+    text: str
+    locs: tuple[Loc, ...]
+    kind: str
+
+
+def first_problem(
+    error: ValidationError,
+    tree: dict[str, Any],
+    inherited: set[Loc],
+    source: str,
+    changes: list[Override],
+) -> str:
+    """Return the one-line message of the first problem and the number of others."""
+    problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
+    # Two wrong elements of one array are one problem.
+    problems = [problem for i, problem in enumerate(problems) if problem not in problems[:i]]
+    known = {(problem.kind, problem.locs) for problem in problems}
+    problems = [problem for problem in problems if not _is_echo(problem, inherited, known)]
+    # A misspelt key is also a missing one: the spelling is the message that helps.
+    problems.sort(key=lambda problem: problem.kind != "unknown")
+    first, n_more = problems[0], len(problems) - 1
+    where = blamed(source, changes, first.locs)
+    more = f" (and {n_more} more)" if n_more else ""
+    return one_line(f"{where}: {first.text}{more}")
+
+
+def blamed(source: str, changes: list[Override], locs: tuple[Loc, ...]) -> str:
+    """Return the place to blame for the values at `locs`: the file, or the last --set of them."""
+    where = source
+    for change in changes:
+        if any(_starts(loc, changed) for loc in locs for changed in change.locs):
+            where = f"{source} with --set {cut(change.text)}"
+    return where
+
+
+def _is_echo(
+    problem: _Problem, inherited: set[Loc], known: set[tuple[str, tuple[Loc, ...]]]
+) -> bool:
+    """Tell whether the arm before has the same problem and this one only took it over."""
+    before = []
+    for loc in problem.locs:
+        taken = loc in inherited or (problem.kind == "missing" and loc[-1] != "name")
+        if loc[0] != "arms" or len(loc) < 3 or not taken:
+            return False
+        before.append(("arms", loc[1] - 1, loc[2]))
+    return (problem.kind, tuple(before)) in known
+
+
+def _starts(loc: Loc, above: Loc) -> bool:
+    """Tell whether `above` is `loc` or a table that holds it."""
+    return loc[: len(above)] == above
+
+
+def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
+    """Translate one of pydantic's errors."""
+    raw: Loc = item["loc"]
+    # Below a key there are only the elements of its value, which messages show as a whole.
+    loc = raw[: 3 if raw[:1] in (("arms",), ("scenarios",)) else 2]
+    if item["type"] in ("extra_forbidden", "invalid_key"):
+        model = model_at(loc[:-1])
+        fields = model.model_fields if model else {}
+        return _Problem(unknown_key(loc[:-1], loc[-1], fields, tree), (loc,), "unknown")
+    if item["type"] == "missing" and len(raw) == len(loc):
+        what = _meaning(field_at(loc))
+        return _Problem(f"missing key {dotted(loc, tree)} ({what})", (loc,), "missing")
+    reason = item.get("ctx", {}).get("error")
+    if isinstance(reason, Refusal):
+        locs = tuple((*loc, *key) for key in reason.keys) or (loc,)
+        return _Problem(f"{_found(locs[0], tree)}: {reason.reason}", locs, "value")
+    field = field_at(loc)
+    allowed = allowed_words(field)
+    if item["type"] == "finite_number":
+        allowed = allowed.replace("number", "finite number")
+    text = f"{_found(loc, tree)}: expected {allowed} ({_meaning(field)})"
+    return _Problem(text, (loc,), "value")
+
+
+def unknown_key(above: Loc, key: Any, known: Iterable[str], tree: dict[str, Any]) -> str:
+    """Return the message for `key`, which the table at `above` does not have."""
+    known = list(known)
+    text = f"unknown key {dotted((*above, key), tree)}"
+    closest = " or ".join(_closest(above, str(key), known))
+    text += f"; did you mean {closest}?" if closest else ";"
+    return f"{text} allowed: {', '.join(known)}"
+
+
+def _closest(above: Loc, key: str, known: list[str]) -> list[str]:
+    """Return the paths that an unknown `key` of the table at `above` may have meant."""
+    paths = [info.key for info in describe_keys()]
+    if elsewhere := [path for path in paths if path.endswith(f".{key}")]:
+        return elsewhere  # the right key in the wrong table
+    if starts := [name for name in known if name.startswith(key) and key]:
+        return [".".join(map(key_text, (*above, name))) for name in starts]
+    if near := difflib.get_close_matches(key, known, 1):
+        return [".".join(map(key_text, (*above, near[0])))]
+    names = {path.rpartition(".")[2]: path for path in paths}
+    return [names[name] for name in difflib.get_close_matches(key, names, 1, 0.8)]
+
+
+def model_at(loc: Loc) -> type[Table] | None:
+    """Return the model of the table at `loc`, None if there is a plain value."""
+    model: Any = Scene
+    for part in loc:
+        if isinstance(part, int):
+            continue  # an arm: the model is that of the array's elements
+        field = model.model_fields.get(part) if model else None
+        model = _element_model(field.annotation) if field else None
+    return model
+
+
+def _element_model(annotation: Any) -> type[Table] | None:
+    """Return the model a field holds, itself or as elements of an array."""
+    if get_origin(annotation) is tuple:
+        annotation = get_args(annotation)[0]
+    return annotation if isinstance(annotation, type) and issubclass(annotation, Table) else None
+
+
+def field_at(loc: Loc) -> FieldInfo:
+    """Return the field at `loc`; an element of `arms` counts as a field of its own."""
+    if isinstance(loc[-1], int):
+        one = _element_model(Scene.model_fields[loc[0]].annotation)
+        return FieldInfo(annotation=one, description=f"one of {loc[0]}")
+    model = model_at(loc[:-1])
+    assert model is not None, loc
+    return model.model_fields[loc[-1]]
+
+
+def _meaning(field: FieldInfo) -> str:
+    """Return the field's description, with its unit if it has one."""
+    return str(field.description).removesuffix(" [-]")
+
+
+def allowed_words(field: FieldInfo) -> str:
+    """Return in words what `field` accepts."""
+    return _allowed_type(field.annotation, field.metadata)
+
+
+def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "") -> str:
+    annotation = without_none(annotation)
+    origin, args = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
+        return _allowed_type(args[0], rules, plural)
+    if origin in (Union, UnionType):
+        return " | ".join(_allowed_type(one, metadata) for one in args)
+    if origin is Literal:
+        return " | ".join(shown(value) for value in args)
+    if origin is tuple and _element_model(annotation):
+        if _element_model(annotation) is Arm:
+            return "an array of tables [[arms]], at least one"
+        return "an array of tables"
+    if origin is tuple:
+        rows = get_origin(args[0]) is tuple
+        inner = "arrays of three numbers" if rows else _allowed_type(args[0], plural="s")
+        count = "" if args[-1] is Ellipsis else "two "
+        return f"an array of {count}{inner}"
+    if isinstance(annotation, type) and issubclass(annotation, Table):
+        return f"a table with the keys {', '.join(annotation.model_fields)}"
+    nouns = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}
+    noun = nouns[annotation]
+    noun = noun.split()[1] + plural if plural else noun
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    bounds = [
+        f"{sign} {getattr(rule, name):.12g}"
+        for rule in metadata
+        for name, sign in signs.items()
+        if hasattr(rule, name)
+    ]
+    return " ".join([noun, " and ".join(bounds)]).strip()
+
+
+def _found(loc: Loc, tree: dict[str, Any]) -> str:
+    """Return "key.path = value" for the value at `loc`, or for its default."""
+    node: Any = tree
+    for part in loc:
+        try:
+            node = node[part]
+        except (KeyError, IndexError, TypeError):
+            return f"{dotted(loc, tree)} = {shown(field_at(loc).default)} (default)"
+    return f"{dotted(loc, tree)} = {shown(node)}"
+
+
+def dotted(loc: Loc, tree: dict[str, Any]) -> str:
+    """Return the TOML spelling of a path, with the name of the arm it belongs to."""
+    text = ".".join(map(key_text, loc))
+    name = arm_name(tree, loc[1]) if loc[0] == "arms" and len(loc) > 1 else None
+    return f"{text} ({name})" if name and loc[2:] != ("name",) else text
+
+
+def arm_name(tree: dict[str, Any], index: Any) -> str | None:
+    """Return the name of an arm if it has one that can stand in a message."""
+    try:
+        return check_arm_name(tree["arms"][index]["name"])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return None
+
+
+# --- documentation ---------------------------------------------------------------------------
+
+
+class KeyInfo(NamedTuple):
+    """One key of a scene as documentation lists it; `default` is "" where there is none."""
+
+    key: str
+    allowed: str
+    default: str
+    description: str
+
+
+def describe_keys() -> list[KeyInfo]:
+    """List all keys of a scene in the order of the models, e.g. `arms.length`, `payload.mass`."""
+    return list(_describe(Scene, ""))
+
+
+def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
+    for key, field in model.model_fields.items():
+        below = _element_model(field.annotation)
+        if below is not None:
+            yield from _describe(below, f"{prefix}{key}.")
+            continue
+        default = "" if field.is_required() else shown(field.default)
+        default = "none" if default == "None" else default
+        yield KeyInfo(f"{prefix}{key}", allowed_words(field), default, str(field.description))

@@ -1,0 +1,1 @@
+"""Designs under varied scene values: store, sweeps, random samples, tables."""

@@ -1,0 +1,402 @@
+"""Pictures of studies: pure functions of what a study found, on the root only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from dolfinopt.output.files import designed, gather_views, read_design
+from dolfinopt.plots.style import (
+    COLOURS,
+    DENSITY,
+    GREY,
+    PALETTE,
+    ends_right,
+    label_ends,
+    log2_scale,
+    log_scale,
+    looks,
+    new_figure,
+    save,
+    spans_decade,
+)
+from dolfinopt.profiling import Ledger
+from dolfinopt.scene.load import Scene
+from dolfinopt.study import tables as findings
+from dolfinopt.study.tables import (
+    BarFigure,
+    DesignFigure,
+    HistogramFigure,
+    LineFigure,
+    MatrixFigure,
+    Panel,
+    ScatterFigure,
+    Study,
+    TornadoFigure,
+    joined,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from dolfinopt.output.files import ArmView
+
+FEW = 40  # points a line that get markers
+NARROW = 5.4  # inches, of a column
+CROWD = 7  # matrix columns that still have room for large numbers
+LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
+PANEL = 3.2  # inches, height of a panel of curves
+
+Looks = Mapping[str, Mapping[str, Any]]
+
+
+def draw_study(study: Study, folder: Path) -> list[Path]:
+    """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
+    styles = common_looks(study.figures)
+    paths = []
+    for figure in study.figures:
+        name = joined(study.name, figure.name)
+        paths.append(save(draw(figure, styles), folder / f"{name}.png"))
+    return paths
+
+
+def common_looks(figures: Iterable[findings.Figure]) -> Looks:
+    """Return one look for every curve's name in all these figures, and for every design's."""
+    groups = []
+    for figure in figures:
+        if isinstance(figure, LineFigure):
+            groups.append([line.label for row in figure.rows for p in row for line in p.lines])
+        elif isinstance(figure, HistogramFigure):
+            groups.append([panels[0].title for panels in figure.rows])
+    return looks(groups)
+
+
+def draw(figure: findings.Figure, styles: Looks | None = None) -> Figure:
+    """Return a study's figure, drawn.
+
+    Args:
+        figure: what.
+        styles: of curves and designs by name, see `common_looks`; default: of this figure alone.
+    """
+    if isinstance(figure, LineFigure):
+        return line_figure(figure, styles)
+    if isinstance(figure, MatrixFigure):
+        return matrix_figure(figure)
+    if isinstance(figure, TornadoFigure):
+        return tornado_figure(figure)
+    if isinstance(figure, HistogramFigure):
+        return histogram_figure(figure, styles)
+    if isinstance(figure, BarFigure):
+        return bar_figure(figure)
+    if isinstance(figure, ScatterFigure):
+        return scatter_figure(figure, styles)
+    return design_figure(figure)
+
+
+def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
+    """Return the panels of curves.
+
+    Names stand where the curves end, in the last panel of each row that shows them; or in a legend
+    beside it, where curves end anywhere. Panels of one quantity share its axis.
+    """
+    rows, columns = len(figure.rows), max(map(len, figure.rows))
+    styles = styles or common_looks([figure])
+    drawn = new_figure((4.4 if columns > 1 else 6.5) * columns + 3.0, (PANEL + 0.4) * rows + 0.4)
+    grid = drawn.subplots(rows, columns, squeeze=False)
+    for row, panels in zip(grid, figure.rows, strict=True):
+        for axes in row[len(panels) :]:
+            axes.set_visible(False)
+        for axes, panel in zip(row, panels):
+            _draw_panel(axes, panel, styles)
+    _share_axes(grid, figure.rows)
+    for row, panels in zip(grid, figure.rows, strict=True):
+        _name_curves(row, panels)
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12, parse_math=False)
+    return drawn
+
+
+def _share_axes(grid: np.ndarray, rows: Sequence[Sequence[Panel]]) -> None:
+    """Let panels below each other share x, and those beside each other y, of one quantity each."""
+    for row, panels in zip(grid, rows, strict=True):
+        for axes, panel in zip(row[1:], panels[1:]):
+            same = panel.y_label == panels[0].y_label
+            if same and axes.get_yscale() == row[0].get_yscale():
+                axes.sharey(row[0])
+                row[0].autoscale(axis="y")
+                if row[0].get_yscale() == "linear" and row[0].get_ylim()[0] > 0.0:
+                    row[0].set_ylim(bottom=0.0)
+    for j, column in enumerate(grid.T):
+        shown = [(axes, row[j]) for axes, row in zip(column, rows, strict=True) if j < len(row)]
+        for axes, panel in shown[1:]:
+            first, one = shown[0]
+            if panel.x_label == one.x_label and axes.get_xscale() == first.get_xscale():
+                limits = [v for a in (first, axes) for v in a.get_xlim()]
+                axes.sharex(first)
+                first.set_xlim(min(limits), max(limits))
+
+
+def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
+    """Write the names of a row's curves, each once."""
+    last = len(panels) - 1
+    left = dict.fromkeys(line.label for panel in panels for line in panel.lines)
+    if all(list(left) == [panel.title] for panel in panels):  # the title says it
+        return
+    if all(ends_right(axes) for axes in row[: last + 1] if axes.lines):
+        for k in range(last, -1, -1):
+            mine = {line.label for line in panels[k].lines} & set(left)
+            label_ends(row[k], PANEL - 0.7, mine)
+            left = {name: None for name in left if name not in mine}
+        return
+    handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
+    row[last].legend(
+        [handles[name] for name in left],
+        list(left),
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.02),
+        frameon=False,
+        fontsize=9,
+        handlelength=3.0,
+    )
+
+
+def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
+    """Return the panels below each other, each with its legend below: legible on a phone.
+
+    Their left edges are one line.
+    """
+    panels = [panel for row in figure.rows for panel in row]
+    styles = styles or common_looks([figure])
+    heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
+    drawn = new_figure(NARROW, sum(heights), 160)
+    grid = drawn.subplots(len(panels), 1, squeeze=False, height_ratios=[1.0] * len(panels))[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        _draw_panel(axes, panel, styles)
+        if panel.lines and [line.label for line in panel.lines] != [panel.title]:
+            axes.legend(
+                loc="upper left",
+                bbox_to_anchor=(0.0, -0.2),
+                borderaxespad=0.0,
+                frameon=False,
+                fontsize=9,
+                handlelength=3.0,
+            )
+    drawn.align_ylabels(list(grid))
+    return drawn
+
+
+def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
+    """Draw one panel."""
+    from matplotlib.ticker import MaxNLocator
+
+    for line in panel.lines:
+        style = dict(styles[line.label])
+        if len(line.x) > FEW:
+            style["marker"] = ""
+        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **style)
+    values = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
+    x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
+    if len(values) and (spans_decade(values) or (panel.y_log and values.min() > 0.0)):
+        log_scale(axes, values)
+    elif len(values) and values.min() >= 0.0 and values.min() < 0.5 * values.max():
+        axes.set_ylim(bottom=0.0)
+    if panel.x_log2 and len(x) and x.min() > 0.0:
+        log2_scale(axes)
+    elif len(x) and (x % 1 == 0).all():
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if any(len(line.x) > FEW for line in panel.lines):
+        axes.set_xlim(x.min(), x.max())
+    axes.set_xlabel(panel.x_label, parse_math=False)
+    axes.set_ylabel(panel.y_label, parse_math=False)
+    axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
+    axes.grid(True, alpha=0.3)
+
+
+def matrix_figure(figure: MatrixFigure) -> Figure:
+    """Return heat maps with their numbers."""
+    count = len(figure.labels)
+    side = max(3.6, 0.62 * count + 1.6)
+    drawn = new_figure(side * len(figure.panels) + 0.6, side + 0.5)
+    for axes, (title, values) in zip(drawn.subplots(1, len(figure.panels), squeeze=False)[0],
+                                     figure.panels, strict=True):  # fmt: skip
+        image = axes.imshow(values, cmap="RdBu_r", vmin=-LOSS, vmax=LOSS)
+        for (i, j), value in np.ndenumerate(values):
+            dark = abs(value) > 0.6 * LOSS
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", color="w" if dark else "k",
+                      fontsize=9 if count <= CROWD else 7)  # fmt: skip
+        axes.set_xticks(range(count), figure.labels)
+        axes.set_yticks(range(count), figure.labels)
+        axes.set_xlabel(figure.column_label, parse_math=False)
+        axes.set_ylabel(figure.row_label, parse_math=False)
+        axes.set_title(title, loc="left", fontsize=10)
+        drawn.colorbar(image, ax=axes, shrink=0.8, extend=_beyond(values))
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+def _beyond(values: np.ndarray) -> Literal["neither", "min", "max", "both"]:
+    """Return at which ends of the colour scale values lie beyond it."""
+    low, high = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
+    return "both" if low and high else "min" if low else "max" if high else "neither"
+
+
+def tornado_figure(figure: TornadoFigure) -> Figure:
+    """Return bars from the lowest to the highest value, the most telling key on top."""
+    drawn = new_figure(9.0, sum(1.1 + 0.45 * len(bars) for _, bars in figure.panels) + 0.4)
+    heights = [1.0 + 0.5 * len(bars) for _, bars in figure.panels]
+    grid = drawn.subplots(len(figure.panels), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (title, bars) in zip(grid, figure.panels, strict=True):
+        place = np.arange(len(bars))
+        for k, (colour, label) in enumerate(
+            ((PALETTE[0], "at the first value"), (PALETTE[1], "at the last value"))
+        ):
+            # The second is narrower: both may point the same way.
+            width = (0.7, 0.4)[k]
+            axes.barh(place, [bar[1 + k] for bar in bars], width, color=colour, label=label)
+        axes.set_yticks(place, [bar[0] for bar in bars])
+        axes.invert_yaxis()
+        axes.axvline(0.0, color="black", linewidth=0.8)
+        axes.set_xlabel("change [%]")
+        axes.set_title(title, loc="left", fontsize=10, parse_math=False)
+        axes.grid(True, axis="x", alpha=0.3)
+    grid[0].legend(frameon=False, fontsize=9, loc="best")
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+# -- designs ---------------------------------------------------------------------------------
+
+
+def design_figure(figure: DesignFigure) -> Figure:
+    """Return the designs below each other, arms side by side, to one scale."""
+    views = [_views(scene, path) for _, scene, path in figure.designs]
+    columns = max(map(len, views))
+    tall = max(np.ptp(v.corners[..., 1]) / np.ptp(v.corners[..., 0]) for row in views for v in row)
+    wide = 6.0
+    drawn = new_figure(wide * columns + 0.4, len(views) * (wide * tall + 0.45) + 1.2)
+    grid = drawn.subplots(len(views), columns, squeeze=False)
+    for row, arms, (label, _, _) in zip(grid, views, figure.designs, strict=True):
+        for axes, view in zip(row, arms):
+            image = _draw_arm(axes, view)
+            axes.set_title(view.name, loc="right", fontsize=9, color=GREY)
+        for axes in row[len(arms) :]:
+            axes.set_visible(False)
+        row[0].set_title(label, loc="left", fontsize=10, parse_math=False)
+    for axes in grid[-1]:
+        axes.xaxis.set_visible(True)
+        axes.set_xlabel("x [m]")
+    drawn.colorbar(image, ax=grid, location="bottom", shrink=0.3, aspect=40, label=DENSITY)
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+def _draw_arm(axes: Axes, view: ArmView) -> Any:
+    """Fill the cells of one arm."""
+    from matplotlib.collections import PolyCollection
+
+    # Edges of the faces' colour close the seams between neighbours.
+    cells = PolyCollection(list(view.corners), array=view.density, cmap=COLOURS,
+                           edgecolors="face", linewidths=0.2)  # fmt: skip
+    cells.set_clim(0.0, 1.0)
+    axes.add_collection(cells)
+    low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+    axes.xaxis.set_visible(False)
+    axes.set_yticks([])
+    return cells
+
+
+def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
+    """Return the arms of a design file, on this rank alone."""
+    from mpi4py import MPI
+
+    from dolfinopt.arms.arm import build_arms
+    from dolfinopt.parallel import share_arms
+
+    share = share_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, share, Ledger())
+    return designed(gather_views(scene, share, arms, read_design(path, share, arms)))
+
+
+# -- random values ---------------------------------------------------------------------------
+
+
+def histogram_figure(figure: HistogramFigure, styles: Looks | None = None) -> Figure:
+    """Return histograms, the share of the samples below as a curve, and the nominal values."""
+    from matplotlib.ticker import MaxNLocator
+
+    rows, columns = len(figure.rows), max(map(len, figure.rows))
+    styles = styles or common_looks([figure])
+    drawn = new_figure(5.2 * columns, 3.2 * rows + 0.5)
+    grid = drawn.subplots(rows, columns, squeeze=False)
+    for row, panels in zip(grid, figure.rows, strict=True):
+        for axes, panel in zip(row, panels):
+            colour = styles[panels[0].title]["color"]
+            axes.hist(panel.values, bins="fd", color=colour, alpha=0.55)
+            axes.axvline(panel.nominal, color="black", linestyle="--", linewidth=1.2)
+            axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
+            axes.set_xlabel(panel.x_label, parse_math=False)
+            axes.set_ylabel("samples [-]")
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+            share = axes.twinx()
+            ordered = np.sort(panel.values)
+            share.step(ordered, np.arange(1, len(ordered) + 1) / len(ordered), where="post",
+                       color=GREY, linewidth=1.4)  # fmt: skip
+            share.set_ylim(0.0, 1.0)
+            share.set_ylabel("share of samples below [-]", color=GREY)
+    drawn.suptitle(f"{figure.title}; dashed: nominal", x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+def bar_figure(figure: BarFigure) -> Figure:
+    """Return groups of bars with their intervals."""
+    rows, columns = len(figure.rows), max(map(len, figure.rows))
+    place = np.arange(len(figure.labels))
+    drawn = new_figure((1.5 + 1.1 * max(3, len(place))) * columns + 0.6, 3.2 * rows + 0.8)
+    grid = drawn.subplots(rows, columns, squeeze=False, sharey=True)
+    for row, panels in zip(grid, figure.rows, strict=True):
+        for axes, panel in zip(row, panels):
+            width = 0.8 / len(panel.groups)
+            for k, (label, bars) in enumerate(panel.groups):
+                value, low, high = bars.T
+                x = place + (k - 0.5 * (len(panel.groups) - 1)) * width
+                ends = np.maximum([value - low, high - value], 0.0)
+                axes.bar(x, value, 0.9 * width, yerr=ends, capsize=3, label=label,
+                         color=PALETTE[k % len(PALETTE)], alpha=0.8)  # fmt: skip
+            # A key in two lines takes half the width.
+            names = [label.replace(".", ".\n", 1) for label in figure.labels]
+            axes.set_xticks(place, names, fontsize=8, parse_math=False)
+            axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
+            axes.set_ylabel(panel.y_label)
+            axes.grid(True, axis="y", alpha=0.3)
+    grid[0, 0].legend(frameon=False, fontsize=9)
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn
+
+
+def scatter_figure(figure: ScatterFigure, styles: Looks | None = None) -> Figure:
+    """Return points, a row a quantity and a column an input."""
+    from matplotlib.ticker import EngFormatter
+
+    rows, columns = len(figure.rows), len(figure.columns)
+    names = [label.partition(": ")[0] for label, _ in figure.rows]
+    styles = styles if styles and set(names) <= set(styles) else looks([names])
+    drawn = new_figure(3.2 * columns + 0.8, 2.5 * rows + 0.5)
+    grid = drawn.subplots(rows, columns, squeeze=False, sharex="col", sharey="row")
+    for i, (row, (y_label, y)) in enumerate(zip(grid, figure.rows, strict=True)):
+        for axes, (x_label, x) in zip(row, figure.columns):
+            axes.plot(x, y, ".", color=styles[names[i]]["color"], alpha=0.35, markersize=3)
+            axes.grid(True, alpha=0.3)
+            if np.abs(x).max() >= 1e4:  # 70 G rather than a power of ten in a corner
+                axes.xaxis.set_major_formatter(EngFormatter())
+            if axes is row[0]:
+                axes.set_ylabel(y_label.replace(": ", "\n", 1), fontsize=9, parse_math=False)
+            if i == rows - 1:
+                axes.set_xlabel(x_label, fontsize=9, parse_math=False)
+    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    return drawn

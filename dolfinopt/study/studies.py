@@ -1,0 +1,132 @@
+"""Studies of a scene: objectives, reductions, and sweeps over any numeric value.
+
+A study plans cases (see `cases`), has them done, and puts tables and figures together from what
+they left; a second study of the same takes what is there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from dolfinopt.errors import InputError
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.plans import Plan
+from dolfinopt.study.presets import coordinates_plan, objective_plan, reduction_plan
+from dolfinopt.study.store import run_cases
+from dolfinopt.study.sweep import sweep_plan
+from dolfinopt.study.tables import Study, file_name
+from dolfinopt.study.variants import COORDINATES, Vary, parse_vary
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+Topic = Literal["payload", "flattening", "coordinates", "objective", "reduction"]
+
+# What a topic varies unless told otherwise.
+RANGES = {"payload": "payload.mass=4:8:9", "flattening": "motion.flattening=0:1:9"}
+
+
+def study(
+    scene: Scene,
+    topic: Topic | None,
+    vary: Sequence[str],
+    designs: Sequence[Path],
+    folder: Path,
+    world: MPI.Comm,
+    *,
+    reoptimize: bool = False,
+    shown: bool = True,
+) -> Study:
+    """Do a study (collective); the result is complete on the root.
+
+    Args:
+        scene: what is varied.
+        topic: which study; None: a sweep over `vary` alone.
+        vary: values to sweep over, see `parse_vary`; in place of the topic's own.
+        designs: design.npz files to simulate in place of the initial and the optimised design.
+        folder: DIR, where the cases are kept.
+        world: all ranks.
+        reoptimize: optimise for every scenario, too.
+        shown: draw progress.
+
+    Raises:
+        InputError: something asked for is not possible; nothing was computed.
+    """
+    from dolfinopt.output.folders import prepare_folder
+    from dolfinopt.parallel import on_root, together
+
+    plan = on_root(world, _plan, scene, topic, tuple(vary), tuple(designs), reoptimize)
+    on_root(world, prepare_folder, folder)
+    outcomes = run_cases(plan.cases, folder, world, shown=shown)
+    with together(world):
+        tables, figures = plan.report(outcomes)
+    failures = tuple(f"{o.case.label}: {o.failure}" for o in outcomes.failures)
+    return Study(plan.name, tuple(tables), tuple(figures), failures, outcomes.computed)
+
+
+def _plan(
+    scene: Scene,
+    topic: Topic | None,
+    vary: tuple[str, ...],
+    designs: tuple[Path, ...],
+    reoptimize: bool,
+) -> Plan:
+    """Check what is asked and plan it (root only)."""
+    asked = [parse_vary(text) for text in vary]
+    keys = [one.key for one in asked]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise InputError(f"--vary {key} twice; give all its values in one")
+    if topic in ("objective", "reduction", "coordinates"):
+        return _fixed_plan(scene, topic, asked, designs, reoptimize)
+    if topic is None and not asked:
+        raise InputError("sweep: name a topic (payload, flattening, coordinates) or what to --vary")
+    if topic is not None:
+        own = parse_vary(RANGES[topic])
+        if own.key not in keys:
+            asked.insert(0, own)
+    return sweep_plan(scene, sweep_name(topic, vary), asked, designs, reoptimize)
+
+
+def sweep_name(topic: Topic | None, vary: Sequence[str]) -> str:
+    """Return the name of a sweep's files: the topic, and the keys that it varies besides."""
+    own = RANGES.get(topic or "", "=").partition("=")[0]
+    own = COORDINATES if topic == "coordinates" else own
+    keys = [text.partition("=")[0].strip() for text in vary]
+    return file_name(*([topic] if topic else []), *(key for key in keys if key != own))
+
+
+def _fixed_plan(
+    scene: Scene,
+    topic: Topic,
+    asked: Sequence[Vary],
+    designs: tuple[Path, ...],
+    reoptimize: bool,
+) -> Plan:
+    """Plan a topic that has its own variants."""
+    for one in asked:
+        if topic == "objective" or one.key != COORDINATES:
+            only = "none" if topic == "objective" else f"only {COORDINATES}"
+            raise InputError(f"--vary {one.text}: expected {only} with {_command(topic)}")
+    if topic in ("objective", "reduction") and designs:
+        raise InputError(f"--design: expected none with {_command(topic)}, which makes its own")
+    if reoptimize:
+        raise InputError(f"--reoptimize: not with {_command(topic)}; see compare reductions")
+    if topic == "objective":
+        return objective_plan(scene)
+    counts = [_whole(value, asked[0]) for value in asked[0].values] if asked else None
+    if topic == "coordinates":
+        return coordinates_plan(scene, topic, designs, counts)
+    return reduction_plan(scene, counts)
+
+
+def _command(topic: Topic) -> str:
+    return f"sweep {topic}" if topic == "coordinates" else f"compare {topic}s"
+
+
+def _whole(value: str, vary: Vary) -> int:
+    if float(value) % 1.0:
+        raise InputError(f"--vary {vary.text}: expected whole numbers, found {value}")
+    return int(float(value))

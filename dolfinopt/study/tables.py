@@ -1,0 +1,268 @@
+"""What a study finds: tables and the data of figures, and their files."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dolfinopt.scene.load import Scene
+
+Cell = str | int | float
+LONGEST = 120  # characters of a study's name, which file names begin with
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of figures.
+
+    Attributes:
+        name: of its file, "" for the study's main table.
+        title: a sentence.
+        columns: with units.
+        rows: one cell a column; nan is left empty.
+    """
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def markdown(self) -> str:
+        """Return the table in Markdown, four digits a number."""
+        shown = [[_shown(cell) for cell in row] for row in self.rows]
+        widths = [max(map(len, column)) for column in zip(self.columns, *shown)]
+        lines = [self.columns, ["-" * width for width in widths], *shown]
+        body = ["| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines]
+        return "\n".join([self.title, "", *body]) + "\n"
+
+    def csv(self) -> str:
+        """Return the table as CSV, ten digits a number."""
+        return _csv(self.columns, self.rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve.
+
+    Attributes:
+        label: in the legend.
+        x, y: equal lengths.
+    """
+
+    label: str
+    x: np.ndarray
+    y: np.ndarray
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves over one pair of axes, which are labelled with their units.
+
+    Attributes:
+        title, x_label, y_label: above and beside it.
+        lines: curves.
+        x_log2: numbers that are doubled rather than added to, as those of coordinates.
+        y_log: logarithmic y although the values span no decade.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    x_log2: bool = False
+    y_log: bool = False
+
+
+@dataclass(frozen=True)
+class LineFigure:
+    """Panels in rows; the curves of a name look alike in all of them."""
+
+    name: str
+    title: str
+    rows: tuple[tuple[Panel, ...], ...]
+
+    def csv(self) -> str:
+        """Return all curves: a row a point."""
+        points = [
+            (panel.title, line.label, float(x), float(y))
+            for row in self.rows
+            for panel in row
+            for line in panel.lines
+            for x, y in zip(line.x, line.y, strict=True)
+        ]
+        first = self.rows[0][0]
+        one = len({(p.x_label, p.y_label) for row in self.rows for p in row}) == 1
+        labels = (first.x_label, first.y_label) if one else ("x", "y")
+        return _csv(("panel", "line", *labels), points)
+
+
+@dataclass(frozen=True)
+class DesignFigure:
+    """Designs beside each other: labels, scenes and files."""
+
+    name: str
+    title: str
+    designs: tuple[tuple[str, Scene, Path], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixFigure:
+    """Design i in scenario j: values (n, n) with row and column labels."""
+
+    name: str
+    title: str
+    row_label: str
+    column_label: str
+    labels: tuple[str, ...]
+    panels: tuple[tuple[str, np.ndarray], ...]
+
+
+@dataclass(frozen=True)
+class TornadoFigure:
+    """How far each key, alone, moves a figure.
+
+    Attributes:
+        panels: title, and for every bar its label and the relative changes at both ends.
+    """
+
+    name: str
+    title: str
+    panels: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """How values (n,) of one design scatter, and the nominal one."""
+
+    title: str
+    x_label: str
+    values: np.ndarray
+    nominal: float
+
+
+@dataclass(frozen=True)
+class HistogramFigure:
+    """Histograms in rows, with the share of the values below."""
+
+    name: str
+    title: str
+    rows: tuple[tuple[Histogram, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Bars:
+    """Groups of bars: a label, and value, lower and upper end (n, 3) of each."""
+
+    title: str
+    y_label: str
+    groups: tuple[tuple[str, np.ndarray], ...]
+
+
+@dataclass(frozen=True)
+class BarFigure:
+    """Panels of bars in rows; `labels` (n,) below all of them."""
+
+    name: str
+    title: str
+    labels: tuple[str, ...]
+    rows: tuple[tuple[Bars, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ScatterFigure:
+    """Points: every row's values (n,) by every column's."""
+
+    name: str
+    title: str
+    columns: tuple[tuple[str, np.ndarray], ...]
+    rows: tuple[tuple[str, np.ndarray], ...]
+
+
+Figure = (
+    LineFigure
+    | DesignFigure
+    | MatrixFigure
+    | TornadoFigure
+    | HistogramFigure
+    | BarFigure
+    | ScatterFigure
+)
+
+
+@dataclass(frozen=True)
+class Study:
+    """What a study found.
+
+    Attributes:
+        name: of its files.
+        tables: the main one first.
+        figures: to draw.
+        failures: one line each.
+        computed: cases that were not there before.
+        data: tables too long to be read, for CSV files alone.
+    """
+
+    name: str
+    tables: tuple[Table, ...]
+    figures: tuple[Figure, ...]
+    failures: tuple[str, ...]
+    computed: int
+    data: tuple[Table, ...] = ()
+
+    def markdown(self) -> str:
+        """Return all tables."""
+        return "\n".join(table.markdown() for table in self.tables)
+
+
+def write_study(study: Study, folder: Path) -> list[Path]:
+    """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
+    from dolfinopt.output.files import write_text
+
+    texts = {
+        f"{joined(study.name, table.name)}.csv": table.csv()
+        for table in (*study.tables, *study.data)
+    }
+    for figure in study.figures:
+        if isinstance(figure, LineFigure):
+            texts[f"{joined(study.name, figure.name)}_curves.csv"] = figure.csv()
+    texts[f"{study.name}.md"] = study.markdown()
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return [folder / name for name in texts]
+
+
+def file_name(*parts: str) -> str:
+    """Return parts of a file's name with _ between them, cut to what file systems take."""
+    name = re.sub(r"[^A-Za-z0-9_.-]", "-", joined(*parts))
+    if len(name) <= LONGEST:
+        return name
+    return f"{name[: LONGEST - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def joined(*parts: str) -> str:
+    """Return the parts of a file name that are not empty, with _ between them."""
+    return "_".join(part for part in parts if part)
+
+
+def _shown(cell: Cell) -> str:
+    if isinstance(cell, float):
+        return "" if math.isnan(cell) else f"{cell:.4g}"
+    return str(cell).replace("|", "\\|")
+
+
+def _csv(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        writer.writerow([f"{c:.10g}" if isinstance(c, float) and c == c else
+                         ("" if c != c else c) for c in row])  # fmt: skip
+    return stream.getvalue()

@@ -1,0 +1,174 @@
+"""Variants of a scene: other values, objectives and reductions."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
+from dolfinopt.study.store import REFERENCE, REFERENCE_METHOD
+
+# Label, and the settings that make it.
+OBJECTIVES = (
+    ("dynamic loads (esl)", ("kind=esl", "gradient=esl")),
+    ("dynamic loads (esl), exact gradient", ("kind=esl", "gradient=exact")),
+    ("dynamic loads (esl) chosen by deviation", ("kind=esl", "gradient=esl", "worst=deviation")),
+    ("compliance over the horizon", ("kind=compliance", "gradient=esl")),
+    ("compliance over the horizon, exact gradient", ("kind=compliance", "gradient=exact")),
+    ("deviation", ("kind=deviation", "gradient=esl")),
+    ("deviation, exact gradient", ("kind=deviation", "gradient=exact")),
+    ("static compliance", ("kind=static",)),
+    ("eigenfrequency, rigid bodies attached", ("kind=eigenfrequency", "attached=rigid-body")),
+    ("eigenfrequency, point masses attached", ("kind=eigenfrequency", "attached=point-mass")),
+    ("eigenfrequency, nothing attached", ("kind=eigenfrequency", "attached=none")),
+)
+COORDINATES = "reduction.coordinates"
+METHODS = ("craig-bampton", "modal", "krylov", "balanced")
+# The Gramian's responses span few directions; more coordinates have nothing to describe.
+MOST = {"balanced": 12}
+
+
+# -- values ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Vary:
+    """One scene value and what it takes.
+
+    Attributes:
+        key: its path, e.g. "payload.mass".
+        values: as --set would take them.
+        text: as the user wrote it.
+    """
+
+    key: str
+    values: tuple[str, ...]
+    text: str
+
+    @property
+    def numbers(self) -> list[float]:
+        """The values, as numbers."""
+        return [float(value) for value in self.values]
+
+    @property
+    def axis(self) -> str:
+        """Key with its unit, for axes and columns."""
+        name = re.sub(r"^(arms)\.[^.]+\.(?=[^.]+$)", r"\1.", self.key)
+        units = {
+            info.key: match[1]
+            for info in describe_keys()
+            if (match := re.search(r"\[([^\]]*)\]$", info.description))
+        }
+        return f"{self.key} [{units.get(name, '-')}]"
+
+
+def parse_vary(text: str) -> Vary:
+    """Return what "key.path=start:stop:count" or "key.path=a,b,c" asks for.
+
+    Raises:
+        InputError: it is neither.
+    """
+    remedy = f"--vary {text}: expected key.path=start:stop:count or key.path=a,b,c with numbers"
+    key, equals, values = (part.strip() for part in text.partition("="))
+    if not key or not equals:
+        raise InputError(f"{remedy}, for example payload.mass=4:8:9")
+    if ":" not in values:
+        found = [value.strip() for value in values.split(",")]
+        if not all(map(_is_number, found)):
+            raise InputError(remedy)
+        return Vary(key, tuple(dict.fromkeys(found)), text)
+    parts = [part.strip() for part in values.split(":")]
+    if len(parts) != 3 or not all(map(_is_number, parts[:2])) or not parts[2].isdigit():
+        raise InputError(remedy)
+    if int(parts[2]) < 2 or float(parts[0]) == float(parts[1]):
+        raise InputError(f"--vary {text}: expected at least two values between two ends")
+    steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
+    # Whole numbers stay whole: a key may be an integer.
+    whole = all(re.fullmatch(r"[+-]?\d+", part) for part in parts[:2]) and (steps % 1 == 0).all()
+    return Vary(key, tuple(str(int(v)) if whole else repr(float(v)) for v in steps), text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def changed(scene: Scene, *overrides: str) -> Scene:
+    """Return the scene with some values changed, each "key.path=value".
+
+    Raises:
+        InputError: there is no such key, or it does not allow the value.
+    """
+    from dolfinopt.multibody.motion import check_motion
+
+    other = scene_from_dict(scene.to_tree(), scene.source, overrides)
+    check_motion(other)
+    return other
+
+
+def varied(scene: Scene, settings: Sequence[tuple[Vary, str]]) -> Scene:
+    try:
+        return changed(scene, *(f"{vary.key}={value}" for vary, value in settings))
+    except InputError as error:
+        asked = " ".join(f"--vary {vary.text}" for vary, _ in settings)
+        raise InputError(f"{asked}: {error}") from None
+
+
+# -- reductions ------------------------------------------------------------------------------
+
+
+def reduced(scene: Scene, method: str, coordinates: int) -> Scene:
+    """Return the scene with another reduction; options of its own method are kept.
+
+    Raises:
+        InputError: the arms have fewer degrees of freedom, or the method needs more coordinates.
+    """
+    options = Reduction.model_fields
+    settings = []
+    if scene.reduction.method != method:
+        settings = [f"reduction.{key}={list(options[key].default)}" for key in ("shifts", "band")]
+    settings.append(f"reduction.tolerance={options['tolerance'].default!r}")  # of "auto" alone
+    return changed(scene, f"reduction.method={method}", f"{COORDINATES}={coordinates}", *settings)
+
+
+def reference_scene(scene: Scene) -> Scene:
+    """Return the scene with so many coordinates that more make no difference."""
+    most = [arm.n_reducible for arm in scene.arms if arm.n_reducible is not None]
+    return reduced(scene, REFERENCE_METHOD, min([REFERENCE, *most]))
+
+
+def reductions(scene: Scene, counts: Sequence[int] | None, usual: Sequence[int]) -> list[Scene]:
+    """Return the scene with every method and number of coordinates that it can have.
+
+    Raises:
+        InputError: one that was asked for, `counts`, is possible with no method.
+    """
+    scenes = []
+    refusals: dict[int, InputError] = {}
+    for method in METHODS:
+        for count in usual if counts is None else counts:
+            if counts is None and count > MOST.get(method, count):
+                continue
+            try:
+                scenes.append(reduced(scene, method, count))
+                refusals.pop(count, None)
+            except InputError as error:
+                known = any(s.reduction.coordinates == count for s in scenes)
+                if counts is not None and not known:
+                    refusals[count] = error
+    if refusals:
+        raise next(iter(refusals.values()))
+    if not scenes:
+        raise InputError(f"{scene.source}: no reduction is possible with these arms")
+    return scenes
+
+
+def reduction_name(scene: Scene) -> str:
+    return f"{scene.reduction.method} {scene.reduction.coordinates}"

@@ -1,0 +1,429 @@
+"""Modes with what an arm carries: dense solves, beams in closed form, crossings, gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg
+from mpi4py import MPI
+from remainders import SCENE, build, rates, tip, uneven, wave
+from scipy.optimize import brentq
+
+import dolfinopt as do
+from dolfinopt.arms.arm import Arm
+from dolfinopt.arms.vibration import (
+    Chain,
+    LoadedModes,
+    RigidIntegrals,
+    loaded_modes,
+    rigid_integrals,
+    squared_period,
+)
+from dolfinopt.responses.evaluation import constraint_gradients
+from dolfinopt.responses.sensitivity import period_gradient
+
+Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
+NOTHING = RigidIntegrals(0.0, 0j, 0.0)
+
+
+def arm_of(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
+    """Return the first arm, solid, on its own ranks."""
+    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    arm = Arm(scene, 0, comm, do.Ledger())
+    arm.set_design(np.ones(arm.mesh.num_cells))
+    return arm
+
+
+def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
+    """Return the field on the arm's cells."""
+    return field(0, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0]))
+
+
+# -- what an arm carries ---------------------------------------------------------------------
+
+
+def chain_of_points(
+    rng: np.random.Generator, arms: int
+) -> tuple[Chain, list[tuple[np.ndarray, np.ndarray]]]:
+    """Return a chain of random bodies and each one's point masses (m, x + i y)."""
+    clouds = [
+        (rng.uniform(0.1, 1.0, 7), rng.normal(size=7) + 1j * rng.normal(size=7))
+        for _ in range(arms)
+    ]
+    bodies = [RigidIntegrals(m.sum(), complex(m @ z), float(m @ np.abs(z) ** 2)) for m, z in clouds]
+    reach = [complex(*rng.normal(size=2)) for _ in range(arms)]
+    angles = list(rng.uniform(-3.0, 3.0, arms))
+    load = RigidIntegrals(0.7, 0j, 0.2)
+    return Chain(bodies, reach, angles, load, "rigid-body"), clouds
+
+
+def direct_inertia(chain: Chain, clouds: list[tuple[np.ndarray, np.ndarray]], k: int) -> np.ndarray:
+    """Return the inertia (3, 3) of all that arm k carries, summed point by point.
+
+    Every outboard point is placed in arm k's frame, its velocity under (u_x, u_y, theta) of arm
+    k's outboard point written down, and the kinetic energy's matrix summed.
+    """
+    masses, places = [np.zeros(0)], [np.zeros(0, dtype=complex)]
+    origin, turn = 0j, 1.0 + 0j
+    for j in range(k + 1, len(clouds)):
+        turn *= np.exp(1j * chain.angles[j])
+        masses.append(clouds[j][0])
+        places.append(origin + turn * clouds[j][1])
+        origin += turn * chain.reach[j]
+    m = np.concatenate([*masses, [chain.payload.mass]])
+    z = np.concatenate([*places, [origin]])
+    velocity = np.zeros((len(m), 2, 3))
+    velocity[:, 0, 0] = velocity[:, 1, 1] = 1.0
+    velocity[:, 0, 2], velocity[:, 1, 2] = -z.imag, z.real
+    inertia = np.einsum("n,nik,nil->kl", m, velocity, velocity)
+    inertia[2, 2] += chain.payload.inertia
+    return inertia
+
+
+@pytest.mark.parametrize("arms", [1, 2, 3, 4])
+@pytest.mark.parametrize("kind", ["rigid-body", "point-mass", "none"])
+def test_carried(arms: int, kind: str) -> None:
+    """Against point masses placed at the chain's random angles, to rounding."""
+    rng = np.random.default_rng(arms)
+    chain, clouds = chain_of_points(rng, arms)
+    carried = Chain(chain.bodies, chain.reach, chain.angles, chain.payload, kind).carried()
+    assert len(carried) == arms
+    for k, load in enumerate(carried):
+        expected = direct_inertia(chain, clouds, k)
+        if kind == "point-mass":
+            expected = np.diag([expected[0, 0], expected[0, 0], 0.0])
+        elif kind == "none":
+            expected = np.zeros((3, 3))
+        np.testing.assert_allclose(load.matrix(), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("arms", [1, 2, 3, 4])
+@pytest.mark.parametrize("kind", ["rigid-body", "point-mass", "none"])
+def test_body_slopes_are_the_transpose(arms: int, kind: str) -> None:
+    """<W, carried(bodies)> is linear in the bodies, and <slopes(W), bodies> the same number."""
+    rng = np.random.default_rng(arms)
+    (chain, _), (other, _) = chain_of_points(rng, arms), chain_of_points(rng, arms)
+    weights = list(rng.normal(size=(arms, 3, 3)))
+
+    def product(bodies: list[RigidIntegrals]) -> float:
+        moved = Chain(bodies, chain.reach, chain.angles, chain.payload, kind).carried()
+        return sum(np.sum(w * load.matrix()) for w, load in zip(weights, moved, strict=True))
+
+    one = Chain(chain.bodies, chain.reach, chain.angles, chain.payload, kind)
+    slopes = one.body_slopes(weights)
+    found = sum(
+        s.mass * d.mass + (np.conj(s.moment) * d.moment).real + s.inertia * d.inertia
+        for s, d in zip(slopes, other.bodies, strict=True)
+    )
+    both = [a + b for a, b in zip(chain.bodies, other.bodies, strict=True)]
+    expected = product(both) - product(list(chain.bodies))
+    assert found == pytest.approx(expected, rel=1e-11, abs=1e-11)
+    assert (expected == 0.0) == (arms == 1 or kind == "none")
+
+
+def test_rigid_integrals_of_a_bar() -> None:
+    """Solid, and with the outer half empty: m, m L / 2, m (L^2 / 3 + h^2 / 12).
+
+    Gmsh places nodes to 1e-12 of the length.
+    """
+    arm = arm_of((20, 2))
+    for share in (1.0, 0.5):
+        solid = arm.mesh.centroid[:, 0] < share
+        elastic = arm.elastic
+        elastic.set_design(np.ones(len(solid)), 2700.0 * solid)
+        found, m = rigid_integrals(elastic), 2700.0 * 0.06 * 0.01 * share
+        assert found.mass == pytest.approx(m, rel=1e-11)
+        assert found.moment == pytest.approx(0.5 * m * share, rel=1e-11)
+        assert found.inertia == pytest.approx(m * (share**2 / 3.0 + 0.06**2 / 12.0), rel=1e-11)
+
+
+# -- frequencies -----------------------------------------------------------------------------
+
+
+def dense_values(arm: Arm, carried: np.ndarray, count: int) -> np.ndarray:
+    """Return the lowest eigenvalues of T'KT, T'MT + carried, densely from the elements."""
+    elastic, operators = arm.elastic, arm.elastic.operators
+    points, size = operators.points, len(operators.points)
+    K, M = np.zeros((2, 2 * size, 2 * size))
+    stiffness = arm.solid.young_modulus * arm.material.stiffness
+    density = arm.solid.density * arm.material.mass
+    for e, cell in enumerate(operators.cells):
+        dofs = (2 * cell[:, None] + [0, 1]).ravel()
+        K[np.ix_(dofs, dofs)] += stiffness[e] * operators.stiffness[e]
+        for c in (0, 1):
+            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * operators.mass[e]
+    length = elastic.mesh.outboard_point[0]
+    clamped, end = np.isclose(points[:, 0], 0.0), np.isclose(points[:, 0], length)
+    inner = np.flatnonzero(~(clamped | end))
+    T = np.zeros((2 * size, 2 * len(inner) + 3))
+    for column, dof in enumerate((2 * inner[:, None] + [0, 1]).ravel()):
+        T[dof, column] = 1.0
+    for node in np.flatnonzero(end):
+        T[2 * node, -3], T[2 * node, -1] = 1.0, -points[node, 1]
+        T[2 * node + 1, -2] = 1.0
+    mass = T.T @ M @ T
+    mass[-3:, -3:] += carried
+    return scipy.linalg.eigh(T.T @ K @ T, mass, eigvals_only=True)[:count]
+
+
+@pytest.mark.parametrize(
+    "carried",
+    [NOTHING, RigidIntegrals(6.0, 0j, 0.0), RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)],
+    ids=["nothing", "point", "body"],
+)
+def test_dense_eigenproblem(carried: RigidIntegrals) -> None:
+    """Any design on a small mesh; unit modal mass, carried mass included."""
+    arm = arm_of((9, 3), "arms.height=0.2")
+    arm.set_design(design_of(arm))
+    modes = loaded_modes(arm.elastic, carried, 5, None)
+    expected = dense_values(arm, carried.matrix(), 5)
+    # LAPACK is right to 1e-16 of the largest eigenvalue, some 1e6 times the lowest.
+    np.testing.assert_allclose(modes.values, expected, rtol=1e-8)
+    assert modes.frequency == pytest.approx(np.sqrt(expected[0]) / (2.0 * np.pi), rel=1e-8)
+    flat = modes.field.reshape(-1, 5)
+    mass = flat.T @ arm.elastic.mass_times(modes.field).reshape(-1, 5)
+    mass += modes.outboard.T @ carried.matrix() @ modes.outboard
+    np.testing.assert_allclose(mass, np.eye(5), atol=1e-9)
+
+
+def test_an_arm_cut_in_two() -> None:
+    """The same on the ranks that share an arm."""
+    carried = RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)
+    found = []
+    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        arm = arm_of((24, 3), comm=comm)
+        arm.set_design(design_of(arm))
+        found.append(loaded_modes(arm.elastic, carried, 3, None).values)
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+
+
+def euler_values(carried: RigidIntegrals, height: float, count: int) -> np.ndarray:
+    """Return squared frequencies of the scene's arm as an Euler-Bernoulli beam with a tip body.
+
+    w = A (cosh bx - cos bx) + B (sinh bx - sin bx), b^4 = s^2 mu / EI at the frequency s, with
+    EI w_xx = s^2 (J w_x + c w) and EI w_xxx = -s^2 (m w + c w_x) at the tip; c is the first
+    moment along the arm, which is 1 m long.
+    """
+    m, c, J = carried.mass, carried.moment.real, carried.inertia
+    bending, line = 70e9 * 0.01 * height**3 / 12.0, 2700.0 * 0.01 * height  # N m2, kg/m
+
+    def determinant(b: float) -> float:
+        ch, sh, co, si = np.cosh(b), np.sinh(b), np.cos(b), np.sin(b)
+        w, w1 = np.array([ch - co, sh - si]), b * np.array([sh + si, ch - co])
+        w2, w3 = b**2 * np.array([ch + co, sh + si]), b**3 * np.array([sh - si, ch + co])
+        load = b**4 / line
+        rows = np.array([w2 - load * (J * w1 + c * w), w3 + load * (m * w + c * w1)])
+        return float(np.linalg.det(rows)) / ch  # grows like it
+
+    grid = np.linspace(0.05, 12.0, 2000)
+    signs = np.array([determinant(b) for b in grid])
+    ends = np.flatnonzero(signs[:-1] * signs[1:] < 0.0)[:count]
+    roots = np.array([brentq(determinant, grid[i], grid[i + 1], xtol=1e-14) for i in ends])
+    return roots**4 * bending / line
+
+
+@pytest.mark.parametrize(
+    "carried",
+    [
+        NOTHING,
+        RigidIntegrals(2.0, 0j, 0.0),
+        RigidIntegrals(2.0, 0j, 0.3),
+        RigidIntegrals(2.0, 0.6 + 0j, 0.5),
+    ],
+    ids=["nothing", "mass", "inertia", "ahead of the tip"],
+)
+def test_beam_with_a_tip_body(carried: RigidIntegrals) -> None:
+    """Two bending frequencies: the elements' shear falls with their length squared.
+
+    What is left on the extrapolated mesh is the beam's own shear and rotary inertia, which fall
+    with its height squared.
+    """
+    left = []
+    for height in (0.04, 0.02):
+        expected = euler_values(carried, height, 2)
+        if carried == NOTHING:  # the table's roots of cosh cos = -1
+            b = (expected * 12.0 * 2700.0 / 70e9 / height**2) ** 0.25
+            np.testing.assert_allclose(b, [1.8751040687, 4.6940911330], rtol=1e-9)
+        values = []
+        for cells in (2.0 / height, 4.0 / height, 8.0 / height):
+            arm = arm_of((round(cells), 1), f"arms.height={height}", "material.poisson_ratio=0.0")
+            values.append(loaded_modes(arm.elastic, carried, 2, None).values)
+        coarse, middle, fine = np.array(values)
+        np.testing.assert_allclose(np.log2((coarse - middle) / (middle - fine)), 2.0, atol=0.1)
+        left.append(((4.0 * fine - middle) / 3.0) / expected - 1.0)
+    # A tip mass' first mode feels so little of them that the meshes' error shows beside it.
+    np.testing.assert_allclose(np.log2(np.divide(*left)), 2.0, atol=0.2)
+    assert (np.abs(left[-1]) < 10.0 * 0.02**2).all()
+
+
+# -- crossing modes --------------------------------------------------------------------------
+
+STUBBY = ("arms.length=0.3", "arms.height=0.9")
+MASS = 20.0  # kg
+
+
+def symmetric(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a design symmetric about the axis, whose axial and bending modes do not mix."""
+    return 0.5 + 0.2 * np.cos(3.0 * x) * np.cos(2.0 * y)
+
+
+def stubby() -> Arm:
+    """Return an arm three times as high as long, of the symmetric design."""
+    arm = arm_of((8, 8), *STUBBY)
+    arm.set_design(design_of(arm, symmetric))
+    return arm
+
+
+@cache
+def coinciding() -> RigidIntegrals:
+    """Return what the stubby arm carries when its two lowest frequencies are equal.
+
+    Both are bending, one shifts the body and one turns it; they repel each other unless two
+    numbers are right, the place of the centre of mass along the arm and the inertia. Newton's
+    method: by perturbation theory a change dM gives the pair's matrix -lambda phi' dM phi, which
+    has to close the gap and must not mix them.
+    """
+    arm, moment, inertia = stubby(), -0.15 * MASS, 2.5 + 0.15**2 * MASS
+    for _ in range(20):
+        carried = RigidIntegrals(MASS, complex(moment, 0.0), inertia)
+        modes = loaded_modes(arm.elastic, carried, 2, None)
+        (low, high), phi = modes.values, modes.outboard
+        if high - low < 1e-11 * high:
+            return carried
+        changes = []
+        for unit in (RigidIntegrals(0.0, 1.0 + 0j, 0.0), RigidIntegrals(0.0, 0j, 1.0)):
+            pair = -high * phi.T @ unit.matrix() @ phi
+            changes.append([pair[0, 0] - pair[1, 1], 2.0 * pair[0, 1]])
+        step = np.linalg.solve(np.transpose(changes), [high - low, 0.0])
+        moment, inertia = moment + step[0], inertia + step[1]
+    raise AssertionError((moment, inertia, low, high))
+
+
+def slopes_at(
+    arm: Arm, carried: RigidIntegrals, exponent: float, follow: bool
+) -> tuple[Callable[[np.ndarray], LoadedModes], np.ndarray]:
+    """Return the modes of a design, and the gradient of the squared period at the present one."""
+    start = loaded_modes(arm.elastic, carried, 3, None).start
+
+    def modes(x: np.ndarray) -> LoadedModes:
+        arm.set_design(x)
+        return loaded_modes(arm.elastic, carried, 3, start)
+
+    x = design_of(arm, symmetric)
+    return modes, period_gradient(arm, modes(x), exponent, follow).cells
+
+
+@pytest.mark.parametrize("exponent", [4.0, 20.0])
+@pytest.mark.parametrize("direction", [uneven, wave])
+def test_p_mean_where_modes_coincide(direction: Field, exponent: float) -> None:
+    """The two lowest eigenvalues are equal to 1e-11, their vectors any: the gradient is one.
+
+    Of either mode alone it is none: the remainder is of first order.
+    """
+    arm, carried = stubby(), coinciding()
+    x, d = design_of(arm, symmetric), design_of(arm, direction)
+    orders = []
+    for follow in (False, True):
+        modes, slope = slopes_at(arm, carried, exponent, follow)
+
+        def value(h: float, modes=modes, follow: bool = follow) -> float:
+            return squared_period(modes(x + h * d), exponent, follow)[0]
+
+        orders.append(rates(value, float(slope @ d), (1e-3, 2.5e-4)))
+    assert orders[0] == pytest.approx(2.0, abs=0.1)
+    assert orders[1] == pytest.approx(1.0, abs=0.1)
+
+
+def test_p_mean_bounds_the_longest() -> None:
+    """Between the largest squared period and k^(1/p) times it; its slope by differences."""
+    rng = np.random.default_rng(2)
+    for exponent in (2.0, 20.0, 200.0):
+        values = rng.uniform(1.0, 2.0, 4)
+        modes = LoadedModes(values, np.empty(0), np.empty(0), np.empty(0), 0)
+        value, slope = squared_period(modes, exponent, False)
+        longest = 4.0 * np.pi**2 / values.min()
+        assert longest <= value <= longest * 4.0 ** (1.0 / exponent)
+        for k in range(4):
+            h = 1e-6 * np.eye(4)[k]
+            there, back = (
+                squared_period(
+                    LoadedModes(v, np.empty(0), np.empty(0), np.empty(0), 0), exponent, False
+                )[0]
+                for v in (values + h, values - h)
+            )
+            assert slope[k] == pytest.approx((there - back) / 2e-6, abs=1e-6 * longest)
+
+
+def test_following_a_mode_through_a_crossing() -> None:
+    """Rotary inertia lowers bending below the axial mode, which it does not touch: MAC keeps it."""
+    arm, seen = stubby(), []
+
+    def carried(inertia: float) -> RigidIntegrals:
+        return RigidIntegrals(MASS, 0j, inertia).moved(-0.15 + 0j)
+
+    first = loaded_modes(arm.elastic, carried(0.5), 3, None)
+    axial = int(np.argmax(np.abs(first.outboard[0]) / np.abs(first.outboard[1])))
+    start = first.start[:, [axial, *np.delete(range(3), axial)]]
+    for inertia in np.linspace(0.5, 3.0, 11):
+        modes = loaded_modes(arm.elastic, carried(inertia), 3, start)
+        start = modes.start
+        seen.append((modes.followed, modes.values[modes.followed]))
+    followed, values = zip(*seen, strict=True)
+    assert sorted(set(followed)) == [1, 2] and followed[0] == axial == 1 and followed[-1] == 2
+    np.testing.assert_allclose(values, first.values[1], rtol=1e-9)
+    period, by_values = squared_period(modes, 20.0, True)
+    assert period == pytest.approx(4.0 * np.pi**2 / values[0], rel=1e-9)
+    assert np.flatnonzero(by_values).tolist() == [2]
+
+
+# -- gradients -------------------------------------------------------------------------------
+
+RIGID = "arms.arm{}.rigid=true"
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["objective.attached=rigid-body"],
+        ["objective.attached=rigid-body", "objective.elbow_angle=2.1", "payload.inertia=0.4"],
+        ["objective.attached=rigid-body", "objective.follow=true"],
+        ["objective.attached=point-mass"],
+        ["objective.attached=none", "arms.passive=0.1"],
+        ["arms.arm2.design=arm1", "objective.exponent=3.0"],
+        ["arms.arm2.design=arm1", "objective.attached=point-mass"],
+        [RIGID.format(1)],
+        [RIGID.format(2)],
+        ["arms.arm2.density=8000.0", "arms.arm2.young_modulus=2e11", "interpolation.law=simp"],
+    ],
+    ids=" ".join,
+)
+def test_gradients_are_ones(overrides: list[str]) -> None:
+    """All arms' squared periods by all densities: an arm feels the mass of those outboard of it."""
+    built = build("objective.kind=eigenfrequency", "payload.mass=1.0", *overrides)
+    x = built.fields(wave)
+    for direction in (uneven, tip):
+        d = built.fields(direction)
+        built.evaluate(x)
+        slope = built.dot(built.gradient(), d)
+        if slope == 0.0:  # the tip is solid, or no design
+            assert direction is tip
+            continue
+
+        def value(h: float, d=d) -> float:
+            return built.evaluate({k: x[k] + h * d[k] for k in x})[0].objective
+
+        assert rates(value, slope, (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1), direction
+
+
+def test_the_outboard_arm_weighs_on_the_inboard_one() -> None:
+    """Without the coupling the gradient of arm 1's period by arm 2's mass would be missing."""
+    built = build("objective.kind=eigenfrequency", "constraints.first_frequency=1.0")
+    built.evaluate(built.fields(wave))
+    first, second = constraint_gradients(built.scene, built.share, built.arms)
+    ones = built.fields(lambda k, x, y: np.full(len(x), float(k == 1)))
+    others = built.fields(lambda k, x, y: np.full(len(x), float(k == 0)))
+    assert built.dot(first, ones) > 0.0  # heavier outboard: longer period
+    assert built.dot(second, others) == 0.0  # arm 2 does not feel arm 1

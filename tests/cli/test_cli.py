@@ -1,0 +1,481 @@
+"""The command line: files, exit status, and one line for whatever the user got wrong."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.cli import commands
+from dolfinopt.errors import InputError
+from dolfinopt.output.folders import RUN_FILES
+
+ROOT = Path(__file__).parents[2]
+SCENE = ROOT / "demos" / "two_arm.toml"
+TINY = [
+    word
+    for value in ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
+    for word in ("--set", value)
+]
+SMALL = ["--set", "arms.cells=[40,4]", "--set", "simulation.sample=0.005"]
+WORLD = MPI.COMM_WORLD
+
+
+def run(*arguments: object) -> None:
+    """Run a command in this process, on all ranks."""
+    commands.main([str(a) for a in arguments], standalone_mode=False, obj=WORLD)
+
+
+def shell(*arguments: object, ranks: int = 0) -> subprocess.CompletedProcess:
+    """Run the command in a process of its own, or under mpirun."""
+    command = [sys.executable, "-m", "dolfinopt", *map(str, arguments)]
+    if ranks:
+        command = ["mpirun", "-n", str(ranks), *command]
+    # os.environ is as it was before this process began MPI, which would confuse another mpirun.
+    environment = dict(os.environ)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, cwd="/", env=environment
+    )
+
+
+@pytest.fixture(scope="module")
+def optimised(tmp_path_factory):
+    """A short optimisation's folder, with pictures."""
+    path = tmp_path_factory.mktemp("run") if WORLD.rank == 0 else None
+    folder = WORLD.bcast(path, root=0) / "out"
+    run("optimize", SCENE, *SMALL, "--set", "optimizer.max_iterations=3", "--out", folder)
+    WORLD.barrier()
+    return folder
+
+
+def test_optimize_writes_every_file(optimised):
+    expected = {
+        "checkpoint.npz",
+        "design.npz",
+        "design.png",
+        "design.vtu",
+        "design.xdmf",
+        "deviation.png",
+        "history.csv",
+        "history.png",
+        "machine.png",
+        "summary.json",
+        "trajectory.csv",
+        "trajectory.npz",
+    }
+    assert {path.name for path in optimised.iterdir()} == expected
+
+
+def test_time_is_the_time_one_waited(optimised):
+    """Pictures are part of it, and the animation is drawn on request only."""
+    seconds = json.loads((optimised / "summary.json").read_text())["seconds"]
+    assert seconds["pictures"] > 0.0
+    assert seconds["total"] >= sum(s for name, s in seconds.items() if name != "total")
+    if WORLD.rank == 0:
+        run_alone = optimised.parent / "animated"
+        shutil.copytree(optimised, run_alone)
+    WORLD.barrier()
+    run("plot", optimised.parent / "animated", "--animation")
+    WORLD.barrier()
+    assert (optimised.parent / "animated" / "motion.gif").stat().st_size > 10_000
+
+
+def test_design_file(optimised):
+    with np.load(optimised / "design.npz") as design:
+        arrays = {f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "density")}
+        assert set(design.files) == {"units", *arrays}
+        assert design["units"].tolist() == ["centroid: m", "density: -"]
+        centroid, density = design["arm1/centroid"], design["arm1/density"]
+    assert centroid.shape == (160, 2) and density.shape == (160,)
+    assert 0.0 <= density.min() and density.max() <= 1.0
+    # Half a cell from the ends and edges.
+    np.testing.assert_allclose(centroid.min(axis=0), [0.0125, -0.0225], atol=1e-12)
+    np.testing.assert_allclose(centroid.max(axis=0), [0.9875, 0.0225], atol=1e-12)
+
+
+def test_trajectory_files(optimised):
+    with np.load(optimised / "trajectory.npz") as data:
+        shapes = {key: data[key].shape for key in data.files}
+        deviation, compliance, t = data["deviation"], data["compliance"], data["t"]
+        q_r, q_e, forces = data["q_r"], data["q_e"], data["joint_forces"]
+        units = dict(text.split(": ", 1) for text in data["units"].tolist())
+    assert units["deviation"] == "m" and units["joint_forces"] == "N, N m, N m"
+    assert set(units) == set(shapes) - {"units"}
+    assert shapes == {
+        "t": (601,),
+        "q_r": (601, 3),
+        "q_e": (601, 8),
+        "deviation": (601, 2),
+        "compliance": (601, 2),
+        "joint_forces": (601, 3),
+        "initial_deviation": (601, 2),
+        "units": (7,),
+    }
+    lines = (optimised / "trajectory.csv").read_text().splitlines()
+    assert lines[0].startswith("t,deviation_x,deviation_y,deviation,compliance,q_r_cart,")
+    table = np.genfromtxt(optimised / "trajectory.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["t"], t, atol=1e-12)
+    # Ten digits are written.
+    np.testing.assert_allclose(table["deviation_x"], deviation[:, 0], atol=1e-11)
+    np.testing.assert_allclose(table["deviation_y"], deviation[:, 1], atol=1e-11)
+    np.testing.assert_allclose(table["compliance"], compliance.sum(axis=1), atol=1e-9)
+    np.testing.assert_allclose(table["compliance_arm2"], compliance[:, 1], atol=1e-9)
+    for k, name in enumerate(("cart", "arm1", "arm2")):
+        np.testing.assert_allclose(table[f"q_r_{name}"], q_r[:, k], rtol=1e-9)
+        np.testing.assert_allclose(table[f"joint_force_{name}"], forces[:, k], atol=1e-7)
+    np.testing.assert_allclose(table["q_e_arm2_4"], q_e[:, 7], atol=1e-9)
+    units = json.loads((optimised / "summary.json").read_text())["units"]["trajectory.csv"]
+    assert list(units) == lines[0].split(",")
+    assert units["joint_force_cart"] == "N" and units["joint_force_arm2"] == "N m"
+
+
+def test_history_ends_in_the_summary(optimised):
+    lines = (optimised / "history.csv").read_text().splitlines()
+    header = "iteration,objective,max_deviation,grayness,volume_fraction,change,seconds,kkt,"
+    header += "volume_fraction_arm1,volume_fraction_arm2"
+    assert lines[0] == header
+    assert [int(line.split(",")[0]) for line in lines[1:]] == [0, 1, 2, 3]
+    last = dict(zip(header.split(","), map(float, lines[-1].split(",")), strict=True))
+    summary = json.loads((optimised / "summary.json").read_text())
+    assert last["objective"] == pytest.approx(summary["objective"], rel=1e-9)
+    assert last["objective"] == pytest.approx(summary["compliance"], rel=1e-9)
+    assert last["max_deviation"] == pytest.approx(summary["max_deviation"], rel=1e-9)
+    assert last["grayness"] == pytest.approx(summary["grayness"], rel=1e-9)
+    assert summary["iterations"] == 3 and summary["converged"] is False
+    assert "max_iterations" in summary["stop_reason"]
+    assert last["kkt"] == pytest.approx(summary["kkt"], rel=1e-9)
+    assert 1e-2 < summary["kkt"] < 1.0  # far from an optimum after three iterations
+    for name, one in summary["constraints"].items():
+        assert one["value"] == pytest.approx(last[name], rel=1e-9)
+        assert (one["limit"], one["unit"], one["met"]) == (0.5, "-", True)
+
+
+def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
+    run(
+        "simulate",
+        SCENE,
+        *SMALL,
+        "--design",
+        optimised / "design.npz",
+        "--out",
+        shared_tmp_path,
+        "--no-plots",
+    )
+    WORLD.barrier()
+    ours, theirs = (
+        json.loads((folder / "summary.json").read_text()) for folder in (shared_tmp_path, optimised)
+    )
+    # Both simulations are right to simulation.tolerance = 1e-4, on grids of their own.
+    assert ours["compliance"] == pytest.approx(theirs["compliance"], rel=2e-4)
+    assert ours["max_deviation"] == pytest.approx(theirs["max_deviation"], rel=2e-4)
+    assert ours["first_frequency"] == pytest.approx(theirs["first_frequency"], rel=1e-9)
+    assert not list(shared_tmp_path.glob("*.png"))
+
+
+def test_gradient_file(optimised, shared_tmp_path):
+    out = shared_tmp_path / "deep" / "g.npz"
+    run("gradient", SCENE, *SMALL, "--kind", "esl", "--out", out)
+    WORLD.barrier()
+    with np.load(out) as data:
+        assert set(data.files) == {
+            "objective",
+            "units",
+            *(f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "gradient")),
+        }
+        assert data["objective"] > 0.0
+        assert (data["arm1/gradient"] < 0.0).all()  # more material is always stiffer
+
+
+def test_plot_draws_anew(optimised):
+    before = (optimised / "design.png").read_bytes()
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        (optimised / "design.png").unlink()
+    WORLD.barrier()
+    run("plot", optimised)
+    WORLD.barrier()
+    assert (optimised / "design.png").read_bytes() == before
+
+
+@pytest.mark.serial
+def test_a_project_can_be_moved(tmp_path):
+    """Scene, mesh and run folder together: it resumes and draws; another mesh is refused."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    shutil.copy(ROOT / "meshes" / "arm_bores.geo", there / "own.geo")
+    text = (ROOT / "demos" / "two_arm_bores.toml").read_text()
+    text = re.sub(r'mesh = ".*?"', 'mesh = "own.geo"', text)
+    (there / "scene.toml").write_text(text)
+    small = ["--set", "arms.mesh_size=0.02", "--set", "simulation.sample=0.005", "--no-plots"]
+    done = shell("optimize", there / "scene.toml", *small, "--out", there / "results" / "run",
+                 "--set", "optimizer.max_iterations=1")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for file in (there / "results" / "run" / "summary.json", there / "results/run/checkpoint.npz"):
+        assert file.is_file()
+    shutil.copytree(there, here)
+    shutil.rmtree(there)
+    resume = ["optimize", here / "scene.toml", *small, "--out", here / "results" / "run",
+              "--resume", "--set", "optimizer.max_iterations=2"]  # fmt: skip
+    done = shell(*resume)
+    assert done.returncode == 0, done.stderr
+    assert len((here / "results" / "run" / "history.csv").read_text().splitlines()) == 4
+    summary = json.loads((here / "results" / "run" / "summary.json").read_text())
+    assert summary["scene"]["arms"][0]["mesh"] == "../../own.geo"
+    assert shell("plot", here / "results" / "run").returncode == 0
+    # The run's folder alone finds the mesh where it was.
+    shutil.copytree(here / "results" / "run", tmp_path / "elsewhere" / "deep" / "run")
+    assert shell("plot", tmp_path / "elsewhere" / "deep" / "run").returncode == 0
+    with open(here / "own.geo", "a") as stream:
+        stream.write("// another\n")
+    done = shell(*resume)
+    assert done.returncode == 2
+    assert "the content of the file arms.0.mesh has changed" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ([], "esl"),
+        (["--set", "objective.gradient=exact"], "exact"),
+        (["--set", "objective.gradient=exact", "--kind", "esl"], "esl"),
+    ],
+)
+def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
+    def written(name, *more):
+        run("gradient", SCENE, *TINY, *more, "--out", shared_tmp_path / name)
+        WORLD.barrier()
+        with np.load(shared_tmp_path / name) as data:
+            return data["arm1/gradient"]
+
+    expected = {one: written(f"{one}.npz", "--kind", one) for one in ("esl", "exact")}
+    capsys.readouterr()
+    np.testing.assert_array_equal(written("g.npz", *words), expected[kind])
+    assert not np.allclose(expected["esl"], expected["exact"], rtol=0.1)
+    if WORLD.rank == 0:
+        assert f"{kind} gradient in" in capsys.readouterr().out
+
+
+# -- used folders ----------------------------------------------------------------------------
+
+USED = {
+    "optimize": ["optimize", SCENE, "--set", "optimizer.max_iterations=1", "--no-plots"],
+    "simulate": ["simulate", SCENE, "--no-plots"],
+    "export": ["export", SCENE],
+    "gradient": ["gradient", SCENE],
+}
+
+
+@pytest.mark.parametrize("name", USED)
+def test_results_are_replaced_only_when_asked(shared_tmp_path, name):
+    """A used folder is refused; --overwrite removes what the program itself has left there."""
+    folder = shared_tmp_path / "o"
+    line = [*USED[name], *TINY, "--out", folder / "g.npz" if name == "gradient" else folder]
+    run(*line)
+    WORLD.barrier()
+    written = {path.name for path in folder.iterdir()}
+    contents = {path.name: path.read_bytes() for path in folder.iterdir()}
+    WORLD.barrier()
+    with pytest.raises(InputError, match=r"holds results already.*--overwrite") as caught:
+        run(*line)
+    assert "\n" not in str(caught.value)
+    assert ("--resume" in str(caught.value)) == (name == "optimize")
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == contents
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        for stale in ("design.png", "motion.gif", "notes.txt", "mine.png"):
+            (folder / stale).write_bytes(b"old")
+    WORLD.barrier()
+    run(*line, "--overwrite")
+    WORLD.barrier()
+    own = {"notes.txt", "mine.png"}
+    if name in ("export", "gradient"):  # they write no pictures that could be stale
+        own |= {"design.png", "motion.gif"}
+    assert {path.name for path in folder.iterdir()} == written | own
+
+
+def test_every_file_of_a_run_is_known(optimised):
+    """What a run writes is what --overwrite removes."""
+    assert {path.name for path in optimised.iterdir()} <= set(RUN_FILES)
+
+
+@pytest.mark.parametrize("how", ["--overwrite", "--resume"])
+def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, how):
+    """No summary of an earlier run stands beside a new history, which `plot` would mix."""
+    from dolfinopt.optimization import loop as optimization
+
+    folder = shared_tmp_path / "o"
+    line = ["optimize", SCENE, *TINY, "--no-plots", "--out", folder, "--set"]
+    run(*line, "optimizer.max_iterations=1")
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        (folder / "design.png").write_bytes(b"old")
+    WORLD.barrier()
+
+    def killed(*_):
+        raise RuntimeError("killed")
+
+    monkeypatch.setattr(optimization._Run, "_update", killed)
+    with pytest.raises(RuntimeError, match="killed"):
+        run(*line, "optimizer.max_iterations=3", how)
+    WORLD.barrier()
+    assert {path.name for path in folder.iterdir()} == {"checkpoint.npz", "history.csv"}
+    with pytest.raises(InputError, match=r"summary\.json"):
+        run("plot", folder)
+
+
+# -- bad input -------------------------------------------------------------------------------
+
+
+def bad(tmp: Path) -> list[tuple[str, list[object], list[str]]]:
+    """Return (name, arguments, words of the message) of commands that must be refused."""
+    opt = ["optimize", SCENE, *SMALL, "--set", "optimizer.max_iterations=1", "--out", tmp / "o"]
+    sim = ["simulate", SCENE, *SMALL, "--out", tmp / "o"]
+    return [
+        ("unknown key", [*opt, "--set", "payload.mas=1"], ["payload.mas", "payload.mass"]),
+        ("negative", [*opt, "--set", "arms.length=-1"], ["arms.0.length", "-1", ">= 1e-06"]),
+        ("nan", [*opt, "--set", "payload.mass=nan"], ["payload.mass", "nan"]),
+        ("type", [*opt, "--set", 'payload.mass="six"'], ["payload.mass", "six", "number"]),
+        ("volume", [*opt, "--set", "design.volume_fraction=1.5"], ["volume_fraction", "1.5"]),
+        ("modes", [*opt, "--set", "reduction.coordinates=100000"], ["coordinates", "100000"]),
+        ("reach", [*opt, "--set", "motion.radius=5"], ["at t =", "m from the shoulder", "5"]),
+        ("no scene", ["optimize", tmp / "no.toml"], ["no.toml"]),
+        ("a folder", ["optimize", tmp], [str(tmp)]),
+        ("unwritable", [*opt[:-1], "/proc/nowhere/o"], ["/proc/nowhere/o", "--out"]),
+        ("no checkpoint", [*opt, "--resume"], ["checkpoint.npz", "--resume"]),
+        ("no design", [*sim, "--design", tmp / "no.npz"], ["no.npz"]),
+        ("no design file", [*sim, "--design", SCENE], [str(SCENE), ".npz"]),
+        ("no run", ["plot", tmp], ["summary.json"]),
+        ("gradient to folder", ["gradient", SCENE, "--out", tmp], [str(tmp), "--out"]),
+        ("no such option", [*opt, "--nonsense"], ["--nonsense"]),
+        ("no such command", ["optimise", SCENE], ["optimise"]),
+    ]
+
+
+NAMES = [name for name, _, _ in bad(Path("x"))]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bad_input_is_one_line(name, shared_tmp_path):
+    import click
+
+    [(arguments, words)] = [(a, w) for n, a, w in bad(shared_tmp_path) if n == name]
+    with pytest.raises((InputError, click.UsageError)) as caught:
+        run(*arguments)
+    error = caught.value
+    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+    WORLD.barrier()
+    assert not list(shared_tmp_path.iterdir())  # nothing written
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.pop("arm2/density"), ["arm2/density", "missing"]),
+        (lambda d: d.update({"arm1/density": d["arm1/density"][:-1]}), ["shape"]),
+        (lambda d: d.update({"arm1/density": d["arm1/density"] + 1.0}), ["[0, 1]"]),
+        (lambda d: d.update({"arm1/density": d["arm1/density"] * np.nan}), ["nan"]),
+        (lambda d: d.update({"arm1/centroid": 2.0 * d["arm1/centroid"]}), ["covers"]),
+        (lambda d: d.update({"arm1/centroid": d["arm1/centroid"][:, ::-1]}), ["covers"]),
+    ],
+)
+def test_design_that_does_not_fit(optimised, shared_tmp_path, change, words):
+    with np.load(optimised / "design.npz") as data:
+        arrays = {key: data[key] for key in data.files}
+    change(arrays)
+    path = shared_tmp_path / "bad.npz"
+    if WORLD.rank == 0:
+        np.savez(path, **arrays)
+    WORLD.barrier()
+    with pytest.raises(InputError) as caught:
+        run("simulate", SCENE, *SMALL, "--design", path, "--out", shared_tmp_path / "o")
+    for word in [str(path), *words]:
+        assert word in str(caught.value)
+    assert not (shared_tmp_path / "o").exists()
+
+
+def test_resume_of_another_scene(optimised):
+    with pytest.raises(InputError, match=r"payload\.mass = 6\.0 there, 7\.0 here"):
+        run(
+            "optimize",
+            SCENE,
+            *SMALL,
+            "--set",
+            "payload.mass=7",
+            "--out",
+            optimised,
+            "--resume",
+        )
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_exit_status_and_streams(shared_tmp_path, ranks):
+    """Status 2 and one line on standard error, from the process itself and through mpirun."""
+    done = shell("optimize", SCENE, "--set", "payload.mas=1", "--out", shared_tmp_path, ranks=ranks)
+    assert done.returncode == 2
+    ours = [line for line in done.stderr.splitlines() if "payload.mas" in line]
+    assert len(ours) == 1 and ours[0].startswith("dolfinopt: ")
+    assert "Traceback" not in done.stderr and done.stdout == ""
+    if not ranks:
+        assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.mark.parametrize("words", [[], ["--help"], ["optimize", "--help"]])
+def test_help_is_printed_once(words, ranks):
+    """On standard output, with status 0, before MPI could tell the ranks apart."""
+    done = shell(*words, ranks=ranks)
+    assert done.returncode == 0 and done.stderr == ""
+    assert done.stdout.count("Usage: dolfinopt") == 1
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["optimise", SCENE], ["optimise", "did you mean optimize?", "(see dolfinopt --help)"]),
+        (["optimize", SCENE, "--ot", "x"], ["--ot", "(see dolfinopt optimize --help)"]),
+        (["gradient"], ["SCENE", "(see dolfinopt gradient --help)"]),
+    ],
+)
+def test_a_wrong_word_is_told_once(words, parts, ranks):
+    done = shell(*words, ranks=ranks)
+    assert done.returncode == 2 and done.stdout == ""
+    [line] = [line for line in done.stderr.splitlines() if line.startswith("dolfinopt: ")]
+    for part in parts:
+        assert part in line
+
+
+@pytest.mark.serial
+def test_without_petsc_one_line_says_how_to_get_it(tmp_path):
+    code = """if True:
+        import sys
+        sys.modules["petsc4py"] = None  # as if it were not installed
+        from dolfinopt.cli import main
+        main()"""
+    line = [sys.executable, "-c", code, "simulate", str(SCENE), "--out", str(tmp_path / "o")]
+    done = subprocess.run(line, capture_output=True, text=True, env=dict(os.environ), timeout=60)
+    assert done.returncode == 1 and done.stdout == ""
+    [line] = done.stderr.splitlines()
+    assert "petsc4py not installed" in line and "conda install" in line
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.serial
+def test_help_and_version():
+    done = shell("--help")
+    assert done.returncode == 0
+    for command in ("optimize", "simulate", "gradient", "plot"):
+        assert command in done.stdout
+    assert shell("--version").stdout.startswith("dolfinopt")

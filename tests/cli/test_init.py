@@ -1,0 +1,188 @@
+"""What helps to write a scene: templates, keys, the schema; and a script's interpreter."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.cli import commands
+from dolfinopt.cli.init import TEMPLATES
+from dolfinopt.data import template_folder
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.motion import check_motion
+from dolfinopt.scene.json_schema import scene_schema
+from dolfinopt.scene.load import describe_keys, load_scene
+from dolfinopt.scene.plausibility import implausible
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+ROOT = Path(__file__).parents[2]
+DEMOS = sorted((ROOT / "demos").glob("*.toml"))
+
+
+def run(*words: object) -> None:
+    commands.main([str(w) for w in words], standalone_mode=False, obj=MPI.COMM_WORLD)
+
+
+def errors(data: object) -> list[str]:
+    """Return what the schema finds wrong, as an editor would."""
+    schema = scene_schema()
+    jsonschema.Draft7Validator.check_schema(schema)
+    return [error.message for error in jsonschema.Draft7Validator(schema).iter_errors(data)]
+
+
+# -- init ------------------------------------------------------------------------------------
+
+
+def test_every_template_is_offered():
+    assert {path.stem for path in template_folder().glob("*.toml")} == set(TEMPLATES)
+
+
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_a_template_is_a_scene(tmp_path, capsys, template):
+    """Complete but for the own geometry, plausible, and known to the schema in its first line."""
+    run("init", tmp_path / 'my "machine"', "--template", template)
+    scene = tmp_path / 'my "machine".toml'
+    said = capsys.readouterr().out
+    assert "dolfinopt optimize" in said and str(scene) in said
+    lines = scene.read_text().splitlines()
+    assert lines[0] == "#:schema ./dolfinopt.schema.json"
+    assert sum("#" in line for line in lines) > 15  # it explains itself
+    assert json.loads((tmp_path / "dolfinopt.schema.json").read_text()) == scene_schema()
+    assert errors(tomllib.loads(scene.read_text())) == []
+    if template == "step":
+        assert str(tmp_path / "arm.step") in said
+        with pytest.raises(InputError, match=r"arm\.step"):
+            load_scene(scene)
+        (tmp_path / "arm.step").write_text("ISO-10303-21;")
+    loaded = load_scene(scene)
+    assert loaded.name == 'my "machine"'
+    check_motion(loaded)
+    assert implausible(loaded) == []
+
+
+def test_init_replaces_nothing(tmp_path):
+    """No scene, and no table beside it; nothing is half-written."""
+    for name in ("a.toml", "b.csv"):
+        (tmp_path / name).write_text("mine")
+    for name in ("a", "a.toml", "b"):
+        with pytest.raises(InputError, match="exists already"):
+            run("init", tmp_path / name, "--template", "pick-and-place")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        "a.toml": "mine",
+        "b.csv": "mine",
+    }
+    with pytest.raises(InputError, match="cannot be written"):
+        run("init", tmp_path / "a.toml" / "c")
+    run("init", tmp_path / "deep" / "c.toml")
+    assert load_scene(tmp_path / "deep" / "c.toml").name == "c"
+
+
+# -- keys ------------------------------------------------------------------------------------
+
+
+def test_keys_explains_every_key(capsys):
+    run("keys")
+    said = capsys.readouterr().out
+    for info in describe_keys():
+        assert f"\n{info.key}" in f"\n{said}"
+
+
+def test_keys_by_pattern(capsys):
+    run("keys", "payload.mass")
+    head, meaning = capsys.readouterr().out.splitlines()
+    assert head.startswith("payload.mass [kg]: a number >= 0")
+    assert "default 6.0" in head and meaning.strip() == "point mass at the end-effector"
+    run("keys", "arms.*")
+    heads = [line for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
+    names = [info.key for info in describe_keys() if info.key.startswith("arms.")]
+    assert [line.split(":")[0].split(" ")[0] for line in heads] == names
+    with pytest.raises(InputError, match=r"payload\.mas2: .*payload\.mass"):
+        run("keys", "payload.mas2")
+
+
+# -- schema ----------------------------------------------------------------------------------
+
+
+def test_schema_is_printed(capsys):
+    run("schema")
+    assert json.loads(capsys.readouterr().out) == scene_schema()
+
+
+@pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
+def test_schema_takes_the_demos(path):
+    assert errors(tomllib.loads(path.read_text())) == []
+
+
+def test_schema_knows_every_key_with_its_meaning():
+    schema = scene_schema()
+    for info in describe_keys():
+        *tables, key = info.key.split(".")
+        node = schema
+        for table in tables:
+            node = node["properties"][table]
+            node = node.get("items", node)
+            node = schema["definitions"][node["$ref"].rpartition("/")[2]]
+        assert node["properties"][key]["description"] == info.description
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "word"),
+    [
+        (("payload", "mas"), 1.0, "mas"),
+        (("payload", "mass"), -1.0, "minimum"),
+        (("payload", "mass"), "six", "number"),
+        (("motion", "law"), "cubic", "cubic"),
+        (("reduction", "coordinates"), "many", "many"),
+        (("loads",), {}, "loads"),
+        (("arms", 0, "cells"), [10], "[10]"),
+        (("arms", 0, "cells"), [10, 2, 2], "[10, 2, 2]"),
+    ],
+)
+def test_schema_finds_what_is_wrong(path, value, word):
+    data = tomllib.loads((ROOT / "demos" / "two_arm.toml").read_text())
+    node = data
+    for part in path[:-1]:
+        node = node[part]
+    node[path[-1]] = value
+    [message] = errors(data)
+    assert word in message
+
+
+# -- ./dolfinopt.sh python -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_launcher_runs_a_script(tmp_path, ranks):
+    """With the interpreter of the set-up, its settings, and all arguments."""
+    launcher = tmp_path / "dolfinopt.sh"
+    launcher.write_bytes((ROOT / "dolfinopt.sh").read_bytes())
+    (tmp_path / "pyproject.toml").touch()
+    python = tmp_path / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    stamp = f"cksum '{launcher}' '{tmp_path}/pyproject.toml' /etc/debian_version 2>/dev/null"
+    ready = subprocess.run(["bash", "-c", stamp], capture_output=True).stdout  # as when set up
+    (tmp_path / ".venv" / "ready").write_bytes(ready)
+    script = tmp_path / "my script.py"
+    script.write_text(
+        "import os, sys\nsys.stdout.write(f'{sys.argv[1:]} {os.environ[\"OMP_NUM_THREADS\"]}\\n')\n"
+    )
+    line = ["bash", str(launcher), *(["-n", str(ranks)] if ranks else []), "python"]
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
+    options = {"capture_output": True, "text": True, "env": environment, "timeout": 60}
+    done = subprocess.run([*line, str(script), "a b", "--out"], **options)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["['a b', '--out'] 1"] * max(ranks, 1)
+    done = subprocess.run(line, **options)
+    assert done.returncode == 2 and "python needs a script" in done.stderr

@@ -1,0 +1,220 @@
+"""Interpolation laws: published values, slopes against the complex step, and local modes."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.density.interpolation import LAWS, SWITCH, interpolate
+from dolfinopt.output.run import optimize
+from dolfinopt.scene.load import Law, load_scene
+
+ROOT = Path(__file__).parents[2]
+BOTH_SIDES = SWITCH * (1.0 + np.array([-1e-3, -1e-9, -2e-16, 0.0, 2e-16, 1e-9, 1e-3]))
+X = np.sort(np.concatenate([np.linspace(0.0, 1.0, 101), BOTH_SIDES]))
+FLOOR = 1e-6
+ROUNDING = 4e-15  # a handful of operations on numbers of order one (penalty <= 5)
+
+
+def values(x, law, penalty=3.0, floor=FLOOR):
+    return interpolate(np.atleast_1d(np.asarray(x, dtype=float)), law, penalty, floor)
+
+
+# -- values ----------------------------------------------------------------------------------
+
+
+def test_the_scene_offers_every_law():
+    assert set(Law.__args__) == set(LAWS)
+
+
+@pytest.mark.parametrize("floor", [1e-9, 1e-6, 0.1])
+@pytest.mark.parametrize("penalty", [1.0, 3.0, 4.5])
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_every_law_joins_void_and_solid(law, penalty, floor):
+    ends = values([0.0, 1.0], law, penalty, floor)
+    void = floor if law == "two-material" else floor**2
+    assert ends.stiffness == pytest.approx([void, 1.0], rel=ROUNDING)
+    # Equal ratios of stiffness to mass at both ends: perfect void has no slow local modes.
+    assert ends.mass == pytest.approx([void, 1.0], rel=ROUNDING)
+
+
+def test_two_material_law_in_the_middle():
+    half = values(0.5, "two-material")
+    assert half.stiffness == pytest.approx([0.125 + 0.875e-6], rel=ROUNDING)
+    assert half.mass == pytest.approx([0.5 + 0.5e-6], rel=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("law", "x", "stiffness", "mass"),
+    [
+        ("simp", 0.5, 0.125, 0.5),
+        ("simp", 1e-3, 1e-9, 1e-3),
+        ("pedersen", 0.5, 0.125, 0.5),
+        ("pedersen", 0.05, 0.05 / 100.0, 0.05),
+        ("pedersen", 1e-3, 1e-5, 1e-3),
+        ("du-olhoff", 0.5, 0.125, 0.5),
+        ("du-olhoff", 0.05, 0.05**3, 6e5 * 0.05**6 - 5e6 * 0.05**7),
+        ("ramp", 0.5, 0.5 / 2.5, 0.5),
+        ("ramp", 1e-3, 1e-3 / 3.997, 1e-3),
+    ],
+)
+def test_published_values(law, x, stiffness, mass):
+    """With penalty 3; the trace of a second material adds floor^2 = 1e-12."""
+    at = values(x, law)
+    assert at.stiffness == pytest.approx([stiffness], rel=ROUNDING, abs=1.01 * FLOOR**2)
+    assert at.mass == pytest.approx([mass], rel=ROUNDING, abs=1.01 * FLOOR**2)
+
+
+@pytest.mark.parametrize("penalty", [1.0, 2.0, 3.0, 4.5])
+def test_pedersen_is_continuous_at_the_switch_for_every_penalty(penalty):
+    """And its slope jumps from e / x to p e / x."""
+    below, above = np.nextafter(SWITCH, 0.0), SWITCH
+    at = values([below, above], "pedersen", penalty)
+    assert np.diff(at.stiffness)[0] == pytest.approx(0.0, abs=1e-15)
+    assert at.stiffness_slope[1] == pytest.approx(penalty * at.stiffness_slope[0], rel=1e-14)
+
+
+def test_du_olhoff_is_continuously_differentiable_at_the_switch():
+    """Terms of 36 and 35 cancel to a slope of 1: some units of rounding of 36."""
+    at = values([np.nextafter(SWITCH, 0.0), SWITCH], "du-olhoff")
+    for jump in map(np.diff, (at.stiffness, at.stiffness_slope, at.mass, at.mass_slope)):
+        assert abs(jump[0]) < 1e-13
+
+
+@pytest.mark.parametrize("penalty", [1.0, 2.0, 3.0, 4.5])
+@pytest.mark.parametrize("law", ["simp", "pedersen", "du-olhoff", "ramp"])
+def test_laws_differ_from_simp_below_the_switch_only(law, penalty):
+    above = X[X >= SWITCH]
+    got, simp = values(above, law, penalty), values(above, "simp", penalty)
+    same = np.array_equal(got.stiffness, simp.stiffness) and np.array_equal(got.mass, simp.mass)
+    assert same is (law != "ramp")
+
+
+def test_lightest_support_of_near_void():
+    """E / rho, to which the square of local frequencies is proportional, from 1e-3 to 1 [-].
+
+    Pedersen: 0.1^2. Du and Olhoff: x^3 / m, least at x = 0.09. RAMP: 1 / (1 + q).
+    """
+    x = np.geomspace(1e-3, 1.0, 3001)
+
+    def least(law):
+        at = values(x, law)
+        return float((at.stiffness / at.mass).min())
+
+    assert least("simp") == pytest.approx(1e-6, rel=2e-3)  # floor^2 is 1e-3 of x^3
+    assert least("pedersen") == pytest.approx(0.01, rel=1e-9)
+    assert least("du-olhoff") == pytest.approx(0.09**-3 / (6e5 - 5e6 * 0.09), rel=1e-4)
+    assert least("ramp") == pytest.approx(1.0 / (1.0 + 3.0 * 0.999), rel=1e-8)
+    # The second material's floor comes too late: (f + x^3) / (f + x) has a trough at x^3 = f / 2.
+    assert least("two-material") == pytest.approx(1.5e-6 / 0.5e-6 ** (1 / 3), rel=1e-3)
+
+
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_more_material_is_stiffer_and_heavier(law):
+    at = values(X, law)
+    assert (np.diff(at.stiffness) >= 0.0).all() and (np.diff(at.mass) >= -ROUNDING).all()
+    coarse = values(X[::5], law)  # without neighbours a unit of rounding apart
+    assert (np.diff(coarse.stiffness) > 0.0).all() and (np.diff(coarse.mass) > 0.0).all()
+
+
+# -- slopes ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", sorted(LAWS))
+@pytest.mark.parametrize("penalty", [1.0, 2.0, 3.0, 4.5])
+def test_slopes_are_the_derivatives(law, penalty):
+    # f(x + ih) = f + ih f' exactly up to rounding: no difference is taken. From 0, where x^p has
+    # a branch point, plain evaluation of the limit serves.
+    step = 1e-30
+    floor = 1e-3
+    at = interpolate(X, law, penalty, floor)
+    shifted = interpolate(X[1:] + 1j * step, law, penalty, floor)
+    # NumPy's complex power goes through exp(p log x): p |log x| units in the last place. Du and
+    # Olhoff's slope is a difference of 36 and 35.
+    rounding = (300 if law == "du-olhoff" else 10) * ROUNDING
+    assert np.abs(shifted.stiffness.imag / step - at.stiffness_slope[1:]).max() < rounding
+    assert np.abs(shifted.mass.imag / step - at.mass_slope[1:]).max() < rounding
+    at_zero = interpolate(np.array([0.0, 1e-12]), law, penalty, floor)
+    # The limit's error is of order 1e-12 (p >= 2) or rounding of the values over 1e-12 (p = 1).
+    for value, slope in ((at_zero.stiffness, at.stiffness_slope), (at_zero.mass, at.mass_slope)):
+        assert np.diff(value)[0] / 1e-12 == pytest.approx(slope[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_input_is_left_alone(law):
+    x = X.copy()
+    at = interpolate(x, law, 3.0, 1e-6)
+    assert np.array_equal(x, X)
+    assert not any(np.shares_memory(x, array) for array in vars(at).values())
+
+
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_no_cells_at_all(law):
+    assert interpolate(np.empty(0), law, 3.0, 1e-6).stiffness.shape == (0,)  # a rank may have none
+
+
+def test_unknown_law():
+    with pytest.raises(KeyError, match="no-such-law"):
+        interpolate(X, "no-such-law", 3.0, 1e-6)
+
+
+# -- in a scene ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", sorted(LAWS))
+def test_every_law_optimises(law):
+    overrides = [f"interpolation.law={law}", "arms.cells=[30, 4]", "optimizer.max_iterations=4"]
+    result = optimize(load_scene(ROOT / "demos/two_arm.toml", overrides))
+    if MPI.COMM_WORLD.rank == 0:
+        first, last = (result.history[k].objective for k in (0, -1))
+        assert last < 0.6 * first  # the first steps, 0.2 at most each, at least halve it nearly
+
+
+def demo() -> ModuleType:
+    """Import the demo by its path."""
+    path = ROOT / "demos/demo_localised_modes.py"
+    spec = importlib.util.spec_from_file_location("demo_localised_modes", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_local_modes_of_a_frame_with_void(shared_tmp_path: Path) -> None:
+    """Classic SIMP's lowest modes live in the windows; the other laws' are the frame's."""
+    spectra = demo().main(shared_tmp_path, (40, 6), (1e-3, 1e-2, 0.0))
+    if MPI.COMM_WORLD.rank > 0:
+        assert spectra == []
+        return
+    found = {(one.law, one.void): one for one in spectra}
+    simp = found["simp", 1e-3]
+    assert simp.frequency[-1] < found["du-olhoff", 1e-3].frequency[0]  # all below the frame's first
+    assert (simp.strain > 0.99).all() and (simp.kinetic > 0.99).all()
+    assert found["simp", 1e-2].local.sum() >= 2
+    for void in (1e-3, 1e-2):
+        for law in ("pedersen", "du-olhoff", "ramp"):
+            assert not found[law, void].local.any()
+    # Two-material does as far as its floor is not small beside x^3.
+    assert not found["two-material", 1e-3].local.any()
+    assert found["two-material", 1e-2].local.any()
+    # All of them agree about the frame alone. Two-material's windows are as stiff as 1e-6 of solid,
+    # which adds 0.14 % to one frequency.
+    for law in LAWS:
+        assert not found[law, 0.0].local.any()
+        assert found[law, 0.0].frequency == pytest.approx(found["simp", 0.0].frequency, rel=2e-3)
+    assert (shared_tmp_path / "localised_modes.png").stat().st_size > 10_000
+
+
+def test_local_frequencies_scale_with_the_root_of_stiffness_by_mass() -> None:
+    """From x = 1e-3 to 2e-3 x^2 grows fourfold, and a window's own frequency twofold."""
+    first, second = (demo().spectrum("simp", void, (40, 6)) for void in (1e-3, 2e-3))
+    local = first.frequency[first.local][0], second.frequency[second.local][0]
+    # floor^2 adds 1e-3 to the stiffness of x^3 = 1e-9, and the frame is not rigid.
+    assert local[1] / local[0] == pytest.approx(2.0, rel=2e-3)

@@ -1,0 +1,187 @@
+"""Widths of members and gaps of crisp designs: drawn by hand, and those of robust ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.density.filter import HelmholtzFilter
+from dolfinopt.density.members import thinnest
+from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.optimization.loop import _Evaluated, _Run
+from dolfinopt.output.summary import _filter_warnings, _widths
+
+WORLD = MPI.COMM_WORLD
+SCENE = str(Path(__file__).parents[2] / "demos/two_arm.toml")
+CELL = 0.005  # m
+
+
+def cells(along=200, across=12, triangles=False):
+    """Return corners (n, 3 or 4, 2) and the cells' column and row."""
+    x, y = np.arange(along + 1) * CELL, np.arange(across + 1) * CELL
+    p = np.stack(np.meshgrid(x, y, indexing="ij"), axis=2)
+    quads = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=2).reshape(-1, 4, 2)
+    corners = quads
+    if triangles:
+        corners = np.concatenate([quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]])
+    i, j = (quads.mean(axis=1) / CELL).astype(int).T
+    return corners, i, j
+
+
+def flanges(j, thick):
+    return (j < thick) | (j >= 12 - thick)
+
+
+DRAWN = [  # solid by column and row; member and gap in cells
+    ("flanges", lambda i, j: flanges(j, 2), 2.0, 8.0),
+    ("webs", lambda i, j: flanges(j, 3) | (i % 20 < 4), 3.0, 6.0),
+    ("thin webs", lambda i, j: flanges(j, 3) | (i % 20 < 1), 1.0, 6.0),
+    ("slots", lambda i, j: flanges(j, 3) | (i % 20 > 4), 3.0, 5.0),
+    ("diagonal webs", lambda i, j: flanges(j, 4) | ((i - j) % 30 < 6), 4.0, 4.0),
+    ("islands", lambda i, j: (i % 20 < 3) & (j % 6 < 3), 3.0, 3.0),
+    ("neck", lambda i, j: (abs(i - 100) > 1) | (abs(2 * j - 11) < 3), 2.0, 12.0),
+    ("chain by corners", lambda i, j: flanges(j, 2) | (i % 12 == j), 0.0, None),
+    ("solid", lambda i, j: i >= 0, 12.0, None),
+]
+
+
+@pytest.mark.parametrize("triangles", [False, True], ids=["squares", "triangles"])
+@pytest.mark.parametrize(("name", "solid", "member", "gap"), DRAWN, ids=[d[0] for d in DRAWN])
+def test_widths_of_drawn_designs(name, solid, member, gap, triangles):
+    """To half a sample, an eighth of a cell, where edges follow the cells."""
+    corners, i, j = cells(triangles=triangles)
+    crisp = np.tile(solid(i, j), 2 if triangles else 1)
+    found_member, found_gap = thinnest(corners, crisp)
+    # A triangle is half a square: its samples are closer, and hit edges less squarely.
+    close = 0.25 if triangles else 0.01
+    assert found_member / CELL == pytest.approx(member, abs=close)
+    if gap is not None:
+        assert found_gap / CELL == pytest.approx(gap, abs=close)
+    elif name == "solid":
+        assert found_gap is None
+
+
+def test_nothing_solid_has_no_widths():
+    corners, i, _ = cells(10, 4)
+    assert thinnest(corners, i < 0) == (None, None)
+
+
+def test_corners_are_no_members():
+    """A triangular island in the middle of a wide field: its corners are thin, it is not."""
+    corners, i, j = cells(60, 60)
+    member, _ = thinnest(corners, (j > 10) & (abs(2 * i - 59) < 50 - j))
+    assert member > 10.0 * CELL
+
+
+@pytest.mark.parametrize("erosion", [0.05, 0.1, 0.25, 0.4])
+def test_the_radius_of_a_width(erosion):
+    """A strip whose middle just reaches the eroded threshold has the asked width at one half.
+
+    Filtered on 4000 cells along a line; the strip in the middle, or at an open edge.
+    """
+    data = {"projection": "robust", "minimum_member": 0.05, "erosion": erosion}
+    design = do.load_scene(SCENE, (f"design={toml(data)}", "arms.height=0.2")).design
+    cell = 1.0 / 4000.0
+    mesh = structured_arm(MPI.COMM_SELF, "a", 1.0, 0.002, (4000, 1))
+    order = np.argsort(mesh.centroid[:, 0])
+    # The ends of this arm stand for free edges.
+    none = np.empty(0, dtype=np.int32)
+    mesh = dataclasses.replace(mesh, inboard_facets=none, outboard_facets=none)
+    wide = dataclasses.replace(mesh)
+    smooth = HelmholtzFilter(wide, design.radius)
+    half = -design.radius / (2.0 * np.sqrt(3.0)) * np.log(0.5 - erosion)
+    strip = np.clip((half - np.abs(mesh.centroid[:, 0] - 0.5)) / cell + 0.5, 0.0, 1.0)
+    y = smooth.forward(strip)
+    assert y.max() == pytest.approx(0.5 + erosion, abs=2e-3)
+    assert (y > 0.5).sum() * cell == pytest.approx(0.05, abs=3.0 * cell)
+    assert np.diff(y[order]).max() > 0.0
+
+
+def toml(data):
+    return "{" + ", ".join(f"{k}={v!r}" for k, v in data.items()) + "}"
+
+
+ROBUST = [
+    "arms.arm2.rigid=true",
+    "arms.length=0.28",
+    "arms.cells=[84,18]",
+    "motion.radius=0.15",
+    "motion.joint_height=-0.2",
+    "objective.kind=static",
+    "design.projection=robust",
+    "design.continuation=5",
+    "design.sharpness=32.0",
+    "optimizer.max_iterations=60",
+]
+
+
+def test_members_of_a_robust_design_are_as_wide_as_asked():
+    """To one cell; members along the edges, too, which a mirroring filter would halve."""
+    width, cell = 0.012, 0.06 / 18
+    scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}", "design.erosion=0.25"))
+    result = do.optimize(scene)
+    widths = _widths(result.share, result.arms, result.x_phys)
+    volume = WORLD.bcast(result.history[-1].volume_fraction if WORLD.rank == 0 else None, root=0)
+    assert volume == pytest.approx(0.5, abs=0.01)  # of the nominal design
+    if WORLD.rank == 0:
+        member, gap = widths[0]
+        assert member >= width - cell
+        assert gap >= width - cell
+
+
+@pytest.mark.parametrize("width", [0.012, 0.0])
+def test_which_design_carries_the_volume(width):
+    """With a width the dilated one, scaled so that the nominal one meets its limit; else that."""
+    scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}"))
+    share = do.share_arms(WORLD, scene.cell_counts)
+    ledger = do.Ledger()
+    arms = do.build_arms(scene, share, ledger)
+    run = _Run(scene, share, arms, ledger, None, None)
+    run.sharpness = 4.0
+    x = np.linspace(0.1, 0.9, run.variables.size)
+    realised = run._realised(x)
+    designs = [_Evaluated({k: one[i] for k, one in realised.items()}, None, None) for i in range(3)]
+    value, slopes = run._volume(designs)
+    _, dilated, nominal = (run.variables.volume_constraints(one.x_phys) for one in designs)
+    assert value == pytest.approx(nominal)
+    assert dilated > nominal
+    expected = run.variables.volume_slopes(designs[1 if width else 2].realised)
+    factor = (1.0 + nominal) / (1.0 + dilated) if width else np.ones(len(nominal))
+    np.testing.assert_allclose(slopes, expected * factor[:, None], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "reason"),
+    [
+        (["design.minimum_member=0.015"], 'unless design.projection = "robust"'),
+        (
+            ["design.projection=robust", "design.minimum_member=0.014"],
+            r"at least 3 cells of arm .arm1., 0\.015 \[m\]",
+        ),
+        (
+            ["design.projection=robust", "design.minimum_member=0.021"],
+            r"at most a third of the height of arm .arm1., 0\.02 \[m\]",
+        ),
+        (
+            ["design.projection=robust", "design.minimum_member=0.02", "design.filter_radius=0.01"],
+            r"expected 0\.0075, the default, with minimum_member = 0\.02: .* 0\.049976",
+        ),
+        (["design.minimum_member=-1.0"], "a number >= 0"),
+    ],
+)
+def test_widths_that_cannot_be(overrides, reason):
+    with pytest.raises(do.InputError, match=reason):
+        do.load_scene(SCENE, overrides)
+
+
+@pytest.mark.parametrize(("radius", "count"), [(0.0075, 1), (0.01, 0), (0.0, 1)])
+def test_a_filter_of_less_than_two_cells_warns(radius, count):
+    scene = do.load_scene(SCENE, (f"design.filter_radius={radius}",))
+    found = _filter_warnings(scene, {0: 0.005, 1: 0.005})
+    assert len(found) == count
+    assert all("set design.filter_radius = 0.01 or more" in text for text in found)

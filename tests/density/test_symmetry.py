@@ -1,0 +1,129 @@
+"""Symmetric designs: pairs of cells, the exact transpose, and the chain of an arm."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.arms.arm import Arm
+from dolfinopt.data import mesh_folder
+from dolfinopt.density.symmetry import AxisSymmetry
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.arm_mesh import arm_mesh, structured_arm
+from dolfinopt.scene.load import Arm as Entry
+
+COMM = MPI.COMM_WORLD
+BORES = str(mesh_folder() / "arm_bores.geo")
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm_bores.toml"
+EPS = np.finfo(float).eps
+
+
+def bores(shape, **keys):
+    keys = {"length": 0.5, "height": 0.06, "thickness": 0.01, "mesh_size": 0.01} | keys
+    return arm_mesh(COMM, Entry(name="a", mesh=BORES, cell_shape=shape, **keys))
+
+
+MESHES = {
+    "rectangle": lambda: structured_arm(COMM, "a", 1.0, 0.06, (20, 4)),
+    "odd rectangle": lambda: structured_arm(COMM, "a", 1.0, 0.06, (20, 5)),
+    "quadrilaterals": lambda: bores("quadrilateral"),
+    "triangles": lambda: bores("triangle"),
+}
+
+
+@pytest.fixture(scope="module", params=MESHES)
+def mesh(request):
+    return MESHES[request.param]()
+
+
+def scattered():
+    """Return a mesh with centroids off their places, so that mirror images are no pairs."""
+    mesh = structured_arm(COMM, "a", 1.0, 0.5, (20, 10))
+    off = 0.02 * np.sin(mesh.centroid @ [[900.0, 310.0], [470.0, 850.0]])
+    return dataclasses.replace(mesh, centroid=mesh.centroid + off)
+
+
+def wave(centroid):
+    """Return a field in [0, 1] without any symmetry."""
+    return 0.5 + 0.5 * np.sin(31.0 * centroid[:, 0] + 70.0 * centroid[:, 1] + 0.4)
+
+
+def test_field_becomes_the_mean_of_itself_and_its_mirror_image(mesh):
+    symmetry = AxisSymmetry(mesh)
+    here, there = mesh.centroid, mesh.centroid * [1.0, -1.0]
+    y = symmetry.forward(wave(here))
+    # Gmsh places points to 1e-9 of their curves, the wave is 80 / m steep.
+    assert np.allclose(y, 0.5 * (wave(here) + wave(there)), atol=1e-7)
+    assert np.array_equal(symmetry.forward(y), y)  # pairs: the second time changes nothing
+    even = np.cos(50.0 * here[:, 1])
+    assert np.allclose(symmetry.forward(even), even, atol=1e-7)
+    odd = np.sin(50.0 * here[:, 1])
+    assert np.allclose(symmetry.forward(odd), 0.0, atol=1e-7)
+    assert np.array_equal(symmetry.forward(np.full(mesh.num_cells, 0.3)), np.full(len(odd), 0.3))
+
+
+@pytest.mark.parametrize("pairs", [True, False])
+def test_backward_is_the_transpose(mesh, pairs):
+    """Also where the map to the nearest cell is no pairing."""
+    mesh = mesh if pairs else scattered()
+    symmetry = AxisSymmetry(mesh)
+    assert pairs == (len(np.unique(symmetry.mirror)) == len(symmetry.mirror))
+    x, w = wave(mesh.centroid), np.cos(90.0 * mesh.centroid[:, 0] - 33.0 * mesh.centroid[:, 1])
+    forward, backward = symmetry.forward(x), symmetry.backward(w)
+    left, right, size = COMM.allreduce(np.array([w @ forward, backward @ x, np.abs(w) @ forward]))
+    assert abs(left - right) < 100.0 * EPS * size  # sums of some hundred terms
+
+
+def test_volume_is_kept(mesh):
+    symmetry = AxisSymmetry(mesh)
+    x = wave(mesh.centroid)
+    before, after = COMM.allreduce(np.array([mesh.area @ x, mesh.area @ symmetry.forward(x)]))
+    assert after == pytest.approx(before, rel=1e-8)  # areas of a pair agree to 1e-9
+
+
+def test_mesh_without_symmetry_is_refused():
+    mesh = structured_arm(COMM, "a", 1.0, 0.06, (20, 4))
+    above = dataclasses.replace(mesh, centroid=mesh.centroid + np.array([0.0, 0.03]))
+    with pytest.raises(InputError, match=r"has no mirror image within 1\.25 cell") as caught:
+        AxisSymmetry(above)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+# --- in an arm -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["quadrilateral", "triangle"])
+def test_chain_is_the_transpose_of_physical(shape):
+    """Symmetry, filter and solid cells together, on an arm that the ranks share."""
+    overrides = ["arms.mesh_size=0.012", f'arms.cell_shape="{shape}"']
+    arm = Arm(do.load_scene(SCENE, overrides), 0, COMM, do.Ledger())
+    centroid = arm.mesh.centroid
+    x, dx = 0.35 + 0.3 * wave(centroid), 0.3 * np.cos(60.0 * centroid[:, 1] + 20.0 * centroid[:, 0])
+    w = arm.mesh.area * np.sin(45.0 * centroid[:, 0] + 90.0 * centroid[:, 1])
+    change = arm.physical(x + dx) - arm.physical(x)  # linear: no limit is met
+    left, right, size = COMM.allreduce(
+        np.array([w @ change, arm.chain(w) @ dx, np.abs(w) @ np.abs(change)])
+    )
+    assert abs(left - right) < 1e-12 * size
+    physical = arm.physical(x)
+    assert np.allclose(AxisSymmetry(arm.mesh).forward(physical), physical, atol=1e-9)
+    assert (physical[arm.mesh.passive] == 1.0).all()
+
+
+def test_optimised_design_is_symmetric():
+    overrides = ["arms.mesh_size=0.012", "optimizer.max_iterations=3", "motion.elbow=1"]
+    result = do.optimize(do.load_scene(SCENE, overrides))
+    for k, arm in result.arms.items():
+        x = result.x_phys[k]
+        assert np.allclose(AxisSymmetry(arm.mesh).forward(x), x, atol=1e-9)
+        assert np.ptp(x) > 0.5  # there is a design
+        assert (x[arm.mesh.passive] == 1.0).all()
+    if COMM.rank == 0:
+        objectives = [row.objective for row in result.history]
+        assert objectives[-1] < 0.5 * objectives[0]
+        assert result.history[-1].volume_fraction < 0.5

@@ -1,0 +1,360 @@
+"""Many problems of the same bodies at once against each of them alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import beam, random_cloud
+
+from dolfinopt.dynamics import batch, radau
+from dolfinopt.dynamics.adjoint import trajectory_slopes
+from dolfinopt.dynamics.collocation import beginnings, radau_iia, rows_at, stages_of, starts
+from dolfinopt.dynamics.modal_coordinates import modes_of
+from dolfinopt.dynamics.newton_matrix import alone as alone_of
+from dolfinopt.dynamics.newton_matrix import factorise
+from dolfinopt.dynamics.problem import ElasticProblem, Solution, even_steps, relative_error
+from dolfinopt.dynamics.simplified_newton import held_factors
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.mechanism import (
+    Mechanism,
+    Scale,
+    inverse_dynamics,
+    linearise,
+    tangent,
+)
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
+from dolfinopt.paths.time_laws import quintic
+from dolfinopt.profiling import Ledger
+
+TOLERANCE = 1e-4
+LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
+DAMPING = 1e-3  # s
+
+
+def reach(duration: float, size: float):
+    """Return a quintic motion of cart and two joints."""
+
+    def motion(t: np.ndarray) -> RigidMotion:
+        s, sd, sdd = quintic(t, duration)
+        moved = size * np.array([0.2, 1.0, -0.8])
+        home = np.array([0.0, 0.6, 0.8])
+        return RigidMotion(home + np.outer(s, moved), np.outer(sd, moved), np.outer(sdd, moved))
+
+    return motion
+
+
+def two_arms(
+    payload: float = 1.0,
+    inertia: float = 0.01,
+    duration: float = 0.6,
+    horizon: float = 1.0,
+    size: float = 1.0,
+    gravity: tuple[float, float] = (0.0, 0.0),
+    factors: tuple[float, float, float] = (1.0, 1.0, DAMPING),
+    bending: float = 10.0,
+) -> ElasticProblem:
+    """Return two slender arms of 1 to 50 Hz; factors of mass, stiffness, and the damping, s."""
+    body = beam(bending=bending, axial=300.0, damping=DAMPING).body()
+    bodies = tuple(of_material(body, *factors) for _ in range(2))
+    mechanism = Mechanism(bodies, payload, inertia, gravity, 0.0)
+    return ElasticProblem(mechanism, reach(duration, size), (0.0, duration, horizon))
+
+
+def various() -> list[ElasticProblem]:
+    """Return problems that differ in all that a batch knows."""
+    return [
+        two_arms(),
+        two_arms(payload=0.7, inertia=0.02),
+        two_arms(duration=0.7, horizon=1.3),
+        two_arms(size=0.5, gravity=(0.0, -2.0)),
+        two_arms(factors=(1.1, 0.9, 0.0)),
+        two_arms(factors=(0.9, 1.2, 2.0 * DAMPING)),
+    ]
+
+
+def solve(problems: list[ElasticProblem], starts_: list[Solution | None] | None = None):
+    """Return the solutions and the ledger; nothing may have been left to the single method."""
+    ledger = Ledger()
+    found = batch.integrate(problems, TOLERANCE, 3, ledger, starts_ or [None] * len(problems))
+    return found, ledger
+
+
+@pytest.fixture
+def alone(monkeypatch) -> list[ElasticProblem]:
+    """Return what the batch leaves to the single method."""
+    left: list[ElasticProblem] = []
+    single = batch._alone
+
+    def counted(problem: ElasticProblem, *rest):
+        left.append(problem)
+        return single(problem, *rest)
+
+    monkeypatch.setattr(batch, "_alone", counted)
+    return left
+
+
+def distance(problem: ElasticProblem, one: Solution, other: Solution) -> float:
+    """Return the relative difference in energy over the horizon."""
+    t = np.linspace(0.0, problem.breakpoints[-1], 500)
+    here, there = one.sample(t), other.sample(t)
+    return relative_error(problem.mechanism, here - there, there)
+
+
+# -- many mechanisms in one ------------------------------------------------------------------
+
+
+def test_scales_are_those_of_scaled_bodies():
+    """Instant by instant other payloads, gravity and materials: as each mechanism by itself."""
+    rng = np.random.default_rng(3)
+    clouds = [random_cloud(rng, 3).body() for _ in range(2)]
+    bodies = [replace(body, D=body.K) for body in clouds]
+    factors = rng.uniform(0.5, 2.0, (4, 2, 3))
+    payload = rng.uniform(0.5, 2.0, (4, 4))
+    q, qd, qdd = rng.normal(size=(3, 4, 6))
+    motion = RigidMotion(*rng.normal(size=(3, 4, 3)))
+    many = Mechanism(
+        tuple(bodies),
+        payload[:, 0],
+        payload[:, 1],
+        (payload[:, 2], payload[:, 3]),
+        0.0,
+        tuple(Scale(*factors[:, k].T.copy()) for k in range(2)),
+    )
+    rows, drives = inverse_dynamics(many, motion, q, qd, qdd)
+    slopes = linearise(many, motion, q, qd, qdd)
+    change = rng.normal(size=(3, 4, 6))
+    felt = slopes.times(*change, np.arange(6))
+    for n in range(4):
+        one = Mechanism(
+            tuple(
+                of_material(body, f[0], f[1], f[2] / f[1])
+                for body, f in zip(bodies, factors[n], strict=True)
+            ),
+            payload[n, 0],
+            payload[n, 1],
+            (payload[n, 2], payload[n, 3]),
+            0.0,
+        )
+        at = RigidMotion(motion.q[n : n + 1], motion.qd[n : n + 1], motion.qdd[n : n + 1])
+        here = (q[n : n + 1], qd[n : n + 1], qdd[n : n + 1])
+        alone = inverse_dynamics(one, at, *here)
+        # The same sums in another order: rounding.
+        np.testing.assert_allclose(rows[n], alone[0][0], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(drives[n], alone[1][0], rtol=1e-11, atol=1e-11)
+        matrix = tangent(one, at, *here)[0]
+        np.testing.assert_allclose(slopes.dense()[n], matrix, rtol=1e-11, atol=1e-11)
+        moved = matrix @ np.concatenate([x[n] for x in change])
+        np.testing.assert_allclose(felt[n], moved, rtol=1e-10, atol=1e-10)
+
+
+def test_wanted_rows_and_repeated_instants():
+    """One instant's tangent for several changes, of some rows: the same numbers."""
+    problem = two_arms()
+    rng = np.random.default_rng(5)
+    q, qd, qdd = 0.01 * rng.normal(size=(3, 4, 6))
+    keep, wanted = np.array([0, 2, 4]), np.array([1, 2, 5])
+    slopes = linearise(problem.mechanism, problem.motion(np.linspace(0, 0.6, 4)), q, qd, qdd, keep)
+    change = rng.normal(size=(3, 8, 3))
+    both = slopes.times(*change, wanted)
+    for k in range(2):
+        each = slopes.times(*change[:, k::2], np.arange(6))
+        np.testing.assert_allclose(both[k::2], each[:, wanted], rtol=1e-12, atol=1e-12)
+
+
+def test_related_bodies():
+    """Scaled bodies are found, with their factors; others are not."""
+    problems = [
+        two_arms(),
+        two_arms(factors=(1.5, 0.5, 3.0 * DAMPING)),
+        two_arms(factors=(1.0, 1.0, 0.0)),
+        two_arms(bending=11.0),
+    ]
+    bar = rigid_bar(0.5, 0.05, 0.01, 2700.0)
+    last = replace(problems[0].mechanism, bodies=(problems[0].mechanism.bodies[0], bar))
+    problems.append(replace(problems[0], mechanism=last))
+    first, other, undamped, stiffer, rigid = batch.related(problems)
+    np.testing.assert_allclose(first, [[1.0, 1.0, DAMPING]] * 2, rtol=1e-12)
+    np.testing.assert_allclose(other, [[1.5, 0.5, 1.5 * DAMPING]] * 2, rtol=1e-12)
+    np.testing.assert_allclose(undamped, [[1.0, 1.0, 0.0]] * 2, rtol=1e-12)
+    assert stiffer is None and rigid is None
+
+
+# -- Newton's matrix -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 4])
+def test_held_matrix_is_exact_where_the_tangent_rests(stages):
+    """At rest and without motion, stage by stage the same tangent: both matrices are one."""
+    resting = replace(two_arms(), motion=lambda t: reach(0.6, 1.0)(np.zeros_like(t)))
+    modes, method = modes_of(resting), radau_iia(stages)
+    own = stages_of(modes, method, even_steps(resting, 12))
+    count = len(own.h)
+    slow = np.arange(6)
+    zero = np.zeros((count, stages, 6))
+    exact = factorise(own, zero, zero, zero, slow)
+    flat = np.zeros((count, 6))
+    found = held_factors(own, (flat, flat), zero, slow, alone_of(own))
+    rows = np.random.default_rng(1).normal(size=zero.shape)
+    for mine, theirs in zip(
+        found.solve(rows, np.zeros((2, 6))), exact.solve(rows, np.zeros((2, 6))), strict=True
+    ):
+        np.testing.assert_allclose(mine, theirs, atol=1e-8 * np.abs(theirs).max())
+
+
+def doubled(motion):
+    return RigidMotion(*(np.tile(x, (2, 1)) for x in (motion.q, motion.qd, motion.qdd)))
+
+
+def test_runs_begin_anew():
+    """Steps of two runs: each is solved as by itself."""
+    problem = two_arms()
+    modes, method = modes_of(problem), radau_iia(3)
+    own = stages_of(modes, method, even_steps(problem, 20))
+    twice = replace(
+        own,
+        h=np.tile(own.h, 2),
+        motion=doubled(own.motion),
+        middle=doubled(own.middle),
+        runs=2,
+    )
+    rng = np.random.default_rng(2)
+    a = rng.normal(size=(len(twice.h), 3, 6))
+    state = rng.normal(size=(2, 2, 6))
+    half = len(own.h)
+    q, qd = beginnings(twice, (state[0], state[1]), a)
+    zero = np.zeros_like(a)
+    slow = np.array([2, 5])
+    rows = rows_at(twice, zero, zero, a)
+    both = factorise(twice, zero, zero, zero, slow).solve(rows, np.zeros((2, 6)))
+    for k, part in enumerate((slice(0, half), slice(half, None))):
+        alone = starts(own, (state[0][k], state[1][k]), a[part])
+        np.testing.assert_allclose(q[part], alone[0][:-1], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(qd[part], alone[1][:-1], rtol=1e-12, atol=1e-12)
+        one = factorise(own, zero[part], zero[part], zero[part], slow)
+        single = one.solve(rows[part], np.zeros((2, 6)))
+        for mine, theirs in zip(both, single, strict=True):
+            np.testing.assert_allclose(mine[part], theirs, atol=1e-9 * np.abs(theirs).max())
+
+
+# -- the whole -------------------------------------------------------------------------------
+
+
+def test_batch_is_each_of_them_alone(alone):
+    """To the tolerance with steps of its own, and to Newton's remainder on the same steps."""
+    problems = various()
+    found, ledger = solve(problems)
+    assert not alone  # all of them in the batch
+    assert ledger.counts.newton_iterations > 0
+    assert len({len(one.a) for one in found}) == 2  # without damping it takes more of them
+    for problem, one in zip(problems, found, strict=True):
+        single = radau.integrate(problem, TOLERANCE, 3, Ledger())
+        assert one.error <= TOLERANCE
+        assert distance(problem, one, single) <= 2.0 * TOLERANCE
+        same = radau.on_grid(problem, one.edges, TOLERANCE, 3)
+        assert distance(problem, one, same) <= LEFT
+        # Of a single answer: more by what its contraction may leave, up to a quarter.
+        assert 0.9 <= one.error / same.error <= 1.3
+
+
+def test_order_does_not_matter():
+    problems = various()
+    here, _ = solve(problems)
+    there, _ = solve(problems[::-1])
+    for one, other in zip(here, there[::-1], strict=True):
+        assert np.array_equal(one.edges, other.edges) and np.array_equal(one.a, other.a)
+
+
+def test_a_start_keeps_its_steps(alone):
+    """From its own solution the same steps, and less work."""
+    problems = various()
+    cold, first = solve(problems)
+    warm, second = solve(problems, cold)
+    assert not alone
+    assert second.counts.newton_iterations < first.counts.newton_iterations
+    for problem, one, other in zip(problems, cold, warm, strict=True):
+        assert np.array_equal(one.edges, other.edges)
+        assert distance(problem, one, other) <= LEFT
+
+
+def test_one_problem_is_solved_as_ever(alone):
+    problem = two_arms()
+    (one,), _ = solve([problem])
+    single = radau.integrate(problem, TOLERANCE, 3, Ledger())
+    assert np.array_equal(one.a, single.a) and len(alone) == 1
+
+
+def test_other_bodies_are_solved_alone(alone):
+    """A stiffer arm is no scaled one: it does not spoil the batch of the others."""
+    stiffer = two_arms(bending=40.0)
+    problems = [two_arms(), stiffer, two_arms(payload=1.2)]
+    found, _ = solve(problems)
+    assert alone == [stiffer]
+    for problem, one in zip(problems, found, strict=True):
+        single = radau.integrate(problem, TOLERANCE, 3, Ledger())
+        assert distance(problem, one, single) <= 2.0 * TOLERANCE
+
+
+def test_failure_stays_alone():
+    """Arms spun too fast for their stiffness fail; the others do not notice."""
+    soft = two_arms(factors=(1.0, 1e-2, DAMPING), size=300.0)
+    with pytest.raises(ConvergenceError) as error:
+        radau.integrate(soft, TOLERANCE, 3, Ledger())
+    good = [two_arms(), two_arms(payload=1.3)]
+    found, _ = solve([good[0], soft, good[1]])
+    assert isinstance(found[1], ConvergenceError) and str(found[1]) == str(error.value)
+    without, _ = solve(good)
+    for problem, one, other in zip(good, (found[0], found[2]), without, strict=True):
+        assert np.array_equal(one.edges, other.edges)
+        assert distance(problem, one, other) <= LEFT  # the matrix is renewed at other times
+
+
+def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
+    """Whom Newton's method in the batch gives up is solved by itself."""
+    problems = [two_arms(), two_arms(payload=1.3), two_arms(payload=1.6)]
+    newton = batch._newton
+
+    def refuses(grid, a, goal):
+        found = newton(grid, a, goal)
+        heavy = grid.family.payload[grid.members, 0] == 1.6
+        return replace(found, converged=found.converged & ~heavy)
+
+    monkeypatch.setattr(batch, "_newton", refuses)
+    found, _ = solve(problems)
+    assert alone == [problems[2]]
+    assert all(one.error <= TOLERANCE for one in found)
+
+
+def test_adjoint_of_a_solution_from_the_batch():
+    """Slopes through a solution of the batch are those through the same one found alone."""
+    problems = [two_arms(), two_arms(payload=1.5)]
+    found, _ = solve(problems)
+    problem, one = problems[1], found[1]
+    same = radau.on_grid(problem, one.edges, TOLERANCE, 3)
+    t = np.linspace(0.1, 1.0, 7)
+    by_q = np.random.default_rng(4).normal(size=(7, 6))
+    here, there = (trajectory_slopes(problem, x, t, by_q) for x in (one, same))
+    for mine, theirs in zip(here, there, strict=True):
+        for name in ("K", "M", "C", "outboard"):
+            expected = getattr(theirs, name)
+            got = getattr(mine, name)
+            np.testing.assert_allclose(got, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_bodies_without_coordinates(alone):
+    """A rigid arm among them."""
+    bar = rigid_bar(0.5, 0.05, 0.01, 2700.0)
+
+    def problem(payload: float) -> ElasticProblem:
+        whole = two_arms(payload=payload)
+        bodies: tuple[ShapeIntegrals, ...] = (bar, whole.mechanism.bodies[1])
+        return replace(whole, mechanism=replace(whole.mechanism, bodies=bodies))
+
+    problems = [problem(1.0), problem(1.5)]
+    found, _ = solve(problems)
+    assert not alone
+    for one, each in zip(found, problems, strict=True):
+        same = radau.on_grid(each, one.edges, TOLERANCE, 3)
+        assert distance(each, one, same) <= LEFT

@@ -1,0 +1,52 @@
+"""The error of vibrations that steps are too long for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dolfinopt.dynamics.collocation import Stages, radau_iia
+from dolfinopt.dynamics.problem import lagrange_slopes
+from dolfinopt.dynamics.unresolved import _lost, unresolved
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+
+
+def test_slopes_of_polynomials() -> None:
+    """A cubic by four nodes: its own value and derivatives, at the ends and beyond."""
+    nodes, tau = np.array([0.1, 0.4, 0.7, 1.0]), np.array([-0.2, 0.0, 0.55, 1.0])
+    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0])
+    found = lagrange_slopes(nodes, tau) @ cubic(nodes)
+    for k, row in enumerate(found):
+        # Rounding of the inverted powers' matrix, some thousand large.
+        np.testing.assert_allclose(row, cubic.deriv(k)(tau) if k else cubic(tau), atol=1e-11)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("damping", [0.0, 1e30])
+def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
+    """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
+    method, h = radau_iia(3), np.full(10, 0.1)
+    still = RigidMotion(*np.zeros((3, 30, 1)))
+    mechanism = Mechanism((), 0.0, 0.0, (0.0, 0.0), 0.0)
+    stages = Stages(mechanism, np.array([1e154]), method, h, still, still)
+    t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]
+    states = (t**2, np.zeros_like(t), np.zeros_like(t))
+    single = tuple(np.full((1, 1), x) for x in (1.0, damping, 1e-290))
+    found = unresolved(stages, single, states, np.zeros((1, 1)), np.array([0]))
+    assert found.shape == (1, 1)
+    assert 0.0 <= found[0, 0] < 1e-12
+
+
+@pytest.mark.parametrize("stages", [2, 3, 4])
+@pytest.mark.parametrize("z", [0.3j, 2.0j, -0.1 + 5.0j, -3.0 + 0.0j])
+def test_lost_is_what_collocation_makes_of_a_free_vibration(stages: int, z: complex) -> None:
+    """y' = z y over unit steps, the stages' equations solved one step after the other."""
+    method = radau_iia(stages)
+    y, apart = 1.0 + 0.0j, []
+    for n in range(1, 6):
+        k = np.linalg.solve(np.eye(stages) - z * method.A, np.full(stages, z * y))
+        y = y + method.A[-1] @ k
+        apart.append(abs(np.exp(n * z) - y))
+    found = _lost(method, np.array([[[z]]]), np.array([5]))
+    assert found[0, 0, 0] == pytest.approx(max(apart), rel=1e-9)

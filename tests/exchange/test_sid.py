@@ -1,0 +1,384 @@
+"""Standard input data: the text file as other programs write it, round trips, damaged files."""
+
+import re
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.sid import (
+    Node,
+    StandardInputData,
+    Taylor,
+    read_sid,
+    read_sid_npz,
+    sid_text,
+    taylor,
+    write_sid,
+    write_sid_npz,
+)
+
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
+MATRICES = ("mdCM", "J", "Ct", "Cr", "Me", "Gr", "Ge", "Oe", "ksigma", "Ke", "De")
+PARTS = ("origin", "phi", "psi", "AP", "sigma")
+
+# A bar of 3 kg and 2 m that swings about its end by v = (x / 2)^2 q in the manner of FEMBS, by
+# hand: Fortran's exponents, ragged columns, zeros left out, half of a symmetric matrix.
+BAR = """    2    2    :No. nodes, No. modes:a bar
+ part
+      new modal                                 =
+           refmod
+                mass                            = 3.00000000000D+00
+                nelastq                         =   2
+                ielastq (   1)                  =Eigen Mode    1 :        1.135 Hz
+                ielastq (   2)                  = Eigen Mode    2 :        2.557 Hz
+           end refmod
+           frame
+                new node                        =       17
+                     rframe                     = body ref
+                     origin
+                          order                 =   1
+                          nrow                  =   3
+                          ncol                  =   1
+                          nq                    =   2
+                          nqn                   =   0
+                          structure             =   0
+                     end origin
+                     phi
+                          order                 =   0
+                          nrow                  =   3
+                          ncol                  =   2
+                          nq                    =   2
+                          nqn                   =   0
+                          structure             =   3
+                          m0( 2, 1)             = 1.00000000000D+00
+                          m0(2,2)=-.5D-1
+                     end phi
+                     psi
+                          order                 =   0
+                          nrow                  =   3
+                          ncol                  =   2
+                          nq                    =   2
+                          nqn                   =   0
+                          structure             =   3
+                          m0( 3, 1)             = 1.00000000000D+00
+                     end psi
+                     AP
+                          order                 =   1
+                          nrow                  =   3
+                          ncol                  =   3
+                          nq                    =   2
+                          nqn                   =   0
+                          structure             =   4
+                          m1( 1, 1, 2)          =-1.00000000000D+00
+                          m1( 2, 1, 1)          = 1.00000000000D+00
+                     end AP
+                end node
+           end frame
+           {matrices}
+      end modal
+ end part
+"""
+
+
+def block(name, order, nrow, ncol, structure, *entries):
+    lines = [name, f"order = {order}", f"nrow = {nrow}", f"ncol={ncol}", "nq = 2", "nqn = 0"]
+    return "\n".join([*lines, f"structure = {structure}", *entries, f"end {name}"])
+
+
+BLOCKS = [
+    block("mdCM", 1, 3, 1, 3, "m0( 1, 1) = 3.0D+00", "m1( 2, 1, 1) = 1.0D+00"),
+    block("J", 1, 6, 1, 3, "m0(2,1) = 4.D+00", "m0(3,1) = 4.0D0", "m1( 4, 1, 1) = -1.5e+00"),
+    block("Ct", 0, 2, 3, 3, "m0( 1, 2) = 1.0D+00"),
+    block("Cr", 1, 2, 3, 3, "m0( 1, 3) = 1.5D+00", "m1( 1, 2, 3) = 0.25", "m1( 2, 1, 3) =-0.25"),
+    block("Me", 0, 2, 2, 4),
+    block("Gr", 0, 3, 6, 3, "m0( 3, 6) = 0.125"),
+    block("Ge", 0, 2, 6, 3, "m0( 1, 6) = 0.5"),
+    block("Oe", 1, 2, 6, 3, "m1( 1, 1, 3) = -1.0D+00", "m1( 2, 2, 3) = -1.0D+00"),
+    block("ksigma", 0, 2, 1, 0),
+    block("Ke", 0, 2, 2, 2, "m0( 1, 1) = 50.0", "m0( 2, 1) = 3.0D-01", "m0( 2, 2) = 2.6D+02"),
+    block("De", 0, 2, 2, 1, "m0( 1, 1) = 0.5", "m0( 2, 2) = 0.75"),
+]
+
+
+def bar(blocks=BLOCKS, text=BAR):
+    return text.replace("{matrices}", "\n".join(blocks))
+
+
+def read(tmp_path, text):
+    path = tmp_path / "bar.SID_FEM"
+    path.write_text(text)
+    return read_sid(path)
+
+
+def bits(data):
+    """Return everything the data hold, arrays as bytes with their shapes."""
+
+    def of(value):
+        if isinstance(value, Taylor):
+            numbers = (value.order, value.structure, value.nqn)
+            arrays = (value.M0, value.M1)
+            return numbers, [(a.shape, np.ascontiguousarray(a).tobytes()) for a in arrays]
+        if isinstance(value, Node):
+            return [of(getattr(value, f.name)) for f in fields(value)]
+        return value if not isinstance(value, tuple) else [of(v) for v in value]
+
+    return {f.name: of(getattr(data, f.name)) for f in fields(data)}
+
+
+def matrix(*shape, **entries):
+    """Return a matrix with entries such as r12=3.0, counted from one."""
+    out = np.zeros(shape)
+    for place, value in entries.items():
+        out[tuple(int(digit) - 1 for digit in place[1:])] = value
+    return out
+
+
+def test_a_file_in_the_manner_of_fembs(tmp_path):
+    data = read(tmp_path, bar())
+    assert data.mass == 3.0 and data.coordinates == 2 and data.comment == "a bar"
+    assert data.names == ("Eigen Mode    1 :        1.135 Hz", "Eigen Mode    2 :        2.557 Hz")
+    [node] = data.nodes
+    assert (node.name, node.rframe, node.sigma) == ("17", "body ref", None)
+    expected = {
+        "mdCM": (matrix(3, 1, r11=3.0), matrix(3, 2, 1, r211=1.0)),
+        "J": (matrix(6, 1, r21=4.0, r31=4.0), matrix(6, 2, 1, r411=-1.5)),
+        "Ct": (matrix(2, 3, r12=1.0), matrix(2, 2, 3)),
+        "Cr": (matrix(2, 3, r13=1.5), matrix(2, 2, 3, r123=0.25, r213=-0.25)),
+        "Me": (np.eye(2), matrix(2, 2, 2)),  # structure 4: the unit matrix, without entries
+        "Gr": (matrix(3, 6, r36=0.125), matrix(3, 2, 6)),
+        "Ge": (matrix(2, 6, r16=0.5), matrix(2, 2, 6)),
+        "Oe": (matrix(2, 6), matrix(2, 2, 6, r113=-1.0, r223=-1.0)),
+        "ksigma": (matrix(2, 1), matrix(2, 2, 1)),
+        "Ke": (np.array([[50.0, 0.3], [0.3, 260.0]]), matrix(2, 2, 2)),  # the half left out
+        "De": (np.diag([0.5, 0.75]), matrix(2, 2, 2)),
+    }
+    for name, (M0, M1) in expected.items():
+        assert np.array_equal(getattr(data, name).M0, M0), name
+        assert np.array_equal(getattr(data, name).M1, M1), name
+    assert [getattr(data, name).order for name in expected] == [1, 1, 0, 1, 0, 0, 0, 1, 0, 0, 0]
+    assert np.array_equal(node.phi.M0, matrix(3, 2, r21=1.0, r22=-0.05))
+    assert np.array_equal(node.psi.M0, matrix(3, 2, r31=1.0))
+    assert np.array_equal(node.AP.M0, np.eye(3))
+    assert np.array_equal(node.AP.M1, matrix(3, 2, 3, r112=-1.0, r211=1.0))
+    assert np.array_equal(node.origin.M1, np.zeros((3, 2, 1)))
+    # Evaluated: J_xy = -1.5 q_1, mdCM = (3, q_1, 0).
+    q = np.array([0.5, 7.0])
+    assert np.array_equal(data.inertia(q), [[0, -0.75, 0], [-0.75, 4, 0], [0, 0, 4]])
+    assert np.array_equal(data.mdCM.at(q)[:, 0], [3.0, 0.5, 0.0])
+
+
+def test_spacing_case_and_order_do_not_matter(tmp_path):
+    reference = bits(read(tmp_path, bar()))
+    unspaced = re.sub(r"[ ]*([=(),])[ ]*", r"\1", bar()).replace("nodes,No", "nodes, No")
+    begins = re.sub(r"^ *(mdCM|[JA]P?|refmod|phi)$", r"begin of \1", bar(), flags=re.MULTILINE)
+    variants = {
+        "tabs": re.sub(r"^ +", "\t", bar(), flags=re.MULTILINE).replace("a bar", "a bar  "),
+        "unspaced": unspaced,
+        "blank lines": bar().replace("\n", "\n\n").replace("a bar\n\n", "a bar\n"),
+        "Windows": bar().replace("\n", "\r\n"),
+        "upper case": "".join(
+            line if "Eigen" in line or "body ref" in line or ":" in line else line.upper()
+            for line in bar().splitlines(keepends=True)
+        ),
+        "begin of, end of": re.sub(r"\bend (\w)", r"end of \1", begins),
+        "backwards": bar(BLOCKS[::-1]),
+    }
+    for name, text in variants.items():
+        assert text != bar(), name
+        assert bits(read(tmp_path, text)) == reference, name
+
+
+def random_data(rng, nq, sigma, J=(6, 1)):
+    """Data without any zero, of every structure but zero."""
+
+    def full(nrow, ncol, order, structure=3):
+        M0 = rng.normal(size=(nrow, ncol))
+        if structure == 2:
+            M0 = M0 + M0.T
+        M0 = {1: np.diag(np.diag(M0)), 4: np.eye(nrow, ncol)}.get(structure, M0)
+        M1 = rng.normal(size=(nrow, nq, ncol)) if order else np.zeros((nrow, nq, ncol))
+        return Taylor(M0, M1, order, structure)
+
+    nodes = tuple(
+        Node(
+            name,
+            "body ref",
+            full(3, 1, 1),
+            full(3, nq, 0),
+            full(3, nq, 1),
+            full(3, 3, 1, 4),
+            full(6, 1, 1) if sigma else None,
+        )
+        for name in ("1", "25", "tip")
+    )
+    shapes = {"mdCM": (3, 1), "J": J, "Gr": (3, 3 * nq), "Ge": (nq, 3 * nq), "Oe": (nq, 6)}
+    shapes |= {"Ct": (nq, 3), "Cr": (nq, 3), "ksigma": (nq, 1)}
+    kinds = {"Me": 2, "Ke": 1, "De": 4}
+    return StandardInputData(
+        mass=rng.uniform(),
+        names=tuple(f"Eigen Mode {k:4d} :  {k}.5 Hz" for k in range(nq)),
+        nodes=nodes,
+        comment="random",
+        **{name: full(*shape, k % 2) for k, (name, shape) in enumerate(shapes.items())},
+        **{name: full(nq, nq, 0, structure) for name, structure in kinds.items()},
+    )
+
+
+@pytest.mark.parametrize(("nq", "sigma", "J"), [(1, False, (6, 1)), (3, True, (3, 3))])
+def test_round_trips_are_exact(tmp_path, nq, sigma, J):
+    data = random_data(np.random.default_rng(nq), nq, sigma, J)
+    write_sid(tmp_path / "a.sid", data)
+    write_sid_npz(tmp_path / "a.sid.npz", data)
+    assert bits(read_sid(tmp_path / "a.sid")) == bits(data)
+    assert bits(read_sid_npz(tmp_path / "a.sid.npz")) == bits(data)
+
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@settings(max_examples=30)
+@given(values=st.lists(numbers, min_size=9, max_size=9), structure=st.integers(0, 4))
+def test_every_number_survives(tmp_path_factory, values, structure):
+    """Denormal and largest numbers, negative zeros, matrices that their structure belies."""
+    tmp_path = tmp_path_factory.mktemp("numbers")
+    data = random_data(np.random.default_rng(0), 3, False)
+    M0 = np.reshape(values, (3, 3))
+    data = replace(data, Ke=Taylor(M0, np.zeros((3, 3, 3)), 0, structure))
+    write_sid(tmp_path / "a.sid", data)
+    again = read_sid(tmp_path / "a.sid").Ke
+    assert again.M0.tobytes() == M0.tobytes()
+    # Only what the matrix is not is called otherwise.
+    assert again.structure == structure or structure in (0, 4)
+
+
+def test_files_of_order_zero_may_have_no_coordinates(tmp_path):
+    """Some programs write nq = 0 where nothing depends on q."""
+    lines = bar().splitlines()
+    lines[lines.index("nq = 2", lines.index("Ge"))] = "nq = 0"
+    data = read(tmp_path, "\n".join(lines))
+    assert data.Ge.M1.shape == (2, 0, 6)
+    write_sid(tmp_path / "b.sid", data)
+    assert bits(read_sid(tmp_path / "b.sid")) == bits(data)
+
+
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [("1.5", 1.5), ("-.5d0", -0.5), ("+2E1", 20.0), ("4", 4.0), ("1.0-100", 1e-100)],
+)
+def test_numbers_of_other_programs(tmp_path, written, value):
+    data = read(tmp_path, bar().replace("m0( 3, 6) = 0.125", f"m0( 3, 6) = {written}"))
+    assert data.Gr.M0[2, 5] == value
+
+
+def test_what_the_writer_prints():
+    data = random_data(np.random.default_rng(2), 2, False)
+    Ct = np.array([[0.1, 0.0, -2.5e-7], [0.0, 0.0, 1.0]])
+    text = sid_text(replace(data, Ct=taylor(Ct, nq=2, structure=3)))
+    lines = text.splitlines()
+    assert lines[0] == "    3    2    :No. nodes, No. modes:random"
+    start = lines.index("           Ct")
+    head = [line.split("=")[1].strip() for line in lines[start + 1 : start + 7]]
+    assert head == ["0", "2", "3", "2", "0", "3"]
+    # 17 digits, Fortran's exponent, the equals sign in column 49.
+    assert lines[start + 7 : start + 11] == [
+        "                          m0( 1, 1)             =  1.0000000000000001D-01",
+        "                          m0( 1, 3)             = -2.4999999999999999D-07",
+        "                          m0( 2, 3)             =  1.0000000000000000D+00",
+        "           end Ct",
+    ]
+    assert {line.index("=") for line in lines if "=" in line} == {48}
+
+
+# -- damaged files ---------------------------------------------------------------------------
+
+
+def edited(old, new, count=1):
+    assert old in bar()
+    return bar().replace(old, new, count)
+
+
+def without(name):
+    return bar([text for text in BLOCKS if not text.startswith(name)])
+
+
+DAMAGED = {
+    "empty": ("", ["line 0", "'part'"]),
+    "not SID": ("x,y\n1,2\n", ["line 2", "the file ends", "'part'"]),
+    "no number": (edited("3.00000000000D+00", "three"), ["line 5", "mass", "a number"]),
+    "nan": (edited("3.00000000000D+00", "nan"), ["line 5", "finite"]),
+    "infinite": (edited("m0( 1, 1) = 50.0", "m0( 1, 1) = 1D999"), ["1D999", "finite"]),
+    "no value": (edited("= 3.00000000000D+00", ""), ["line 5", "a number"]),
+    "no integer": (edited("nelastq                         =   2", "nelastq = 2.5"), ["line 6"]),
+    "too many names": (edited("ielastq (   2)", "ielastq (   3)"), ["line 8", "1..2"]),
+    "no refmod": (edited("           refmod\n", ""), ["line 4", "'refmod'"]),
+    "no mass": (edited("mass        ", "weight        "), ["line 5", "'mass'", "weight"]),
+    "unknown block": (edited("\nCt\n", "\nCx\n"), ["Cx", "'Ct'", "'end modal'"]),
+    "missing block": (without("Oe"), ["'Oe' before", "end modal"]),
+    "twice": (bar([*BLOCKS, BLOCKS[2]]), ["'Ct'", "only once"]),
+    "wrong end": (edited("end Ct", "end Cr"), ["end Cr", "'end Ct'"]),
+    "row": (edited("m0( 1, 2) = 1.0", "m0( 3, 2) = 1.0"), ["m0( 3, 2)", "(1..2, 1..3)"]),
+    "zeroth row": (edited("m0( 1, 2) = 1.0", "m0( 0, 2) = 1.0"), ["(1..2, 1..3)"]),
+    "two indices": (edited("m1( 1, 2, 3)", "m1( 1, 3)"), ["m1( 1, 3)", "(1..2, 1..2, 1..3)"]),
+    "entry twice": (edited("m0( 2, 2) = 2.6", "m0( 2, 1) = 2.6"), ["only once"]),
+    "no structure": (edited("structure = 4\nend Me", "end Me"), ["'structure' of Me"]),
+    "structure 5": (edited("structure = 4\nend Me", "structure = 5\nend Me"), ["0 to 4"]),
+    "order 2": (edited("order = 1", "order = 2"), ["order = 2", "0 to 1"]),
+    "m1 of order 0": (edited("m0( 3, 6) = 0.125", "m1( 3, 1, 6) = 1"), ["m1", "order 0"]),
+    "m0 of a zero": (edited("structure = 0\nend ks", "structure=0\nm0(1,1)=1\nend ks"), ["zero"]),
+    "dimension": (edited("nrow = 6", "nrow = 5"), ["end J", "6 x 1 or 3 x 3", "5 x 1"]),
+    "coordinates": (edited("nq = 2", "nq = 3"), ["nq = 2 of mdCM, not 3"]),
+    "early entry": (edited("nqn = 0\nstructure = 3\nm0( 1, 1)", "m0( 1, 1)"), ["before"]),
+    "node without phi": (
+        re.sub(r" +phi\n.*end phi\n", "", bar(), flags=re.DOTALL),
+        ["'phi' of node 17 before", "end node"],
+    ),
+    "node without a name": (edited("=       17", "="), ["line 11", "a name of its own"]),
+    "higher order": (edited("nqn = 0", "nqn = 4"), ["nqn = 4", "0 to 0"]),
+    "no modal": (" part\n end part\n", ["line 2", "'new modal'"]),
+    "unfinished": (bar()[:-20], ["the file ends", "'end modal'"]),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_file(tmp_path, name):
+    text, words = DAMAGED[name]
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    message = str(caught.value)
+    assert "\n" not in message and message.startswith(f"{tmp_path / 'bar.SID_FEM'}, line ")
+    for word in words:
+        assert word in message, message
+
+
+def test_no_damage_goes_unsaid(tmp_path):
+    """A file that ends anywhere is refused; so is one with a line of nonsense anywhere."""
+    lines = bar().splitlines()
+    for cut in range(len(lines)):
+        with pytest.raises(InputError, match=f"line {cut}: the file ends, expected"):
+            read(tmp_path, "\n".join(lines[:cut]))
+    for place in range(1, len(lines)):
+        for nonsense in ("m0( 1, 1", "= 3", "end", "\x00\ufffd"):
+            text = "\n".join([*lines[:place], nonsense, *lines[place:]])
+            if place == 1:  # still the comment
+                assert read(tmp_path, text).mass == 3.0
+                continue
+            with pytest.raises(InputError, match=f"line {place + 1}: found"):
+                read(tmp_path, text)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(InputError, match=r"none\.sid: cannot be read .*SID"):
+        read_sid(tmp_path / "none.sid")
+    with pytest.raises(InputError, match=r"none\.npz: cannot be read"):
+        read_sid_npz(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("no archive")
+    with pytest.raises(InputError, match=r"text\.npz: cannot be read"):
+        read_sid_npz(tmp_path / "text.npz")
+    np.savez(tmp_path / "other.npz", mass=1.0)
+    with pytest.raises(InputError, match=r"other\.npz: the array '\w+' is missing"):
+        read_sid_npz(tmp_path / "other.npz")

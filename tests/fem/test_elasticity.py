@@ -1,0 +1,393 @@
+"""Element operators, K(x) and M(x), the factorised interior, and the energies of cells."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import dolfinx.fem.petsc
+import numpy as np
+import pytest
+import scipy.linalg
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from dolfinopt.errors import InputError
+from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.profiling import Ledger
+
+COMM = MPI.COMM_WORLD
+LENGTH, HEIGHT, THICKNESS = 1.0, 0.2, 0.01  # m
+POISSON = 0.33
+YOUNG, DENSITY = 70e9, 2700.0  # Pa, kg/m3
+G = YOUNG / (2.0 * (1.0 + POISSON))  # Pa
+# Sums of a few thousand rounded terms; measured: 1e-15 to 1e-13.
+ROUNDING = 1e-12
+
+
+def make_mesh(cells=(8, 3), comm=COMM, distort=None):
+    """Return an arm; `distort` displaces its points, (n, 2) -> (n, 2), the same on all ranks."""
+    mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
+    if distort is not None:
+        points = mesh.mesh.geometry.x
+        points[:, :2] += distort(points[:, :2])
+    return mesh
+
+
+def bulge(points):
+    """Move interior points only: the arm stays a rectangle, its cells no longer are."""
+    x, y = points.T
+    inside = np.sin(np.pi * x / LENGTH) * np.cos(np.pi * y / HEIGHT)
+    return np.stack([0.04 * inside * np.cos(7.0 * x), 0.02 * inside * np.sin(9.0 * x + y)], axis=1)
+
+
+def make_arm(mesh, degree=1):
+    return ElasticArm(mesh, element_operators(mesh, THICKNESS, POISSON, degree), Ledger())
+
+
+def rough_design(mesh):
+    """Return Young's modulus and density that vary by orders of magnitude from cell to cell."""
+    place = np.round(mesh.centroid, 9)
+    x = 0.5 + 0.499 * np.sin(1e3 * place[:, 0] + 5e3 * place[:, 1])
+    return YOUNG * x**3, DENSITY * x
+
+
+def rough_field(points, columns=1):
+    """Return nodal fields (n, 2, columns) without structure, the same on any number of ranks."""
+    place = np.round(points, 9)
+    k = np.arange(1, columns + 1)
+    phase = place[:, 0, None] * (37.0 + 11.0 * k) + place[:, 1, None] * (101.0 - 7.0 * k)
+    return np.stack([np.sin(phase), np.cos(1.7 * phase + k)], axis=1)
+
+
+def energy(arm, field):
+    """Return u' K u over all ranks, N m."""
+    return arm.comm.allreduce(float(np.vdot(field, arm.stiffness_times(field))))
+
+
+def owned_rows(arm, field):
+    """Add up the contributions of all ranks to a nodal field (n_nodes, 2); return owned rows."""
+    total = fem.Function(arm.operators.space)
+    total.x.array[:] = field.ravel()
+    compat.scatter_reverse_add(total)
+    owned = arm.operators.space.dofmap.index_map.size_local
+    return total.x.array[: 2 * owned].reshape(owned, 2).copy()
+
+
+# -- element matrices -----------------------------------------------------------------------------
+
+
+def q4_matrices(corners):
+    """Return stiffness (8, 8) and mass (4, 4) by hand: bilinear, 2 x 2 Gauss points, E = rho = 1.
+
+    Corners (4, 2) in tensor-product order.
+    """
+    elastic = np.array([[1.0, POISSON, 0.0], [POISSON, 1.0, 0.0], [0.0, 0.0, 0.5 * (1 - POISSON)]])
+    elastic /= 1.0 - POISSON**2
+    k, m = np.zeros((8, 8)), np.zeros((4, 4))
+    gauss = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])
+    for a in gauss:
+        for b in gauss:
+            shape = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+            local = np.array([[b - 1, 1 - b, -b, b], [a - 1, -a, 1 - a, a]])
+            jacobian = local @ corners
+            weight = 0.25 * abs(np.linalg.det(jacobian)) * THICKNESS
+            slope = np.linalg.solve(jacobian, local)
+            strain = np.zeros((3, 8))
+            strain[0, 0::2] = strain[2, 1::2] = slope[0]
+            strain[1, 1::2] = strain[2, 0::2] = slope[1]
+            k += weight * strain.T @ elastic @ strain
+            m += weight * np.outer(shape, shape)
+    return k, m
+
+
+@pytest.mark.parametrize("shear", [0.0, 0.4])
+def test_element_matrices_against_hand_coded_quadrilateral(shear):
+    # On parallelograms 2 x 2 points integrate both matrices exactly, as FFCx does.
+    mesh = make_mesh((5, 2), distort=lambda x: np.stack([shear * x[:, 1], 0.1 * x[:, 0]], axis=1))
+    operators = element_operators(mesh, THICKNESS, POISSON)
+    assert np.allclose(operators.points[operators.cells], _corners(mesh), atol=1e-15)
+    assert len(operators.cells) == mesh.num_cells
+    for corners, k_e, m_e in zip(_corners(mesh), operators.stiffness, operators.mass):
+        k, m = q4_matrices(corners)
+        assert np.abs(k_e - k).max() < 1e-12 * np.abs(k).max()
+        assert np.abs(m_e - m).max() < 1e-12 * np.abs(m).max()
+
+
+def _corners(mesh):
+    return compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
+
+
+def test_rectangular_cells_have_consistent_mass_in_closed_form():
+    mesh = make_mesh((5, 2))
+    operators = element_operators(mesh, THICKNESS, POISSON)
+    line = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6.0
+    volume = LENGTH * HEIGHT * THICKNESS / 10.0
+    # Gmsh places points to 2e-12 of the length.
+    assert np.allclose(operators.mass, volume * np.kron(line, line), rtol=1e-10)
+
+
+# -- stiffness and mass ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("distort", [None, bulge], ids=["rectangles", "distorted"])
+def test_patch(distort, degree):
+    """A linear displacement gives constant strain: exact energy and, in tension, no inner force."""
+    arm = make_arm(make_mesh(distort=distort), degree)
+    arm.set_design(np.full(arm.mesh.num_cells, YOUNG), np.full(arm.mesh.num_cells, DENSITY))
+    volume = LENGTH * HEIGHT * THICKNESS
+    for slope in ([[1e-3, 2e-3], [-5e-4, 7e-4]], [[1e-3, 0.0], [0.0, -POISSON * 1e-3]]):
+        slope = np.array(slope)
+        field = (arm.points @ slope.T)[:, :, None]
+        far = field + np.array([0.3, -0.2])[:, None]
+        strain = 0.5 * (slope + slope.T)
+        plane = (1 - POISSON) * strain + POISSON * np.trace(strain) * np.eye(2)
+        stress = YOUNG / (1 - POISSON**2) * plane
+        exact = volume * np.vdot(stress, strain)
+        assert energy(arm, field) == pytest.approx(exact, rel=ROUNDING)
+        # A translation 300 times the displacement costs the square of that if it is not removed
+        # cell by cell: 1e-9 then, measured.
+        assert arm.energy_matrix(far)[0, 0] == pytest.approx(exact, rel=ROUNDING)
+    # The last is uniaxial: upper and lower edges are free of stress, the ends carry all.
+    forces, outboard = arm.restrict(arm.stiffness_times(field))
+    pull = stress[0, 0] * HEIGHT * THICKNESS
+    assert np.abs(forces).max(initial=0.0) < ROUNDING * pull
+    assert outboard[:, 0] == pytest.approx([pull, 0.0, 0.0], abs=ROUNDING * pull)
+
+
+def test_quadratic_elements_bend_exactly():
+    """Pure bending u = -k x y, v = k (x^2 + nu y^2) / 2: u'Ku = E I L k^2."""
+    arm = make_arm(make_mesh((3, 1)), degree=2)
+    arm.set_design(np.full(arm.mesh.num_cells, YOUNG), np.full(arm.mesh.num_cells, DENSITY))
+    curvature = 1e-2  # 1/m
+    x, y = arm.points.T
+    field = curvature * np.stack([-x * y, 0.5 * (x**2 + POISSON * y**2)], axis=1)
+    inertia = THICKNESS * HEIGHT**3 / 12.0
+    exact = YOUNG * inertia * LENGTH * curvature**2
+    # Gmsh places points to 2e-12 of the length. Measured: 8e-15.
+    assert arm.energy_matrix(field[:, :, None])[0, 0] == pytest.approx(exact, rel=1e-10)
+
+
+@pytest.mark.parametrize("distort", [None, bulge], ids=["rectangles", "distorted"])
+def test_rigid_motions_and_nothing_else_are_free_of_energy(distort):
+    arm = make_arm(make_mesh(comm=MPI.COMM_SELF, distort=distort))
+    arm.set_design(*rough_design(arm.mesh))
+    size = 2 * len(arm.points)
+    K = arm.stiffness_times(np.eye(size).reshape(-1, 2, size)).reshape(size, size)
+    assert np.abs(K - K.T).max() < ROUNDING * np.abs(K).max()
+    x, y = arm.points.T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    rigid = np.stack([[one, none], [none, one], [-y, x]]).transpose(2, 1, 0)
+    assert np.abs(arm.stiffness_times(rigid)).max() < ROUNDING * np.abs(K).max()
+    values = scipy.linalg.eigvalsh(0.5 * (K + K.T))
+    assert np.abs(values[:3]).max() < ROUNDING * values[-1]
+    # The weakest cells are 1e-9 of the stiffest: far above rounding, so the gap is clear.
+    assert values[3] > 1e3 * np.abs(values[:3]).max()
+
+
+@pytest.mark.parametrize("distort", [None, bulge], ids=["rectangles", "distorted"])
+def test_matrices_against_assembly_of_the_forms(distort):
+    """K(x) v and M(x) v against DOLFINx's own assembly with modulus and density as fields."""
+    mesh = make_mesh(distort=distort)
+    arm = make_arm(mesh)
+    young, density = rough_design(mesh)
+    arm.set_design(young, density)
+    space = arm.operators.space
+    constant = getattr(fem, "functionspace", fem.FunctionSpace)(mesh.mesh, ("DG", 0))
+    E, rho = fem.Function(constant), fem.Function(constant)
+    E.x.array[: mesh.num_cells], rho.x.array[: mesh.num_cells] = young, density
+    u, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+
+    def strain(a):
+        return ufl.sym(ufl.grad(a))
+
+    lame = E * POISSON / (1 - POISSON**2)
+    stress = lame * ufl.tr(strain(u)) * ufl.Identity(2) + E / (1 + POISSON) * strain(u)
+    forms = (
+        (THICKNESS * ufl.inner(stress, strain(v)) * ufl.dx, arm.stiffness_times),
+        (THICKNESS * rho * ufl.inner(u, v) * ufl.dx, arm.mass_times),
+    )
+    fields = rough_field(arm.points, columns=3)
+    for form, product in forms:
+        matrix = dolfinx.fem.petsc.assemble_matrix(fem.form(form))
+        matrix.assemble()
+        right, left = matrix.createVecs()
+        ours = product(fields)
+        for k in range(fields.shape[2]):
+            right.array = fields[: right.getLocalSize() // 2, :, k].ravel()
+            matrix.mult(right, left)
+            expected = left.array_r.reshape(-1, 2)
+            difference = owned_rows(arm, ours[:, :, k]) - expected
+            # The forms' factors meet in another order: rounding only.
+            scale = COMM.allreduce(np.abs(expected).max(initial=0.0), MPI.MAX)
+            assert np.abs(difference).max(initial=0.0) < ROUNDING * scale
+
+
+def test_energies_of_cells_and_columns():
+    arm = make_arm(make_mesh())
+    young, density = rough_design(arm.mesh)
+    arm.set_design(young, density)
+    fields = rough_field(arm.points, columns=4)
+    products = arm.stiffness_times(fields)
+    energies = COMM.allreduce(np.einsum("nik,nil->kl", fields, products))
+    matrix = arm.energy_matrix(fields)
+    assert np.array_equal(matrix, matrix.T)
+    assert np.abs(matrix - energies).max() < ROUNDING * np.abs(energies).max()
+    left, right = fields[:, :, :2], fields[:, :, 2:]
+    cells = arm.cell_stiffness_products(left, right)
+    total = COMM.allreduce(float(young @ cells))
+    assert total == pytest.approx(np.trace(energies[:2, 2:]), rel=ROUNDING * 100)
+    # The derivative with respect to one cell's modulus is that cell's own energy.
+    for cell in range(0, arm.mesh.num_cells, 5):
+        alone = np.zeros(arm.mesh.num_cells)
+        alone[cell] = 1.0
+        arm._young = alone
+        values = arm._on_cells(left)[cell], arm._on_cells(right)[cell]
+        one = np.sum(values[0] * (arm.operators.stiffness[cell] @ values[1]))
+        assert cells[cell] == pytest.approx(one, rel=ROUNDING)
+
+
+# -- the reduced structure ------------------------------------------------------------------------
+
+
+def test_interfaces_and_dofs():
+    arm = make_arm(make_mesh((8, 3)))
+    assert np.allclose(arm.points[arm.inboard, 0], 0.0, atol=1e-9)
+    assert np.allclose(arm.points[arm.outboard, 0], LENGTH, atol=1e-9)
+    owned = arm.operators.space.dofmap.index_map.size_local
+    counts = np.array([arm.inboard[:owned].sum(), arm.outboard[:owned].sum(), arm.num_interior])
+    assert COMM.allreduce(counts).tolist() == [4, 4, 2 * 7 * 4]
+    assert arm.num_dofs == 2 * 7 * 4 + 3
+    assert (arm.inboard == (arm.points[:, 0] < 1e-9)).all()
+    assert (arm.outboard == (arm.points[:, 0] > LENGTH - 1e-9)).all()
+
+
+def test_expand_moves_the_outboard_interface_rigidly():
+    arm = make_arm(make_mesh())
+    field = arm.expand(np.zeros((arm.num_interior, 3)), np.eye(3))
+    assert np.array_equal(field, arm.rigid)
+    x, y = arm.points[arm.outboard].T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    expected = np.stack([[one, none], [none, one], [-y, x - LENGTH]]).transpose(2, 1, 0)
+    assert np.allclose(field[arm.outboard], expected, atol=1e-15)
+    assert not field[~arm.outboard].any()
+
+
+def test_expand_and_restrict_are_transposes():
+    arm = make_arm(make_mesh())
+    rng = np.random.default_rng(COMM.rank)
+    interior = rng.normal(size=(arm.num_interior, 2))
+    outboard = np.array([[1.0, -0.4], [0.3, 2.0], [-0.7, 0.1]])
+    forces = rng.normal(size=(len(arm.points), 2, 2))  # of this rank's cells alone
+    below, beyond = arm.restrict(forces)
+    field = arm.expand(interior, outboard)
+    left = COMM.allreduce(float(np.vdot(field, forces)))
+    right = COMM.allreduce(float(np.vdot(interior, below))) + float(np.vdot(outboard, beyond))
+    assert left == pytest.approx(right, abs=ROUNDING * 100)
+    assert not arm.expand(interior, outboard)[arm.inboard].any()
+
+
+def test_expand_gives_ghosts_their_owners_values():
+    arm = make_arm(make_mesh())
+    values = rough_field(arm.points)
+    interior = values[arm.interior_nodes].reshape(-1, 1)
+    field = arm.expand(interior, np.zeros((3, 1)))
+    inside = ~(arm.inboard | arm.outboard)
+    assert np.array_equal(field[inside], values[inside])
+
+
+def test_solution_of_the_interior_satisfies_the_assembled_equations():
+    arm = make_arm(make_mesh((20, 4)))
+    arm.set_design(*rough_design(arm.mesh))
+    right = rough_field(arm.points, columns=3)[arm.interior_nodes].reshape(-1, 3)
+    u = arm.solve(right)
+    field = arm.expand(u, np.zeros((3, 3)))
+    residual = arm.restrict(arm.stiffness_times(field))[0] - right
+    # A backward stable solve leaves unit roundoff times |K| |u| (and 840 unknowns).
+    stiff = arm.operators.stiffness * arm._young[:, None, None]
+    norm = COMM.allreduce(np.abs(stiff).sum(axis=2).max(initial=0.0), MPI.MAX)
+    size = COMM.allreduce(np.abs(u).max(initial=0.0), MPI.MAX)
+    assert np.abs(residual).max(initial=0.0) < 1e-14 * norm * size
+    # The PETSc matrices hold the same.
+    for mat, product in (
+        (arm.interior_stiffness(), arm.stiffness_times),
+        (arm.interior_mass(), arm.mass_times),
+    ):
+        x, y = mat.createVecs()
+        x.array = right[:, 0]
+        mat.mult(x, y)
+        expected = arm.restrict(product(arm.expand(right[:, :1], np.zeros((3, 1)))))[0][:, 0]
+        scale = COMM.allreduce(np.abs(expected).max(initial=0.0), MPI.MAX)
+        assert np.abs(y.array_r - expected).max(initial=0.0) < ROUNDING * scale
+
+
+def test_nothing_is_assembled_or_factorised_twice_for_a_design():
+    arm = make_arm(make_mesh((6, 2)))
+    counts = arm.ledger.counts
+    assert dataclasses.asdict(counts) == dict.fromkeys(dataclasses.asdict(counts), 0)
+    young, density = rough_design(arm.mesh)
+    right = np.ones((arm.num_interior, 2))
+
+    def work():
+        """Ask for everything, twice."""
+        for _ in range(2):
+            arm.solve(right)
+            arm.interior_mass()
+            arm.interior_stiffness()
+            arm.mass_times(arm.rigid)
+            arm.energy_matrix(arm.rigid)
+
+    def tally():
+        return counts.assemblies, counts.factorisations, counts.solves
+
+    arm.set_design(young, density)
+    assert tally() == (1, 0, 0)  # no mass before it is asked for
+    work()
+    assert tally() == (2, 1, 4)
+    arm.set_design(young.copy(), density.copy())
+    work()
+    assert tally() == (2, 1, 8)
+    arm.set_design(2.0 * young, density)
+    work()
+    assert tally() == (3, 2, 12)
+    arm.set_design(2.0 * young, 3.0 * density)
+    work()
+    assert tally() == (4, 2, 16)
+
+
+def test_a_new_design_leaves_nothing_of_the_old():
+    """The kept pattern, symbolic factor and shared arrays give what a fresh arm gives."""
+    mesh = make_mesh((10, 3))
+    used, fresh = make_arm(mesh), make_arm(mesh)
+    young, density = rough_design(mesh)
+    right = rough_field(used.points)[used.interior_nodes].reshape(-1, 1)
+    used.set_design(np.full_like(young, YOUNG), np.full_like(density, DENSITY))
+    used.solve(right)
+    used.interior_mass()
+    young_before = young.copy()
+    for arm in (used, fresh):
+        arm.set_design(young, density)
+    u, expected = used.solve(right), fresh.solve(right)
+    # One operation after the other is the same on one rank; MUMPS may add in another order.
+    scale = COMM.allreduce(np.abs(expected).max(initial=0.0), MPI.MAX)
+    assert np.abs(u - expected).max(initial=0.0) < 1e-10 * scale
+    mass, other = used.interior_mass(), fresh.interior_mass()
+    mass.axpy(-1.0, other)
+    assert mass.norm() < ROUNDING * other.norm()
+    # The arm keeps its own copy of the design.
+    young *= 2.0
+    assemblies = used.ledger.counts.assemblies
+    used.set_design(young_before, density)
+    assert used.ledger.counts.assemblies == assemblies
+
+
+def test_missing_interface_is_named():
+    mesh = make_mesh((3, 1))
+    none = np.empty(0, dtype=np.int32)
+    for side in ("inboard", "outboard"):
+        lacking = dataclasses.replace(mesh, **{f"{side}_facets": none})
+        with pytest.raises(InputError, match=rf"arm 'arm'.*group '{side}'"):
+            make_arm(lacking)

@@ -1,0 +1,99 @@
+"""What does not fit the memory is refused before it is meshed."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.arms.arm import build_arms
+from dolfinopt.errors import InputError
+from dolfinopt.mesh import budget
+from dolfinopt.mesh.budget import check_budget, estimated_cells, free_memory
+from dolfinopt.parallel import share_arms
+from dolfinopt.profiling import Ledger
+from dolfinopt.scene.load import Arm, load_scene
+
+ROOT = Path(__file__).parents[2]
+SCENE = ROOT / "demos" / "two_arm.toml"
+COMM = MPI.COMM_WORLD
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["arms.cells=[100000,100000]", ["arms.mesh=meshes/arm_bores.geo", "arms.mesh_size=1e-6"]],
+)
+def test_what_exceeds_the_memory_is_refused(override):
+    scene = load_scene(SCENE, [override] if isinstance(override, str) else override)
+    for attempt in (
+        lambda: check_budget(COMM, scene),
+        lambda: build_arms(scene, share_arms(COMM, scene.cell_counts), Ledger()),
+    ):
+        with pytest.raises(InputError) as caught:
+            attempt()
+        assert re.search(
+            r"two_arm.toml: about \S+ cells need \S+ GB of memory, where \S+ GB are free, and "
+            r"\S+ days for every iteration; take fewer arms.cells",
+            str(caught.value),
+        )
+
+
+@pytest.mark.parametrize(("free", "fits"), [(2.6e9, True), (2.0e9, False)])
+def test_estimate_is_what_was_measured(monkeypatch, free, fits):
+    """2.28 GB beyond the libraries for two arms of 1600 x 96 cells on one rank."""
+    monkeypatch.setattr(budget, "free_memory", lambda: free + budget.PROCESS * (COMM.size - 1))
+    scene = load_scene(SCENE, ["arms.cells=[1600,96]"])
+    if fits:
+        check_budget(COMM, scene)
+        return
+    with pytest.raises(InputError, match=re.escape("about 3.07e+05 cells need 2.")):
+        check_budget(COMM, scene)
+
+
+def test_cells_of_files_are_estimated():
+    keys = {"name": "a", "length": 1.0, "height": 0.06, "thickness": 0.01}
+    assert estimated_cells(Arm(**keys, mesh="a.step")) == 2400  # a twelfth of the height
+    assert estimated_cells(Arm(**keys, mesh="a.step", mesh_size=1e-3)) == 60_000
+    triangles = Arm(**keys, mesh="a.geo", mesh_size=1e-3, cell_shape="triangle")
+    assert estimated_cells(triangles) == 120_000
+    assert estimated_cells(Arm(**keys, mesh="a.geo")) == 0
+    assert estimated_cells(Arm(**keys, cells=(7, 3))) == 21
+
+
+def write(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.mark.serial
+def test_free_memory(tmp_path):
+    proc, cgroup = tmp_path / "proc", tmp_path / "cgroup"
+    assert free_memory(proc, cgroup) == math.inf
+    write(proc / "meminfo", "MemTotal: 8000000 kB\nMemAvailable:    4000000 kB\n")
+    assert free_memory(proc, cgroup) == 4000000 * 1024
+    write(proc / "self" / "cgroup", "0::/outer/inner\n")
+    assert free_memory(proc, cgroup) == 4000000 * 1024
+    for folder, limit, used in (("outer", "3000", "1000"), ("outer/inner", "max", "500")):
+        write(cgroup / folder / "memory.max", f"{limit}\n")
+        write(cgroup / folder / "memory.current", f"{used}\n")
+        write(cgroup / folder / "memory.stat", "anon 5\ninactive_file 100\n")
+    assert free_memory(proc, cgroup) == 2100
+    write(proc / "self" / "cgroup", "9:cpu:/a\n4:memory:/host/path\n")
+    write(cgroup / "memory" / "memory.limit_in_bytes", "1000")
+    write(cgroup / "memory" / "memory.usage_in_bytes", "1200")
+    write(cgroup / "memory" / "memory.stat", "total_inactive_file 50\n")
+    assert free_memory(proc, cgroup) == 0
+
+
+@pytest.mark.serial
+def test_command_ends_before_it_writes(tmp_path):
+    words = [sys.executable, "-m", "dolfinopt", "optimize", SCENE, "--out", tmp_path / "out"]
+    words += ["--set", "arms.cells=[100000,100000]"]
+    run = subprocess.run(list(map(str, words)), capture_output=True, text=True)
+    assert run.returncode == 2 and not (tmp_path / "out").exists()
+    assert len(run.stderr.splitlines()) == 1 and "GB are free" in run.stderr

@@ -1,0 +1,721 @@
+"""Geometry files: arms with bores, a user's own, and one line for each that cannot be an arm."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
+from dolfinopt.mesh import compat, geometry
+from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.mesh.geometry import FlatMesh, _joint_curves, check_mesh, gmsh_on_root
+from dolfinopt.mesh.step import read_shapes
+from dolfinopt.scene.load import Arm
+
+COMM = MPI.COMM_WORLD
+BORES = str(mesh_folder() / "arm_bores.geo")
+LENGTH, HEIGHT = 0.5, 0.06  # m
+BORE = HEIGHT / 6.0  # m, the file's default
+SHAPES = ["quadrilateral", "triangle"]
+SIDES = {"quadrilateral": 4, "triangle": 3}
+
+
+def entry(mesh, **keys):
+    keys = {"length": LENGTH, "height": HEIGHT, "thickness": 1.0} | keys
+    return Arm(name="a", mesh=str(mesh), **keys)
+
+
+def bores(**keys):
+    return arm_mesh(COMM, entry(BORES, **keys))
+
+
+def collect(values):
+    return np.concatenate(COMM.allgather(values))
+
+
+def corners(mesh):
+    """Return the corners (n, 3 or 4, 2) of this rank's cells."""
+    return compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
+
+
+def facet_nodes(mesh, facets):
+    """Return the coordinates (n, 2) of all ranks' nodes of facets."""
+    space = compat.lagrange_space(mesh.mesh, 1)
+    from dolfinx.fem import locate_dofs_topological
+
+    nodes = locate_dofs_topological(space, 1, facets.astype(np.int32))
+    return collect(space.tabulate_dof_coordinates()[nodes, :2])
+
+
+# --- the arm with bores ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("passive", "ring"), [(0.0, HEIGHT / 8.0), (0.012, 0.012)])
+def test_bores_are_interfaces_in_solid_rings(shape, passive, ring):
+    mesh = bores(mesh_size=0.006, cell_shape=shape, passive=passive)
+    assert corners(mesh).shape[1] == SIDES[shape]
+    for facets, x in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, LENGTH)):
+        radius = np.linalg.norm(facet_nodes(mesh, facets) - [x, 0.0], axis=1)
+        assert len(radius) >= 16
+        assert np.abs(radius - BORE).max() < 1e-9  # Gmsh's points on circles: 1e-11
+    centroid = collect(mesh.centroid)
+    axis = np.where(centroid[:, 0] < 0.5 * LENGTH, 0.0, LENGTH)
+    radius = np.hypot(centroid[:, 0] - axis, centroid[:, 1])
+    assert np.array_equal(collect(mesh.passive), radius < BORE + ring)
+    points = collect(corners(mesh)).reshape(-1, 2)
+    half = 0.5 * HEIGHT
+    np.testing.assert_allclose(points.min(axis=0), [-half, -half], atol=1e-9)
+    np.testing.assert_allclose(points.max(axis=0), [LENGTH + half, half], atol=1e-9)
+    assert np.array_equal(mesh.outboard_point, [LENGTH, 0.0])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_area_of_the_arm_with_bores_converges(shape):
+    """Polygons in place of circles: order 2."""
+    exact = LENGTH * HEIGHT + np.pi * (0.25 * HEIGHT**2 - 2.0 * BORE**2)
+    sizes = HEIGHT / np.array([6.0, 12.0, 24.0])
+    meshes = [bores(mesh_size=size, cell_shape=shape) for size in sizes]
+    errors = [abs(COMM.allreduce(mesh.area.sum()) / exact - 1.0) for mesh in meshes]
+    assert errors[-1] < 1e-4  # 4.2e-5
+    assert 1.7 < np.polyfit(np.log(sizes), np.log(errors), 1)[0] < 2.3  # 1.93
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_mesh_size_is_the_size_of_cells(shape):
+    for size in (0.01, 0.005):
+        mesh = bores(mesh_size=size, cell_shape=shape)
+        middle = np.abs(mesh.centroid[:, 0] - 0.5 * LENGTH) < 0.25 * LENGTH
+        typical = np.median(collect(mesh.area[middle])) / (0.5 if shape == "triangle" else 1.0)
+        assert 0.6 < np.sqrt(typical) / size < 1.1  # equilateral triangles: sqrt(0.87)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_mesh_with_bores_is_its_mirror_image(shape):
+    from scipy.spatial import cKDTree
+
+    centroid = collect(bores(mesh_size=0.01, cell_shape=shape).centroid)
+    distance, pair = cKDTree(centroid).query(centroid * [1.0, -1.0])
+    assert distance.max() < 1e-7 * HEIGHT  # Gmsh places points of curves to 1e-9 of their length
+    assert np.array_equal(pair[pair], np.arange(len(pair)))
+
+
+@pytest.mark.parametrize(
+    ("keys", "reason"),
+    [
+        ({"passive": 0.02}, "do not fit into half the height, 0.03 m"),
+        ({"length": 0.05}, "overlap within the length 0.05 m"),
+    ],
+)
+def test_bores_that_do_not_fit(keys, reason):
+    assert reason in message(BORES, **keys)
+
+
+# --- a user's own files ----------------------------------------------------------------------
+
+PLAIN = """
+Point(1) = {0, -0.03, 0, 0.02}; Point(2) = {0.5, -0.03, 0, 0.02};
+Point(3) = {0.5, 0.03, 0, 0.02}; Point(4) = {0, 0.03, 0, 0.02};
+Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+"""
+TIP = """
+Point(5) = {0.52, 0.01, 0, 0.02}; Point(6) = {0.52, -0.01, 0, 0.02};
+Line(5) = {2, 6}; Line(6) = {6, 5}; Line(7) = {5, 3};
+Curve Loop(2) = {5, 6, 7, -2}; Plane Surface(2) = {2};
+"""
+MILLIMETRES = re.sub(r"\b0\.\d+", lambda m: str(1e3 * float(m[0])), PLAIN)
+ENDS = 'Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};\n'
+
+
+@pytest.fixture
+def write(shared_tmp_path):
+    """Return a function that writes a text file on the root and returns its path on all ranks."""
+
+    def write(name, text):
+        path = shared_tmp_path / name
+        if COMM.rank == 0:
+            path.write_text(text + "\n")  # Gmsh ignores a last statement without it
+        COMM.barrier()
+        return path
+
+    return write
+
+
+def gmsh_writes(path, make):
+    """Let Gmsh on the root write what `make(gmsh)` makes; return the path on all ranks."""
+    with gmsh_on_root(COMM) as gmsh:
+        if COMM.rank == 0:
+            make(gmsh)
+            gmsh.write(str(path))
+    COMM.barrier()
+    return path
+
+
+def figures(mesh):
+    """Return number of cells, area, solid area, lines of each interface: of all ranks."""
+    owned = mesh.mesh.topology.index_map(1).size_local
+    lines = [(mesh.inboard_facets < owned).sum(), (mesh.outboard_facets < owned).sum()]
+    parts = [mesh.num_cells, mesh.area.sum(), mesh.area[mesh.passive].sum(), *lines]
+    return COMM.allreduce(np.array(parts))
+
+
+def test_own_geometry_without_parameters(write):
+    """Groups in capitals; no group "design": all other surfaces are designed."""
+    groups = ENDS.upper().replace("PHYSICAL CURVE", "Physical Curve")
+    path = write("own.geo", PLAIN + TIP + groups + 'Physical Surface("passive") = {2};')
+    _, area, solid, inboard, outboard = figures(arm_mesh(COMM, entry(path)))
+    assert area == pytest.approx(0.03 + 0.02 * 0.04, rel=1e-9)
+    assert solid == pytest.approx(0.02 * 0.04, rel=1e-9)
+    assert inboard == outboard == 3
+    quads = figures(arm_mesh(COMM, entry(path, cell_shape="quadrilateral")))
+    assert quads[1:3] == pytest.approx([area, solid], rel=1e-9)
+
+
+def test_surfaces_in_no_group_are_left_out_if_there_is_a_design(write):
+    path = write("own.geo", PLAIN + TIP + ENDS + 'Physical Surface("design") = {1};')
+    assert figures(arm_mesh(COMM, entry(path)))[1:3] == pytest.approx([0.03, 0.0], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["passive2", "Passive boss", "PASSIVE_left"])
+def test_groups_are_told_by_how_their_names_begin(write, name):
+    path = write("own.geo", PLAIN + TIP + ENDS + f'Physical Surface("{name}") = {{2}};')
+    mesh = arm_mesh(COMM, entry(path))
+    assert figures(mesh)[2] == pytest.approx(0.02 * 0.04, rel=1e-9)
+    assert mesh.notes == ()
+
+
+def test_unknown_groups_of_surfaces_are_listed(write):
+    groups = 'Physical Surface("boss") = {2}; Physical Surface("web") = {1};'
+    mesh = arm_mesh(COMM, entry(write("own.geo", PLAIN + TIP + ENDS + groups)))
+    assert figures(mesh)[2] == 0.0
+    assert len(mesh.notes) == 1
+    assert 'surfaces named "boss", "web" are no group' in mesh.notes[0]
+
+
+def test_unknown_products_are_listed(shared_tmp_path):
+    path = step_file(shared_tmp_path / "arm.step", arm=plate, bush=ring)
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004))
+    assert not mesh.passive.any()
+    assert len(mesh.notes) == 1 and '"arm", "bush"' in mesh.notes[0]
+
+
+def test_passive_cells_lie_within_passive_of_an_interface(write):
+    """The rule of the rectangular arm, where the file has no parameter for it."""
+    mesh = arm_mesh(COMM, entry(write("own.geo", PLAIN + ENDS), passive=0.07))
+    x = mesh.centroid[:, 0]
+    assert np.array_equal(mesh.passive, np.minimum(x, LENGTH - x) < 0.07)
+    assert 0 < COMM.allreduce(int(mesh.passive.sum())) < COMM.allreduce(mesh.num_cells)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("version", [2.2, 4.1])
+def test_mesh_file_holds_what_its_geometry_did(shared_tmp_path, shape, version):
+    def make(gmsh):
+        gmsh.onelab.setNumber("Parameters/1 length (m)", [LENGTH])
+        gmsh.onelab.setNumber("Parameters/3 mesh size (m)", [0.01])
+        gmsh.onelab.setNumber("Parameters/6 cell shape", [float(shape == "quadrilateral")])
+        gmsh.open(BORES)
+        gmsh.model.mesh.generate(2)
+        gmsh.option.setNumber("Mesh.MshFileVersion", version)
+
+    path = gmsh_writes(shared_tmp_path / "arm.msh", make)
+    expected = figures(bores(mesh_size=0.01, cell_shape=shape))
+    np.testing.assert_allclose(figures(arm_mesh(COMM, entry(path))), expected, rtol=1e-12)
+
+
+def plate(occ):
+    """Make a rectangle with a bore at each joint axis, that of the inboard one larger by 3 mm."""
+    half = 0.5 * HEIGHT
+    bar = occ.addRectangle(-half, -half, 0.0, LENGTH + HEIGHT, HEIGHT)
+    tools = [(2, occ.addDisk(x, 0.0, 0.0, r, r)) for x, r in ((0.0, 0.013), (LENGTH, BORE))]
+    occ.cut([(2, bar)], tools)
+    occ.synchronize()
+
+
+def ring(occ):
+    """Make the ring between a bore of 10 mm and that of the plate."""
+    occ.cut([(2, occ.addDisk(0, 0, 0, 0.013, 0.013))], [(2, occ.addDisk(0, 0, 0, BORE, BORE))])
+    occ.synchronize()
+
+
+def bar_with_straight_ends(occ):
+    occ.addRectangle(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT)
+    occ.synchronize()
+
+
+def step_file(path, **products):
+    """Write a STEP file in millimetres with one product for each `name=make(occ)`."""
+
+    def write(gmsh, make):
+        gmsh.clear()
+        make(gmsh.model.occ)
+        gmsh.option.setString("Geometry.OCCTargetUnit", "M")
+        gmsh.write(str(path))
+        return path.read_text()
+
+    with gmsh_on_root(COMM) as gmsh:
+        if COMM.rank == 0:
+            data = ""
+            for k, (name, make) in enumerate(products.items()):
+                text = re.sub(
+                    r"'Open CASCADE STEP translator[^']*'", f"'{name}'", write(gmsh, make)
+                )
+                head, rest = text.split("DATA;")
+                body, tail = rest.split("ENDSEC;", 1)
+                data += re.sub(r"#(\d+)", lambda m, k=k: f"#{k * 10000 + int(m[1])}", body)
+            assert "MILLI" in data
+            path.write_text(f"{head}DATA;{data}ENDSEC;{tail}")
+    COMM.barrier()
+    return path
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_step_with_bores(shared_tmp_path, shape):
+    path = step_file(shared_tmp_path / "arm.step", plate=plate)
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.003, cell_shape=shape))
+    assert corners(mesh).shape[1] == SIDES[shape]
+    area = HEIGHT * (LENGTH + HEIGHT) - np.pi * (0.013**2 + BORE**2)
+    assert figures(mesh)[1] == pytest.approx(area, rel=1e-3)  # polygons in place of circles
+    for facets, x, r in ((mesh.inboard_facets, 0.0, 0.013), (mesh.outboard_facets, LENGTH, BORE)):
+        radius = np.linalg.norm(facet_nodes(mesh, facets) - [x, 0.0], axis=1)
+        assert len(radius) > 10 and np.abs(radius - r).max() < 1e-9
+
+
+def test_step_with_straight_ends(shared_tmp_path):
+    path = step_file(shared_tmp_path / "arm.stp", bar=bar_with_straight_ends)
+    mesh = arm_mesh(COMM, entry(path))  # a twelfth of the height
+    assert figures(mesh)[1] == pytest.approx(LENGTH * HEIGHT, rel=1e-9)
+    for facets, x in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, LENGTH)):
+        nodes = facet_nodes(mesh, facets)
+        assert np.abs(nodes[:, 0] - x).max() < 1e-9
+        assert np.abs(nodes[:, 1]).max() == pytest.approx(0.5 * HEIGHT, rel=1e-9)
+
+
+def test_step_product_named_passive_stays_solid(shared_tmp_path):
+    """Two products that touch without a common curve; the ring's inner circle is the interface."""
+    path = step_file(shared_tmp_path / "arm.step", arm=plate, passive=ring)
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004))
+    radius = np.linalg.norm(mesh.centroid, axis=1)
+    assert np.array_equal(mesh.passive, radius < 0.0129)
+    assert COMM.allreduce(int(mesh.passive.sum())) >= 10
+    nodes = facet_nodes(mesh, mesh.inboard_facets)
+    assert np.abs(np.linalg.norm(nodes, axis=1) - BORE).max() < 1e-9
+
+
+def test_step_names_edges_and_faces(shared_tmp_path):
+    """The larger hole is named, though a smaller one is about the same axis."""
+    path = step_file(shared_tmp_path / "arm.step", arm=two_faces)
+    if COMM.rank == 0:
+        text = path.read_text()
+        # The circle through (13, 0) mm, and the face that also reaches the bore of 10 mm.
+        edge = named(text, "EDGE_CURVE", lambda p: np.allclose(p, [[13.0, 0.0, 0.0]]))
+        face = named(edge, "ADVANCED_FACE", lambda p: len(p) == 2)
+        path.write_text(
+            face.replace("EDGE_CURVE('x'", "EDGE_CURVE('Inboard'").replace("('x'", "('passive'")
+        )
+    COMM.barrier()
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004))
+    nodes = facet_nodes(mesh, mesh.inboard_facets)
+    assert np.abs(np.linalg.norm(nodes, axis=1) - 0.013).max() < 1e-9
+    assert np.array_equal(mesh.passive, np.linalg.norm(mesh.centroid, axis=1) < 0.0129)
+
+
+def two_faces(occ):
+    """Make plate and ring in one, with a common curve."""
+    plate(occ)
+    occ.cut([(2, occ.addDisk(0, 0, 0, 0.013, 0.013))], [(2, occ.addDisk(0, 0, 0, BORE, BORE))])
+    occ.fragment(occ.getEntities(2), [])
+    occ.synchronize()
+
+
+def named(text, kind, fits):
+    """Return the text of a STEP file with the name x for shapes whose vertices fit."""
+    marked = re.sub(rf"#(\d+) = {kind}\(''", rf"#\1 = {kind}('\1'", text)
+    for shapes in read_shapes(marked):
+        for number, vertices in zip(shapes.names, shapes.vertices, strict=True):
+            if fits(vertices):
+                marked = marked.replace(f"{kind}('{number}'", f"{kind}('x'")
+    return re.sub(rf"{kind}\('\d+'", f"{kind}(''", marked)
+
+
+def test_geometry_that_merges_a_step_file_names_its_curves(shared_tmp_path, write):
+    step_file(shared_tmp_path / "arm.step", bar=bar_with_straight_ends)
+    text = 'SetFactory("OpenCASCADE"); Geometry.OCCTargetUnit = "M"; Merge "arm.step";\n'
+    text += 'e = 1e-6; Physical Curve("inboard") = Curve In BoundingBox {-e, -1, -e, e, 1, e};\n'
+    text += 'Physical Curve("outboard") = Curve In BoundingBox {0.5 - e, -1, -e, 0.5 + e, 1, e};\n'
+    mesh = arm_mesh(COMM, entry(write("arm.geo", text + "Mesh.MeshSizeMax = 0.01;")))
+    assert figures(mesh)[1] == pytest.approx(LENGTH * HEIGHT, rel=1e-9)
+    assert figures(mesh)[3] == figures(mesh)[4] == 6
+
+
+# --- what cannot be an arm -------------------------------------------------------------------
+
+
+def message(path, **keys):
+    """Return the line with which a file is refused, on all ranks."""
+    with pytest.raises(InputError) as caught:
+        arm_mesh(COMM, entry(path, **keys))
+    text = str(caught.value)
+    assert text.startswith(str(path)) and "arm 'a'" in text and len(text.splitlines()) == 1
+    assert caught.value.__suppress_context__ or caught.value.__context__ is None
+    return text
+
+
+@pytest.mark.parametrize(
+    ("text", "keys", "reason"),
+    [
+        (PLAIN, {}, 'no curves in a group "inboard"; found no named groups; name the'),
+        (PLAIN + ENDS.replace("inb", "onb"), {}, 'found curves "onboard", curves "outboard"'),
+        (PLAIN + ENDS.replace("2", "4"), {}, 'curve 4 is in both groups "inboard" and "outboard"'),
+        (
+            PLAIN + ENDS + 'Physical Surface("design") = {1}; Physical Surface("passive") = {1};',
+            {},
+            'surface 1 is in both groups "design" and "passive"',
+        ),
+        (PLAIN + ENDS, {"length": 0.6}, "(0.5, 0) m, expected (length, 0) = (0.6, 0) m within"),
+        (PLAIN + ENDS, {"height": 0.1}, "0.06 m high, expected height = 0.1 m within 0.005 m"),
+        (
+            MILLIMETRES + ENDS,
+            {},
+            "(500, 0) m, expected (length, 0) = (0.5, 0) m within 0.003",
+        ),
+        (MILLIMETRES + ENDS, {}, "lengths are in metres, these look like millimetres"),
+        (PLAIN + ENDS, {"mesh_size": 0.01}, 'no parameter "mesh size (m)"'),
+        (PLAIN.replace("0.03, 0,", "0.03, 1,") + ENDS, {}, "up to 1 m off the plane z = 0"),
+        (PLAIN + ENDS + "Point(9) = {foo, 0, 0};", {}, "Unknown variable 'foo'"),
+        ("Point(1) = {0, 0, 0};" + ENDS, {}, "no curves in a group"),
+        (
+            PLAIN + TIP + ENDS + "Mesh.Algorithm = 5; Recombine Surface {2};",
+            {},
+            "mixes triangles and quadrilaterals",
+        ),
+        (
+            PLAIN + ENDS + "Extrude {0, 0, 0.1} { Surface{1}; Layers{1}; }\nMesh 3;",
+            {},
+            "off the plane z = 0",
+        ),
+    ],
+)
+def test_geometry_that_cannot_be_an_arm(write, text, keys, reason):
+    assert reason in message(write("own.geo", text), **keys)
+
+
+def remade(path, text, change):
+    """Write a .msh file of a .geo text after `change(gmsh)`."""
+
+    def make(gmsh):
+        source = path.with_suffix(".geo")
+        source.write_text(text + "\n")
+        gmsh.open(str(source))
+        change(gmsh)
+
+    return gmsh_writes(path, make)
+
+
+def test_meshes_that_cannot_be_an_arm(shared_tmp_path, write):
+    design = 'Physical Surface("design") = {1};'
+
+    def second_order(gmsh):
+        gmsh.option.setNumber("Mesh.ElementOrder", 2)
+        gmsh.model.mesh.generate(2)
+
+    def body(gmsh):
+        gmsh.model.geo.extrude([(2, 1)], 0, 0, 0.02)
+        gmsh.model.geo.synchronize()
+        gmsh.model.addPhysicalGroup(3, [1])
+        gmsh.model.mesh.generate(3)
+
+    def curves_only(gmsh):
+        gmsh.model.mesh.generate(1)
+
+    for change, reason in (
+        (second_order, 'cells of kind "Triangle 6"; expected straight'),
+        (body, "a mesh of a body in 3D"),
+        (curves_only, "no cells; mesh its surfaces in 2D"),
+    ):
+        path = remade(shared_tmp_path / f"{change.__name__}.msh", PLAIN + ENDS + design, change)
+        assert reason in message(path)
+    assert "syntax error" in message(write("none.msh", "hello\n"))
+
+
+def solid_box(occ):
+    occ.addBox(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT, 0.01)
+    occ.synchronize()
+
+
+def chamfered(occ):
+    box = occ.addBox(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT, 0.01)
+    occ.synchronize()
+    edge = occ.getEntitiesInBoundingBox(-1.0, 0.029, 0.009, 1.0, 0.031, 0.011, 1)[0][1]
+    face = occ.getEntitiesInBoundingBox(-1.0, -1.0, 0.009, 1.0, 1.0, 0.011, 2)[0][1]
+    occ.chamfer([box], [edge], [face], [0.002])
+    occ.synchronize()
+
+
+def stepped(occ):
+    low = occ.addBox(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT, 0.01)
+    boss = occ.addBox(0.2, -0.01, 0.0, 0.02, 0.02, 0.02)
+    occ.fuse([(3, low)], [(3, boss)])
+    occ.synchronize()
+
+
+def lifted(make, z, thickness):
+    """Return what makes a solid from z on of the section that `make` makes."""
+
+    def solid(occ):
+        make(occ)
+        faces = occ.getEntities(2)
+        occ.translate(faces, 0.0, 0.0, z)
+        occ.extrude(faces, 0.0, 0.0, thickness)
+        occ.remove(occ.getEntities(2), recursive=False)
+        occ.synchronize()
+
+    return solid
+
+
+@pytest.mark.parametrize("z", [0.0, -0.005, 0.3])
+def test_prismatic_solid_is_taken_by_its_planar_face(shared_tmp_path, z):
+    path = step_file(shared_tmp_path / "arm.step", arm=lifted(plate, z, 0.01))
+    flat = step_file(shared_tmp_path / "flat.step", arm=plate)
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004, thickness=0.01))
+    expected = figures(arm_mesh(COMM, entry(flat, mesh_size=0.004)))
+    np.testing.assert_allclose(figures(mesh), expected, rtol=0.02)  # another triangulation
+    nodes = facet_nodes(mesh, mesh.inboard_facets)
+    assert np.abs(np.linalg.norm(nodes, axis=1) - 0.013).max() < 1e-9
+    assert np.abs(mesh.mesh.geometry.x[:, 2]).max() == 0.0
+
+
+def test_solids_side_by_side(shared_tmp_path):
+    path = step_file(
+        shared_tmp_path / "arm.step", arm=lifted(plate, 0.1, 0.01), passive2=lifted(ring, 0.1, 0.01)
+    )
+    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004, thickness=0.01))
+    assert np.array_equal(mesh.passive, np.linalg.norm(mesh.centroid, axis=1) < 0.0129)
+    assert COMM.allreduce(int(mesh.passive.sum())) >= 10
+
+
+@pytest.mark.parametrize(
+    ("make", "keys", "reason"),
+    [
+        (solid_box, {"thickness": 0.02}, "0.01 m thick along z, expected arms.thickness = 0.02 m"),
+        (solid_box, {"thickness": 1e-5}, "lengths are in metres, these look like millimetres"),
+        (chamfered, {"thickness": 0.01}, "is neither normal to z nor along it; expected a section"),
+        (stepped, {"thickness": 0.02}, "a solid with a step at z = 0.01 m between its end faces"),
+    ],
+)
+def test_solids_that_cannot_be_an_arm(shared_tmp_path, make, keys, reason):
+    path = step_file(shared_tmp_path / "arm.step", arm=make)
+    assert reason in message(path, **keys)
+
+
+INCHES = [k / 16.0 for k in range(1, 17)]
+
+
+@pytest.mark.parametrize("x", [0.0, 0.1])
+def test_bores_of_any_radius_are_interfaces(x):
+    """Also where rounding of an arc's points puts its two halves on either side of a border."""
+    radii = [0.5 * 0.0254 * inch for inch in INCHES] + [1e-3 * k for k in range(2, 16)]
+    radii += [0.0254 * k / 64.0 for k in range(5, 20)]
+    for radius in radii:
+        with gmsh_on_root(COMM) as gmsh:
+            if COMM.rank > 0:
+                continue
+            occ = gmsh.model.occ
+            centre = occ.addPoint(x, 0.0, 0.0)
+            ring = [occ.addPoint(x + s * radius, t * radius, 0.0) for s, t in QUARTERS]
+            arcs = [occ.addCircleArc(ring[k - 1], centre, ring[k]) for k in range(4)]
+            occ.synchronize()
+            assert sorted(_joint_curves(gmsh.model, x, 0.1)) == sorted(arcs), radius
+
+
+QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
+
+def outline(occ):
+    occ.addCircle(0.0, 0.0, 0.0, BORE)
+    occ.synchronize()
+
+
+def test_step_files_that_cannot_be_an_arm(shared_tmp_path, write):
+    path = shared_tmp_path / "arm.step"
+    assert "it holds no face" in message(step_file(path, line=outline))
+    assert "no interface at (0.4, 0) m: expected a circular" in message(
+        step_file(path, arm=plate), length=0.4
+    )
+    assert "no STEP file" in message(write("none.step", "hello\n"))
+
+
+# --- the checks themselves -------------------------------------------------------------------
+
+
+def two_squares(**changes):
+    """Return the mesh of an arm of two square cells, 2 m x 1 m."""
+    x, y = np.meshgrid([0.0, 1.0, 2.0], [-0.5, 0.5])
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(6)], axis=1)
+    parts = {
+        "points": points,
+        "cells": np.array([[0, 1, 4, 3], [1, 2, 5, 4]]),
+        "inboard": np.array([[0, 3]]),
+        "outboard": np.array([[5, 2]]),
+    }
+    return FlatMesh(**parts | changes)
+
+
+SQUARES = Arm(name="a", length=2.0, height=1.0, thickness=1.0, mesh="a.msh")
+
+
+def test_check_accepts():
+    check_mesh(two_squares(), SQUARES)
+    check_mesh(two_squares(cells=np.array([[0, 3, 4, 1], [1, 2, 5, 4]])), SQUARES)  # clockwise
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"cells": np.array([[0, 1, 3, 4], [1, 2, 5, 4]])}, "1 cells are folded or flat"),
+        ({"cells": np.array([[0, 1, 2], [0, 1, 4]])}, "1 cells are folded or flat"),
+        ({"cells": np.array([[0, 1, 3], [2, 5, 4]])}, "falls into 2 parts"),
+        ({"inboard": np.array([[0, 4]])}, '"inboard" has lines that are no sides'),
+        ({"outboard": np.array([[1, 4]])}, '"outboard" has its middle at (1, 0) m'),
+        ({"inboard": np.array([[0, 3, 1]])}, "its lines are curved"),
+    ],
+)
+def test_check_refuses(changes, reason):
+    with pytest.raises(InputError, match=re.escape(reason)):
+        check_mesh(two_squares(**changes), SQUARES)
+
+
+def test_options_of_one_file_do_not_reach_the_next(write):
+    """RecombineAll, sizes and parameters of an arm before leave the next one as it is alone."""
+    path = write("own.geo", PLAIN + ENDS)
+    alone = figures(arm_mesh(COMM, entry(path)))
+    arm_mesh(COMM, entry(path, cell_shape="quadrilateral"))
+    bores(mesh_size=0.02)
+    assert np.array_equal(figures(arm_mesh(COMM, entry(path))), alone)
+    assert np.array_equal(figures(bores()), figures(bores(mesh_size=HEIGHT / 12.0)))
+
+
+def test_a_refused_file_does_not_reach_the_next(write):
+    """Gmsh's parser would go on with the rest of a text it gave up."""
+    path = write("own.geo", PLAIN + ENDS)
+    alone = figures(arm_mesh(COMM, entry(path)))
+    assert "'bar'" in message(write("bad.geo", "foo bar;\nPoint(1) = {1, 2, 3};\n" + PLAIN))
+    assert np.array_equal(figures(arm_mesh(COMM, entry(path))), alone)
+
+
+def fan(turns, count=12):
+    """Return triangles about the origin through so many turns, neighbours sharing a side."""
+    angle = np.linspace(0.0, 2.0 * np.pi * turns, count + 1)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count + 1)], axis=1)
+    cells = np.array([[0, k, k + 1] for k in range(1, count + 1)])
+    return np.concatenate([np.zeros((1, 3)), rim]), cells
+
+
+def grid(along=6, across=3):
+    """Return points (n, 3) and quadrilaterals of a grid of unit cells."""
+    x, y = np.meshgrid(np.arange(along + 1.0), np.arange(across + 1.0))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    first = (np.arange(across)[:, None] * (along + 1) + np.arange(along)).ravel()
+    return points, np.stack([first, first + 1, first + along + 2, first + along + 1], axis=1)
+
+
+def horseshoe(turn):
+    """Return a strip of unit width bent round by so many turns: beyond one it meets itself."""
+    points, cells = grid(40, 1)
+    angle = 2.0 * np.pi * turn * points[:, 0] / 40.0
+    radius = 4.0 + points[:, 1]
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1), cells
+
+
+def check_cells(points, cells):
+    geometry._check_cells(FlatMesh(points, cells, cells[:1, :2], cells[:1, :2]))
+
+
+def pushed():
+    """Return triangles with an inner point beyond its neighbours."""
+    points, quads = grid()
+    cells = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    points[8] += [1.3, 0.2, 0.0]
+    return points, cells
+
+
+def mirrored():
+    """Return a grid of cells the last column of which is folded back onto the one before."""
+    points, cells = grid()
+    points[points[:, 0] == 6.0, 0] = 4.0
+    return points, cells
+
+
+def doubled():
+    """Return a grid and a moved copy of one of its cells, which shares a point with it."""
+    points, cells = grid()
+    copies = points[cells[7]] + [0.01, 0.013, 0.0]
+    new = len(points) + np.arange(4)
+    points = np.concatenate([points, copies])
+    new[2] = cells[7, 2]
+    return points, np.concatenate([cells, [new]])
+
+
+@pytest.mark.parametrize(
+    ("made", "overlaps"),
+    [
+        (grid(), False),
+        (fan(0.9), False),
+        (fan(1.1), True),
+        (horseshoe(0.95), False),
+        (horseshoe(1.02), True),
+        (pushed(), True),
+        (mirrored(), True),
+        (doubled(), True),
+    ],
+    ids=["grid", "fan", "fan-1.1", "horseshoe", "horseshoe-1.02", "pushed", "mirrored", "doubled"],
+)
+def test_overlapping_cells_are_refused(made, overlaps):
+    if not overlaps:
+        check_cells(*made)
+        return
+    with pytest.raises(InputError, match=r"\d+ cells overlap others, the first at \("):
+        check_cells(*made)
+
+
+def test_inverted_cells_of_a_mesh_file(shared_tmp_path):
+    """The mesh that was accepted with too much mass: one node moved across its neighbours."""
+    design = 'Physical Surface("design") = {1};'
+
+    def push(gmsh):
+        gmsh.model.mesh.generate(2)
+        tags, points, _ = gmsh.model.mesh.getNodes(2, 1)
+        gmsh.model.mesh.setNode(int(tags[0]), [points[0] + 0.045, points[1], 0.0], [])
+
+    path = remade(shared_tmp_path / "pushed.msh", PLAIN + ENDS + design, push)
+    assert re.search(r"\d+ cells (overlap|are folded)", message(path))
+
+
+# --- whose fault it is -----------------------------------------------------------------------
+
+
+def test_errors_of_the_program_are_not_the_users(write, monkeypatch):
+    path = write("own.geo", PLAIN + ENDS)
+
+    def broken(*_):
+        raise ZeroDivisionError("a mistake in here")
+
+    monkeypatch.setattr(geometry, "flatten", broken)
+    with gmsh_on_root(COMM) as gmsh:
+        if COMM.rank == 0:
+            with pytest.raises(ZeroDivisionError):
+                geometry.build_model(gmsh, entry(path))
+
+
+@pytest.mark.serial
+def test_truncated_step_file_leaves_the_terminal_alone(shared_tmp_path, capfd):
+    path = step_file(shared_tmp_path / "arm.step", arm=plate)
+    path.write_text(path.read_text()[:3000])
+    capfd.readouterr()
+    message(path)
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,325 @@
+"""Meshes: the parametric geometry, its groups, and the facets between cells."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import dolfinx
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.arms.arm import Arm as ScenesArm
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import interior_facets, structured_arm
+from dolfinopt.mesh.geometry import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.scene.load import Arm
+
+COMM = MPI.COMM_WORLD
+# Gmsh places the points of a curve by integrating its length to Mesh.LcIntegrationPrecision = 1e-9;
+# measured here: off by 2e-12 of the curve's length at most.
+PLACING = 1e-10
+
+SHAPES = [  # length m, height m, cells
+    (1.0, 0.06, (20, 4)),
+    (2.5, 0.1, (50, 3)),
+    (0.3, 0.5, (1, 1)),
+    (0.7, 0.2, (1, 7)),
+    (3.0, 0.02, (7, 1)),
+    (10.0, 0.01, (400, 2)),  # a thousand times longer than high
+]
+
+
+def arm(length=1.0, height=0.06, cells=(20, 4), passive=0.0, comm=COMM):
+    return structured_arm(comm, "arm", length, height, cells, passive)
+
+
+def collect(values, comm=COMM):
+    """Return the owned rows of all ranks."""
+    return np.concatenate(comm.allgather(values))
+
+
+def grid(length, height, cells):
+    """Return the cells' centroids, ordered by x, then y."""
+    x = (np.arange(cells[0]) + 0.5) * length / cells[0]
+    y = (np.arange(cells[1]) + 0.5) * height / cells[1] - 0.5 * height
+    return np.stack([np.repeat(x, cells[1]), np.tile(y, cells[0])], axis=1)
+
+
+@pytest.fixture(scope="module", params=SHAPES, ids=str)
+def shaped(request):
+    """Return length, height, cells and the mesh made of them."""
+    return *request.param, arm(*request.param)
+
+
+def test_cells_tile_the_arm(shaped):
+    length, height, cells, mesh = shaped
+    centroid, area = collect(mesh.centroid), collect(mesh.area)
+    assert mesh.num_cells == len(mesh.centroid) == compat.local_cell_counts(mesh.mesh)[0]
+    assert len(area) == cells[0] * cells[1]
+    size = np.array([length / cells[0], height / cells[1]])
+    place = np.rint(centroid / size * 2.0).astype(int)  # exact up to half a cell
+    centroid = centroid[np.lexsort((place[:, 1], place[:, 0]))]
+    assert np.abs(centroid - grid(length, height, cells)).max() < PLACING * length
+    tolerance = PLACING * (length / size[0] + height / size[1])
+    assert np.abs(area / size.prod() - 1.0).max() < tolerance
+    assert np.array_equal(mesh.outboard_point, [length, 0.0])
+    assert not mesh.passive.any()
+
+
+def test_interfaces_are_the_short_sides(shaped):
+    length, height, cells, mesh = shaped
+    owned = mesh.mesh.topology.index_map(1).size_local
+    for facets, x in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, length)):
+        assert COMM.allreduce(int((facets < owned).sum())) == cells[1]
+        middle = np.empty((0, 3))
+        if len(facets):
+            middle = dolfinx.mesh.compute_midpoints(mesh.mesh, 1, facets.astype(np.int32))
+        assert np.all(np.abs(middle[:, 0] - x) < PLACING * length)
+        sides = np.sort(collect(middle[facets < owned, 1]))
+        expected = (np.arange(cells[1]) + 0.5) * height / cells[1] - 0.5 * height
+        assert np.abs(sides - expected).max() < PLACING * height
+
+
+# A cell is passive when its centre is nearer to an end than `passive`; on the border it is not.
+@pytest.mark.parametrize(
+    ("along", "passive", "columns"),
+    [
+        (20, 0.0, 0),
+        (20, 0.024, 0),  # below the first centre
+        (20, 0.026, 1),
+        (20, 0.05, 1),
+        (20, 0.08, 2),
+        (20, 0.46, 9),
+        (20, 0.474, 9),
+        (20, 0.476, 10),  # all solid
+        (8, 0.1875, 1),  # exactly the second column's centre
+        (5, 0.3, 1),
+        (5, 0.49, 2),  # one column of design left
+        (5, 0.51, 3),  # the middle column belongs to both ends: all solid
+        (1, 0.3, 0),
+        (1, 0.6, 1),
+        (6, 5.0, 6),  # longer than the arm
+    ],
+)
+def test_passive_cells_have_their_centre_within_the_passive_length(along, passive, columns):
+    mesh = arm(cells=(along, 2), passive=passive)
+    x = mesh.centroid[:, 0]
+    rule = np.minimum(x, 1.0 - x) < passive - 1e-12  # rounding must not decide the border
+    assert np.array_equal(mesh.passive, rule)
+    assert COMM.allreduce(int(mesh.passive.sum())) == 2 * min(2 * columns, along)
+    assert np.abs(collect(mesh.area) * along / 0.03 - 1.0).max() < 1e-9
+    # Blocks of solid cells leave the interfaces where they are.
+    for facets, end in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, 1.0)):
+        assert COMM.allreduce(len(facets)) >= 2
+        if len(facets):
+            middle = dolfinx.mesh.compute_midpoints(mesh.mesh, 1, facets.astype(np.int32))
+            assert np.abs(middle[:, 0] - end).max() < PLACING
+    if 2.0 * passive < 1.0:  # what a scene admits
+        entry = Arm(
+            name="a", length=1.0, height=0.06, thickness=0.01, cells=(along, 2), passive=passive
+        )
+        assert entry.passive_columns == columns
+
+
+@pytest.mark.parametrize("cells", [(6, 3), (9, 1), (1, 5), (1, 1)])
+def test_interior_facets_of_rectangles(cells):
+    mesh = arm(1.2, 0.2, cells)
+    dx, dy = 1.2 / cells[0], 0.2 / cells[1]
+    first, second, length, distance = interior_facets(mesh.mesh)
+    middle = _centroids(mesh.mesh)
+    along = np.abs(middle[first] - middle[second])
+    upright = along[:, 0] > 0.5 * dx
+    assert np.allclose(along, np.where(upright[:, None], [dx, 0.0], [0.0, dy]), atol=PLACING)
+    assert np.allclose(length, np.where(upright, dy, dx), rtol=1e-8)
+    assert np.allclose(distance, np.where(upright, dx, dy), rtol=1e-8)
+    # Each facet counts half on each side, so that those between ranks count once in all.
+    count = 0.5 * ((first < mesh.num_cells).sum() + (second < mesh.num_cells).sum())
+    nx, ny = cells
+    assert COMM.allreduce(count) == (nx - 1) * ny + nx * (ny - 1)
+
+
+@pytest.mark.parametrize("shape", ["quadrilateral", "triangle"])
+def test_interior_facets_against_brute_force(shape):
+    kind = getattr(dolfinx.mesh.CellType, shape)
+    corners = [np.zeros(2), np.array([1.0, 0.5])]
+    mesh = dolfinx.mesh.create_rectangle(COMM, corners, [5, 4], kind)
+    points = mesh.geometry.x
+    points[:, :2] += 0.03 * np.sin(9.0 * points[:, [1, 0]] + np.array([0.3, 1.1]))
+    cells = compat.cell_geometry_nodes(mesh, sum(compat.local_cell_counts(mesh)))
+    sets = [set(nodes) for nodes in cells]
+    middle = _centroids(mesh)
+    expected = {}
+    for i in range(len(sets)):
+        for j in range(i):
+            shared = sorted(sets[i] & sets[j])
+            if len(shared) == 2:
+                a, b = points[shared]
+                expected[j, i] = (np.linalg.norm(a - b), np.linalg.norm(middle[i] - middle[j]))
+    first, second, length, distance = interior_facets(mesh)
+    found = {(min(i, j), max(i, j)): (a, b) for i, j, a, b in zip(first, second, length, distance)}
+    assert len(found) == len(first)
+    assert found.keys() == expected.keys()
+    for pair, figures in expected.items():
+        assert found[pair] == pytest.approx(figures, rel=1e-14)
+
+
+def _centroids(mesh):
+    count = sum(compat.local_cell_counts(mesh))
+    return compat.cell_coordinates(mesh, count)[:, :, :2].mean(axis=1)
+
+
+def test_area_of_distorted_cells():
+    # Against the boundary: twice the area is the sum of x dy - y dx around the polygon.
+    from dolfinopt.mesh.arm_mesh import _cell_area
+
+    rng = np.random.default_rng(1)
+    quad = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    for corners, around in ((quad, [0, 1, 3, 2]), (quad[:3], [0, 1, 2])):
+        cells = corners + 0.2 * rng.uniform(-1.0, 1.0, (30, len(corners), 2))
+        x, y = cells[:, around, 0], cells[:, around, 1]
+        twice = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+        assert np.allclose(_cell_area(cells), 0.5 * twice, rtol=1e-14)
+
+
+# In a process of its own: Gmsh keeps parameters as long as the process lives.
+GMSH_ALONE = """
+import json, sys
+import gmsh
+gmsh.initialize(["gmsh", "-v", "0", *sys.argv[2:]])
+gmsh.open(sys.argv[1])
+gmsh.model.mesh.generate(2)
+groups = []
+for dim, tag in gmsh.model.getPhysicalGroups():
+    entities = gmsh.model.getEntitiesForPhysicalGroup(dim, tag)
+    elements = [gmsh.model.mesh.getElements(dim, e) for e in entities]
+    kinds = sorted({gmsh.model.mesh.getElementProperties(k)[0] for e in elements for k in e[0]})
+    count = sum(len(tags) for e in elements for tags in e[1])
+    groups.append([dim, tag, gmsh.model.getPhysicalName(dim, tag), kinds, count])
+print(json.dumps([groups, gmsh.model.getBoundingBox(-1, -1)]))
+"""
+CURVE, SURFACE = ["Line 2"], ["Quadrilateral 4"]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("arguments", "length", "surfaces"),
+    [
+        ("", 1.0, [[2, DESIGN, "design", SURFACE, 2400]]),
+        (
+            "-setnumber length 2 -setnumber passive 0.05",
+            2.0,
+            [[2, DESIGN, "design", SURFACE, 2280], [2, PASSIVE, "passive", SURFACE, 120]],
+        ),
+    ],
+)
+def test_geometry_opens_by_itself(arguments, length, surfaces):
+    """Gmsh alone meshes the file, with its defaults or with -setnumber."""
+    command = [sys.executable, "-c", GMSH_ALONE, str(mesh_folder() / "arm.geo")]
+    run = subprocess.run(command + arguments.split(), capture_output=True, text=True, check=True)
+    groups, box = json.loads(run.stdout)
+    curves = [[1, INBOARD, "inboard", CURVE, 12], [1, OUTBOARD, "outboard", CURVE, 12]]
+    assert groups == curves + surfaces
+    assert box == pytest.approx((0.0, -0.03, 0.0, length, 0.03, 0.0), abs=1e-6)  # Gmsh's margin
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
+def test_every_rank_holds_a_part():
+    mesh = arm(cells=(40, 4))
+    assert mesh.num_cells > 0
+    alone = arm(cells=(40, 4), comm=MPI.COMM_SELF)
+    assert alone.num_cells == 160
+
+
+# --- arms from files -------------------------------------------------------------------------
+
+BORES = str(mesh_folder() / "arm_bores.geo")
+SHAPED = ["quadrilateral", "triangle"]
+
+
+def solid(size, shape, comm=COMM):
+    """Return first frequency, Hz, flexibility (3, 3) and body of the solid arm with bores."""
+    entry = {
+        "name": "a",
+        "length": 0.5,
+        "height": 0.06,
+        "thickness": 0.01,
+        "mesh": BORES,
+        "mesh_size": size,
+        "cell_shape": shape,
+    }
+    material = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
+    data = {"material": material, "arms": [entry], "design": {"filter_radius": 0.0}}
+    arm = ScenesArm(do.scene_from_dict(data), 0, comm, do.Ledger())
+    body = arm.reduce(np.ones(arm.mesh.num_cells))
+    squares = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real
+    flexibility = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
+    return np.sqrt(squares.min()) / (2.0 * np.pi), flexibility, body
+
+
+def test_arm_with_bores_converges_to_the_same_frequency():
+    """Triangles and quadrilaterals, clamped at one bore and rigid at the other: order 2."""
+    limits = []
+    for shape in SHAPED:
+        f = np.array([solid(0.06 / n, shape, MPI.COMM_SELF)[0] for n in (6, 12, 24)])
+        steps = -np.diff(f)  # from above: too stiff
+        rate = np.log2(steps[0] / steps[1])
+        assert 1.6 < rate < 2.4, shape
+        limits.append(f[-1] - steps[1] / (2.0**rate - 1.0))
+    assert limits[0] == pytest.approx(limits[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", SHAPED)
+def test_arm_with_bores_is_a_beam_between_them(shape):
+    """u_x, u_y and theta of the outboard bore about its centre; pulling does not bend."""
+    _, flexibility, body = solid(0.005, shape)
+    EI, GA = 70e9 * 0.01 * 0.06**3 / 12.0, 70e9 / 2.66 * 0.01 * 0.06  # N m2, N
+    l = 0.5  # noqa: E741
+    # A beam with a rotational spring at each bore, whose flexibility the tip's rotation gives.
+    spring = 0.5 * (flexibility[2, 2] - l / EI)
+    assert 0.0 < spring < 0.1 * l / EI  # 0.055
+    assert flexibility[1, 2] == pytest.approx(l**2 / (2.0 * EI) + l * spring, rel=1e-3)  # 2e-4
+    bending = l**3 / (3.0 * EI) + l**2 * spring + l / (GA * 5.0 / 6.0)
+    assert flexibility[1, 1] == pytest.approx(bending, rel=1e-2)  # 2e-3
+    assert flexibility[0, 0] == pytest.approx(l / (70e9 * 0.01 * 0.06), rel=0.2)
+    scale = np.sqrt(np.outer(np.diag(flexibility), np.diag(flexibility)))
+    assert np.abs((flexibility / scale)[0, 1:]).max() < 1e-7  # mirror images to 1e-9 of the curves
+    assert np.array_equal(body.outboard_point, [0.5, 0.0])
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
+@pytest.mark.parametrize("shape", SHAPED)
+def test_ranks_that_share_an_arm_with_bores_agree(shape):
+    shared, flexibility, _ = solid(0.01, shape)
+    alone, other, _ = solid(0.01, shape, MPI.COMM_SELF)
+    assert shared == pytest.approx(alone, rel=1e-9)
+    assert np.abs(flexibility - other).max() < 1e-9 * np.abs(other).max()
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("design.volume_fraction=0.02", "of the volume of arm 'arm1'"),
+        ("design={volume_fraction=0.02, shared_volume=true}", "of the volume of all arms together"),
+        ("reduction.coordinates=9999", "expected at most"),
+    ],
+)
+def test_limits_that_only_the_mesh_can_tell(override, reason):
+    """The solid rings of the demo are 0.0207 of an arm; its coarse mesh has some 1000 dofs."""
+    file = Path(__file__).parents[2] / "demos" / "two_arm_bores.toml"
+    scene = do.load_scene(file, ["arms.mesh_size=0.015", override])
+    share = do.share_arms(COMM, scene.cell_counts)
+    problem = ""
+    try:
+        do.build_arms(scene, share, do.Ledger())
+    except InputError as error:
+        problem = str(error)
+    problems = [text for text in COMM.allgather(problem) if text]  # some ranks may have no arm
+    assert problems and all(reason in text for text in problems)
+    assert all(text.startswith(str(file)) and len(text.splitlines()) == 1 for text in problems)

@@ -1,0 +1,164 @@
+"""Inertia shape integrals: rigid figures in closed form, modes by brute-force quadrature."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+from mpi4py import MPI
+
+from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.multibody.shape_integrals import first_frequency, plane_body, shape_integrals
+from dolfinopt.profiling import Ledger
+from dolfinopt.reduction import Basis, Options, craig_bampton, modal
+
+COMM = MPI.COMM_WORLD
+LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.01  # m
+YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # Pa, -, kg/m3
+DAMPING = 2e-4  # s
+REDUCTORS = {"craig-bampton": craig_bampton, "modal": modal}
+# Gmsh places points to 2e-12 of the length.
+PLACING = 1e-10
+# Sums over some dozens of cells; measured: 1e-15.
+ROUNDING = 1e-12
+
+
+def make_arm(cells=(10, 3), comm=COMM):
+    mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
+    return ElasticArm(mesh, element_operators(mesh, THICKNESS, POISSON), Ledger())
+
+
+def uneven(place):
+    """Densities in [0, 1] without structure, the same on any number of ranks."""
+    place = np.round(place, 9)
+    return 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
+
+
+@pytest.fixture(scope="module")
+def uniform_arm():
+    arm = make_arm()
+    ones = np.ones(arm.mesh.num_cells)
+    arm.set_design(YOUNG * ones, DENSITY * ones)
+    return arm
+
+
+@pytest.fixture(scope="module")
+def uneven_arm():
+    arm = make_arm()
+    x = uneven(arm.mesh.centroid)
+    arm.set_design(YOUNG * x**3, DENSITY * x)
+    return arm
+
+
+def test_rigid_integrals_of_a_rectangle(uniform_arm):
+    body = shape_integrals(uniform_arm, craig_bampton(uniform_arm, Options(3)), DAMPING)
+    mass = DENSITY * LENGTH * HEIGHT * THICKNESS
+    assert body.mass == pytest.approx(mass, rel=PLACING)
+    expected = [0.5 * mass * LENGTH, 0.0]
+    assert body.moment == pytest.approx(expected, abs=PLACING * mass * LENGTH)
+    inertia = mass * (LENGTH**2 / 3.0 + HEIGHT**2 / 12.0)
+    assert body.inertia == pytest.approx(inertia, rel=PLACING)
+    assert np.array_equal(body.outboard_point, [LENGTH, 0.0])
+    assert body.num_modes == 3
+
+
+def test_integrals_of_rigid_motions(uneven_arm):
+    """Modes (1, 0), (0, 1) and S X turn the integrals of modes into those of the rigid body."""
+    arm = uneven_arm
+    x, y = arm.points.T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    V = np.stack([[one, none], [none, one], [-y, x]]).transpose(2, 1, 0)
+    basis = Basis(V, arm.mass_times(V), np.zeros((3, 3)), np.eye(3), np.empty((0, 0)))
+    body = shape_integrals(arm, basis, DAMPING)
+    m, (cx, cy), J = body.mass, body.moment, body.inertia
+    assert abs(cy) > 1e-6 * m  # the design is not symmetric: cy counts below
+    # S (1, 0) = (0, 1), S (0, 1) = -(1, 0), S S X = -X.
+    expected = {
+        "C": [[m, 0.0, -cy], [0.0, m, cx]],
+        "j": [cx, cy, 0.0],
+        "r": [-cy, cx, J],
+        "M": [[m, 0.0, -cy], [0.0, m, cx], [-cy, cx, J]],
+        "G": [[0.0, -m, -cx], [m, 0.0, -cy], [cx, cy, 0.0]],
+    }
+    for name, values in expected.items():
+        assert np.abs(getattr(body, name) - values).max() < ROUNDING * (m + J), name
+
+
+def quadrature(arm, x, V):
+    """Return the integrals by 3 x 3 Gauss points a cell of the bilinear fields, one by one."""
+    points = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
+    weights = np.array([5.0, 8.0, 5.0]) / 18.0
+    S = np.array([[0.0, -1.0], [1.0, 0.0]])
+    q = V.shape[2]
+    m, c, J = 0.0, np.zeros(2), 0.0
+    C, j, r = np.zeros((2, q)), np.zeros(q), np.zeros(q)
+    M, G = np.zeros((q, q)), np.zeros((q, q))
+    for nodes, density in zip(arm.operators.cells, DENSITY * x):
+        corners, modes = arm.points[nodes], V[nodes]
+        area = abs(np.linalg.det([corners[1] - corners[0], corners[2] - corners[0]]))
+        for a, wa in zip(points, weights):
+            for b, wb in zip(points, weights):
+                shape = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+                dm = wa * wb * area * THICKNESS * density
+                X, Phi = shape @ corners, np.tensordot(shape, modes, 1)
+                m, c, J = m + dm, c + dm * X, J + dm * X @ X
+                C += dm * Phi
+                j += dm * X @ Phi
+                r += dm * (S @ X) @ Phi
+                M += dm * Phi.T @ Phi
+                G += dm * Phi.T @ (S @ Phi)
+    parts = (m, c, J, C, j, r, M, G)
+    return [arm.comm.allreduce(part) for part in parts]
+
+
+@pytest.mark.parametrize("method", sorted(REDUCTORS))
+def test_integrals_of_modes_by_quadrature(uneven_arm, method):
+    arm = uneven_arm
+    basis = REDUCTORS[method](arm, Options(6))
+    body = shape_integrals(arm, basis, DAMPING)
+    names = ("mass", "moment", "inertia", "C", "j", "r", "M", "G")
+    for name, expected in zip(names, quadrature(arm, uneven(arm.mesh.centroid), basis.V)):
+        scale = np.abs(expected).max()
+        assert np.abs(getattr(body, name) - expected).max() < ROUNDING * scale, name
+    assert np.array_equal(body.G, -body.G.T)
+    assert np.array_equal(body.M, body.M.T)
+    assert np.linalg.eigvalsh(body.M)[0] > 0.0
+    assert np.array_equal(body.K, basis.stiffness)
+    assert np.array_equal(body.D, DAMPING * basis.stiffness)
+    assert np.array_equal(body.outboard, basis.outboard)
+
+
+def test_first_frequency():
+    """Against the generalised eigenproblem, of a body whose mass matrix is far from diagonal."""
+    rng = np.random.default_rng(3)
+    root, other = rng.normal(size=(2, 5, 5))
+    M, K = root @ root.T + 0.1 * np.eye(5), 1e6 * (other @ other.T + 0.1 * np.eye(5))
+    none = np.zeros(5)
+    body = plane_body(
+        1.0, none[:2], 1.0, np.zeros((2, 5)), none, none, M, M, K, K, np.zeros((3, 5)), none[:2]
+    )
+    lowest = np.sqrt(scipy.linalg.eigvalsh(K, M)[0]) / (2.0 * np.pi)
+    # Cholesky's factor loses the condition of M, 100, in digits.
+    assert first_frequency(body) == pytest.approx(lowest, rel=1e-12)
+
+
+def test_first_frequency_of_a_spring_and_a_mass():
+    none, one = np.zeros(1), np.ones((1, 1))
+    body = plane_body(
+        1.0, np.zeros(2), 1.0, np.zeros((2, 1)), none, none,
+        4.0 * one, 0.0 * one, 400.0 * one, one, np.zeros((3, 1)), np.zeros(2),
+    )  # fmt: skip
+    assert first_frequency(body) == pytest.approx(10.0 / (2.0 * np.pi), rel=1e-15)
+
+
+def test_modes_give_the_first_frequency_of_the_body(uneven_arm):
+    body = shape_integrals(uneven_arm, modal(uneven_arm, Options(2)), DAMPING)
+    values = np.sqrt(np.diag(body.K)) / (2.0 * np.pi)
+    # Modes are orthonormal in M to 1e-12.
+    assert first_frequency(body) == pytest.approx(values[0], rel=1e-11)
+    # Every other basis gives an upper bound.
+    for q in (3, 4, 8):
+        body = shape_integrals(uneven_arm, craig_bampton(uneven_arm, Options(q)), DAMPING)
+        assert first_frequency(body) > values[0] * (1.0 - 1e-11)
+    assert first_frequency(body) == pytest.approx(values[0], rel=1e-5)  # measured: 3e-7

@@ -1,0 +1,322 @@
+"""MBDyn's modal element: format, lumped against consistent inertia; the command `export`."""
+
+import os
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.cli import commands
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
+from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.multibody.mbdyn import (
+    ModalElement,
+    fem_text,
+    lumped_nodes,
+    modal_element,
+    read_fem,
+    write_fem,
+)
+from dolfinopt.multibody.shape_integrals import shape_integrals
+from dolfinopt.multibody.standard_input import load_body, spatial_moments
+from dolfinopt.profiling import Ledger
+from dolfinopt.reduction import Options, craig_bampton
+
+COMM = MPI.COMM_WORLD
+LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.02  # m
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+# Gmsh places points to 2e-12 of the length; sums over some hundred nodes lose less.
+PLACING = 1e-10
+
+
+def reduced(cells, comm=MPI.COMM_SELF, uneven=False):
+    """Return the body, its moments and nodes; nodes are None but on the first rank."""
+    mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
+    elastic = ElasticArm(mesh, element_operators(mesh, THICKNESS, 0.33), Ledger())
+    x = np.ones(mesh.num_cells)
+    if uneven:
+        place = np.round(mesh.centroid, 9)
+        x = 0.5 + 0.4 * np.sin(30.0 * place[:, 0] + 170.0 * place[:, 1])
+    elastic.set_design(70e9 * x**3, 2700.0 * x)
+    basis = craig_bampton(elastic, Options(4))
+    body = shape_integrals(elastic, basis, 2e-4)
+    return body, spatial_moments(elastic, basis, THICKNESS), lumped_nodes(elastic, basis)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return reduced((8, 3), uneven=True)
+
+
+@pytest.fixture(scope="module")
+def element(parts):
+    return modal_element(*parts, THICKNESS)
+
+
+def test_round_trip_is_exact(tmp_path, element):
+    write_fem(tmp_path / "a.fem", element)
+    again = read_fem(tmp_path / "a.fem")
+    for field in fields(ModalElement):
+        ours, theirs = getattr(element, field.name), getattr(again, field.name)
+        assert np.shape(ours) == np.shape(theirs) and np.array_equal(ours, theirs), field.name
+
+
+def read_as_mbdyn_does(text):
+    """Return the numbers of every record group, by the steps of MBDyn's reader.
+
+    It takes a line when it looks for a group, then as many words as it needs wherever line ends
+    are, then the rest of the line; mode shapes begin with a line that begins with two stars.
+    """
+    position = 0
+
+    def line():
+        nonlocal position
+        end = text.index("\n", position)
+        found, position = text[position:end], end + 1
+        return found
+
+    def words(count):
+        nonlocal position
+        found = []
+        for _ in range(count):
+            while text[position].isspace():
+                position += 1
+            start = position
+            while not text[position].isspace():
+                position += 1
+            found.append(text[start:position])
+        return found
+
+    def numbers(*shape):
+        return np.array(words(int(np.prod(shape))), dtype=float).reshape(shape)
+
+    groups = {}
+    while position < len(text):
+        title = line()
+        if not title.startswith("** RECORD GROUP "):
+            continue
+        group = int(title[len("** RECORD GROUP ") :].split(",")[0])
+        if group == 1:
+            line()
+            revision, *sizes = words(6)
+            count, modes, *others = map(int, sizes)
+            assert revision == "REV0" and others == [0, 0, 0]
+            groups[1] = (count, modes)
+        elif group == 2:
+            groups[2] = words(count)
+        elif group == 8:
+            shapes = []
+            for _ in range(modes):
+                assert line().startswith("**")
+                shapes.append(numbers(count, 6))
+                assert not line().strip()
+            groups[8] = np.array(shapes)
+        else:
+            square, nodal = (modes, modes), (count,)
+            shape = {5: nodal, 6: nodal, 7: nodal, 11: (count, 6), 12: (13,)}.get(group, square)
+            groups[group] = numbers(*shape)
+    return groups
+
+
+def test_mbdyn_reads_it(element):
+    groups = read_as_mbdyn_does(fem_text(element))
+    assert sorted(groups) == [1, 2, 5, 6, 7, 8, 9, 10, 11, 12, 13]
+    assert groups[1] == (9 * 4 + 2, 4)
+    assert groups[2] == [str(k) for k in range(1, 39)]
+    assert np.array_equal(np.column_stack([groups[k] for k in (5, 6, 7)]), element.points)
+    assert np.array_equal(groups[8].transpose(1, 2, 0), element.modes)
+    for group, name in ((9, "M"), (10, "K"), (11, "lumped"), (13, "D")):
+        assert np.array_equal(groups[group], getattr(element, name)), name
+    expected = [element.mass, *element.centre, *element.inertia.ravel()]
+    assert np.array_equal(groups[12], expected)
+    # MBDyn warns of masses that differ by direction, and of matrices that are not symmetric.
+    assert np.array_equal(groups[11][:, 0], groups[11][:, 1])
+    assert np.array_equal(groups[11][:, 0], groups[11][:, 2])
+    assert np.array_equal(groups[9], groups[9].T) and np.array_equal(groups[10], groups[10].T)
+
+
+def test_interfaces_are_the_first_nodes(parts, element):
+    body = parts[0]
+    assert np.array_equal(element.points[:2], [[0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0]])
+    assert not element.modes[0].any() and not element.lumped[:2].any()
+    assert np.array_equal(element.modes[1, [0, 1, 5]], body.outboard)
+    assert not element.modes[1, [2, 3, 4]].any()
+    # Mesh nodes of the outboard edge move as the rigid interface does, to the digits of its place.
+    edge = np.abs(element.points[2:, 0] - LENGTH) < 1e-9
+    assert edge.sum() == 4
+    levers = element.points[2:][edge, 1]
+    expected = body.outboard[0] - np.outer(levers, body.outboard[2])
+    np.testing.assert_allclose(element.modes[2:][edge, 0], expected, atol=1e-9)
+
+
+def invariants(element):
+    """Return what MBDyn makes of the lumped masses (its technical manual's invariants)."""
+    m, p, phi = element.lumped[:, 0], element.points, element.modes[:, :3]
+    second = np.einsum("n,ni,nj->ij", m, p, p)
+    J = np.trace(second) * np.eye(3) - second + np.diag(element.lumped[:, 3:].sum(axis=0))
+    return {
+        "mass": m.sum(),
+        "moment": m @ p,
+        "J": J,
+        "Inv3": np.einsum("n,nik->ik", m, phi),
+        "Inv4": np.einsum("n,nik->ik", m, np.cross(p[:, :, None], phi, axis=1)),
+        "Inv5": np.einsum("n,nikl->ikl", m, np.cross(phi[:, :, :, None], phi[:, :, None], axis=1)),
+        "M": np.einsum("n,nik,nil->kl", m, phi, phi),
+    }
+
+
+def test_first_moments_are_exact(parts, element):
+    """Row sums keep what is linear in the shape functions: mass, centre of mass, int Phi."""
+    body = parts[0]
+    found = invariants(element)
+    size = body.mass * LENGTH
+    assert found["mass"] == pytest.approx(body.mass, rel=PLACING)
+    np.testing.assert_allclose(found["moment"], [*body.moment, 0.0], atol=PLACING * size)
+    np.testing.assert_allclose(found["Inv3"][:2], body.C, atol=PLACING * np.abs(body.C).max())
+
+
+def test_second_moments_converge():
+    """What is quadratic in them is right to the square of the cells' size."""
+    errors = []
+    for n in (1, 2, 4):
+        body, moments, nodes = reduced((8 * n, 2 * n))
+        found = invariants(modal_element(body, moments, nodes, THICKNESS))
+        errors.append(
+            [
+                abs(found["J"][2, 2] / body.inertia - 1.0),
+                np.abs(found["Inv4"][2] - body.r).max() / np.abs(body.r).max(),
+                np.abs(found["Inv5"][2].T - body.G).max() / np.abs(body.G).max(),
+                np.abs(found["M"] - body.M).max() / np.abs(body.M).max(),
+            ]
+        )
+    rates = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    # Measured: 1.93 to 2.03.
+    assert rates[-1].min() > 1.8 and rates[-1].max() < 2.2, rates
+    assert np.max(errors[-1]) < 0.01
+
+
+def test_global_inertia_of_a_uniform_plate():
+    """Group 12 is the consistent one: of a cuboid, about its centre."""
+    body, moments, nodes = reduced((4, 2))
+    element = modal_element(body, moments, nodes, THICKNESS)
+    mass, (a, b, c) = 2700.0 * LENGTH * HEIGHT * THICKNESS, (LENGTH, HEIGHT, THICKNESS)
+    expected = mass / 12.0 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
+    assert element.mass == pytest.approx(mass, rel=PLACING)
+    np.testing.assert_allclose(element.centre, [0.5 * LENGTH, 0.0, 0.0], atol=PLACING)
+    np.testing.assert_allclose(element.inertia, expected, atol=PLACING * mass)
+
+
+def test_nodes_of_an_arm_on_several_ranks(parts):
+    """Shared by all ranks, an arm has the same nodes and masses; the modes agree to rounding."""
+    _, _, nodes = reduced((8, 3), COMM, uneven=True)
+    if COMM.rank != 0:
+        assert nodes is None
+        return
+    alone = parts[2]
+    np.testing.assert_allclose(nodes.points, alone.points, atol=1e-12)
+    np.testing.assert_allclose(nodes.masses, alone.masses, rtol=1e-12)
+    # Eigenvectors are right to 1e-10.
+    np.testing.assert_allclose(nodes.modes, alone.modes, atol=1e-8 * np.abs(alone.modes).max())
+
+
+# -- damaged files ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("** RECORD GROUP 9,", "** RECORD 9,", ["record group 9, MODAL MASS MATRIX, is missing"]),
+        ("** RECORD GROUP 10", "** RECORD GROUP 9", ["record group 9 stands there twice"]),
+        ("REV0        38", "REV0        39", ["record group 2 has 38 labels, expected 39"]),
+        ("REV0        38", "REV0     three", ["record group 1", "five integers"]),
+        ("  4         0", "  5         0", ["record group 8 has 912 numbers, expected 1140"]),
+        ("INERTIA\n ", "INERTIA\n 1.0 ", ["record group 12 has 14 numbers, expected 13"]),
+        ("INERTIA\n ", "INERTIA\n x", ["record group 12", "could not convert"]),
+    ],
+)
+def test_damaged_file(tmp_path, element, old, new, words):
+    text = fem_text(element)
+    assert text.count(old) == 1
+    path = tmp_path / "a.fem"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_fem(path)
+    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(InputError, match=r"none\.fem: cannot be read"):
+        read_fem(tmp_path / "none.fem")
+
+
+# -- the command -----------------------------------------------------------------------------
+
+SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]
+
+
+def export(folder, *arguments, world=COMM):
+    command = ["export", SCENE, *SMALL, *arguments, "--out", folder]
+    commands.main([str(word) for word in command], standalone_mode=False, obj=world)
+    world.barrier()
+
+
+def test_export_writes_every_arm(shared_tmp_path):
+    export(shared_tmp_path / "out")
+    names = {f"{arm}{kind}" for arm in ("arm1", "arm2") for kind in (".sid", ".sid.npz", ".fem")}
+    assert set(os.listdir(shared_tmp_path / "out")) == names
+    for arm, length in (("arm1", 1.0), ("arm2", 0.8)):
+        path = shared_tmp_path / "out" / f"{arm}.sid"
+        body = load_body(path, length=length)
+        assert body.num_modes == 4
+        # Half solid 0.06 m x 0.01 m of aluminium, and void of 1e-6 of it.
+        expected = 2700.0 * length * 0.06 * 0.01 * (0.5 + 0.5e-6)
+        assert body.mass == pytest.approx(expected, rel=1e-9)
+        text = sid_text(read_sid_npz(path.with_name(f"{arm}.sid.npz")))
+        assert text == path.read_text() == sid_text(read_sid(path))
+        element = read_fem(path.with_suffix(".fem"))
+        assert np.array_equal(element.K, body.K) and np.array_equal(element.M, body.M)
+        assert element.mass == body.mass and len(element.labels) == 21 * 4 + 2
+        assert np.array_equal(element.points[1, :2], body.outboard_point)
+
+
+def test_export_is_the_same_on_any_number_of_ranks(shared_tmp_path):
+    export(shared_tmp_path / "all")
+    if COMM.rank == 0:
+        export(shared_tmp_path / "one", world=MPI.COMM_SELF)
+        for name in os.listdir(shared_tmp_path / "all"):
+            if not name.endswith(".npz"):  # archives hold the time of day
+                ours, theirs = (shared_tmp_path / side / name for side in ("all", "one"))
+                assert ours.read_bytes() == theirs.read_bytes(), name
+    COMM.barrier()
+
+
+def test_export_of_a_design(shared_tmp_path):
+    """The file's densities, not the initial ones; an arm that shares a design has the same body."""
+    shared = ["--set", "arms.arm2.length=1.0", "--set", 'arms.arm2.design="arm1"']
+    if COMM.rank == 0:
+        x = (np.arange(20) + 0.5) / 20
+        place = np.stack(np.meshgrid(x, [-0.02, 0.0, 0.02], indexing="ij"), axis=2).reshape(-1, 2)
+        density = np.where(place[:, 0] < 0.5, 1.0, 0.2)
+        arms = ("arm1", "arm2")
+        arrays = {f"{arm}/centroid": place for arm in arms}
+        np.savez(shared_tmp_path / "d.npz", **arrays, **{f"{arm}/density": density for arm in arms})
+    COMM.barrier()
+    export(shared_tmp_path / "out", "--design", shared_tmp_path / "d.npz", *shared)
+    bodies = [load_body(shared_tmp_path / "out" / f"{arm}.sid") for arm in ("arm1", "arm2")]
+    # x = 0.2 weighs a fifth: the two-material law's mass is linear.
+    assert bodies[0].mass == pytest.approx(2700.0 * 0.06 * 0.01 * 0.6, rel=1e-5)
+    assert bodies[0].moment[0] / bodies[0].mass == pytest.approx((0.125 + 0.075) / 0.6, rel=1e-5)
+    assert np.array_equal(bodies[0].K, bodies[1].K)
+
+
+def test_rigid_arms_are_left_out(shared_tmp_path, capsys):
+    export(shared_tmp_path / "out", "--set", "arms.arm1.rigid=true")
+    assert {path.stem.split(".")[0] for path in (shared_tmp_path / "out").iterdir()} == {"arm2"}
+    if COMM.rank == 0:
+        assert "arm1: not exported" in capsys.readouterr().out

@@ -1,0 +1,304 @@
+"""Inverse dynamics against Lagrange's equations of point masses, energy and closed forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bodies import Chain, assert_close, derivative, random_cloud
+
+from dolfinopt.multibody.mechanism import (
+    Mechanism,
+    body_slopes,
+    compliance,
+    deviation,
+    elastic_rows,
+    end_effector,
+    end_effector_slopes,
+    inverse_dynamics,
+    tangent,
+)
+from dolfinopt.multibody.motion import RigidMotion, rigid_motion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.scene.load import load_scene
+
+COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
+DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Return the same random numbers on all ranks."""
+    return np.random.default_rng(7)
+
+
+def chain(rng: np.random.Generator, arms: int) -> Chain:
+    """Return a chain of random clouds with payload and gravity in both directions."""
+    clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
+    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4)
+
+
+def states(rng: np.random.Generator, model: Chain, count: int) -> np.ndarray:
+    """Return random y, yd, ydd (3, count, size)."""
+    return rng.normal(scale=0.7, size=(3, count, model.size))
+
+
+def forces(model: Chain, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+    """Return `inverse_dynamics` in the order of y (n, size)."""
+    r = model.rigid
+    motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
+    rows, drives = inverse_dynamics(model.mechanism(), motion, y[:, r:], yd[:, r:], ydd[:, r:])
+    return np.concatenate([drives, rows], axis=1)
+
+
+@ARMS
+def test_forces_are_those_of_lagranges_equations(rng: np.random.Generator, arms: int) -> None:
+    """Cart, joints and elastic rows: gravity, payload and damping included."""
+    model = chain(rng, arms)
+    y, yd, ydd = states(rng, model, 3)
+    found = forces(model, y, yd, ydd)
+    for n in range(3):
+        expected = model.forces(y[n], yd[n], ydd[n])
+        assert_close(found[n], expected, DIFFERENCES)
+
+
+@ARMS
+def test_tangent_is_the_derivative_of_the_rows(rng: np.random.Generator, arms: int) -> None:
+    """Column by column of q, qd and qdd."""
+    model = chain(rng, arms)
+    mechanism, r = model.mechanism(), model.rigid
+    y, yd, ydd = states(rng, model, 4)
+    motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
+    state = np.concatenate([y[:, r:], yd[:, r:], ydd[:, r:]], axis=1)
+
+    unit = np.eye(state.shape[1])
+
+    def rows(t: float) -> np.ndarray:
+        moved = (np.split(state + t * e, 3, axis=1) for e in unit)
+        return np.stack([inverse_dynamics(mechanism, motion, *x)[0] for x in moved], axis=2)
+
+    found = tangent(mechanism, motion, *np.split(state, 3, axis=1))
+    expected = derivative(rows)
+    assert_close(found, expected, DIFFERENCES)
+
+
+@ARMS
+def test_mass_matrix_is_that_of_the_points(rng: np.random.Generator, arms: int) -> None:
+    """Symmetric and positive definite over rigid and elastic coordinates together."""
+    model = chain(rng, arms)
+    y, yd, _ = states(rng, model, 1)[:, 0]
+    unit = np.eye(model.size)
+    repeat = np.ones((model.size, 1))
+    mass = forces(model, y * repeat, yd * repeat, unit)
+    mass = mass - forces(model, y[None], yd[None], np.zeros((1, model.size)))
+    expected = [[model.momentum_product(y, a, b) for a in unit] for b in unit]
+    # Rounding of a difference of forces ten times larger than the mass.
+    assert_close(mass, np.array(expected), 1e-13)
+    assert_close(mass, mass.T, 1e-13)
+    assert np.linalg.eigvalsh(mass).min() > 0.0
+    motion = RigidMotion(*(x[None, : model.rigid] for x in (y, yd, yd)))
+    elastic = (x[None, model.rigid :] for x in (y, yd, yd))
+    by_qdd = tangent(model.mechanism(), motion, *elastic)[0, :, -(model.size - model.rigid) :]
+    part = mass[model.rigid :, model.rigid :]
+    assert_close(by_qdd, part, 1e-13)
+
+
+@ARMS
+def test_work_becomes_energy(rng: np.random.Generator, arms: int) -> None:
+    """int (forces . yd - dissipation) dt = change of T + V along a motion nobody solved for."""
+    model = chain(rng, arms)
+    amplitude, phase = rng.normal(scale=0.3, size=(2, model.size))
+    frequency = rng.uniform(1.0, 4.0, size=model.size)  # rad/s
+    nodes, weights = np.polynomial.legendre.leggauss(40)  # exact to rounding over 1 s
+    t = np.concatenate([0.5 * (nodes + 1.0), [0.0, 1.0]])[:, None]
+    angle = frequency * t + phase
+    y = amplitude * np.sin(angle)
+    yd = amplitude * frequency * np.cos(angle)
+    ydd = -amplitude * frequency**2 * np.sin(angle)
+    power = (forces(model, y, yd, ydd) * yd).sum(axis=1) - [model.dissipation(v) for v in yd]
+    work = 0.5 * weights @ power[:-2]
+    energy = [model.kinetic(y[n], yd[n]) + model.potential(y[n]) for n in (-2, -1)]
+    assert_close(work, energy[1] - energy[0], 1e-12, np.abs(power).max())
+
+
+def test_rigid_limit_is_the_two_link_arm() -> None:
+    """Elastic coordinates at rest in zero: the textbook's torques of two links on a cart.
+
+    Source: Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), section 7.4, with
+    the cart's acceleration added.
+    """
+    rng = np.random.default_rng(3)
+    (m1, c1, J1, l1), (m2, c2, J2, l2) = (1.5, 0.4, 0.5, 1.0), (0.9, 0.3, 0.2, 0.8)
+    mp, Jp, g = 0.7, 0.05, 9.81
+    mechanism = Mechanism(
+        (rigid_link(m1, c1, J1, l1), rigid_link(m2, c2, J2, l2)), mp, Jp, (0.0, -g), 0.3
+    )
+    q, qd, qdd = rng.normal(size=(3, 6, 3))
+    zero = np.zeros((6, 2))
+    _, drives = inverse_dynamics(mechanism, RigidMotion(q, qd, qdd), zero, zero, zero)
+
+    alpha, total = q[:, 1], q[:, 1] + q[:, 2]
+    w1, w2 = qd[:, 1], qd[:, 1] + qd[:, 2]
+    wd1, wd2 = qdd[:, 1], qdd[:, 1] + qdd[:, 2]
+    s1 = m1 * c1 + (m2 + mp) * l1  # first moments that follow each link's direction
+    s2 = m2 * c2 + mp * l2
+    inner, outer = J1 + (m2 + mp) * l1**2, J2 + mp * l2**2 + Jp
+    cos, sin = np.cos(q[:, 2]), np.sin(q[:, 2])
+    x = qdd[:, 0]
+    elbow = (
+        outer * wd2
+        + s2 * l1 * (cos * wd1 + sin * w1**2)
+        + s2 * (g * np.cos(total) - x * np.sin(total))
+    )
+    shoulder = (
+        elbow
+        + inner * wd1
+        + s2 * l1 * (cos * wd2 - sin * w2**2)
+        + s1 * (g * np.cos(alpha) - x * np.sin(alpha))
+    )
+    cart = (
+        (m1 + m2 + mp) * x
+        - s1 * (np.sin(alpha) * wd1 + np.cos(alpha) * w1**2)
+        - s2 * (np.sin(total) * wd2 + np.cos(total) * w2**2)
+    )
+    expected = np.stack([cart, shoulder, elbow], axis=1)
+    assert_close(drives, expected, 1e-13)
+
+
+def rigid_link(mass: float, centre: float, inertia: float, length: float) -> ShapeIntegrals:
+    """Return a link with a single elastic coordinate that moves nothing but itself."""
+    return plane_body(
+        mass=mass,
+        moment=np.array([mass * centre, 0.0]),
+        inertia=inertia,
+        C=np.zeros((2, 1)),
+        j=np.zeros(1),
+        r=np.zeros(1),
+        M=np.eye(1),
+        G=np.zeros((1, 1)),
+        K=np.eye(1),
+        D=np.zeros((1, 1)),
+        outboard=np.zeros((3, 1)),
+        outboard_point=np.array([length, 0.0]),
+    )
+
+
+@ARMS
+def test_instants_do_not_feel_one_another(rng: np.random.Generator, arms: int) -> None:
+    """A batch gives what its instants give one by one."""
+    model = chain(rng, arms)
+    mechanism, r = model.mechanism(), model.rigid
+    y, yd, ydd = states(rng, model, 5)
+    together = forces(model, y, yd, ydd)
+    motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
+    slopes = tangent(mechanism, motion, y[:, r:], yd[:, r:], ydd[:, r:])
+    for n in range(5):
+        part = slice(n, n + 1)
+        one = forces(model, y[part], yd[part], ydd[part])
+        # Matrix products of other shapes sum in another order.
+        assert_close(one[0], together[n], 1e-14, np.abs(together).max())
+        motion = RigidMotion(y[part, :r], yd[part, :r], ydd[part, :r])
+        slope = tangent(mechanism, motion, y[part, r:], yd[part, r:], ydd[part, r:])
+        assert_close(slope[0], slopes[n], 1e-14, np.abs(slopes).max())
+
+
+@ARMS
+def test_end_effector_is_the_payloads_place(rng: np.random.Generator, arms: int) -> None:
+    """Positions, and the deviation from the rigid chain that is zero without deflection."""
+    model = chain(rng, arms)
+    mechanism, r = model.mechanism(), model.rigid
+    y = states(rng, model, 4)[0]
+    motion = RigidMotion(y[:, :r], y[:, :r], y[:, :r])
+    expected = np.array([model.places(row)[1] for row in y])
+    stiff = np.array([model.places(np.append(row[:r], 0.0 * row[r:]))[1] for row in y])
+    size = np.abs(expected).max()
+    assert_close(end_effector(mechanism, motion, y[:, r:]), expected, 1e-14, size)
+    assert_close(deviation(mechanism, motion, y[:, r:]), expected - stiff, 1e-14, size)
+    assert not deviation(mechanism, motion, 0.0 * y[:, r:]).any()
+
+
+def test_compliance_is_twice_the_elastic_energy(rng: np.random.Generator) -> None:
+    """Arm by arm, from the block-diagonal stiffness."""
+    model = chain(rng, 3)
+    mechanism = model.mechanism()
+    q = rng.normal(size=(4, mechanism.coordinates))
+    found = compliance(mechanism.bodies, mechanism.slices, q)
+    assert found.shape == (4, 3)
+    total = np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q)
+    assert_close(found.sum(axis=1), total, 1e-13)
+    alone = np.zeros_like(q)
+    alone[:, mechanism.slices[1]] = q[:, mechanism.slices[1]]
+    parts = compliance(mechanism.bodies, mechanism.slices, alone)
+    assert not parts[:, [0, 2]].any()
+    assert_close(parts[:, 1], found[:, 1], 1e-14)
+
+
+# -- places in memory ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_instants_do_not_depend_on_memory(rng: np.random.Generator, count: int) -> None:
+    """The same bits wherever the arrays lie; NumPy 1.24 multiplies short complex arrays two ways.
+
+    Arrays of all small sizes that come and go make the allocator choose other places every time.
+    """
+    model = chain(rng, 3)
+    mechanism, r = model.mechanism(), model.rigid
+    scene = load_scene(Path(__file__).parents[2] / "demos" / "three_arm.toml")
+    y, yd, ydd = states(rng, model, count)
+    weights = rng.normal(size=(count, 2))
+    t = np.linspace(0.2, 0.7, count)
+    found = set()
+    for k in range(60):
+        order = np.random.default_rng(k)
+        kept = [np.empty(n, dtype=complex) for n in order.integers(1, 9, 1500)]
+        for place in order.permutation(1500)[:700]:
+            kept[place] = kept[0]
+        motion = RigidMotion(y[:, :r].copy(), yd[:, :r].copy(), ydd[:, :r].copy())
+        q, qd, qdd = y[:, r:], yd[:, r:], ydd[:, r:]
+        slopes = body_slopes(mechanism, motion, q, qd, qdd, qd)
+        by_q, by_outboard = end_effector_slopes(mechanism, motion, q, weights)
+        arrays = [
+            *inverse_dynamics(mechanism, motion, q, qd, qdd),
+            elastic_rows(mechanism, motion, q, qd, qdd),
+            tangent(mechanism, motion, q, qd, qdd),
+            end_effector(mechanism, motion, q),
+            *(value for one in slopes for value in (one.w, one.W, one.K, one.outboard)),
+            *(by_q, *by_outboard),
+            *vars(rigid_motion(t, scene)).values(),
+        ]
+        found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) -> None:
+    """Values and sums at up to three instants, which are computed as four."""
+    model = chain(rng, 2)
+    mechanism, r = model.mechanism(), model.rigid
+    y, yd, ydd = states(rng, model, 8)
+    many = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
+    rates, weights = (y[:, r:], yd[:, r:], ydd[:, r:]), rng.normal(size=(8, 2))
+    first = slice(count)
+    few = tuple(x[first] for x in rates)
+    for function in (inverse_dynamics, elastic_rows, tangent):
+        whole, part = function(mechanism, many, *rates), function(mechanism, many[first], *few)
+        if not isinstance(whole, tuple):
+            whole, part = (whole,), (part,)
+        for a, b in zip(whole, part, strict=True):
+            assert len(b) == count
+            np.testing.assert_allclose(b, a[first], rtol=1e-12, atol=1e-12)
+    # What is summed over the instants: weights of none at the others.
+    weights[count:] = 0.0
+    multipliers = np.where(np.arange(8)[:, None] < count, rates[1], 0.0)
+    by_q, by_outboard = end_effector_slopes(mechanism, many[first], few[0], weights[first])
+    whole_q, whole_outboard = end_effector_slopes(mechanism, many, rates[0], weights)
+    np.testing.assert_allclose(by_q, whole_q[first], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(by_outboard[0], whole_outboard[0], rtol=1e-12, atol=1e-12)
+    part = body_slopes(mechanism, many[first], *few, multipliers[first])
+    whole = body_slopes(mechanism, many, *rates, multipliers)
+    for a, b in zip(whole, part, strict=True):
+        np.testing.assert_allclose(b.W, a.W, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(b.K, a.K, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,656 @@
+"""Time laws, paths and inverse kinematics against differences and the forward kinematics.
+
+At the end scenes with one and three arms, from the motion to the gradient.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bodies import Chain, Cloud, assert_close, derivative
+from mpi4py import MPI
+from scipy.optimize import brentq
+
+import dolfinopt as do
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.mechanism import inverse_dynamics
+from dolfinopt.multibody.motion import (
+    MAX_KINKS,
+    Bend,
+    RigidMotion,
+    arc,
+    breakpoints,
+    check_motion,
+    desired_path,
+    line,
+    rigid_motion,
+)
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.parallel import on_root
+from dolfinopt.paths.time_laws import quintic, septic
+from dolfinopt.scene.load import Scene, scene_from_dict
+
+WORLD = MPI.COMM_WORLD
+
+DURATION = 1.9  # s
+INSIDE = np.linspace(0.1, 1.8, 18)  # s, where the path is smooth
+DIFFERENCES = 1e-10  # relative: the sixth power of a step over the tenths of a second of a turn
+DENSE = np.linspace(0.0, 3.0, 601)  # s, over path and rest
+
+# Paths all over the plane: cart still, half way, along and against; links of two lengths.
+SCENES = pytest.mark.parametrize(
+    "keys",
+    [
+        {},
+        {"elbow": 1},
+        {"flattening": 0.0},
+        {"flattening": 0.4, "cart_follow": 0.0},
+        {"cart_follow": 1.0, "lengths": (1.2, 0.9)},
+        {"cart_follow": -0.2, "lengths": (0.8, 1.1), "elbow": 1},
+        {"joint_height": 0.3, "cart_follow": 0.0},  # the shoulder's angle passes pi
+    ],
+    ids=str,
+)
+
+
+def scene(
+    lengths: tuple[float, ...] = (1.0, 1.0), tables: dict[str, Any] | None = None, **motion: Any
+) -> Scene:
+    """Return the paper's example with these arms, this motion and other tables of the scene."""
+    section = {"height": 0.06, "thickness": 0.01, "cells": [20, 2], "passive": 0.0}
+    return scene_from_dict(
+        {
+            "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
+            "arms": [
+                {"name": f"arm{k}", "length": length, **section} for k, length in enumerate(lengths)
+            ],
+            "motion": {"duration": DURATION, "horizon": 3.0, **motion},
+            **(tables or {}),
+        },
+        source="test.toml",
+    )
+
+
+def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
+    """Return the rigid chain's end-effector (n, 2)."""
+    lengths = np.array([arm.length for arm in of.arms])
+    angles = np.cumsum(motion.q[:, 1:], axis=1)
+    x = motion.q[:, 0] + np.cos(angles) @ lengths
+    return np.stack([x, of.motion.joint_height + np.sin(angles) @ lengths], axis=1)
+
+
+def test_quintic_rests_before_and_after() -> None:
+    """Zero speed and acceleration up to the start and from the end on."""
+    s, sd, sdd = quintic(np.array([-1.0, 0.0, DURATION, 5.0]), DURATION)
+    assert s.tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert not sd.any()
+    assert not sdd.any()
+
+
+def test_quintic_derivatives() -> None:
+    """By differences, and the known peaks 15/8 and 10/sqrt(3) of speed and acceleration."""
+    s, sd, sdd = quintic(INSIDE, DURATION)
+    assert_close(derivative(lambda t: quintic(INSIDE + t, DURATION)[0]), sd, DIFFERENCES)
+    assert_close(derivative(lambda t: quintic(INSIDE + t, DURATION)[1]), sdd, DIFFERENCES)
+    assert (np.diff(s) > 0.0).all()
+    peak = DURATION * (0.5 - np.sqrt(3.0) / 6.0)  # where the jerk is zero
+    _, sd, sdd = quintic(np.array([DURATION / 2.0, peak]), DURATION)
+    assert_close(sd[0], 15.0 / 8.0 / DURATION, 1e-14)
+    assert_close(sdd, [0.0, 10.0 / np.sqrt(3.0) / DURATION**2], 1e-14)
+
+
+@pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
+def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
+    """On the ellipse, monotone in x, a straight line when it is flattened altogether."""
+    motion = scene(radius=0.9, flattening=flattening).motion
+    path = arc(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), motion)
+    expected = [[-0.9, 0.0], [0.0, 0.9 * flattening], [0.9, 0.0], [0.9, 0.0]]
+    assert_close(path.p, expected, 1e-14)
+    path = arc(DENSE, motion)
+    height = flattening * np.sqrt(np.maximum(0.9**2 - path.p[:, 0] ** 2, 0.0))
+    # The square root of a rounding error at the ends, where x^2 = r^2.
+    assert_close(path.p[:, 1], height, 1e-7, 0.9)
+    assert (np.diff(path.p[DENSE <= DURATION, 0]) > 0.0).all()
+
+
+@pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
+def test_arc_derivatives(flattening: float) -> None:
+    """Speed and acceleration by differences."""
+    motion = scene(flattening=flattening).motion
+    path = arc(INSIDE, motion)
+    assert_close(derivative(lambda t: arc(INSIDE + t, motion).p), path.pd, DIFFERENCES)
+    assert_close(derivative(lambda t: arc(INSIDE + t, motion).pd), path.pdd, DIFFERENCES)
+
+
+@SCENES
+def test_rigid_chain_traces_the_path(keys: dict[str, Any]) -> None:
+    """To rounding, with the elbow on the side asked for and the cart where it should be."""
+    of = scene(**keys)
+    motion = rigid_motion(DENSE, of)
+    path = arc(DENSE, of.motion)
+    assert_close(end_points(motion, of), path.p, 1e-14)
+    assert (np.sign(motion.q[:, 2]) == of.motion.elbow).all()
+    follow = of.motion.cart_follow
+    assert np.array_equal(motion.q[:, 0], follow * path.p[:, 0])
+    assert np.array_equal(motion.qd[:, 0], follow * path.pd[:, 0])
+    assert np.array_equal(motion.qdd[:, 0], follow * path.pdd[:, 0])
+
+
+@SCENES
+def test_rates_are_derivatives(keys: dict[str, Any]) -> None:
+    """Of all three coordinates, by differences."""
+    of = scene(**keys)
+    motion = rigid_motion(INSIDE, of)
+    speed = derivative(lambda t: rigid_motion(INSIDE + t, of).q, step=2e-3)
+    acceleration = derivative(lambda t: rigid_motion(INSIDE + t, of).qd, step=2e-3)
+    assert_close(speed, motion.qd, DIFFERENCES)
+    assert_close(acceleration, motion.qdd, DIFFERENCES)
+
+
+@SCENES
+def test_angles_are_continuous_and_rest_at_last(keys: dict[str, Any]) -> None:
+    """No jump by 2 pi; nothing moves once the path has ended."""
+    motion = rigid_motion(DENSE, scene(**keys))
+    steps = np.abs(np.diff(motion.q, axis=0)).max(axis=0)
+    assert (steps <= 1.1 * np.abs(motion.qd).max(axis=0) * DENSE[1]).all()
+    rest = DENSE >= DURATION
+    assert not motion.qd[rest].any()
+    assert not motion.qdd[rest].any()
+    assert_close(motion.q[rest], np.broadcast_to(motion.q[-1], motion.q[rest].shape), 1e-15)
+
+
+@pytest.mark.parametrize(
+    ("keys", "time", "distance", "word"),
+    [
+        ({"radius": 4.0}, 0.95, 4.5, "out of reach"),
+        ({"joint_height": -1.0}, 0.95, 2.0, "stretched"),  # singular, just reached
+        ({"lengths": (1.4, 0.6)}, 0.0, np.sqrt(0.5), "too near"),
+        ({"flattening": 0.0, "joint_height": 0.0, "cart_follow": 0.0}, 0.95, 0.0, "folded"),
+    ],
+    ids=["far", "stretched", "near", "folded"],
+)
+def test_unreachable_or_singular_path(
+    keys: dict[str, Any], time: float, distance: float, word: str
+) -> None:
+    """The worst instant and the distance there stand in the message."""
+    of = scene(**keys)
+    with pytest.raises(InputError) as caught:
+        rigid_motion(np.linspace(0.0, DURATION, 191), of)
+    found = re.fullmatch(
+        r"test\.toml: motion: at t = (\S+) s the end-effector is (\S+) m from the shoulder, (.*)",
+        str(caught.value),
+    )
+    assert found
+    assert float(found[1]) == pytest.approx(time, abs=5e-4)  # four digits
+    assert float(found[2]) == pytest.approx(distance, abs=5e-6)  # six digits
+    assert word in found[3]
+    with pytest.raises(InputError, match=r"motion\.joint_height"):
+        check_motion(of)
+
+
+def test_path_within_reach_is_accepted() -> None:
+    """Close to the stretched position, no message."""
+    check_motion(scene(joint_height=-0.999))
+
+
+def test_septic_is_the_law_with_continuous_jerk() -> None:
+    """Rest outside, derivatives by differences, the peak speed 35/16, no jerk at the ends."""
+    s, sd, sdd = septic(np.array([-1.0, 0.0, DURATION, 5.0]), DURATION)
+    assert s.tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert not sd.any()
+    assert not sdd.any()
+    s, sd, sdd = septic(INSIDE, DURATION)
+    assert (np.diff(s) > 0.0).all()
+    assert_close(derivative(lambda t: septic(INSIDE + t, DURATION)[0]), sd, DIFFERENCES)
+    assert_close(derivative(lambda t: septic(INSIDE + t, DURATION)[1]), sdd, DIFFERENCES)
+    assert_close(septic(np.array([DURATION / 2.0]), DURATION)[1], [35.0 / 16.0 / DURATION], 1e-14)
+    near = np.array([1e-6, DURATION - 1e-6])
+    assert np.abs(septic(near, DURATION)[2]).max() / 1e-6 < 1e-3  # it falls with the square
+    assert np.abs(quintic(near, DURATION)[2]).max() / 1e-6 > 1.0  # of the quintic it does not
+
+
+@pytest.mark.parametrize("law", ["quintic", "septic"])
+def test_line_is_straight(law: str) -> None:
+    """From start to end, by the law, all derivatives along it."""
+    motion = scene(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=law).motion
+    path = line(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), motion)
+    assert_close(path.p, [[-0.4, 0.1], [0.2, 0.35], [0.8, 0.6], [0.8, 0.6]], 1e-15)
+    path = line(INSIDE, motion)
+    s = quintic(INSIDE, DURATION) if law == "quintic" else septic(INSIDE, DURATION)
+    for found, expected in zip((path.p - [-0.4, 0.1], path.pd, path.pdd), s, strict=True):
+        assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
+
+
+# -- any number of arms ----------------------------------------------------------------------
+
+LENGTHS = {1: (1.0,), 2: (1.1, 0.9), 3: (0.8, 0.7, 0.5), 4: (0.6, 0.5, 0.5, 0.4)}  # m
+POINTS = np.array([[-0.7, 0.0], [-0.5, 0.3], [0.0, 0.2], [0.4, 0.35], [0.6, 0.1]])  # m
+TIMES = np.array([0.0, 0.5, 0.9, 1.3, DURATION])  # s
+PATHS = {
+    "arc": {"path": "arc", "radius": 0.7, "flattening": 0.5},
+    "line": {"path": "line", "start": [-0.7, -0.1], "end": [0.6, 0.4]},
+    "points": {"path": "points"},
+    "points in time": {"path": "points", "law": "quintic"},
+    "joints": {"path": "joints"},
+    "joints in time": {"path": "joints", "law": "quintic"},
+}
+BASES = {"cart": {}, "fixed": {"base": "fixed", "base_position": 0.1}}
+MOTIONS = [
+    (arms, path, law, base)
+    for arms in (1, 2, 3, 4)
+    for path in PATHS
+    for law in ("quintic", "septic")
+    for base in BASES
+    if "law" not in PATHS[path] or law == "quintic"  # a table with times has its own
+    if arms > 1 or base == "cart" or path.startswith("joints")
+]
+
+
+def joint_rows(columns: int) -> np.ndarray:
+    """Return joint coordinates at `TIMES` (n, columns)."""
+    k = np.arange(columns)
+    return 0.4 * np.sin(TIMES[:, None] * (1.0 + 0.7 * k) + k) + 0.2 * k
+
+
+def table_text(path: str, arms: int, base: str) -> str:
+    """Return a table of points or joints, with times where the path's name says so."""
+    names, rows = ["x", "y"], POINTS
+    if path.startswith("joints"):
+        names = ([] if base == "fixed" else ["cart"]) + [f"arm{k}" for k in range(arms)]
+        rows = joint_rows(len(names))
+    if path.endswith("time"):
+        names, rows = ["t", *names], np.column_stack([TIMES, rows])
+    return "\n".join([",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())])
+
+
+def of_kind(folder: Path, arms: int, path: str, law: str, base: str, **keys: Any) -> Scene:
+    """Return one of `MOTIONS`, with its table in `folder`."""
+    motion = {**PATHS[path], **BASES[base], "law": law, **keys}
+    if motion["path"] in ("points", "joints"):
+        motion["file"] = str(folder / f"{path}{arms}{base}.csv".replace(" ", "-"))
+        Path(motion["file"]).write_text(table_text(path, arms, base))
+    return scene(LENGTHS[arms], **motion)
+
+
+@pytest.mark.parametrize(("arms", "path", "law", "base"), MOTIONS)
+def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str) -> None:
+    """Traces the path or the rows; rates by differences; continuous, at rest at both ends."""
+    of = of_kind(tmp_path, arms, path, law, base)
+    check_motion(of)
+    motion = rigid_motion(DENSE, of)
+    assert motion.q.shape == motion.qd.shape == motion.qdd.shape == (len(DENSE), 1 + arms)
+    if path.startswith("joints"):
+        rows = joint_rows(arms + (base == "cart"))
+        at = TIMES if path == "joints in time" else np.array(breakpoints(of)[:-1])
+        assert_close(rigid_motion(at, of).q[:, -rows.shape[1] :], rows, 1e-12)
+    else:
+        assert_close(end_points(motion, of), desired_path(DENSE, of.motion).p, 2e-14)
+    if base == "fixed":
+        assert (motion.q[:, 0] == 0.1).all()
+        assert not motion.qd[:, 0].any()
+        assert not motion.qdd[:, 0].any()
+    # Differences across a row, where a higher derivative of the spline jumps, would be off.
+    knots = TIMES if path.endswith("time") else np.array(breakpoints(of))
+    inside = INSIDE[np.abs(INSIDE[:, None] - knots).min(axis=1) > 0.01]
+    assert len(inside) >= 12
+    here = rigid_motion(inside, of)
+    speed = derivative(lambda t: rigid_motion(inside + t, of).q, step=2e-3)
+    acceleration = derivative(lambda t: rigid_motion(inside + t, of).qd, step=2e-3)
+    assert_close(speed, here.qd, DIFFERENCES)
+    assert_close(acceleration, here.qdd, DIFFERENCES)
+    size = np.abs(motion.qdd).max()
+    ends = rigid_motion(np.array([0.0, 1e-7, DURATION - 1e-7, DURATION, 2.5]), of)
+    # The jerk is some hundred times the acceleration per second.
+    assert np.abs(ends.qdd).max() < 1e-4 * size
+    assert np.abs(ends.qd).max() < 1e-10 * size
+    assert_close(ends.q[:2], ends.q[[0, 0]], 1e-12)
+    assert_close(ends.q[3:], ends.q[[2, 2]], 1e-12)
+
+
+@pytest.mark.parametrize("elbow", [-1, 1])
+def test_one_arm_leans_to_its_side(elbow: int) -> None:
+    """The cosine has the sign of elbow; the cart is on the other side of the end-effector."""
+    of = scene((1.0,), elbow=elbow, **PATHS["line"])
+    motion = rigid_motion(DENSE, of)
+    assert (np.sign(np.cos(motion.q[:, 1])) == elbow).all()
+    height = desired_path(DENSE, of.motion).p[:, 1] + 0.5
+    assert_close(np.sin(motion.q[:, 1]), height, 1e-15)
+
+
+def test_two_arms_by_the_cosine_rule() -> None:
+    """Angles of the triangle of shoulder, elbow and end-effector."""
+    of = scene((1.1, 0.9), **PATHS["line"], **BASES["fixed"])
+    motion = rigid_motion(DENSE, of)
+    way = desired_path(DENSE, of.motion).p - [0.1, -0.5]
+    distance = np.hypot(*way.T)
+    inner = np.arccos((1.1**2 + 0.9**2 - distance**2) / (2.0 * 1.1 * 0.9))
+    at_shoulder = np.arccos((1.1**2 + distance**2 - 0.9**2) / (2.0 * 1.1 * distance))
+    assert_close(motion.q[:, 2], -(np.pi - inner), 1e-14)
+    assert_close(motion.q[:, 1], np.arctan2(way[:, 1], way[:, 0]) + at_shoulder, 1e-14)
+
+
+@pytest.mark.parametrize("arms", [2, 3, 4, 7])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_bend_is_the_first_from_stretched(arms: int, seed: int) -> None:
+    """By brackets on the chain's own distance: monotone to the least one, and its inverse."""
+    lengths = tuple(np.random.default_rng(seed).uniform(0.2, 1.0, size=arms))
+    bend = Bend(lengths)
+
+    def distance(beta: float) -> float:
+        return float(abs(sum(a * np.exp(1j * k * beta) for k, a in enumerate(lengths))))
+
+    last = np.arccos(bend.least)
+    grid = np.linspace(0.0, last, 400)
+    chain = np.array([distance(beta) for beta in grid])
+    assert (np.diff(chain) < 1e-12).all()
+    if last < np.pi:
+        # Behind the first minimum it rises; 1e-3 rad from it by some 1e-6 of a length.
+        assert distance(last + 1e-3) > distance(last)
+    assert_close(bend.reach, [distance(last), sum(lengths)], 1e-12)
+    wanted = np.linspace(bend.reach[0], bend.reach[1], 23)[1:-1]
+    found = np.arccos(bend.cosine(wanted**2))
+    exact = [brentq(lambda b, d=d: distance(b) - d, 0.0, last, xtol=1e-15) for d in wanted]
+    assert_close(found, exact, 1e-13)  # the distance to rounding over its slope, 0.01 or so
+    z, first, second = bend.lever(found)
+    assert_close(np.abs(z), wanted, 1e-14)
+    assert_close(derivative(lambda h: bend.lever(found + h)[0]), first, 1e-11)
+    assert_close(derivative(lambda h: bend.lever(found + h)[1]), second, 1e-11)
+
+
+@pytest.mark.parametrize("arms", [2, 3])
+def test_angles_do_not_depend_on_the_instants_asked_for(arms: int) -> None:
+    """Alone, backwards and far apart: the shoulder's angle passes pi and goes on."""
+    keys = {"joint_height": 0.3, "cart_follow": 0.0}
+    of = scene({2: (1.0, 1.0), 3: (0.8, 0.8, 0.8)}[arms], **keys)
+    whole = rigid_motion(DENSE, of).q
+    assert np.ptp(np.floor((whole[:, 1] + np.pi) / (2.0 * np.pi))) == 1.0  # it passes
+    assert np.array_equal(rigid_motion(DENSE[::-1], of).q[::-1], whole)
+    alone = [rigid_motion(DENSE[k : k + 1], of).q[0] for k in range(0, len(DENSE), 40)]
+    assert np.array_equal(alone, whole[::40])
+    assert rigid_motion(np.empty(0), of).q.shape == (0, 1 + arms)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "keys", "pattern"),
+    [
+        (
+            (0.5, 0.5, 0.5),
+            {"cart_follow": 0.0},
+            r"at t = 0\.95 s the end-effector is 1\.5 m from the shoulder, stretched or out of "
+            r"reach: arms of 0\.5 m, 0\.5 m and 0\.5 m, all elbows bent alike, need a distance "
+            r"between 0 m and 1\.5 m; change motion\.radius, motion\.flattening, "
+            r"motion\.cart_follow, motion\.joint_height or the arms' length",
+        ),
+        (
+            (1.0, 0.2, 0.2),
+            {"path": "line", "start": [-1, 0.1], "end": [1, 0.1], "base": "fixed"},
+            r"at t = 0\.95 s the end-effector is 0\.6 m from the shoulder, folded or too near: .*"
+            r"motion\.start, motion\.end, motion\.base_position, motion\.joint_height or .*",
+        ),
+        (
+            (1.2,),
+            {},
+            r"at t = 0\.95 s the end-effector is 1\.5 m above the shoulder, upright or out of "
+            r"reach: one arm of 1\.2 m needs less than 1\.2 m; change motion\.radius, "
+            r"motion\.flattening, motion\.joint_height or the arms' length",
+        ),
+        (
+            (1.2,),
+            {"path": "line", "start": [0, 0], "end": [1, -2]},
+            r"at t = 1\.9 s the end-effector is 1\.5 m below the shoulder, .*",
+        ),
+        (
+            (1.0, 1.0),
+            {"path": "line", "start": [0, 0], "end": [1e4, 1e4], "cart_follow": 1e3},
+            r"at t = .* s the end-effector is .*e\+06 m from the shoulder, stretched .*",
+        ),
+    ],
+    ids=["far", "near", "above", "below", "very far"],
+)
+def test_reach_of_any_number_of_arms(
+    lengths: tuple[float, ...], keys: dict[str, Any], pattern: str
+) -> None:
+    """The worst instant and the distance there; the keys that help."""
+    with pytest.raises(InputError, match=rf"^test\.toml: motion: {pattern}$"):
+        check_motion(scene(lengths, **keys))
+
+
+# -- tables ----------------------------------------------------------------------------------
+
+
+def test_points_of_a_straight_line_are_the_line(tmp_path: Path) -> None:
+    """Whatever their distances; without times the law of the scene holds."""
+    shares = np.array([0.0, 0.13, 0.2, 0.71, 1.0])
+    rows = np.array([-0.7, -0.1]) + np.outer(shares, [1.3, 0.5])
+    file = tmp_path / "line.csv"
+    file.write_text("\n".join(["x,y", *(f"{x!r},{y!r}" for x, y in rows.tolist())]))
+    for law in ("quintic", "septic"):
+        straight = rigid_motion(DENSE, scene(law=law, **PATHS["line"]))
+        found = rigid_motion(DENSE, scene(law=law, path="points", file=str(file)))
+        assert_close(found.q, straight.q, 1e-13)
+        assert_close(found.qdd, straight.qdd, 1e-12)
+
+
+def test_breakpoints(tmp_path: Path) -> None:
+    """The end of the path, and the rows of a short table without times."""
+    assert breakpoints(scene()) == (0.0, DURATION, 3.0)
+    assert breakpoints(scene(horizon=DURATION)) == (0.0, DURATION)
+    assert breakpoints(of_kind(tmp_path, 2, "points in time", "quintic", "cart")) == (
+        0.0,
+        DURATION,
+        3.0,
+    )
+    of = of_kind(tmp_path, 2, "points", "septic", "cart")
+    instants = breakpoints(of)
+    assert len(instants) == len(POINTS) + 1
+    assert_close(desired_path(np.array(instants[:-1]), of.motion).p, POINTS, 1e-13)
+    x = np.linspace(-0.5, 0.5, MAX_KINKS + 3)
+    file = tmp_path / "many.csv"
+    file.write_text("\n".join(["x,y", *(f"{a!r},{a * a!r}" for a in x.tolist())]))
+    assert breakpoints(scene(path="points", file=str(file))) == (0.0, DURATION, 3.0)
+
+
+def test_changed_table_is_read_anew(tmp_path: Path) -> None:
+    """The curve is kept, but not longer than the file."""
+    file = tmp_path / "points.csv"
+    file.write_text("x,y\n-0.5,0\n0.5,0\n")
+    of = scene(path="points", file=str(file))
+    before = end_points(rigid_motion(DENSE, of), of)
+    file.write_text("x,y\n-0.5,0\n0.5,0.3\n")
+    os.utime(file, ns=(1, 1))  # another time, even where the clock is coarse
+    after = end_points(rigid_motion(DENSE, of), of)
+    assert_close([before[-1], after[-1]], [[0.5, 0.0], [0.5, 0.3]], 1e-14)
+    file.unlink()
+    with pytest.raises(InputError, match=r"points\.csv: cannot be read \(No such file"):
+        rigid_motion(DENSE, of)
+
+
+@pytest.mark.parametrize(
+    ("text", "keys", "reason"),
+    [
+        (
+            "t,cart,arm0,arm1\n0,0,0,0\n1.5,1,1,1\n",
+            {},
+            "line 3, column t = 1.5: expected motion.duration = 1.9 [s] in the last row; set "
+            "motion.duration = 1.5",
+        ),
+        (
+            "t,cart,arm0,arm1\n0,0,0,0\n1,0,1,1\n1.9,1,1,1\n",
+            {"law": "septic"},
+            "line 3: a row between two stops with motion.law = 'septic' or limits, by which each "
+            "move runs from stop to stop; repeat the row at a later t to stop there, leave it "
+            "out, or leave out the column t, the law's name and the limits",
+        ),
+        (
+            "arm0,arm1\n0,0\n1,1\n",
+            {},
+            "line 1: missing column 'cart'; expected cart,arm0,arm1 or t,cart,arm0,arm1",
+        ),
+        (
+            "cart,arm0,arm1\n0,0,0\n1,1,1\n",
+            {"base": "fixed"},
+            "line 1: unknown column 'cart'; expected arm0,arm1 or t,arm0,arm1",
+        ),
+    ],
+    ids=["duration", "law", "no cart", "cart"],
+)
+def test_table_that_does_not_suit_the_scene(
+    tmp_path: Path, text: str, keys: dict[str, Any], reason: str
+) -> None:
+    """One line that says what to set."""
+    file = tmp_path / "joints.csv"
+    file.write_text(text)
+    of = scene(path="joints", file=str(file), **keys)
+    for call in (check_motion, breakpoints):
+        with pytest.raises(InputError) as caught:
+            call(of)
+        assert str(caught.value) == f"{file}: {reason}"
+
+
+@pytest.mark.parametrize("name", ["t", "cart"])
+def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
+    """Its column would have two meanings."""
+    file = tmp_path / "joints.csv"
+    file.write_text("t,cart,arm1\n0,0,0\n1,1,1\n")
+    keys = {"path": "joints", "file": str(file)}
+    of = scene(**keys)
+    arms = (of.arms[0].model_copy(update={"name": name}), of.arms[1])
+    with pytest.raises(InputError, match=rf"an arm named '{name}'.*another name"):
+        check_motion(of.model_copy(update={"arms": arms}))
+
+
+# -- scenes of one and three arms, end to end -------------------------------------------------
+
+HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `scene`'s arms
+
+
+def simulated(of: Scene, density: float = 1.0) -> Trajectory | None:
+    """Return the trajectory of uniform arms; None but on the root."""
+    ledger = do.Ledger()
+    share = do.share_arms(WORLD, of.cell_counts)
+    arms = do.build_arms(of, share, ledger)
+    x_phys = {k: arm.uniform(density) for k, arm in arms.items()}
+    return do.evaluate(of, share, arms, x_phys, ledger)[1]
+
+
+def bar(length: float) -> Cloud:
+    """Return a rigid solid arm as four point masses: those of Gauss' rule, exact to degree 3."""
+    gauss = np.array([-1.0, 1.0]) / np.sqrt(12.0)
+    x, y = np.meshgrid(length * (0.5 + gauss), HEIGHT * gauss)
+    mass = STEEL[1] * length * HEIGHT * THICKNESS
+    none = np.zeros((0, 0))
+    return Cloud(
+        points=np.stack([x.ravel(), y.ravel()], axis=1),
+        masses=np.full(4, 0.25 * mass),
+        modes=np.zeros((4, 2, 0)),
+        K=none,
+        D=none,
+        outboard=np.zeros((3, 0)),
+        reach=np.array([length, 0.0]),
+    )
+
+
+def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> None:
+    """Slowly: tangential and centrifugal loads of arm and payload on Bernoulli's beam and bar."""
+    file = tmp_path / "joints.csv"
+    file.write_text("t,arm0\n0,0.2\n1.9,2.7\n")  # two rows in time: the quintic law
+    length, mass = 0.7, 0.5  # m, kg
+    of = scene(
+        (length,),
+        {
+            "payload": {"mass": mass},
+            "arms": [
+                {
+                    "name": "arm0",
+                    "length": length,
+                    "height": HEIGHT,
+                    "thickness": THICKNESS,
+                    "passive": 0.0,
+                    "cells": [70, 6],
+                }
+            ],
+        },
+        path="joints",
+        file=str(file),
+        base="fixed",
+    )
+    trajectory = simulated(of)
+
+    def check() -> None:
+        assert trajectory is not None
+        s, sd, sdd = quintic(trajectory.t, DURATION)
+        alpha, speed, acceleration = 0.2 + 2.5 * s, 2.5 * sd, 2.5 * sdd
+        assert_close(trajectory.q_r[:, 1], alpha, 1e-13)
+        deviation = (trajectory.deviation @ [1.0, 1j]) * np.exp(-1j * alpha)
+        area, inertia = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0
+        line_mass = STEEL[1] * area
+        bending = STEEL[0] * inertia
+        across = 11.0 * line_mass * length**5 / 120.0 + mass * length**4 / 3.0
+        along = (line_mass * length**3 / 3.0 + mass * length**2) / (STEEL[0] * area)
+        # Six cells across bend too little and shear adds some: 1.5 % together.
+        assert_close(deviation.imag, -across / bending * acceleration, 0.02)
+        # Pulling needs no fine mesh; the ends, held against contraction, make it 0.3 % shorter.
+        assert_close(deviation.real, along * speed**2, 0.01)
+
+    on_root(WORLD, check)
+
+
+@pytest.mark.parametrize("base", ["cart", "fixed"])
+@pytest.mark.parametrize("arms", [1, 3])
+def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
+    """Of the rigid mechanism to differences, and of the flexible one in all but vibration."""
+    path = "joints in time" if arms == 1 else "points"
+    lengths = {1: (0.7,), 3: (0.7, 0.7, 0.7)}[arms]
+    file = tmp_path / "table.csv"
+    file.write_text(table_text(path, arms, base))
+    gravity = [0.5, -9.81]
+    motion = {**PATHS[path], **BASES[base], "file": str(file), "gravity": gravity}
+    of = scene(lengths, {"payload": {"mass": 2.0, "inertia": 0.1}}, **motion)
+    trajectory = simulated(of)
+
+    def check() -> None:
+        assert trajectory is not None
+        at = slice(100, 1900, 300)
+        rigid = RigidMotion(*(getattr(trajectory.motion, key)[at] for key in ("q", "qd", "qdd")))
+        clouds = tuple(bar(length) for length in lengths)
+        chain = Chain(clouds, 2.0, 0.1, (gravity[0], gravity[1]), of.motion.joint_height)
+        rows = zip(rigid.q, rigid.qd, rigid.qdd, strict=True)
+        expected = np.array([chain.forces(*row) for row in rows])
+        still = np.zeros((len(rigid.q), trajectory.mechanism.coordinates))
+        found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
+        assert_close(found, expected, 1e-10)  # differences of a function of size ten
+        # The arms bend by some thousandths of their length, and a vibration of 8 % goes on.
+        assert_close(trajectory.joint_forces[at], expected, 0.1)
+
+    on_root(WORLD, check)
+
+
+@pytest.mark.parametrize(
+    ("arms", "path", "law", "base"),
+    [
+        (1, "joints in time", "quintic", "fixed"),
+        (1, "line", "trapezoidal", "cart"),
+        (3, "points", "quintic", "cart"),
+        (3, "line", "s-curve", "fixed"),
+    ],
+)
+def test_exact_gradient_of_one_and_three_arms(
+    tmp_path: Path, arms: int, path: str, law: str, base: str
+) -> None:
+    """Taylor remainders of the complete chain fall with the square of the step."""
+    motion = dict(of_kind(tmp_path, arms, path, law, base).to_dict()["motion"], horizon=2.2)
+    lengths = {1: (1.0,), 3: (0.7, 0.7, 0.7)}[arms]
+    tables = {"payload": {"mass": 1.0}, "objective": {"load_cases": 5}}
+    of = scene(lengths, tables, **motion)
+    ledger = do.Ledger()
+    share = do.share_arms(WORLD, of.cell_counts)
+    built = do.build_arms(of, share, ledger)
+    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in built.items()}
+    test = taylor_test(of, share, built, x, ledger)
+    assert test.passed, {row.direction: round(row.rate, 3) for row in test.rows}

@@ -1,0 +1,339 @@
+"""What a run says at its end: converged or not, feasible or not, in which units."""
+
+import json
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from scipy.integrate import trapezoid
+
+import dolfinopt as do
+from dolfinopt.arms.vibration import frequency_excess
+from dolfinopt.cli import commands
+from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.optimization.optimality import kkt_residual
+from dolfinopt.output.files import ArmView, read_history, write_fields
+from dolfinopt.parallel import ArmShare, on_root, sum_over_arms
+from dolfinopt.responses import scenarios
+from dolfinopt.responses.constraints import Limit, distinct, violated, worst_limits
+
+WORLD = MPI.COMM_WORLD
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+QUICK = ["arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9"]
+QUICK += ["simulation.tolerance=1e-2"]
+ENVIRONMENT = dict(os.environ)
+
+
+def scene(*overrides, iterations):
+    settings = [*QUICK, f"optimizer.max_iterations={iterations}", *overrides]
+    return do.load_scene(SCENE, settings)
+
+
+# -- Karush-Kuhn-Tucker residual -------------------------------------------------------------
+
+ALONE = partial(sum_over_arms, ArmShare(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
+
+
+def residual(x, xmin, xmax, df0dx, f, dfdx):
+    return kkt_residual(x, xmin, xmax, df0dx, f, dfdx, {0: slice(0, len(x))}, ALONE)
+
+
+def compliance_problem(seed=0, n=200):
+    """Springs c / x with a limit on sum x: the optimum has x = sqrt(c / l), cut off at bounds."""
+    c = np.random.default_rng(seed).uniform(1e-3, 1.0, n)
+    xmin, xmax, limit = np.full(n, 0.2), np.ones(n), 0.7 * n
+    low, high = 1e-6, 1e3
+    for _ in range(200):
+        middle = np.sqrt(low * high)
+        x = np.clip(np.sqrt(c / middle), xmin, xmax)
+        low, high = (middle, high) if x.sum() > limit else (low, middle)
+    return c, x, xmin, xmax, limit, middle
+
+
+def test_no_residual_at_an_optimum():
+    c, x, xmin, xmax, limit, multiplier = compliance_problem()
+    assert ((x == 1.0).any() and (x == 0.2).any()) and ((x > 0.2) & (x < 1.0)).sum() > 50
+    constraint = np.array([x.sum() / limit - 1.0])
+    gradient = np.full((1, len(x)), 1.0 / limit)
+    found, multipliers = residual(x, xmin, xmax, -c / x**2, constraint, gradient)
+    assert found < 1e-9
+    # Of the objective scaled to a root mean square of 1, in units of the range.
+    rms = np.sqrt(np.mean((0.8 * c / x**2) ** 2))
+    assert multipliers[0] == pytest.approx(multiplier * limit / rms, rel=1e-6)
+    # The same in any unit, and with a repeated and an inactive constraint beside it.
+    more = np.append(np.append(constraint, constraint), -0.3)
+    rows = np.vstack([gradient, gradient, -np.ones(len(x))])
+    scaled = residual(x, xmin, xmax, -1e9 * c / x**2, more, np.array([[1e6], [1.0], [1.0]]) * rows)
+    assert scaled[0] < 1e-9 and scaled[1][2] == 0.0
+
+
+def test_residual_grows_with_the_distance():
+    c, x, xmin, xmax, limit, _ = compliance_problem()
+    inside = (x > 0.25) & (x < 0.95)
+    d = np.where(inside, np.random.default_rng(1).uniform(-1.0, 1.0, len(x)), 0.0)
+    d[inside] -= d[inside].mean()
+    found = []
+    for step in (1e-3, 1e-2):
+        moved = x + step * d
+        slope = -c / moved**2
+        row = np.full((1, len(x)), 1.0 / limit)
+        found.append(residual(moved, xmin, xmax, slope, np.zeros(1), row)[0])
+    assert found[1] == pytest.approx(10.0 * found[0], rel=0.1)
+
+
+def test_residual_of_what_no_multiplier_balances():
+    """|L| / |df0dx| = 1 without constraints, however large; a gradient into a bound is none."""
+    n = 50
+    x, low, high = np.full(n, 0.5), np.zeros(n), np.ones(n)
+    slope = np.where(np.arange(n) % 2, 1.0, -1.0) * 1e-7
+    none = np.zeros(0), np.zeros((0, n))
+    # A step of 1 is cut off at the bounds, half a range away.
+    assert residual(x, low, high, slope, *none)[0] == pytest.approx(0.5, rel=1e-12)
+    assert residual(np.where(slope > 0.0, 0.0, 1.0), low, high, slope, *none)[0] == 0.0
+    # Multipliers are not negative: a constraint that points the other way is no help.
+    row = slope[None]
+    assert residual(x, low, high, slope, np.zeros(1), row)[0] == pytest.approx(0.5, rel=1e-12)
+    assert residual(x, low, high, slope, np.zeros(1), -row)[0] < 1e-12
+    assert residual(x, low, high, slope, np.array([-0.1]), -row)[0] == pytest.approx(0.5)
+    assert residual(x, low, high, np.zeros(n), *none)[0] == 0.0
+
+
+@pytest.mark.slow
+def test_a_resting_design_is_a_stationary_one():
+    """The residual falls by orders of magnitude on the way, and is in file and result alike."""
+    result = do.optimize(scene("objective.kind=static", iterations=200))
+    assert result.converged and result.kkt < 1e-2 and not result.violated
+    if WORLD.rank == 0:
+        assert result.history[0].kkt > 0.1 and result.history[-1].kkt == result.kkt
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
+def test_residual_has_the_same_bits_on_any_number_of_ranks():
+    together = do.optimize(scene("constraints.tip_deflection=1e-4", iterations=2))
+    alone = do.optimize(scene("constraints.tip_deflection=1e-4", iterations=2), world=MPI.COMM_SELF)
+    assert together.kkt == alone.kkt
+    assert together.limits == alone.limits
+
+
+# -- converged, finished, infeasible ---------------------------------------------------------
+
+
+def test_a_tiny_move_limit_is_no_convergence():
+    result = do.optimize(scene("optimizer.move=1e-6", "objective.kind=static", iterations=3))
+    assert not result.converged and result.iterations == 3
+    # Nor is one that just lets variables move less than the tolerance.
+    short = do.optimize(scene("optimizer.move=5e-4", "objective.kind=static", iterations=3))
+    assert not short.converged and short.iterations == 3
+    loose = ["optimizer.move=5e-4", "optimizer.kkt_tolerance=1e6", "objective.kind=static"]
+    assert not do.optimize(scene(*loose, iterations=3)).converged
+
+
+def test_a_large_residual_is_no_convergence():
+    """All changes count as small; the residual of the first steps does not."""
+    small = ["optimizer.tolerance=1", "optimizer.move=1", "objective.kind=static"]
+    result = do.optimize(scene(*small, iterations=2))
+    assert not result.converged and result.kkt > 0.1
+    assert do.optimize(scene(*small, "optimizer.kkt_tolerance=1e6", iterations=2)).converged
+
+
+@pytest.mark.parametrize(
+    ("bound", "words"),
+    [
+        ("constraints.tip_deflection=1e-9", ["tip deflection of arm1", "at most 1e-09 m asked"]),
+        ("constraints.first_frequency=80", ["first frequency of arm2", "at least 80 Hz asked"]),
+    ],
+)
+def test_an_infeasible_end_has_status_1_and_one_line(bound, words, shared_tmp_path):
+    """The files are there all the same, and name the constraint."""
+    folder = shared_tmp_path / "out"
+    line = ["optimize", str(SCENE), "--no-plots", "--out", str(folder)]
+    for override in [*QUICK, "optimizer.max_iterations=2", "objective.kind=static", bound]:
+        line += ["--set", override]
+    with pytest.raises(do.ConvergenceError) as caught:
+        commands.main(line, standalone_mode=False, obj=WORLD)
+    message = str(caught.value)
+    assert "\n" not in message and "%" not in message
+    for word in words:
+        assert word in message
+    WORLD.barrier()
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["converged"] is False
+    name = words[0].replace(" of ", " ").replace(" ", "_")
+    one = summary["constraints"][name]
+    assert one["met"] is False and one["limit"] == float(bound.partition("=")[2])
+    assert f"{one['value']:.3g} {one['unit']}" in message
+    rows = read_history(folder / "history.csv")
+    assert rows[-1].constraints[name] == pytest.approx(one["value"], rel=1e-9)
+    assert [row.iteration for row in rows] == [0, 1, 2] and np.isfinite(rows[-1].kkt)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("bound", ["1e-9", "1.0"])
+def test_exit_status_of_an_optimisation(bound, tmp_path):
+    """0: finished, feasible, though the iterations ran out; 1: not feasible."""
+    line = [sys.executable, "-m", "dolfinopt", "optimize", str(SCENE), "--no-plots"]
+    line += ["--out", str(tmp_path / "out")]
+    bound = f"constraints.tip_deflection={bound}"
+    for override in [*QUICK, "optimizer.max_iterations=1", "objective.kind=static", bound]:
+        line += ["--set", override]
+    done = subprocess.run(line, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    feasible = bound.endswith("1.0")
+    assert done.returncode == (0 if feasible else 1)
+    assert "minimised compliance under static loads" in done.stdout
+    assert done.stdout.count("iterations") == 2  # "1 iterations (optimizer.max_iterations = 1)"
+    told = [text for text in done.stderr.splitlines() if "asked" in text]
+    assert len(told) == (0 if feasible else 1) and "Traceback" not in done.stderr
+
+
+def test_the_last_line_says_what_was_minimised(shared_tmp_path, capsys):
+    def run(command, *overrides):
+        line = [command, str(SCENE), "--no-plots", "--out", str(shared_tmp_path / overrides[-1])]
+        for override in (*QUICK, *overrides):
+            line += ["--set", override]
+        commands.main(line, standalone_mode=False, obj=WORLD)
+        return capsys.readouterr().out.splitlines()[-1] if WORLD.rank == 0 else ""
+
+    line = run("optimize", "optimizer.max_iterations=1", "objective.kind=eigenfrequency")
+    if WORLD.rank == 0:
+        assert (
+            "minimised squared longest periods" in line and " s2 (first frequency of arm1" in line
+        )
+        assert "N m" not in line
+    line = run("simulate", "objective.kind=deviation")
+    if WORLD.rank == 0:
+        assert ": simulated, p-mean of the deviation" in line and "iterations" not in line
+
+
+def test_sentences_tell_a_value_from_its_limit():
+    limit = Limit("first_frequency", "arm2", 60.4321, 80.0, "Hz", least=True)
+    assert limit.sentence == "first frequency of arm2: 60.4 Hz, at least 80 Hz asked"
+    assert distinct(80.0004, 80.0) == ("80.0004", "80")
+    assert not limit.met and violated([limit]) == limit.sentence
+    assert Limit("first_frequency", "arm2", 79.95, 80.0, "Hz", least=True).met  # to 1e-3
+    both = worst_limits([[limit], [Limit("first_frequency", "arm2", 90.0, 80.0, "Hz", least=True)]])
+    assert both == (limit,)
+    assert Limit("volume_fraction", "", 0.6, 0.5, "-").sentence == (
+        "volume fraction: 0.6, at most 0.5 asked"
+    )
+
+
+def test_robust_designs_take_the_scene_s_exponent(monkeypatch):
+    """Eroded, nominal and dilated are combined with objective.exponent."""
+    asked = []
+    original = scenarios.worst_of
+
+    def noted(values, exponent):
+        asked.append((len(values), exponent))
+        return original(values, exponent)
+
+    monkeypatch.setattr("dolfinopt.optimization.loop.worst_of", noted)
+    robust = ["design.projection=robust", "objective.exponent=7", "objective.kind=static"]
+    do.optimize(scene(*robust, iterations=1))
+    assert asked and set(asked) == {(3, 7.0)}
+
+
+# -- figures and files -----------------------------------------------------------------------
+
+
+def test_machine_figures(shared_tmp_path):
+    """Masses, drives and settling are those of the trajectory; every figure has its unit."""
+    line = ["simulate", str(SCENE), "--no-plots", "--out", str(shared_tmp_path)]
+    for override in (*QUICK, "motion.horizon=2.5", "payload.mass=3"):
+        line += ["--set", override]
+    commands.main(line, standalone_mode=False, obj=WORLD)
+    WORLD.barrier()
+    summary = json.loads((shared_tmp_path / "summary.json").read_text())
+    with np.load(shared_tmp_path / "trajectory.npz") as data:
+        t, deviation, forces = data["t"], data["deviation"], data["joint_forces"]
+    after = np.hypot(*deviation[t >= 1.9 - 1e-9].T)
+    assert summary["settling"] == pytest.approx(after.max(), rel=1e-12)
+    assert 0.0 < summary["settling"] < summary["max_deviation"]
+    for k, name in enumerate(("cart", "arm1", "arm2")):
+        assert summary["drive_peak"][name] == pytest.approx(np.abs(forces[:, k]).max())
+        rms = np.sqrt(trapezoid(forces[:, k] ** 2, t) / t[-1])
+        assert summary["drive_rms"][name] == pytest.approx(rms, rel=1e-9)
+    # Half of 2700 kg/m3 on 1 x 0.06 x 0.01 m3.
+    assert summary["mass"]["arm2"] == pytest.approx(0.81, rel=1e-5)
+    units = summary["units"]
+    for key in ("compliance", "settling", "mass", "first_frequency", "drive_peak", "objective"):
+        assert key in summary and units[key]
+    assert units["drive_peak"] == {"cart": "N", "arm1": "N m", "arm2": "N m"}
+    assert summary["kkt"] is None and summary["stop_reason"] == "simulated"
+    assert summary["constraints"]["volume_fraction_arm1"]["met"]
+
+
+def test_settling_of_a_horizon_that_ends_with_the_motion():
+    share = do.share_arms(WORLD, (one := scene(iterations=1)).cell_counts)
+    arms = do.build_arms(one, share, ledger := do.Ledger())
+    x = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    _, trajectory = do.evaluate(one, share, arms, x, ledger)
+    if trajectory is not None:
+        assert trajectory.settling == pytest.approx(np.hypot(*trajectory.deviation[-1]))
+
+
+def test_first_frequency_error_is_that_to_the_full_model():
+    """Against a basis of thirty coordinates, whose first frequency is the full model's to 1e-8."""
+
+    def first(coordinates):
+        one = scene(f"reduction.coordinates={coordinates}", iterations=1)
+        share = do.share_arms(MPI.COMM_SELF, one.cell_counts)
+        arms = do.build_arms(one, share, do.Ledger())
+        x = arms[0].uniform(0.5)
+        body = arms[0].reduce(x)
+        found = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real.min()
+        return arms[0], body, np.sqrt(found)
+
+    arm, body, reduced = first(3)
+    assert isinstance(arm.elastic, ElasticArm) and arm.basis is not None
+    full = first(30)[2]
+    error = frequency_excess(arm.elastic, arm.basis.V, body.K, body.M)
+    assert reduced / full - 1.0 > 1e-3
+    assert error == pytest.approx(reduced / full - 1.0, rel=0.02)
+
+
+SQUARES = np.array(
+    [[[0, 0], [1, 0], [1, 1], [0, 1]], [[1, 0], [2, 0], [2, 1], [1, 1]]], dtype=float
+)
+TRIANGLES = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=float)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("shapes", [[SQUARES], [TRIANGLES], [SQUARES, TRIANGLES]])
+def test_designs_open_in_other_programs(shapes, tmp_path):
+    """PyVista reads both files with the readers of ParaView, meshio the .vtu."""
+    meshio, pyvista = pytest.importorskip("meshio"), pytest.importorskip("pyvista")
+    views = [
+        ArmView(f"arm{k}", corners, corners.mean(axis=1), np.array([0.25, 1.0]), np.zeros(0))
+        for k, corners in enumerate(shapes)
+    ]
+    write_fields(tmp_path, views)
+    density = np.tile([0.25, 1.0], len(shapes))
+    arm = np.repeat(np.arange(len(shapes)), 2)
+    area = sum(2.0 if corners is SQUARES else 1.0 for corners in shapes)
+    for name in ("design.vtu", "design.xdmf"):
+        grid = pyvista.read(tmp_path / name)
+        np.testing.assert_array_equal(grid.cell_data["density"], density)
+        np.testing.assert_array_equal(grid.cell_data["arm"], arm)
+        assert grid.compute_cell_sizes().cell_data["Area"].sum() == pytest.approx(area)
+    mesh = meshio.read(tmp_path / "design.vtu")
+    np.testing.assert_array_equal(np.concatenate(mesh.cell_data["density"]), density)
+    assert {block.type for block in mesh.cells} <= {"quad", "triangle"}
+    assert sum(len(block.data) for block in mesh.cells) == 2 * len(shapes)
+
+
+def test_history_of_a_run_without_constraints_column(shared_tmp_path):
+    """Rows of an earlier version, without residual and constraints, can still be read."""
+
+    def written():
+        path = shared_tmp_path / "history.csv"
+        header = "iteration,objective,max_deviation,grayness,volume_fraction,change,seconds\n"
+        path.write_text(header + "0,1.0,2.0,0.5,0.5,0,0.1\n")
+        return read_history(path)
+
+    (row,) = on_root(WORLD, written)
+    assert row.objective == 1.0 and np.isnan(row.kkt) and row.constraints == {}

@@ -1,0 +1,750 @@
+"""The method of moving asymptotes: against mmapy, optimality, invariances, robustness.
+
+Problems are written for all variables; each rank of COMM_WORLD holds its piece of them.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from mmapy import mmasub
+from mpi4py import MPI
+from scipy.optimize import minimize
+
+import dolfinopt.optimization.mma as mma
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
+
+COMM = MPI.COMM_WORLD
+RAA0 = 1e-5
+PENALTY = 1000.0
+
+Problem = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]  # df0dx, f, dfdx
+
+
+# Variables over the ranks
+
+
+def mine(values):
+    """Return this rank's piece of the last axis."""
+    return np.array_split(np.asarray(values), COMM.size, axis=-1)[COMM.rank]
+
+
+def whole(piece):
+    """Return all pieces, joined, on every rank."""
+    return np.concatenate(COMM.allgather(piece))
+
+
+def whole_state(state):
+    """Return the state of all variables."""
+    fields = {k: whole(getattr(state, k)) for k in ("x_old1", "x_old2", "low", "upp")}
+    return replace(state, **fields)
+
+
+def state_piece(state):
+    """Return this rank's piece of the state of all variables."""
+    fields = {k: mine(getattr(state, k)) for k in ("x_old1", "x_old2", "low", "upp")}
+    return replace(state, **fields)
+
+
+def step(x, df0dx, f, dfdx, lo, hi, state, move=0.2):
+    """Take one step with all variables given, over the ranks; return all of them again."""
+    x_new, state = mma_step(
+        *(mine(x), mine(df0dx), f, mine(dfdx), mine(lo), mine(hi), state_piece(state)),
+        move=move,
+        comm=COMM,
+    )
+    return whole(x_new), whole_state(state)
+
+
+def iterate(problem, x, lo, hi, steps, move=0.2):
+    """Return the designs (steps + 1, n) from x on, and the last state."""
+    designs, state = [x], initial_state(x)
+    for _ in range(steps):
+        x, state = step(x, *problem(x), lo, hi, state, move)
+        designs.append(x)
+    return np.array(designs), state
+
+
+class Ranks:
+    """Let threads stand for ranks: what `mma_step` asks of a communicator."""
+
+    def __init__(self, rank, slots, barrier):
+        self.rank, self.slots, self.barrier, self.size = rank, slots, barrier, len(slots)
+
+    def allgather(self, value):
+        self.slots[self.rank] = value
+        self.barrier.wait()
+        values = list(self.slots)
+        self.barrier.wait()
+        return values
+
+
+def on_threads(size, run):
+    """Return what run(communicator) returns on each of `size` threads."""
+    slots, barrier = [None] * size, threading.Barrier(size, timeout=60.0)
+    with ThreadPoolExecutor(size) as pool:
+        return list(pool.map(lambda rank: run(Ranks(rank, slots, barrier)), range(size)))
+
+
+# Problems
+
+
+def cantilever(x):
+    """Return Svanberg's beam of five boxes (1987, section 4.1): weight, tip deflection <= 1."""
+    a = np.array([61.0, 37.0, 19.0, 7.0, 1.0])
+    return np.full(5, 0.0624), np.array([(a / x**3).sum() - 1.0]), (-3.0 * a / x**4)[None]
+
+
+def two_arms(n, energies=None) -> Problem:
+    """Return the compliance sum_j e_j / x_j with a volume <= 0.4 for each half of the variables."""
+    if energies is None:
+        energies = np.exp(3.0 * np.cos(np.arange(n)))
+    halves = np.array_split(np.arange(n), 2)
+    volume = np.zeros((2, n))
+    for row, half in zip(volume, halves):
+        row[half] = 1.0 / (0.4 * half.size)
+    return lambda x: (-energies / x**2, volume @ x - 1.0, volume)
+
+
+def waves(seed, margin=0.1) -> tuple[Problem, np.ndarray]:
+    """Return a nonconvex problem with up to five constraints, and a start that meets them."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(2, 30)), int(rng.integers(1, 6))
+    c, d = rng.standard_normal((2, 1 + m, n))
+    x = rng.random(n)
+    limit = (c @ np.sin(3.0 * x) + d @ x**2)[1:] + margin * n * rng.random(m)
+
+    def problem(x):
+        values, slopes = c @ np.sin(3.0 * x) + d @ x**2, 3.0 * c * np.cos(3.0 * x) + 2.0 * d * x
+        return slopes[0], values[1:] - limit, slopes[1:]
+
+    return problem, x
+
+
+def any_step(seed):
+    """Return inputs of a step that may be infeasible, degenerate, badly scaled, partly passive."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.choice([1, 2, 5, 20, 200])), int(rng.integers(1, 11))
+    unit = rng.choice([1.0, 1e-3, 1e3])
+    lo = -unit * rng.random(n)
+    hi = lo + unit * (0.1 + rng.random(n))
+    hi = np.where(rng.random(n) < 0.1, lo, hi)
+    spread = rng.choice([0.0, 1.0, 5.0])
+
+    def gradient():
+        g = np.exp(-spread * rng.random(n)) * rng.choice([1.0, -1.0], n)
+        g *= rng.random(n) < rng.choice([0.3, 1.0])
+        return rng.choice([g, np.abs(g), -np.abs(g)]) * 10.0 ** rng.integers(-6, 6)
+
+    df0dx, dfdx = gradient(), np.array([gradient() for _ in range(m)])
+    if rng.random() < 0.2:
+        dfdx[-1] = 0.0
+    sizes = np.array([1.0, -1.0, 0.1, -0.1, 0.01, 0.0])
+    f = rng.choice(sizes, m) * np.abs(dfdx * (hi - lo)).sum(axis=1)
+    x, x1, x2 = (np.minimum(lo + share * (hi - lo), hi) for share in rng.random((3, n)))
+    x = np.where(rng.random(n) < 0.2, lo, x)
+    delta = (hi - lo) * 10.0 ** rng.uniform(-2.0, 1.0, n)
+    state = MMAState(int(rng.choice([0, 5])), x1, x2, x - delta, x + delta, np.empty(0))
+    return x, df0dx, f, dfdx, lo, hi, state, float(rng.choice([0.05, 0.2, 0.5]))
+
+
+# Svanberg's form of the subproblem, as in his papers
+
+
+class Subproblem:
+    """Svanberg's p / (U - x) + q / (x - L) of the normalised functions, with its bounds."""
+
+    def __init__(self, x, df0dx, f, dfdx, lo, hi, new_state, move):
+        width = hi - lo
+        gradients = np.vstack((df0dx, dfdx))
+        scale = np.abs(gradients * width).max(axis=1)
+        scale[scale == 0.0] = 1.0
+        gradients = gradients / scale[:, None]
+        self.low, self.upp, self.x = new_state.low, new_state.upp, x
+        floor = RAA0 / np.where(width > 0.0, width, np.inf)
+        up, down = np.maximum(gradients, 0.0), np.maximum(-gradients, 0.0)
+        self.p = (self.upp - x) ** 2 * (1.001 * up + 0.001 * down + floor)
+        self.q = (x - self.low) ** 2 * (0.001 * up + 1.001 * down + floor)
+        self.f = np.concatenate(([0.0], f / scale[1:]))
+        self.alpha = np.maximum(lo, np.maximum(x - move * width, self.low + 0.1 * (x - self.low)))
+        self.beta = np.minimum(hi, np.minimum(x + move * width, self.upp - 0.1 * (self.upp - x)))
+
+    def values(self, y):
+        """Return the approximations (1 + m,) at the design y."""
+        p_part = self.p * (1.0 / (self.upp - y) - 1.0 / (self.upp - self.x))
+        q_part = self.q * (1.0 / (y - self.low) - 1.0 / (self.x - self.low))
+        return self.f + (p_part + q_part).sum(axis=1)
+
+    def slopes(self, y):
+        """Return the two parts of the derivatives (1 + m, n), rising and falling."""
+        return self.p / (self.upp - y) ** 2, self.q / (y - self.low) ** 2
+
+
+def mmapy_step(x, df0dx, f, dfdx, lo, hi, state, move, magnified=1e4):
+    """Return mmapy's design, asymptotes and final residual for the normalised problem.
+
+    Its interior point method stops at an absolute residual of 1e-7, to be seen in the design
+    divided by the curvature, which may be as low as raa0. All functions times `magnified`, with
+    the penalties to match, are the same problem and lower the residual by as much.
+    """
+    width, m = hi - lo, f.size
+    scale = np.abs(dfdx * width).max(axis=1)
+
+    def column(values):
+        return np.asarray(values, dtype=float).reshape(-1, 1)
+
+    result = mmasub(
+        m,
+        x.size,
+        state.iteration + 1,
+        *map(column, (x, lo, hi, state.x_old1, state.x_old2)),
+        0.0,
+        column(magnified * df0dx / np.abs(df0dx * width).max()),
+        column(magnified * f / scale),
+        magnified * dfdx / scale[:, None],
+        *map(column, (state.low, state.upp)),
+        magnified,
+        np.zeros((m, 1)),
+        np.full((m, 1), PENALTY),
+        np.full((m, 1), 1.0 / magnified),
+        move=move,
+        raa0=magnified * RAA0,
+    )
+    y, excess, _, lam, xsi, eta, _, _, slack, low, upp = (np.ravel(part) for part in result)
+    sub = Subproblem(x, df0dx, f, dfdx, lo, hi, MMAState(0, x, x, low, upp, lam), move)
+    slope = np.concatenate(([1.0], lam)) @ np.subtract(*sub.slopes(y)) - (xsi - eta) / magnified
+    balance = sub.values(y)[1:] + (slack - excess) / magnified
+    return y, low, upp, np.abs(np.concatenate((slope, balance))).max()
+
+
+def largest_difference_from_mmapy(problem, x, lo, hi, steps, move=0.2):
+    """Step from the same designs; return the largest differences of design and asymptotes.
+
+    The asymptotes of variables at rest are left out, because mmapy reads the sign of rounding, and
+    the designs that follow from them. Left out are also designs where mmapy gave up: after 200
+    iterations, without a word, once in about 2000 steps.
+    """
+    state, compared, of_design, of_asymptotes = initial_state(x), 0, 0.0, 0.0
+    for _ in range(steps):
+        inputs = (x, *problem(x), lo, hi, state, move)
+        last, before = x - state.x_old1, state.x_old1 - state.x_old2
+        x, state = step(*inputs)
+        other, low, upp, residual = mmapy_step(*inputs)
+        apart = np.maximum(np.abs(low - state.low), np.abs(upp - state.upp))
+        resting = (last * before != 0.0) & (np.minimum(np.abs(last), np.abs(before)) < 1e-8)
+        of_asymptotes = max(of_asymptotes, apart[~resting].max(initial=0.0))
+        if residual < 1e-10 and apart.max() < 1e-12:  # it aims at 1e-7 / 1e4
+            of_design = max(of_design, np.abs(x - other).max())
+            compared += 1
+    assert compared >= 0.5 * steps
+    return of_design, of_asymptotes
+
+
+# Against known optima and mmapy
+
+
+def test_cantilever_reaches_the_optimum():
+    """The optimum is known: all x_j^4 in proportion to their share in the deflection."""
+    a = np.array([61.0, 37.0, 19.0, 7.0, 1.0]) ** 0.25
+    exact = a * a.sum() ** (1.0 / 3.0)
+    designs, _ = iterate(cantilever, np.full(5, 5.0), np.ones(5), np.full(5, 10.0), 40, move=0.5)
+    assert 0.0624 * exact.sum() == pytest.approx(1.340, abs=5e-4)  # Svanberg 1987
+    np.testing.assert_allclose(designs[-1], exact, rtol=1e-6)
+
+
+def test_cantilever_steps_agree_with_mmapy():
+    design, asymptotes = largest_difference_from_mmapy(
+        cantilever, np.full(5, 5.0), np.ones(5), np.full(5, 10.0), steps=14, move=0.5
+    )
+    assert design < 1e-8
+    assert asymptotes < 1e-12
+
+
+def test_two_volumes_reach_the_optimum():
+    """Every half has x_j = sqrt(e_j / l) within its bounds, l from its volume."""
+    n, lo, hi = 40, 1e-3, 1.0
+    energies = np.exp(3.0 * np.cos(np.arange(n)))
+    bounds = np.full(n, lo), np.full(n, hi)
+    designs, _ = iterate(two_arms(n, energies), np.full(n, 0.4), *bounds, 150)
+    for half in np.array_split(np.arange(n), 2):
+        few, much = 1e-6, 1e6
+        for _ in range(200):
+            multiplier = np.sqrt(few * much)
+            exact = np.clip(np.sqrt(energies[half] / multiplier), lo, hi)
+            few, much = (multiplier, much) if exact.mean() > 0.4 else (few, multiplier)
+        np.testing.assert_allclose(designs[-1][half], exact, atol=1e-6)
+
+
+def test_two_volume_steps_agree_with_mmapy():
+    n = 60
+    design, asymptotes = largest_difference_from_mmapy(
+        two_arms(n), np.full(n, 0.4), np.full(n, 1e-3), np.ones(n), steps=30
+    )
+    assert design < 1e-5  # see test_nonconvex_steps_agree_with_mmapy
+    assert asymptotes < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_nonconvex_steps_agree_with_mmapy(seed):
+    """To mmapy's residual over the least curvature, 1e-7 / 1e4 / raa0 = 1e-6, times some."""
+    problem, x = waves(seed)
+    design, asymptotes = largest_difference_from_mmapy(
+        problem, x, np.zeros(x.size), np.ones(x.size), steps=6
+    )
+    assert design < 5e-5
+    assert asymptotes < 1e-12
+
+
+# Optimality of a step
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_step_satisfies_the_optimality_conditions(seed):
+    """Karush-Kuhn-Tucker in Svanberg's own form, to rounding, for whatever inputs."""
+    x, df0dx, f, dfdx, lo, hi, state, move = any_step(seed)
+    y, new = step(x, df0dx, f, dfdx, lo, hi, state, move)
+    sub = Subproblem(x, df0dx, f, dfdx, lo, hi, new, move)
+    weights = np.concatenate(([1.0], new.multipliers))
+    rising, falling = (weights @ part for part in sub.slopes(y))
+    slope, rounding = rising - falling, 1e-9 * (rising + falling)
+    near = 1e-12 * (hi - lo)
+    assert (y >= np.maximum(lo, sub.alpha - near)).all()
+    assert (y <= np.minimum(hi, sub.beta + near)).all()
+    assert (slope >= -rounding)[y < sub.beta - near].all()
+    assert (slope <= rounding)[y > sub.alpha + near].all()
+
+    left = sub.values(y)[1:] - np.maximum(new.multipliers - PENALTY, 0.0)
+    size = np.abs(sub.f[1:]) + 1.0 + 1e-2 * new.multipliers
+    felt = np.abs(dfdx * (hi - lo)).max(axis=1) > 0.0
+    assert (left <= 1e-10 * size)[felt].all()
+    assert (left >= -1e-10 * size)[new.multipliers > 1e-9].all()
+    assert (new.multipliers >= 0.0).all()
+    assert (new.multipliers[~felt] == 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_step_agrees_with_slsqp(seed):
+    rng = np.random.default_rng(seed)
+    n, m, move = 4, 2, 0.3
+    x, (df0dx, *dfdx) = rng.random(n), rng.standard_normal((1 + m, n))
+    dfdx, f, lo, hi = np.array(dfdx), 0.1 * rng.standard_normal(m), np.zeros(n), np.ones(n)
+    y, new = step(x, df0dx, f, dfdx, lo, hi, initial_state(x), move)
+    sub = Subproblem(x, df0dx, f, dfdx, lo, hi, new, move)
+    other = minimize(
+        lambda y: sub.values(y)[0],
+        x,
+        jac=lambda y: np.subtract(*sub.slopes(y))[0],
+        bounds=list(zip(sub.alpha, sub.beta)),
+        constraints={
+            "type": "ineq",
+            "fun": lambda y: -sub.values(y)[1:],
+            "jac": lambda y: -np.subtract(*sub.slopes(y))[1:],
+        },
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    assert other.success
+    np.testing.assert_allclose(y, other.x, atol=1e-6)
+
+
+# Invariances
+
+
+def scaled(problem, objective, constraints) -> Problem:
+    """Return the problem in other units."""
+
+    def in_other_units(x):
+        df0dx, f, dfdx = problem(x)
+        return objective * df0dx, constraints * f, (constraints * dfdx.T).T
+
+    return in_other_units
+
+
+@pytest.mark.parametrize("objective", [2.0**20, 2.0**-20])
+def test_powers_of_two_give_the_same_bits(objective):
+    n = 50
+    args = np.full(n, 0.4), np.full(n, 1e-3), np.ones(n), 20
+    plain, _ = iterate(two_arms(n), *args)
+    other, _ = iterate(scaled(two_arms(n), objective, np.array([2.0**10, 2.0**-7])), *args)
+    assert np.abs(plain[-1] - plain[0]).max() > 0.1
+    np.testing.assert_array_equal(other, plain)
+
+
+@pytest.mark.parametrize("objective", [1e6, 1e-6, 3.0])
+def test_units_of_functions_do_not_matter(objective):
+    n = 50
+    args = np.full(n, 0.4), np.full(n, 1e-3), np.ones(n), 20
+    plain, _ = iterate(two_arms(n), *args)
+    other, _ = iterate(scaled(two_arms(n), objective, np.array([0.7, 1e5])), *args)
+    np.testing.assert_allclose(other, plain, atol=1e-12)
+
+
+def test_units_of_variables_do_not_matter():
+    problem, x = waves(3)
+    lo, hi, unit = np.zeros(x.size), np.ones(x.size), np.linspace(1e-3, 1e3, x.size)
+
+    def in_other_units(x):
+        df0dx, f, dfdx = problem(x / unit)
+        return df0dx / unit, f, dfdx / unit
+
+    plain, _ = iterate(problem, x, lo, hi, 8)
+    other, _ = iterate(in_other_units, x * unit, lo * unit, hi * unit, 8)
+    np.testing.assert_allclose(other / unit, plain, atol=1e-12)
+
+
+def test_ranks_do_not_matter():
+    """The same designs from the ranks of this run and from one."""
+    n = 10_001  # several blocks of variables
+    designs, _ = iterate(two_arms(n), np.full(n, 0.4), np.full(n, 1e-3), np.ones(n), 12)
+    x = np.full(n, 0.4)
+    state = initial_state(x)
+    for expected in designs[1:]:
+        x, state = mma_step(x, *two_arms(n)(x), 1e-3, 1.0, state)
+        np.testing.assert_allclose(x, expected, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_pieces_do_not_matter(size):
+    """The same with the variables in uneven pieces; of three, one is empty."""
+    n = 500
+    problem, lo, hi = two_arms(n), np.full(n, 1e-3), np.ones(n)
+
+    def run(comm):
+        cuts = [0, n] if comm.size == 1 else [0, *([0] * (size - 2)), 123, n]
+        own = slice(cuts[comm.rank], cuts[comm.rank + 1])
+        x, designs = np.full(n, 0.4), []
+        state = initial_state(x[own])
+        for _ in range(12):
+            df0dx, f, dfdx = problem(x)
+            piece, state = mma_step(
+                *(x[own], df0dx[own], f, dfdx[:, own], lo[own], hi[own], state), comm=comm
+            )
+            x = np.concatenate(comm.allgather(piece))
+            designs.append(x)
+        return np.array(designs), state.multipliers
+
+    ((alone, _),) = on_threads(1, run)
+    results = on_threads(size, run)
+    for designs, multipliers in results:
+        np.testing.assert_allclose(designs, alone, rtol=0.0, atol=1e-12)
+        np.testing.assert_array_equal(multipliers, results[0][1])
+
+
+@pytest.mark.parametrize("deal", [[[0, 1], [2]], [[2, 0], [1]], [[1], [], [2], [0]]])
+def test_undivided_pieces_give_the_same_bits_on_any_ranks(deal):
+    n = 500
+    places = np.split(np.arange(n), [123, 321])
+    problem, lo, hi = two_arms(n), np.full(n, 1e-3), np.ones(n)
+
+    def run(comm, deal):
+        own = np.concatenate([places[k] for k in deal[comm.rank]] or [np.empty(0, int)])
+        pieces = {k: places[k].size for k in deal[comm.rank]}
+        x = np.full(n, 0.4)
+        state = initial_state(x[own])
+        for _ in range(12):
+            df0dx, f, dfdx = problem(x)
+            inputs = x[own], df0dx[own], f, dfdx[:, own], lo[own], hi[own], state
+            y, state = mma_step(*inputs, comm=comm, pieces=pieces)
+            x = np.empty(n)
+            for indices, values in comm.allgather((own, y)):
+                x[indices] = values
+        return x
+
+    (alone,) = on_threads(1, lambda comm: run(comm, [[0, 1, 2]]))
+    assert np.abs(alone - 0.4).max() > 0.1
+    for x in on_threads(len(deal), lambda comm: run(comm, deal)):
+        np.testing.assert_array_equal(x, alone)
+
+
+def test_resumed_run_has_the_same_bits():
+    problem, x = waves(7)
+    lo, hi, state = np.zeros(x.size), np.ones(x.size), initial_state(x)
+    for _ in range(5):
+        x, state = step(x, *problem(x), lo, hi, state)
+    file = io.BytesIO()
+    np.savez(file, x=x, **asdict(state))
+    file.seek(0)
+    with np.load(file) as saved:
+        y, fields = saved["x"], {k: saved[k] for k in asdict(state)}
+    again = MMAState(**fields | {"iteration": int(fields["iteration"])})
+    for _ in range(5):
+        x, state = step(x, *problem(x), lo, hi, state)
+        y, again = step(y, *problem(y), lo, hi, again)
+        np.testing.assert_array_equal(x, y)
+    assert again.iteration == 10
+
+
+def test_inputs_and_results_share_no_memory():
+    n = 8
+    df0dx, f, dfdx = two_arms(n)(np.full(n, 0.4))
+    x = np.full(n, 0.4)
+    before = initial_state(x)
+    x_new, after = mma_step(x, df0dx, f, dfdx, 1e-3, 1.0, before)
+    held = [getattr(s, k) for s in (before, after) for k in ("x_old1", "x_old2", "low", "upp")]
+    for array in (x, df0dx, f, dfdx, x_new):
+        assert not any(np.shares_memory(array, other) for other in held)
+    assert not np.shares_memory(x, x_new)
+    np.testing.assert_array_equal(x, 0.4)
+
+
+# Robustness
+
+
+def test_infeasible_start_becomes_feasible():
+    n = 30
+    x, lo, hi = np.ones(n), np.full(n, 1e-3), np.ones(n)
+    designs, _ = iterate(two_arms(n), x, lo, hi, 12)
+    violation = np.array([two_arms(n)(x)[1].max() for x in designs])
+    assert violation[0] == pytest.approx(1.5)
+    assert (np.diff(violation)[:3] < -0.3).all()  # as fast as the move limit allows
+    assert (violation[4:] <= 1e-9).all()
+
+
+def test_constraints_that_contradict_each_other_are_both_violated():
+    """x <= 0.2 and x >= 0.8 on average: the design ends between them, and the price is paid."""
+    n = 6
+    row = np.full(n, 1.0 / n)
+
+    def problem(x):
+        return np.linspace(0.5, 1.0, n), np.array([row @ x - 0.2, 0.8 - row @ x]), row * [[1], [-1]]
+
+    designs, state = iterate(problem, np.full(n, 0.9), np.zeros(n), np.ones(n), 30)
+    assert (problem(designs[-1])[1] > 0.1).all()
+    assert (state.multipliers > PENALTY).all()
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_constraint_given_twice_counts_once(factor):
+    problem, x = waves(11)
+    df0dx, f, dfdx = problem(x)
+    f[0] = 0.05 * np.abs(dfdx[0]).sum()
+    args = np.zeros(x.size), np.ones(x.size), initial_state(x)
+    once, _ = step(x, df0dx, f, dfdx, *args)
+    f, dfdx = np.append(f, factor * f[0]), np.vstack((dfdx, factor * dfdx[0]))
+    twice, state = step(x, df0dx, f, dfdx, *args)
+    assert np.abs(once - x).max() > 0.01
+    assert state.multipliers[[0, -1]].sum() > 0.0
+    np.testing.assert_allclose(twice, once, atol=1e-9)
+
+
+def test_ten_constraints():
+    rng = np.random.default_rng(5)
+    n, m = 300, 10
+    x = rng.random(n)
+    df0dx, dfdx = rng.standard_normal(n), rng.standard_normal((m, n))
+    args = np.zeros(n), np.ones(n), initial_state(x)
+    y, state = step(x, df0dx, np.zeros(m), dfdx, *args)
+    sub = Subproblem(x, df0dx, np.zeros(m), dfdx, *args[:2], state, 0.2)
+    assert (state.multipliers > 1e-3).sum() >= 8
+    np.testing.assert_allclose(sub.values(y)[1:][state.multipliers > 1e-3], 0.0, atol=1e-11)
+
+
+def test_inactive_constraints_do_not_count():
+    problem, x = waves(2)
+    df0dx, f, dfdx = problem(x)
+    args = np.zeros(x.size), np.ones(x.size), initial_state(x)
+    loose, state = step(x, df0dx, f - 1e3, dfdx, *args)
+    free, _ = step(x, df0dx, np.empty(0), np.empty((0, x.size)), *args)
+    np.testing.assert_array_equal(loose, free)
+    np.testing.assert_array_equal(state.multipliers, 0.0)
+    assert (np.sign(loose - x) == -np.sign(df0dx)).all()
+
+
+@pytest.mark.parametrize("value", [-1.0, 1.0])
+def test_constraint_without_gradient_is_left_out(value):
+    problem, x = waves(4)
+    df0dx, f, dfdx = problem(x)
+    args = np.zeros(x.size), np.ones(x.size), initial_state(x)
+    without, _ = step(x, df0dx, f, dfdx, *args)
+    with_it, state = step(x, df0dx, np.append(f, value), np.vstack((dfdx, np.zeros(x.size))), *args)
+    np.testing.assert_array_equal(with_it, without)
+    assert state.multipliers.shape == (f.size + 1,)
+    assert state.multipliers[-1] == 0.0
+
+
+def test_nothing_to_gain_means_no_step():
+    n = 7
+    x = np.linspace(0.0, 1.0, n)
+    y, _ = step(
+        x, np.zeros(n), -np.ones(1), np.ones((1, n)), np.zeros(n), np.ones(n), initial_state(x)
+    )
+    np.testing.assert_array_equal(y, x)
+
+
+def test_zero_objective_gradient_still_meets_the_constraints():
+    n = 7
+    x = np.full(n, 0.5)
+    args = np.zeros(n), np.ones(n), initial_state(x)
+    df0dx, f, dfdx = np.zeros(n), np.array([0.05]), np.ones((1, n)) / n
+    y, state = step(x, df0dx, f, dfdx, *args)
+    sub = Subproblem(x, df0dx, f, dfdx, *args[:2], state, 0.2)
+    assert sub.values(y)[1] == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(y, y[0], rtol=1e-12)
+
+
+def test_passive_variables_stay_and_do_not_count():
+    """Not even a huge derivative of a variable that cannot move changes the step."""
+    n = 24
+    passive = np.arange(n) % 5 == 0
+    lo = np.where(passive, 1.0 / 3.0, 1e-3)
+    hi = np.where(passive, 1.0 / 3.0, 1.0)
+
+    def huge(x):
+        df0dx, f, dfdx = two_arms(n)(x)
+        return np.where(passive, 1e12, df0dx), f, dfdx
+
+    x = np.where(passive, 1.0 / 3.0, 0.4)
+    designs, _ = iterate(two_arms(n), x, lo, hi, 6)
+    others, _ = iterate(huge, x, lo, hi, 6)
+    np.testing.assert_array_equal(designs[:, passive], 1.0 / 3.0)
+    np.testing.assert_array_equal(others, designs)
+    assert np.abs(designs[-1] - x)[~passive].max() > 0.1
+
+
+def test_single_variable_and_constraint():
+    """min (x - 0.9)^2 with x^2 <= 0.25."""
+
+    def problem(x):
+        return 2.0 * (x - 0.9), x**2 - 0.25, 2.0 * x[None]
+
+    designs, _ = iterate(problem, np.array([0.1]), np.zeros(1), np.ones(1), 30)
+    assert designs[-1, 0] == pytest.approx(0.5, abs=1e-9)
+
+
+def test_moves_are_limited():
+    n, move = 12, 0.05
+    x, lo, hi = np.full(n, 2.0), np.zeros(n), np.full(n, 4.0)
+    y, _ = step(x, -np.ones(n), np.full(1, -99.0), np.ones((1, n)), lo, hi, initial_state(x), move)
+    np.testing.assert_allclose(y, 2.2, rtol=1e-15)  # 5 % of the range
+
+
+def test_variables_at_rest_keep_their_asymptotes():
+    """The sign of a move as small as rounding is chance and must not be seen."""
+    n = 4
+    x = np.full(n, 0.5)
+    noise = np.array([1e-15, -1e-15, 0.1, -0.1])
+    state = MMAState(5, x - noise, x - noise - 0.1, x - 0.3, x + 0.3, np.zeros(1))
+    inputs = x, np.ones(n), -np.ones(1), np.ones((1, n)), np.zeros(n), np.ones(n), state
+    _, new = step(*inputs)
+    np.testing.assert_allclose(new.upp - x, 0.3 * np.array([1.0, 1.0, 1.2, 0.7]), rtol=1e-14)
+
+
+def test_warm_start_saves_evaluations(monkeypatch):
+    """The multipliers of the step before save most evaluations once the design settles."""
+    n, counts = 400, {"warm": 0, "cold": 0}
+    kind = "warm"
+    evaluate = mma._Dual.at
+
+    def counted(self, multipliers):
+        counts[kind] += 1
+        return evaluate(self, multipliers)
+
+    monkeypatch.setattr(mma._Dual, "at", counted)
+    x, state = np.full(n, 0.4), initial_state(np.full(n, 0.4))
+    bounds = np.full(n, 1e-3), np.ones(n)
+    for k in range(40):
+        if k == 10:
+            counts.update(warm=0, cold=0)
+        kind = "cold"
+        cold, _ = step(x, *two_arms(n)(x), *bounds, replace(state, multipliers=np.empty(0)))
+        kind = "warm"
+        x, state = step(x, *two_arms(n)(x), *bounds, state)
+        np.testing.assert_allclose(x, cold, atol=1e-12)
+    assert counts["warm"] <= 4 * 30
+    assert counts["warm"] <= 0.6 * counts["cold"]
+
+
+def test_unsolved_subproblem_is_an_error(monkeypatch):
+    monkeypatch.setattr(mma, "_MAX_EVALUATIONS", 1)
+    problem, x = waves(1)
+    df0dx, f, dfdx = problem(x)
+    f[0] = np.abs(dfdx[0]).sum()
+    with pytest.raises(ConvergenceError, match=r"constraint 0 .* reduce move"):
+        step(x, df0dx, f, dfdx, np.zeros(x.size), np.ones(x.size), initial_state(x))
+
+
+# Bad input, on one rank only: the error must reach all
+
+
+def bad_step(**changes):
+    n = 8
+    x = mine(np.full(n, 0.4))
+    df0dx, f, dfdx = two_arms(n)(np.full(n, 0.4))
+    inputs = {
+        "x": x,
+        "df0dx": mine(df0dx),
+        "f": f,
+        "dfdx": mine(dfdx),
+        "xmin": np.full(x.size, 1e-3),
+        "xmax": np.ones(x.size),
+        "state": initial_state(x),
+    }
+    if COMM.rank == COMM.size - 1:
+        inputs |= {name: change(inputs[name]) for name, change in changes.items()}
+    return mma_step(**inputs, comm=COMM)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["x", "df0dx", "f", "dfdx", "xmin", "xmax"])
+def test_number_that_is_not_finite_is_named(name, value):
+    def spoil(array):
+        array = array.copy()
+        array[..., -1] = value
+        return array
+
+    with pytest.raises(ValueError, match=rf"MMA: {name} is not finite, first at index .*{value}"):
+        bad_step(**{name: spoil})
+
+
+@pytest.mark.parametrize("name", ["df0dx", "f", "dfdx", "xmin", "xmax"])
+def test_wrong_shape_is_named(name):
+    with pytest.raises(ValueError, match=r"MMA: \w+ has shape \(.*\), expected \("):
+        bad_step(**{name: lambda array: array[..., :-1]})
+
+
+@pytest.mark.parametrize("name", ["x_old1", "x_old2", "low", "upp"])
+@pytest.mark.parametrize("spoil", [lambda v: v[:-1], lambda v: v * np.nan])
+def test_foreign_state_is_named(name, spoil):
+    with pytest.raises(ValueError, match=rf"MMA: state.{name} does not hold"):
+        bad_step(state=lambda s: replace(s, **{name: spoil(getattr(s, name))}))
+
+
+def test_design_outside_its_bounds_is_named():
+    with pytest.raises(ValueError, match=r"MMA: x\[0\] = 0.4 is not between 0.5 and 1.0"):
+        bad_step(xmin=lambda lo: lo + 0.499)
+
+
+def test_pieces_that_do_not_add_up_are_an_error():
+    x = np.full(4, 0.4)
+    with pytest.raises(ValueError, match="MMA: pieces hold 3 variables, x 4"):
+        mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), pieces={0: 1, 1: 2})
+
+
+def test_piece_on_two_ranks_is_an_error():
+    def run(comm):
+        x = np.full(4, 0.4)
+        with pytest.raises(ValueError, match=r"MMA: piece 7 is on another rank, too \(rank 1\)"):
+            mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), comm=comm, pieces={7: 4})
+
+    on_threads(2, run)
+
+
+@pytest.mark.parametrize("move", [0.0, -0.1, 1.5, np.nan])
+def test_senseless_move_is_named(move):
+    x = np.full(4, 0.4)
+    with pytest.raises(ValueError, match=r"MMA: move is .*, expected 0 < move <= 1"):
+        mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), move=move)
+
+
+def test_derivative_that_overflows_is_an_error():
+    x = np.full(4, 5.0)
+    df0dx, f, dfdx = two_arms(4)(x)
+    with pytest.raises(ValueError, match="overflows"):
+        mma_step(x, df0dx * 1e308, f, dfdx, 1.0, 1e9, initial_state(x))

@@ -1,0 +1,299 @@
+"""The loop: what it reaches, that it resumes in the same bits, and on any number of ranks."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.output import checkpoint
+
+ROOT = Path(__file__).parents[2]
+SCENE = ROOT / "demos" / "two_arm.toml"
+WORLD = MPI.COMM_WORLD
+
+
+def scene(*overrides):
+    return do.load_scene(SCENE, overrides)
+
+
+def small(*overrides, iterations=6):
+    return scene("arms.cells=[40,4]", f"optimizer.max_iterations={iterations}", *overrides)
+
+
+QUICK = ["motion.horizon=2.0", "simulation.tolerance=1e-3"]
+
+
+def command(*arguments, ranks=0):
+    line = [sys.executable, "-m", "dolfinopt", *map(str, arguments)]
+    return ["mpirun", "-n", str(ranks), *line] if ranks else line
+
+
+# As it was before this process began MPI, which would confuse another mpirun.
+ENVIRONMENT = dict(os.environ)
+
+
+@pytest.mark.slow
+def test_two_arm_manipulator():
+    """The paper's example. An independent model reaches 2.6 N m in 200 iterations."""
+    result = do.optimize(scene("optimizer.max_iterations=60"))
+    if WORLD.rank == 0:
+        first, last = result.history[0], result.history[-1]
+        assert first.objective == pytest.approx(28.038, rel=1e-4)
+        assert first.max_deviation == pytest.approx(55.575e-3, rel=1e-4)
+        assert last.objective < 2.6
+        assert last.max_deviation < 8e-3
+        assert last.volume_fraction == pytest.approx(0.5, abs=1e-4)
+        assert last.grayness < 0.35
+
+
+def test_volume_limits():
+    """Each arm keeps its own limit; a shared limit lets material move to the inner arm."""
+    for shared in (False, True):
+        settings = ["design.shared_volume=true"] if shared else []
+        result = do.optimize(small(*settings, iterations=25))
+        mine = {k: arm.volume_fraction(result.x_phys[k]) for k, arm in result.arms.items()}
+        fractions = list(do.gather_arms(result.share, mine).values())
+        if WORLD.rank == 0:
+            assert np.mean(fractions) == pytest.approx(0.5, abs=2e-3)
+            if shared:
+                assert fractions[0] > 0.52 and fractions[1] < 0.48  # 0.531, 0.469
+            else:
+                assert fractions == pytest.approx([0.5, 0.5], abs=2e-3)
+
+
+def test_stops_when_the_design_rests():
+    result = do.optimize(small("optimizer.tolerance=0.05", iterations=200))
+    assert result.converged and result.iterations < 200
+    if WORLD.rank == 0:
+        assert result.history[-1].change <= 0.05 < result.history[-2].change
+
+
+def test_no_iterations_evaluate_the_initial_design():
+    result = do.optimize(small(iterations=0))
+    assert result.iterations == 0 and not result.converged
+    assert len(result.history) == (1 if WORLD.rank == 0 else 0)
+
+
+def test_passive_cells_stay_solid():
+    result = do.optimize(small("arms.passive=0.05", iterations=4))
+    for k, arm in result.arms.items():
+        assert arm.mesh.passive.sum() == 2 * 2 * 4  # two columns of four cells at both ends
+        assert (result.x_phys[k][arm.mesh.passive] == 1.0).all()
+
+
+# -- constraints and projections -------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_constraints_keep_their_bounds():
+    """Bounds that the free optimum breaks hold in the end, and cost compliance."""
+    # Loose ones, only to be told the values: they change the free design by rounding.
+    loose = ["constraints.first_frequency=0.1", "constraints.tip_deflection=1.0"]
+    free = do.optimize(small(*QUICK, *loose, iterations=40))
+    assert free.evaluation.loaded_frequencies[0] < 5.2 < free.evaluation.loaded_frequencies[1]
+    assert max(free.evaluation.constraints[2:]) > 6e-5 - 1.0
+    for bound in ("constraints.first_frequency=5.215", "constraints.tip_deflection=5.2e-5"):
+        kept = do.optimize(small(*QUICK, bound, iterations=40))
+        # MMA approaches an active bound to a fraction of its last change.
+        assert max(kept.evaluation.constraints) == pytest.approx(0.0, abs=1e-3)
+        assert kept.evaluation.compliance > free.evaluation.compliance * 1.002
+        if WORLD.rank == 0:
+            assert kept.history[-1].volume_fraction == pytest.approx(0.5, abs=1e-3)
+        if "frequency" in bound:
+            assert kept.evaluation.loaded_frequencies[0] == pytest.approx(5.215, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "overrides"),
+    [
+        ("heaviside", ["arms.cells=[60,8]", "design.filter_radius=0.025"]),
+        ("robust", ["arms.cells=[40,6]", "design.filter_radius=0.0375"]),
+    ],
+)
+def test_projection_ends_crisp(kind, overrides):
+    """From all grey, with a filter of one and a half cells, to no grey: cut it is the same design.
+
+    Volume limits hold, and the designs are as good as without a projection, or better.
+    """
+    statics = ["objective.kind=static", *overrides]
+    projected = ["design.continuation=15", f"design.projection={kind}"]
+    result = do.optimize(small(*statics, *projected, iterations=150))
+    grey = do.optimize(small(*statics, iterations=30))
+    if WORLD.rank == 0:
+        last = result.history[-1]
+        assert last.grayness < 0.02 < 0.1 < grey.history[-1].grayness
+        assert last.volume_fraction == pytest.approx(0.5, abs=1e-3)
+        assert result.evaluation.max_deviation < grey.evaluation.max_deviation
+    assert result.crisp.objective == pytest.approx(result.evaluation.objective, rel=0.02)
+    assert result.evaluation.objective < grey.evaluation.objective
+
+
+def test_bounds_out_of_reach_are_told():
+    """No design of half the material is so stiff: the run says so."""
+    result = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1e-6"))
+    assert max(result.evaluation.constraints) > 10.0
+    assert not result.converged
+    value = 1e6 * max(result.evaluation.tip_deflections)
+    assert value > 10.0
+    assert (
+        "tip deflection of arm1" in result.violated and "at most 1e-06 m asked" in result.violated
+    )
+    assert result.violated in result.stop_reason
+    kept = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1.0"))
+    assert kept.violated == "" and "not met" not in kept.stop_reason
+
+
+# -- resume ----------------------------------------------------------------------------------
+
+
+def test_resume_gives_the_same_bits(shared_tmp_path, monkeypatch):
+    """Interrupted after any iteration, whatever was saved last: the same designs and history."""
+    monkeypatch.setattr("dolfinopt.optimization.loop.CHECKPOINT_INTERVAL", 0.0)
+    folders = {name: shared_tmp_path / str(name) for name in ("whole", 0, 1, 4, 6)}
+    if WORLD.rank == 0:
+        for folder in folders.values():
+            folder.mkdir()
+    WORLD.barrier()
+    whole = do.optimize(small(), folders["whole"])
+    for stop in (0, 1, 4, 6):
+        folder = folders[stop]
+        interrupted = small(iterations=stop)
+        do.optimize(interrupted, folder)
+        resumed = do.optimize(small(), folder, resume=True)
+        for k in whole.x_phys:
+            np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
+        rows = [replace(row, seconds=0.0) for row in resumed.history]
+        assert rows == [replace(row, seconds=0.0) for row in whole.history]
+        if WORLD.rank == 0:
+            np.testing.assert_array_equal(resumed.initial_deviation, whole.initial_deviation)
+
+
+# Sharper in every iteration, but not so sharp that arms fall apart, which are slow to simulate.
+GENTLE = ["design.continuation=2", "design.sharpness=4.0", "design.filter_radius=0.05"]
+ROBUST = "design.projection=robust"
+SMALLEST = ["motion.horizon=1.9", "simulation.tolerance=1e-2", "arms.cells=[24,3]"]
+# One line an option of which the next iteration remembers something.
+REMEMBERED = [
+    ["reduction.method=modal"],
+    ["reduction.method=modal", "arms.arm2.design=arm1"],
+    ["reduction.method=krylov", "reduction.coordinates=3"],
+    ["reduction.method=balanced", "reduction.coordinates=3"],
+    ["objective.kind=static"],
+    ["objective.kind=deviation"],
+    ["objective.kind=eigenfrequency"],
+    ["objective.kind=eigenfrequency", "objective.follow=true", *GENTLE, ROBUST],
+    ["objective.kind=eigenfrequency", "objective.follow=true", "arms.arm2.design=arm1"],
+    ["objective.kind=eigenfrequency", "arms.arm1.rigid=true"],
+    ["constraints.first_frequency=5.0", "constraints.tip_deflection=6e-5"],
+    [*GENTLE, "design.projection=heaviside"],
+    [*GENTLE, ROBUST],
+    ["scenarios=[{changes=['payload.mass=3']}, {changes=['motion.flattening=0.5']}]"],
+]
+OPTIONS = pytest.mark.parametrize("overrides", REMEMBERED, ids=" ".join)
+
+
+@OPTIONS
+def test_every_option_resumes_in_the_same_bits(overrides, shared_tmp_path):
+    """Eigenvectors of every arm and place, the projection's sharpness, all are remembered."""
+    settings = [*SMALLEST, *overrides]
+    whole = do.optimize(small(*settings, iterations=3))
+    do.optimize(small(*settings, iterations=1), shared_tmp_path)
+    resumed = do.optimize(small(*settings, iterations=3), shared_tmp_path, resume=True)
+    for k in whole.x_phys:
+        np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
+    rows = [replace(row, seconds=0.0) for row in resumed.history]
+    assert str(rows) == str([replace(row, seconds=0.0) for row in whole.history])  # nan == nan
+    assert str(resumed.evaluation) == str(whole.evaluation)
+    if WORLD.rank == 0:
+        np.testing.assert_array_equal(resumed.initial_deviation, whole.initial_deviation)
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
+@OPTIONS
+def test_every_option_gives_the_same_bits_on_any_number_of_ranks(overrides):
+    settings = [*SMALLEST, *overrides]
+    together = do.optimize(small(*settings, iterations=2))
+    alone = do.optimize(small(*settings, iterations=2), world=MPI.COMM_SELF)
+    for k in together.x_phys:
+        np.testing.assert_array_equal(together.x_phys[k], alone.x_phys[k])
+    assert str(together.evaluation) == str(alone.evaluation)
+
+
+def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
+    """Modal reduction and loaded modes: all rows, those of the outboard interface included."""
+    settings = small("reduction.method=modal", "objective.kind=eigenfrequency", iterations=2)
+    result = do.optimize(settings, shared_tmp_path)
+    for arm in result.arms.values():  # what a third iteration would set out from
+        assert [len(start) for start in arm.starts] == [arm.elastic.num_dofs] * 2
+    memory = checkpoint.load(shared_tmp_path, settings, result.share, result.arms)
+    for k, arm in result.arms.items():
+        empty, loaded = memory.modes[k]  # the objective needs no reduced model
+        assert empty.shape[1] == 0 and loaded.shape == (arm.elastic.num_dofs, 3)
+        assert np.abs(loaded[-3:]).max() > 0.0
+        assert list(memory.cells[k].shape) == [arm.mesh.num_cells, 5]
+
+
+@pytest.mark.serial
+@pytest.mark.slow
+def test_sigkill_and_resume(tmp_path):
+    """Killed at any moment, a resumed run writes the same design to the last bit."""
+    line = ["optimize", SCENE, "--set", "arms.cells=[40,4]", "--no-plots"]
+    line += ["--set", "optimizer.max_iterations=120"]
+    run = {"env": ENVIRONMENT, "check": True, "capture_output": True, "timeout": 120}
+    subprocess.run(command(*line, "--out", tmp_path / "whole"), **run)
+    for moment in (0.0, 0.5, 1.5):
+        folder = tmp_path / str(moment)
+        process = subprocess.Popen(command(*line, "--out", folder), env=ENVIRONMENT)
+        deadline = time.monotonic() + 60.0
+        while not (folder / checkpoint.NAME).exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(moment)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        subprocess.run(command(*line, "--out", folder, "--resume"), **run)
+        with np.load(tmp_path / "whole" / "design.npz") as a, np.load(folder / "design.npz") as b:
+            assert a.files == b.files
+            for key in a.files:
+                np.testing.assert_array_equal(a[key], b[key])
+
+
+def test_damaged_checkpoint(shared_tmp_path):
+    if WORLD.rank == 0:
+        (shared_tmp_path / checkpoint.NAME).write_bytes(b"PK\x03\x04 no archive")
+    WORLD.barrier()
+    with pytest.raises(do.InputError, match="cannot read this checkpoint"):
+        do.optimize(small(), shared_tmp_path, resume=True)
+
+
+def test_more_iterations_may_be_asked_for_on_resume(shared_tmp_path):
+    do.optimize(small(iterations=2), shared_tmp_path)
+    assert do.optimize(small(iterations=3), shared_tmp_path, resume=True).iterations == 3
+
+
+# -- ranks -----------------------------------------------------------------------------------
+
+
+@pytest.mark.serial
+@pytest.mark.slow
+def test_same_design_on_any_number_of_ranks(tmp_path):
+    """1, 2, 3 and 4 ranks: whole arms are dealt out, sums run in the arms' order."""
+    designs = []
+    for ranks in (1, 2, 3, 4):
+        folder = tmp_path / str(ranks)
+        line = ["optimize", SCENE, "--no-plots", "--out", folder]
+        line += ["--set", "arms.cells=[100,6]", "--set", "optimizer.max_iterations=15"]
+        subprocess.run(command(*line, ranks=ranks), env=ENVIRONMENT, check=True, timeout=120)
+        with np.load(folder / "design.npz") as data:
+            keys = [key for key in data.files if key != "units"]
+            designs.append(np.concatenate([data[key].ravel() for key in keys]))
+    for other in designs[1:]:
+        np.testing.assert_array_equal(other, designs[0])

@@ -1,0 +1,73 @@
+"""What a run leaves: the same files from both ways, the summary last."""
+
+import json
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.output import run_folder as results
+from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
+
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+WORLD = MPI.COMM_WORLD
+SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01")
+FILES = {
+    "design.npz",
+    "design.vtu",
+    "design.xdmf",
+    "summary.json",
+    "trajectory.csv",
+    "trajectory.npz",
+}
+
+
+@pytest.fixture(scope="module")
+def result():
+    return do.optimize(do.load_scene(SCENE, SMALL))
+
+
+def simulated(result):
+    scene, ledger = do.load_scene(SCENE, SMALL), do.Ledger()
+    evaluation, trajectory = do.evaluate(scene, result.share, result.arms, result.x_phys, ledger)
+    return Simulated(
+        scene, result.share, result.arms, result.x_phys, evaluation, trajectory, ledger
+    )
+
+
+@pytest.mark.parametrize("paraview", [True, False])
+def test_files(result, shared_tmp_path, paraview):
+    one, other = shared_tmp_path / "one", shared_tmp_path / "other"
+    if WORLD.rank == 0:
+        one.mkdir()
+        other.mkdir()
+    WORLD.barrier()
+    scene = do.load_scene(SCENE, SMALL)
+    written = write_result(scene, one, result, 12.5, paraview=paraview)
+    again = write_simulation(other, simulated(result), 2.5, paraview=paraview)
+    if WORLD.rank > 0:
+        assert written is None and again is None
+        return
+    expected = FILES if paraview else FILES - {"design.vtu", "design.xdmf"}
+    for folder, wall, iterations in ((one, 12.5, 1), (other, 2.5, 0)):
+        assert {path.name for path in folder.iterdir()} == expected
+        summary = json.loads((folder / "summary.json").read_text())
+        assert wall <= summary["seconds"]["total"] < wall + 60.0
+        assert summary["iterations"] == iterations
+    assert [view.name for view in written.views] == ["arm1", "arm2"]
+    assert written.summary["compliance"] == result.evaluation.compliance
+
+
+def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
+    """Whatever fails before, no folder looks complete."""
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(results, "write_trajectory", fail)
+    one = simulated(result)
+    if WORLD.rank == 0:
+        with pytest.raises(OSError, match="disk full"):
+            results._write(shared_tmp_path, [], one.trajectory, None, {}, False)
+        assert not (shared_tmp_path / "summary.json").exists()

@@ -1,0 +1,335 @@
+"""The paper: its cases and figures, and the findings on a recorded coarse run."""
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from dolfinopt.cli import commands
+from dolfinopt.data import paper_scene
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.paper import reproduction as paper
+from dolfinopt.paper.checks import Setting, bend, broken, find, percent, power, read_measured, span
+from dolfinopt.study import store as cases
+
+ROOT = Path(__file__).parents[2]
+WORLD = MPI.COMM_WORLD
+# Figures of `dolfinopt reproduce --coarse`: 100 x 6 cells, 60 iterations.
+RECORDED = read_measured((ROOT / "tests/paper/paper_coarse.json").read_text())
+TINY = ("arms.cells=[16,3]", "optimizer.max_iterations=2", "simulation.sample=0.01")
+# As it was before this process began MPI, which would confuse another mpirun.
+ENVIRONMENT = dict(os.environ)
+
+
+def tiny_plan():
+    """Everything the paper asks, in fewer steps."""
+    return paper.Plan(
+        paper.load_paper(overrides=TINY),
+        variants=paper.VARIANTS[:1] + paper.VARIANTS[-2:],
+        optimised=(4, 8),
+        swept=(4, 12),
+        payload=dataclasses.replace(paper.PAYLOAD, values=(4.0, 6.0, 8.0)),
+        path=dataclasses.replace(paper.PATH, values=(0.0, 0.5, 1.0), optimised=(0.0, 1.0)),
+    )
+
+
+# -- what the texts say of the scene ---------------------------------------------------------
+
+
+def test_texts_take_their_values_from_the_scene():
+    """Payload, path, penalty and volume are those of --set, not the paper's."""
+    assert paper.setting_of(paper.load_paper()) == Setting()
+    settings = ["payload.mass=4", "motion.flattening=0.5", "interpolation.penalty=2"]
+    settings += ["design.initial=0.25", "design.volume_fraction=0.25"]
+    setting = paper.setting_of(paper.load_paper(overrides=settings))
+    assert setting.machine == (
+        "A cart carries two flexible arms that move 4 kg along a semicircle flattened to 0.5."
+    )
+    measured = dataclasses.replace(RECORDED, setting=setting)
+    assert read_measured(measured.json()) == measured
+    words = {finding.name: finding.reason for finding in find(measured)}
+    assert "has 6.25 % of the solid arm's stiffness (0.25 to the power 2)" in words["path, a tenth"]
+    assert "25.0 % of the material in two flanges has 57.8 % of it" in words["path, a tenth"]
+    assert "4 times the material" in words["path, a tenth"]
+    paper_words = {finding.name: finding.reason for finding in find(RECORDED)}
+    assert "12.5 %" in paper_words["path, a tenth"] and "14.3 %" in paper_words["path, a tenth"]
+
+
+# -- findings on the recorded run ------------------------------------------------------------
+
+
+def test_recorded_run_is_the_coarse_one():
+    assert RECORDED.cells == (100, 6) and RECORDED.iterations == 60
+    assert {m.kind for m in RECORDED.objectives} == {
+        "", "esl", "compliance", "deviation", "static", "eigenfrequency"
+    }  # fmt: skip
+
+
+def test_main_findings_stand():
+    """What `reproduce --check` demands of the full run."""
+    findings = find(RECORDED)
+    assert broken(findings) == []
+    asserted = {finding.name for finding in findings if finding.asserted}
+    assert asserted >= {
+        "dynamic loads",  # ranking of the objectives
+        "coordinates, initial design",  # Craig-Bampton flat, modal truncation below
+        "coordinates, optimised design",
+        "deviation by reduction",
+        "payload, loss",
+        "path, loss",
+        "path, a tenth",
+    }
+
+
+def altered(name, index, **changes):
+    """Return the record with one row of a table changed."""
+    rows = list(getattr(RECORDED, name))
+    rows[index] = dataclasses.replace(rows[index], **changes)
+    return dataclasses.replace(RECORDED, **{name: tuple(rows)})
+
+
+def swept(name, index, **factors):
+    """Return the record with figures of one design of a sweep multiplied."""
+    sweep = getattr(RECORDED, name)
+    designs = list(sweep.designs)
+    used = designs[index]
+    changes = {key: tuple(f * v for v in getattr(used, key)) for key, f in factors.items()}
+    designs[index] = dataclasses.replace(used, **changes)
+    return dataclasses.replace(
+        RECORDED, **{name: dataclasses.replace(sweep, designs=tuple(designs))}
+    )
+
+
+MODAL = RECORDED.coordinates[1]
+FLAWS = {
+    "initial deviation": altered("objectives", 0, deviation=0.07),
+    "dynamic loads": altered("objectives", 1, compliance=2.6),
+    "modal truncation with few coordinates": altered("reductions", 2, deviation=0.0085),
+    "Craig-Bampton designs": altered("reductions", 0, compliance=2.6),
+    "coordinates, initial design": altered("coordinates", 1, compliance=MODAL.compliance[::-1]),
+    "coordinates, optimised design": altered("coordinates", 3, compliance=MODAL.compliance),
+    "deviation by reduction": altered("coordinates", 2, apart=(0.02,) * 8),
+    "payload, linear": swept("payload", 0, deviation=np.nan),
+    "payload, loss": swept("payload", 1, compliance=1.06),
+    "path, a tenth": swept("path", 2, deviation=1.1),
+    "path, loss": swept("path", 6, compliance=0.9),
+}
+
+
+@pytest.mark.parametrize("name", FLAWS)
+def test_check_finds(name):
+    """Every demand fails where it should, under its name."""
+    assert any(line.startswith(f"{name}: expected") for line in broken(find(FLAWS[name])))
+
+
+def test_every_demand_can_fail():
+    assert {finding.name for finding in find(RECORDED) if finding.asserted} == set(FLAWS)
+
+
+def test_sentences_follow_from_the_figures():
+    """A finding that holds says so, with the figure; one that does not gives the reason."""
+    for finding in find(RECORDED):
+        start = "Holds: " if finding.holds else "Does not hold: "
+        assert finding.sentence.startswith(start + finding.ours)
+        assert finding.holds or finding.reason
+    stiffer = altered("objectives", 1, deviation=0.0031)
+    before, after = (find(one)[2] for one in (RECORDED, stiffer))
+    assert not before.holds and "7.94 mm" in before.sentence
+    assert after.holds and "3.10 mm" in after.sentence
+
+
+def test_record_is_what_the_program_computes():
+    """So that the record cannot grow old: two simulations, and an optimisation of 60 steps.
+
+    The simulations' figures are those of linear algebra and a tolerance of 1e-4; the design after
+    60 steps depends on rounding a little.
+    """
+    scene = paper.load_paper(coarse=True)
+    plan = paper.Plan(scene)
+    wanted = [plan.resolved(*plan.given[0], method)[0] for method in paper.METHODS]
+    found = list(cases.simulate_scenarios([case.scene for case in wanted], None))
+    for result, recorded in zip(found, RECORDED.coordinates[:2], strict=True):
+        assert result.evaluation.compliance == pytest.approx(recorded.compliance[0], rel=1e-4)
+        assert result.evaluation.max_deviation == pytest.approx(recorded.deviation[0], rel=1e-4)
+    from dolfinopt.output.run import optimize
+
+    label, end = RECORDED.objectives[8].label, RECORDED.objectives[8]
+    (case,) = (case for case in plan.objectives if case.label == label)
+    best = optimize(case.scene, None, world=MPI.COMM_SELF).evaluation
+    assert best.compliance == pytest.approx(end.compliance, rel=1e-2)
+
+
+# -- measures --------------------------------------------------------------------------------
+
+
+def test_measures():
+    x = np.linspace(4.0, 8.0, 9)
+    assert span([2.0, 4.0]) == 0.5
+    assert bend(x, 3.0 + 2.0 * x) < 1e-12
+    assert bend([-1.0, 0.0, 1.0], [3.0, 0.0, 3.0]) == pytest.approx(1.0)
+    assert power(x, 0.1 * x**1.9) == pytest.approx(1.9)
+    assert [percent(s) for s in (0.0125, 0.136, 15.6)] == ["1.25 %", "13.6 %", "16 times"]
+
+
+def test_losses():
+    """Against the best of each column, by hand."""
+    used = dataclasses.replace(RECORDED.path.designs[-1], label="x")
+    sweep = dataclasses.replace(
+        RECORDED.path,
+        values=(0.0, 0.5, 1.0),
+        designs=(
+            dataclasses.replace(used, made_for=float("nan"), compliance=(9.0, 9.0, 9.0)),
+            dataclasses.replace(used, made_for=0.0, compliance=(1.0, 7.0, 5.0)),
+            dataclasses.replace(used, made_for=1.0, compliance=(1.5, 7.0, 4.0)),
+        ),
+    )
+    np.testing.assert_allclose(sweep.loss("compliance"), [[0.0, 0.25], [0.5, 0.0]])
+
+
+def test_record_survives_its_file():
+    again = read_measured(RECORDED.json())
+    assert again.json() == RECORDED.json() and again.objectives == RECORDED.objectives
+
+
+# -- what is planned -------------------------------------------------------------------------
+
+
+def test_scene_comes_with_the_package():
+    demo = ROOT / "demos" / "two_arm.toml"
+    assert paper_scene().read_bytes() == demo.read_bytes()
+    assert paper_scene().is_relative_to(Path(paper.__file__).parent)
+
+
+def test_plan_is_complete():
+    """All that the paper varies, and nothing twice."""
+    plan = paper.Plan(paper.load_paper())
+    scenes = [case.scene for case in plan.cases]
+    assert {s.payload.mass for s in scenes} >= {4.0, 5.0, 6.0, 7.0, 8.0}
+    assert {s.motion.flattening for s in scenes} >= {0.0, 0.25, 0.5, 0.75, 1.0}
+    designs = {case.design for case in plan.cases if isinstance(case.design, cases.Case)}
+    made = designs | {case for case in plan.cases if case.action == "optimize"}
+    made = {case for case in made if case.scene.arms[0].passive == 0.0}
+    found = {
+        (s.reduction.method, s.reduction.coordinates, s.payload.mass, s.motion.flattening)
+        for s in (case.scene for case in made)
+    }
+    assert found == {
+        *(("craig-bampton", 4, mass, 1.0) for mass in (4.0, 6.0, 8.0)),
+        *(("craig-bampton", 4, 6.0, s) for s in (0.0, 0.25, 0.5, 0.75)),
+        *((method, q, 6.0, 1.0) for method in ("craig-bampton", "modal") for q in (4, 48)),
+    }
+    kinds = [case.scene.objective.kind for case in plan.objectives]
+    assert kinds.count("static") == 2 and kinds.count("eigenfrequency") == 2
+    # The nominal design stands for six reasons and is optimised once.
+    assert len(made) == len(plan.objectives) + 3 + 2 + 4
+
+
+def test_bad_input_is_one_line(shared_tmp_path):
+    for words, expected in (
+        (["--set", "payload.mas=4"], "payload.mass"),
+        (["--set", "motion.radius=5"], "from the shoulder"),
+    ):
+        with pytest.raises(InputError, match=expected) as caught:
+            commands.main(
+                ["reproduce", "--out", str(shared_tmp_path / "o"), *words],
+                standalone_mode=False,
+                obj=WORLD,
+            )
+        assert "\n" not in str(caught.value) and not (shared_tmp_path / "o").exists()
+
+
+# -- the run ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Let the command do with fewer steps."""
+    plan = tiny_plan()
+    monkeypatch.setattr(paper, "Plan", lambda scene: dataclasses.replace(plan, scene=scene))
+    return ["reproduce", *(word for value in TINY for word in ("--set", value))]
+
+
+def test_pipeline(small, shared_tmp_path, capsys):
+    """Cases, figures' data, and the verdict; the second time nothing is computed."""
+    out = shared_tmp_path / "o"
+    texts = []
+    for _ in range(2):
+        with pytest.raises(ConvergenceError) as caught:  # two iterations make no good design
+            commands.main(
+                [*small, "--out", str(out), "--check", "--no-plots"],
+                standalone_mode=False,
+                obj=WORLD,
+            )
+        texts.append(capsys.readouterr().out)
+        WORLD.barrier()
+    assert "path, a tenth: expected below a sixth on every path; found" in str(caught.value)
+    if WORLD.rank == 0:
+        counts = [int(re.search(r"(\d+) cases computed", text)[1]) for text in texts]
+        assert counts[0] == len(list(out.glob("cases/*/summary.json"))) and counts[1] == 0
+        assert "payload, linear (paper: nearly linear)." in texts[0]
+        names = {path.name for path in out.iterdir()}
+        assert names == {f"fig{k:02d}.csv" for k in range(3, 16)} | {"measured.json", "cases"}
+        measured = read_measured((out / "measured.json").read_text())
+        assert [f.name for f in find(measured)] == [f.name for f in find(RECORDED)]
+        rows = list(csv.DictReader((out / "fig10.csv").open(newline="")))
+        initial = [r for r in rows if r["line"] == "initial design"]
+        assert [float(r["payload [kg]"]) for r in initial] == [4.0, 6.0, 8.0]
+        own = measured.payload.initial.compliance
+        np.testing.assert_allclose([float(r["compliance [N m]"]) for r in initial], own)
+
+
+PROGRAM = """
+import dataclasses, sys
+sys.path.insert(0, {tests!r})
+from dolfinopt.paper import reproduction as paper
+from test_paper import tiny_plan
+plan = tiny_plan()
+paper.Plan = lambda scene: dataclasses.replace(plan, scene=scene)
+from dolfinopt.cli import main
+main()
+"""
+
+
+@pytest.mark.serial
+@pytest.mark.slow
+def test_killed_run_continues(tmp_path):
+    """On two ranks: the next call does the rest, and every file is that of one that ran through."""
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM.format(tests=str(Path(__file__).parents[1])))
+    settings = [word for value in TINY for word in ("--set", value)]
+    ranks = ["mpirun", "--oversubscribe", "-n", "2"]
+    line = [*ranks, sys.executable, str(program), "reproduce", "--no-plots", *settings, "--out"]
+    options = {"env": ENVIRONMENT, "cwd": ROOT}
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    first = [*line, str(tmp_path / "a")]
+    with subprocess.Popen(first, start_new_session=True, **silent, **options) as begun:
+        limit = time.monotonic() + 60.0
+        while len(list((tmp_path / "a").glob("cases/*/summary.json"))) < 5:
+            assert begun.poll() is None and time.monotonic() < limit
+            time.sleep(0.005)
+        os.killpg(begun.pid, signal.SIGKILL)
+        begun.wait()
+    done = len(list((tmp_path / "a").glob("cases/*/summary.json")))
+    computed = []
+    for name in "ab":
+        ended = subprocess.run([*line, str(tmp_path / name)], capture_output=True, text=True,
+                               timeout=150, **options)  # fmt: skip
+        assert ended.returncode == 0, ended.stderr
+        computed.append(int(re.search(r"(\d+) cases computed", ended.stdout)[1]))
+    # A rank may outlive its killed mpirun for a moment, and finish a case.
+    assert 5 <= done and 0 < computed[0] <= computed[1] - done
+    a, b = (sorted((tmp_path / name).glob("*.*")) for name in "ab")
+    assert [path.name for path in a] == [path.name for path in b] and len(a) == 14
+    for one, other in zip(a, b, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+    assert json.loads(a[-1].read_text())["iterations"] == 2

@@ -1,0 +1,282 @@
+"""The report: complete in itself, sound as HTML, and read in a real browser where there is one."""
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import browser, open_browser
+from mpi4py import MPI
+from test_paper import tiny_plan
+
+from dolfinopt.output.files import ArmView
+from dolfinopt.paper import page as report
+from dolfinopt.paper import reproduction as paper
+from dolfinopt.paper.checks import broken, find, read_measured
+
+WORLD = MPI.COMM_WORLD
+VOID = {"meta", "link", "img", "input", "br", "path", "rect", "circle"}
+PHONE, DESK = (390, 844), (1280, 900)  # px
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A reproduction with few cells and iterations and its folder, on all ranks."""
+    path = WORLD.bcast(tmp_path_factory.mktemp("paper") if WORLD.rank == 0 else None, root=0)
+    done = paper.reproduce(tiny_plan(), path, WORLD, shown=False)
+    if WORLD.rank == 0:
+        report.write_reproduction(done, path)
+    WORLD.barrier()
+    return done, path
+
+
+@pytest.fixture
+def folder(made):
+    return made[1]
+
+
+class Reader(HTMLParser):
+    """Collects what a page consists of; fails where tags are not closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.headings = [], [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert tag not in VOID and self.open and self.open.pop() == tag, tag
+
+    def all(self, name):
+        return [attributes for tag, attributes in self.tags if tag == name]
+
+
+@pytest.fixture
+def page(folder):
+    return Reader((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def test_page_says_where_the_scene_is_not_the_papers(folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert "two flexible arms that move 6 kg along a semicircle." in text
+    assert "simulation.sample = 0.01 in place of 0.001" in text
+    assert "arms.0.cells = [16, 3] in place of [200, 12]" in text
+    assert "payload.mass =" not in text and "$" not in text.split("</style>")[1].split("<script")[0]
+
+
+# -- the files -------------------------------------------------------------------------------
+
+
+def test_every_figure_is_there(folder):
+    """Figures 3 to 15, none of them blank, each with its data."""
+    from PIL import Image
+
+    for number in range(3, 16):
+        picture = Image.open(folder / f"fig{number:02d}.png").convert("L")
+        assert np.asarray(picture).std() > 5.0
+        rows = (folder / f"fig{number:02d}.csv").read_text().splitlines()
+        assert len(rows) > 2 and len({row.count(",") for row in rows if '"' not in row}) == 1
+
+
+def test_page_needs_nothing_from_elsewhere(page):
+    """Everything it loads is inside; the one address is a link to the paper."""
+    loaded = [a.get(key) for _, a in page.tags for key in ("src", "data", "poster", "srcset")]
+    assert all(address.startswith("data:") for address in loaded if address is not None)
+    assert [a["href"] for a in page.all("link")] == ["data:,"]
+    outside = {a["href"] for a in page.all("a") if not a["href"].startswith("#")}
+    assert outside == {"https://doi.org/10.1016/j.piutam.2015.01.018"}
+
+
+def test_style_and_script_load_nothing(folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest|import\(", text)
+
+
+def test_page_is_sound(page):
+    """One heading on top, places that links lead to, and words for every picture."""
+    assert page.all("html")[0]["lang"] == "en" and len(page.all("h1")) == 1
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    inside = {a["href"][1:] for a in page.all("a") if a["href"].startswith("#")}
+    assert inside <= set(ids) and len(inside) == 15
+    assert all(len(image["alt"]) > 10 for image in page.all("img"))
+    assert len(page.all("article")) == 15
+    # 12 figures without that of the designs, which are shown arm by arm: initial design, three
+    # objectives, four reductions, two paths.
+    assert len(page.all("img")) == 12 + 2 * (4 + 4 + 2)
+
+
+def test_every_finding_is_told(folder):
+    """With the paper's figure, ours, and the verdict."""
+    from html import escape
+
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    for finding in find(read_measured((folder / "measured.json").read_text())):
+        for words in (finding.statement, finding.paper, finding.ours, finding.criterion):
+            assert escape(words) in text
+        assert finding.holds or escape(finding.reason) in text
+
+
+def test_page_without_some_results(made, tmp_path):
+    """Cases that failed are named; nothing that needs them holds, and the rest is told."""
+    done, _ = made
+    plan = done.plan
+    lost = {plan.optimum, plan.reductions[-1]}
+    lost |= {case for case in plan.cases if case.design in lost}
+    nothing = {"failure": "it <diverged>", "compliance": np.nan, "max_deviation": np.nan}
+    outcomes = replace(
+        done.outcomes,
+        by_case={
+            case: replace(outcome, **nothing) if case in lost else outcome
+            for case, outcome in done.outcomes.by_case.items()
+        },
+    )
+    measured = paper.measure(plan, outcomes)
+    findings = find(measured)
+    drawn = paper.figures(plan, outcomes, measured)
+    poorer = paper.Reproduction(plan, outcomes, measured, findings, drawn)
+    report.write_reproduction(poorer, tmp_path)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "it &lt;diverged&gt;" in text and len(Reader(text).all("article")) == 15
+    wrong = {line.partition(":")[0] for line in broken(findings)}
+    assert wrong >= {"dynamic loads", "coordinates, optimised design", "payload, loss"}
+    assert "coordinates, initial design" not in wrong
+
+
+# -- pictures of designs ---------------------------------------------------------------------
+
+
+def test_arm_picture_is_to_scale():
+    """Two cells, the left one solid: twice as wide as high, dark on the left."""
+    import io
+
+    from PIL import Image
+
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    corners = 0.5 * np.stack([square, square + np.array([1.0, 0.0])])
+    centroid, modes = corners.mean(axis=1), np.zeros((2, 4, 2, 0))
+    view = ArmView("arm", corners, centroid, np.array([1.0, 0.0]), modes)
+    picture = Image.open(io.BytesIO(report.arm_picture(view, 40))).convert("L")
+    assert picture.size == (40, 20)
+    values = np.asarray(picture)
+    assert values[5:15, 3:17].max() < 80 < 200 < values[5:15, 23:37].min()
+
+
+def test_animation_follows_the_mechanism():
+    """Frames of the SVG end where the trajectory's end-effector is."""
+    from dolfinopt.study.store import simulate_scenarios
+
+    simulated = next(iter(simulate_scenarios([tiny_plan().scene], None)))
+    trajectory = simulated.trajectory
+    at = np.array([0, 80, len(trajectory.t) - 1])
+    flexible, rigid = (report.strip(trajectory, at, factor) for factor in (1.0, 0.0))
+    np.testing.assert_allclose(flexible.tips - rigid.tips, trajectory.deviation[at], atol=1e-12)
+    lengths = np.hypot(*trajectory.deviation[at].T)
+    np.testing.assert_allclose(flexible.deviation, 1e3 * lengths)
+    for text, tip in zip(flexible.arms, flexible.tips, strict=True):
+        numbers = [float(v) for v in re.findall(r"-?\d+\.\d+", text)]
+        assert len(numbers) == 2 + 2 * 6 and text.count("C") == 2
+        np.testing.assert_allclose(numbers[-2:], tip, atol=1e-4)
+    # Rigid arms are straight: all points of one lie on a line from joint to joint.
+    points = np.array(re.findall(r"(-?\d+\.\d+),(-?\d+\.\d+)", rigid.arms[1]), dtype=float)
+    a, b, c, d = points[:4]
+    for point in (b, c):
+        assert abs(np.cross(d - a, point - a)) < 2e-4
+
+
+# -- in a browser ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory):
+    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+in_browser = pytest.mark.skipif(browser() is None, reason="needs Chromium")
+
+
+@in_browser
+@pytest.mark.serial
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_page_in_a_browser(folder, window, size):
+    """No complaint, no request, all pictures there, and nothing wider than the window."""
+    window.open(folder / "report.html", *size)
+    assert window.complaints() == []
+    sent = [address for address in window.requests() if not address.startswith("data:")]
+    assert sent == [(folder / "report.html").resolve().as_uri()]
+    count, missing = window.value(
+        "[document.images.length,"
+        " [...document.images].filter(i => !i.complete || i.naturalWidth === 0).length]"
+    )
+    assert count == 32 and missing == 0
+    assert window.value("document.documentElement.scrollWidth") == size[0]
+    wide = window.value(
+        "[...document.querySelectorAll('body *')].filter(e => !e.closest('.scroll')"
+        " && e.getBoundingClientRect().right > innerWidth + 0.5).map(e => e.outerHTML.slice(0, 80))"
+    )
+    assert wide == []
+
+
+@in_browser
+@pytest.mark.serial
+def test_tables_scroll_in_their_boxes(folder, window):
+    """On a phone figures are wider than their boxes, which scroll; the findings are read down."""
+    window.open(folder / "report.html", *PHONE)
+    wider, moved, first = window.value(
+        "(() => { const boxes = [...document.querySelectorAll('.scroll')];"
+        " const wide = boxes.filter(box => box.scrollWidth > box.clientWidth);"
+        " for (const box of wide) box.scrollLeft = 1;"
+        " return [wide.length, wide.every(b => b.scrollLeft === 1), wide.indexOf(boxes[0])]; })()"
+    )
+    assert wider > 0 and moved and first == -1
+
+
+@in_browser
+@pytest.mark.serial
+def test_text_is_legible(folder, window):
+    """At least 12 px on a phone, and pictures scaled by no more than a third."""
+    window.open(folder / "report.html", *PHONE)
+    small = window.value(
+        "[...document.querySelectorAll('p, td, th, figcaption, dd, dt, h3')]"
+        ".map(e => parseFloat(getComputedStyle(e).fontSize)).reduce((a, b) => Math.min(a, b))"
+    )
+    assert small >= 12.0
+    width = window.value("Math.min(...[...document.querySelectorAll('.plots img')]"
+                         ".map(i => i.getBoundingClientRect().width))")  # fmt: skip
+    assert width >= 340.0
+
+
+@in_browser
+@pytest.mark.serial
+def test_player(folder, window):
+    """The slider moves the mechanism; the button plays and pauses."""
+    window.open(folder / "report.html", *DESK)
+    before = window.value("document.getElementById('before').getAttribute('d')")
+    window.value(
+        "(() => { const s = document.getElementById('frame'); s.value = 3;"
+        " s.dispatchEvent(new Event('input')); })()"
+    )
+    moved = window.value("document.getElementById('before').getAttribute('d')")
+    film = "JSON.parse(document.getElementById('frames').textContent)"
+    assert moved != before and moved == window.value(f"{film}.before[3]")
+    said = window.value("document.getElementById('said').textContent")
+    assert said.startswith(f"{window.value(f'{film}.t[3]'):.2f} s: ")
+    words = [
+        window.value(
+            "(() => { const b = document.getElementById('play'); b.click();"
+            " return b.textContent; })()"
+        )
+        for _ in range(2)
+    ]
+    assert words == ["Pause", "Play"] and window.complaints() == []

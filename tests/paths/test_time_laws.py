@@ -1,0 +1,313 @@
+"""Time laws against closed forms, differences and their limits; tables with stops."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bodies import assert_close
+from mpi4py import MPI
+from scipy.integrate import quad
+
+import dolfinopt as do
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.motion import breakpoints, check_motion, desired_path, rigid_motion
+from dolfinopt.paths.time_laws import Law, Limits, law_for
+from dolfinopt.profiling import Ledger
+from dolfinopt.responses.evaluation import evaluate_batch
+from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
+
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
+EVERY = pytest.mark.parametrize("name", LAWS)
+DEGREES = {"quintic": 5, "septic": 7, "trapezoidal": 2, "s-curve": 3}  # of s between knots
+SMOOTH = {"quintic": 2, "septic": 3, "trapezoidal": 1, "s-curve": 2}  # continuous derivatives
+
+
+def law_of(name: str, share: float = 0.25, length: float = 1.0, **limits: float) -> Law:
+    """Return the law on a path of that length, m."""
+    return law_for(name, length, Limits(**limits), share)
+
+
+def pieces(law: Law, duration: float) -> np.ndarray:
+    """Return the ends of the law's smooth pieces, s."""
+    return np.array([0.0, *(law.knots * duration), duration])
+
+
+def peaks(law: Law, duration: float, length: float) -> np.ndarray:
+    """Return the largest speed, acceleration and jerk, the latter from cubics through samples."""
+    largest = np.zeros(3)
+    for a, b in np.stack([pieces(law, duration)[:-1], pieces(law, duration)[1:]], axis=1):
+        if b - a < 1e-6 * duration:
+            continue
+        t = a + (b - a) * (0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 41)))[1:-1]
+        sdd = law(t, duration)[2]
+        fit = np.polynomial.Polynomial.fit(t, sdd, 5)
+        dense = np.linspace(a, b, 2001)
+        values = law(dense[1:-1], duration)[1], fit(dense), fit.deriv()(dense)
+        largest = np.maximum(largest, [np.abs(x).max() for x in values])
+    return length * largest
+
+
+@EVERY
+@pytest.mark.parametrize("share", [0.05, 0.25, 0.5])
+def test_speed_is_the_rate_and_its_area_the_distance(name: str, share: float) -> None:
+    """By Gauss' rule between the knots, exact there; acceleration likewise to the speed."""
+    law, duration = law_of(name, share), 1.7
+    ends = pieces(law, duration)
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    for order in (1, 2):
+        before = law(np.zeros(1), duration)[order - 1]
+        for a, b in pairwise(ends):
+            t = 0.5 * (a + b) + 0.5 * (b - a) * nodes
+            gained = 0.5 * (b - a) * weights @ law(t, duration)[order]
+            after = law(np.array([b]), duration)[order - 1]
+            assert_close(after - before, [gained], 1e-13, 10.0)
+            before = after
+        assert_close(before, [2.0 - order], 1e-13, 1.0)
+
+
+@EVERY
+def test_law_rests_at_both_ends(name: str) -> None:
+    """Exactly: place and speed at the ends, all before and behind."""
+    law, duration = law_of(name), 0.7
+    s, sd, sdd = law(np.array([-1.0, 0.0, duration, duration * (1 + 1e-9), 2.0]), duration)
+    assert s.tolist() == [0.0, 0.0, 1.0, 1.0, 1.0]
+    assert not sd.any()
+    assert not sdd[[0, 1, 3, 4]].any()
+    if name != "trapezoidal":
+        assert not sdd.any()
+
+
+@EVERY
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
+def test_continuity_is_what_the_law_promises(name: str, share: float) -> None:
+    """Up to that derivative both sides of a knot agree; the next one jumps at some knot."""
+    law, duration = law_of(name, share), 1.0
+    tiny = 1e-7
+    knots = np.concatenate([[0.0], law.knots, [1.0]])
+    both = [law(knots + side * tiny, duration) for side in (-1.0, 1.0)]
+    jumps = [np.abs(a - b).max() for a, b in zip(*both, strict=True)]
+    for order in range(min(SMOOTH[name], 2) + 1):
+        assert jumps[order] <= 1e-3
+    if SMOOTH[name] == 1:
+        assert jumps[2] > 1.0
+        left = law(knots[1:], duration)[2]  # at a knot itself: the value before it
+        assert_close(left, both[0][2][1:], 1e-12)
+
+
+def test_trapezoid_and_s_curve_in_closed_form() -> None:
+    """The default profiles' largest speed 4/3, acceleration 16/3 and 64/9 of their units."""
+    trapezoid, curve = law_of("trapezoidal"), law_of("s-curve")
+    assert_close(peaks(trapezoid, 2.0, 1.0)[:2], [4 / 3 / 2, 16 / 3 / 4], 1e-12)
+    assert_close(peaks(curve, 2.0, 1.0), [4 / 3 / 2, 64 / 9 / 4, 64 / 9 * 16 / 8], 1e-9)
+    assert_close(trapezoid.knots, [0.25, 0.75], 1e-15)
+    assert_close(curve.knots, np.array([1, 3, 4, 12, 13, 15]) / 16, 1e-15)
+
+
+@EVERY
+def test_limits_are_met_exactly(name: str) -> None:
+    """At the least duration one of them is reached and none exceeded, whichever binds."""
+    rng = np.random.default_rng(5)
+    binding = set()
+    for _ in range(60):
+        length = 10.0 ** rng.uniform(-2.0, 1.0)
+        chosen = rng.permutation(3)[: rng.integers(1, 4)]
+        names = np.array(["speed", "acceleration", "jerk"])[chosen]
+        limits = {
+            str(key): 10.0 ** rng.uniform(-1.0, 2.0)
+            for key in names
+            if (name, key) != ("trapezoidal", "jerk")
+        }
+        if not limits:
+            continue
+        law = law_of(name, 0.25, length, **limits)
+        found = dict(
+            zip(("speed", "acceleration", "jerk"), peaks(law, law.least, length), strict=True)
+        )
+        shares = {key: found[key] / limit for key, limit in limits.items()}
+        assert_close(max(shares.values()), 1.0, 1e-6)
+        binding.add(max(shares, key=lambda key: shares[key]))
+    assert len(binding) == (2 if name == "trapezoidal" else 3)
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ({"speed": 1.0, "acceleration": 2.0}, 2.0 + 0.5),  # D/v + v/a
+        ({"speed": 9.0, "acceleration": 2.0}, 2.0),  # 2 sqrt(D/a)
+        ({"acceleration": 2.0}, 2.0),
+        ({"speed": 1.0}, 2.0 / 0.75),  # D/(v (1 - share))
+    ],
+)
+def test_fastest_trapezoid(limits: dict[str, float], expected: float) -> None:
+    """Two metres, in closed form."""
+    assert_close(law_of("trapezoidal", 0.25, 2.0, **limits).least, expected, 1e-14)
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ({"speed": 1.0, "acceleration": 2.0, "jerk": 8.0}, 2.0 + 0.5 + 0.25),  # D/v + v/a + a/j
+        ({"speed": 1.0, "acceleration": 99.0, "jerk": 4.0}, 2.0 + 1.0),  # D/v + 2 sqrt(v/j)
+        ({"jerk": 32.0}, (32.0 * 2.0 / 32.0) ** (1 / 3)),  # cbrt(32 D/j)
+        ({"acceleration": 4.0, "jerk": 16.0}, 0.25 + np.sqrt(0.25**2 + 4 * 2.0 / 4.0)),
+    ],
+)
+def test_fastest_s_curve(limits: dict[str, float], expected: float) -> None:
+    """Two metres, in closed form (Biagiotti & Melchiorri 2008, 3.4)."""
+    assert_close(law_of("s-curve", 0.25, 2.0, **limits).least, expected, 1e-14)
+
+
+# -- in scenes --------------------------------------------------------------------------------
+
+
+def posed(**motion: Any) -> Scene:
+    """Return the example with another motion."""
+    data = load_scene(SCENE, ("arms.cells=[20,2]",)).to_dict()
+    return scene_from_dict(data | {"motion": motion}, "test.toml")
+
+
+@EVERY
+def test_path_runs_by_the_law(name: str) -> None:
+    """Against an independent quadrature of its own acceleration, by SciPy, twice."""
+    of = posed(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=name, duration=1.2)
+    ends = [0.0, *(t for t in breakpoints(of) if 0.0 < t <= 1.2)]
+
+    def speed(t: float) -> float:
+        return float(desired_path(np.array([t]), of.motion).pd[0, 0])
+
+    for order, expected in ((1, 1.2), (2, 0.0)):
+        gained = 0.0
+        for a, b in pairwise(ends):
+            integrand = (
+                speed
+                if order == 1
+                else lambda t: float(desired_path(np.array([t]), of.motion).pdd[0, 0])
+            )
+            gained += quad(integrand, a, b, epsabs=1e-12)[0]
+        assert_close(gained, expected, 1e-11, 1.0)
+
+
+def test_duration_follows_from_the_limits() -> None:
+    """Unless stated; values that follow stay free in changes, and a short one is refused."""
+    limits = {"law": "trapezoidal", "max_speed": 2.0, "max_acceleration": 5.0}
+    of = posed(**limits)
+    assert_close(of.motion.duration, np.pi / 2.0 + 2.0 / 5.0, 1e-14)
+    half = scene_from_dict(of.to_tree(), "test.toml", ["motion.radius=0.9"])
+    assert_close(half.motion.duration, 0.9 * np.pi / 2.0 + 2.0 / 5.0, 1e-14)
+    assert scene_from_dict(of.to_dict()).motion == of.motion
+    slow = posed(**limits, duration=2.5)
+    speed = np.linalg.norm(desired_path(np.linspace(0.0, 2.5, 5001), slow.motion).pd, axis=1)
+    assert_close(speed.max(), 2.0 * of.motion.duration / 2.5, 1e-12)
+    with pytest.raises(
+        InputError, match=r"^test\.toml: motion\.duration = 1\.9: expected at least"
+    ):
+        posed(**limits, duration=1.9)
+    # A long one takes the horizon with it.
+    assert posed(law="septic", max_speed=0.5).motion.horizon > 13.0
+
+
+@pytest.mark.parametrize(
+    ("motion", "reason"),
+    [
+        (
+            {"law": "trapezoidal", "max_jerk": 9.0},
+            'max_jerk = 9.0: expected none with motion.law = "trapezoidal"',
+        ),
+        (
+            {"law": "s-curve", "max_jerk": 9.0, "acceleration_share": 0.3},
+            "acceleration_share = 0.3: expected 0.25, the default, with motion.max_jerk",
+        ),
+        ({"horizon": 1.0}, "horizon = 1.0: expected at least motion.duration = 1.9"),
+        ({"duration": 2.5, "horizon": 2.0}, "horizon = 2.0: expected at least motion.duration"),
+    ],
+)
+def test_values_that_do_not_go_together(motion: dict[str, Any], reason: str) -> None:
+    """One line that names the key, the value and the other key."""
+    with pytest.raises(InputError) as caught:
+        posed(**motion)
+    assert f"test.toml: motion.{reason}" in str(caught.value)
+
+
+DWELL = "t,x,y\n0,-0.4,0.1\n0.18,0.3,0.2\n0.22,0.3,0.2\n0.4,0.5,0.6\n"
+
+
+@EVERY
+def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
+    """At the point to rounding, without speed and acceleration; rest to rest on both sides."""
+    file = tmp_path / "pick.csv"
+    file.write_text(DWELL)
+    of = posed(path="points", file=str(file), law=name)
+    assert of.motion.duration == 0.4
+    t = np.linspace(0.1801, 0.2199, 200)
+    path = desired_path(t, of.motion)
+    assert_close(path.p, np.tile([0.3, 0.2], (200, 1)), 1e-15)
+    assert not path.pd.any()
+    assert not path.pdd.any()
+    rigid = rigid_motion(t, of)
+    assert not rigid.qd.any()
+    assert not rigid.qdd.any()
+    assert {0.18, 0.22, 0.4} <= {round(one, 12) for one in breakpoints(of)}
+    # Between stops each move is straight and follows the law.
+    law, tau = law_of(name), np.linspace(0.0, 0.18, 50)
+    s, sd, _ = law(tau, 0.18)
+    found = desired_path(tau, of.motion)
+    assert_close(found.p, np.array([-0.4, 0.1]) + np.outer(s, [0.7, 0.1]), 1e-12)
+    assert_close(found.pd, np.outer(sd, [0.7, 0.1]), 1e-11)
+    later = desired_path(0.22 + tau, of.motion)
+    assert_close(later.p, np.array([0.3, 0.2]) + np.outer(s, [0.2, 0.4]), 1e-11)
+    check_motion(of)
+
+
+def test_joints_stop_and_moves_between_stops_may_have_rows(tmp_path: Path) -> None:
+    """A spline of degree 5 between stops; a stop at the start and at the end, too."""
+    file = tmp_path / "joints.csv"
+    rows = ["0,0,1.5,-1", "0.1,0,1.5,-1", "0.4,0.1,1.2,-1.2", "0.6,0.2,1,-1.1", "0.8,0.2,1,-1.1"]
+    file.write_text("\n".join(["t,cart,arm1,arm2", *rows]))
+    of = posed(path="joints", file=str(file))
+    assert of.motion.duration == 0.8
+    t = np.concatenate([np.linspace(0.0, 0.1, 30), np.linspace(0.6, 0.9, 30)])
+    rest = rigid_motion(t, of)
+    assert not rest.qd.any()
+    assert not rest.qdd.any()
+    assert_close(rest.q[:30], np.tile([0.0, 1.5, -1.0], (30, 1)), 0.0)
+    assert_close(rest.q[30:], np.tile([0.2, 1.0, -1.1], (30, 1)), 0.0)
+    h = 1e-4
+    at = np.array([0.1, 0.25, 0.4, 0.5, 0.6])
+    before, here, after = (rigid_motion(at + k * h, of) for k in (-1, 0, 1))
+    assert_close((after.q - before.q) / (2 * h), here.qd, 1e-5, 1.0)
+    assert_close((after.qd - before.qd) / (2 * h), here.qdd, 2e-3, 10.0)
+    assert_close(rigid_motion(np.array([0.4]), of).q, [[0.1, 1.2, -1.2]], 1e-14)
+
+
+def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
+    """Each move has the time that the table gives it: too little is named by file and line."""
+    file = tmp_path / "pick.csv"
+    file.write_text(DWELL)
+    with pytest.raises(InputError, match=r"pick\.csv: line 3, column t = 0\.18: 0\.18 s for this"):
+        check_motion(posed(path="points", file=str(file), law="s-curve", max_speed=4.0))
+    check_motion(posed(path="points", file=str(file), law="s-curve", max_speed=6.0))
+    with pytest.raises(InputError, match=r"expected none with motion\.path = \"joints\""):
+        posed(path="joints", file=str(file), max_speed=1.0)
+
+
+def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:
+    """Several payloads at once, steps ending at every jump: what each of them does alone."""
+    file = tmp_path / "pick.csv"
+    file.write_text("t,x,y\n0,-0.4,0.1\n0.5,0.3,0.2\n0.7,0.3,0.2\n1.3,0.5,0.6\n")
+    motion = {"path": "points", "file": str(file), "law": "trapezoidal", "horizon": 1.5}
+    of = posed(**motion)
+    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 2.0, 3.0)]
+    ledger = Ledger()
+    share = do.share_arms(MPI.COMM_SELF, of.cell_counts)
+    arms = do.build_arms(of, share, ledger)
+    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
+    together = evaluate_batch(scenes, share, arms, x, ledger)
+    for scene, both in zip(scenes, together, strict=True):
+        assert isinstance(both, tuple)
+        alone = do.evaluate(scene, share, arms, x, ledger)[0]
+        assert_close(both[0].max_deviation, alone.max_deviation, 2e-4)

@@ -1,0 +1,350 @@
+"""The choice of coordinates: what the estimate is worth, and that every use of a scene keeps it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from remainders import SCENE, Built, build, wave
+
+import dolfinopt as do
+from dolfinopt.dynamics.problem import relative_error
+from dolfinopt.dynamics.simulation import simulate
+from dolfinopt.optimization import loop as optimization
+from dolfinopt.output.run_folder import write_result
+from dolfinopt.parallel import gather_arms
+from dolfinopt.responses import order_selection as coordinates
+from dolfinopt.responses.order_selection import Choice, estimated_error
+from dolfinopt.study.store import compare, simulate_scenarios
+
+WORLD = MPI.COMM_WORLD
+AUTO = 'reduction.coordinates="auto"'
+SHORT = "motion.horizon=1.9"
+
+
+def auto(*overrides: str, tolerance: float = 1e-2, cells: tuple[int, int] = (24, 3)) -> Built:
+    return build(AUTO, f"reduction.tolerance={tolerance}", SHORT, *overrides, cells=cells)
+
+
+def error(built: Built, x: dict[int, np.ndarray], count: int) -> float:
+    place = built.scene, built.share, built.arms
+    return estimated_error(*place, x, count, built.ledger)
+
+
+def choose(built: Built, x: dict[int, np.ndarray]) -> Choice:
+    choice = do.choose_coordinates(built.scene, built.share, built.arms, x, built.ledger)
+    assert choice is not None
+    return choice
+
+
+def clouds(seed: int, crisp: bool):
+    """Return smooth random densities in [0.1, 1], or void and solid, as a function of place."""
+
+    def field(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        rng = np.random.default_rng([seed, k])
+        total = np.zeros_like(x)
+        for _ in range(12):
+            along, across, phase = rng.uniform((2.0, -60.0, 0.0), (40.0, 60.0, 7.0))
+            total += rng.normal() * np.cos(along * x + across * y + phase)
+        grey = 0.55 + 0.45 * np.tanh(total / 3.0)
+        # Solid edges, so that what a crisp design carries does not hang in void.
+        edge = np.abs(y) > 0.02
+        return np.where((grey > 0.55) | edge, 1.0, 0.1) if crisp else grey
+
+    return field
+
+
+DESIGNS = {
+    "uniform": lambda k, x, y: np.full_like(x, 0.5),
+    "wave": wave,
+    "random 1": clouds(1, False),
+    "random 2": clouds(2, False),
+    "crisp 3": clouds(3, True),
+    "crisp 4": clouds(4, True),
+}
+CELLS = (30, 4)
+# Vibrations near resonance, whose errors a static estimate would miss.
+SHAKEN = ("damping.stiffness_proportional=1e-5", "payload.mass=2", "motion.duration=1.2")
+
+
+# -- the estimate ----------------------------------------------------------------------------
+
+
+def padded_error(built: Built, x, few: int, many: int) -> float:
+    """Return the error of a number of Craig-Bampton coordinates, by the coordinates alone.
+
+    The first of many coordinates are the few: with zeros behind, their motion is one of the many.
+    """
+    found = []
+    for count in (few, many):
+        data = built.scene.to_dict()
+        data["reduction"] |= {"coordinates": count, "tolerance": 1e-3}
+        data["simulation"]["tolerance"] = 3e-5
+        scene = do.scene_from_dict(data)
+        arms = {k: arm.under(scene) for k, arm in built.arms.items()}
+        bodies = gather_arms(built.share, {k: arm.reduce(x[k]) for k, arm in arms.items()})
+        found.append(simulate(scene, list(bodies.values()), do.Ledger()) if bodies else None)
+    result = None
+    if WORLD.rank == 0:
+        short, long = found
+        padded = np.zeros_like(long.q_e)
+        for a, b in zip(short.mechanism.slices, long.mechanism.slices, strict=True):
+            padded[:, b.start : b.start + few] = short.q_e[:, a]
+        result = relative_error(long.mechanism, padded - long.q_e, long.q_e)
+    return WORLD.bcast(result, root=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [*((name, ()) for name in DESIGNS), ("uniform", SHAKEN)],
+)
+def test_estimate_is_the_error(name, overrides):
+    """Against twice as many coordinates as the estimate compares with, integrated more finely.
+
+    Those it compares with, 24, leave less than a tenth of what 4 do.
+    """
+    built = auto(*overrides, cells=CELLS)
+    x = built.fields(DESIGNS[name])
+    assert error(built, x, 4) == pytest.approx(padded_error(built, x, 4, 48), rel=0.1)
+
+
+@pytest.mark.parametrize("method", ["modal", "krylov", "balanced"])
+def test_estimate_of_other_bases(method):
+    """Node by node: the energy of what the displacements of two motions differ by."""
+    built = auto(f"reduction.method={method}", cells=CELLS)
+    x = built.fields(wave)
+    estimate = error(built, x, 4)
+    moved, fields = [], []
+    for kind, count in ((method, 4), ("craig-bampton", 48)):
+        data = built.scene.to_dict()
+        data["reduction"] |= {"coordinates": count, "tolerance": 1e-3, "method": kind}
+        data["simulation"]["tolerance"] = 3e-5
+        scene = do.scene_from_dict(data)
+        arms = {k: arm.under(scene) for k, arm in built.arms.items()}
+        bodies = gather_arms(built.share, {k: arm.reduce(x[k]) for k, arm in arms.items()})
+        motion = simulate(scene, list(bodies.values()), do.Ledger()) if bodies else None
+        moved.append(WORLD.bcast(motion and (motion.q_e, motion.mechanism.slices), root=0))
+        fields.append({k: arm.basis.V for k, arm in arms.items()})
+    worst = {}
+    for k, arm in built.arms.items():
+        u, richer = (V[k] @ q[::5, parts[k]].T for V, (q, parts) in zip(fields, moved, strict=True))
+        norms = [
+            np.sqrt(np.sum(w * arm.elastic.stiffness_times(w), axis=(0, 1)).max())
+            for w in (u - richer, richer)
+        ]
+        worst[k] = norms[0] / norms[1]
+    true = max(value for part in WORLD.allgather(worst) for value in part.values())
+    # Every fifth instant finds the maxima to some percent; 24 coordinates leave less.
+    assert estimate == pytest.approx(true, rel=0.1)
+
+
+def test_scenarios_count():
+    """The worst of them, each posed by itself."""
+    heavy = "payload.mass=9"
+    built = auto(f"scenarios=[{{changes=['{heavy}', 'material.young_modulus=60e9']}}]")
+    alone = auto(heavy, "material.young_modulus=60e9"), auto()
+    x = built.fields(wave)
+    parts = [error(one, x, 4) for one in alone]
+    # Steps are those of the scene that needs most: right to TIME_SHARE of the tolerance.
+    assert error(built, x, 4) == pytest.approx(max(parts), rel=0.02)
+
+
+# -- the choice ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overrides", "tolerance"),
+    [
+        ([], 1e-2),
+        ([], 3e-4),
+        (["reduction.method=krylov", "reduction.shifts=[0.0,20.0]"], 1e-3),
+        (["reduction.method=balanced"], 1e-2),
+        (["reduction.method=modal"], 0.4),
+        (["arms.arm1.rigid=true"], 1e-3),
+        (["simulation.integrator=generalized-alpha"], 1e-3),
+    ],
+)
+def test_fewest_that_meet_the_tolerance(overrides, tolerance):
+    built = auto(*overrides, tolerance=tolerance)
+    x = built.fields(lambda k, *at: wave(0, *at))
+    choice = choose(built, x)
+    assert choice.error == dict(choice.tried)[choice.coordinates] <= tolerance
+    # Beside a basis that may be richer: the richer one for many coordinates is kept.
+    assert choice.error == pytest.approx(error(built, x, choice.coordinates), rel=0.1)
+    fewest = built.scene.reduction.fewest
+    if choice.coordinates > fewest:
+        assert dict(choice.tried)[choice.coordinates - 1] > tolerance
+    assert [count for count, _ in choice.tried] == sorted({count for count, _ in choice.tried})
+    for k, arm in built.arms.items():
+        assert arm.reduce(x[k]).num_modes == choice.coordinates
+
+
+def test_shared_design_counts_like_two():
+    """Two arms of one design err as if each had its own."""
+    shared, own = auto("arms.arm2.design=arm1"), auto()
+    found = [error(b, b.fields(lambda k, *at: wave(0, *at)), 4) for b in (shared, own)]
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
+
+
+def test_three_arms():
+    scene = do.load_scene(
+        SCENE.parent / "three_arm.toml",
+        (AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"),
+    )
+    share = do.share_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, share, do.Ledger())
+    x = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    choice = do.choose_coordinates(scene, share, arms, x, do.Ledger())
+    assert choice.error <= 1e-2
+
+
+def test_a_given_number_costs_nothing():
+    built = build("reduction.coordinates=5", SHORT)
+    before = replace(built.ledger.counts)
+    place = built.scene, built.share, built.arms, built.fields(wave), built.ledger
+    assert do.choose_coordinates(*place) is None
+    assert built.ledger.counts == before
+    assert all(arm.coordinates == 5 and arm.basis is None for arm in built.arms.values())
+
+
+def test_more_coordinates_than_dofs_are_not_tried():
+    """2 x 1 cells: 2 dofs at each of two free nodes and 3 of the interface, 7 in all: exact."""
+    built = auto("payload.mass=0.1", "motion.horizon=1.9", tolerance=1e-5, cells=(2, 1))
+    choice = choose(built, built.fields(wave))
+    assert choice.coordinates <= 7
+
+
+def test_none_is_enough(monkeypatch):
+    monkeypatch.setattr(coordinates, "MOST", 6)
+    built = auto("reduction.method=modal", tolerance=1e-3)
+    with pytest.raises(do.ConvergenceError, match=r"up to 6 coordinates .*tolerance = 0.001; give"):
+        choose(built, built.fields(wave))
+
+
+def test_unresolved():
+    """Nothing takes "auto" for a number."""
+    built = auto()
+    message = r'reduction\.coordinates = "auto".*choose_coordinates'
+    for k, arm in built.arms.items():
+        with pytest.raises(do.InputError, match=message):
+            arm.reduce(built.fields(wave)[k])
+
+
+# -- optimisations ---------------------------------------------------------------------------
+
+
+def small(*overrides: str, iterations: int = 3):
+    settings = ["arms.cells=[24,3]", "motion.horizon=1.9", f"optimizer.max_iterations={iterations}"]
+    return do.load_scene(SCENE, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
+
+
+def test_optimises_with_the_choice():
+    """As with the number; the choice is looked at again in the end."""
+    found = do.optimize(small())
+    count = found.choice.coordinates
+    stated = f"reduction.coordinates={count}", "reduction.tolerance=0.001"
+    same = do.optimize(small(*stated))
+    assert same.choice is None
+    for k in found.x_phys:
+        np.testing.assert_array_equal(found.x_phys[k], same.x_phys[k])
+    assert dict(found.choice.tried)[count] <= 0.01 / optimization.RESERVE
+    built = Built(small(), found.share, dict(found.arms), do.Ledger())
+    assert found.choice.error == error(built, found.x_phys, count)
+    assert found.choice.error != dict(found.choice.tried)[count]
+
+
+def test_resumes_in_the_same_bits(shared_tmp_path):
+    whole = do.optimize(small(iterations=2))
+    do.optimize(small(iterations=1), shared_tmp_path)
+    resumed = do.optimize(small(iterations=2), shared_tmp_path, resume=True)
+    assert resumed.choice == whole.choice
+    assert str(resumed.evaluation) == str(whole.evaluation)
+    for k in whole.x_phys:
+        np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
+
+
+def test_without_a_motion_the_final_design_decides():
+    """Nothing is simulated before the iterations end."""
+    found = do.optimize(small("objective.kind=static"))
+    assert found.counts.simulations == 0
+    assert found.choice.error == dict(found.choice.tried)[found.choice.coordinates] <= 0.01
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
+def test_any_number_of_ranks():
+    together = do.optimize(small(iterations=1))
+    alone = do.optimize(small(iterations=1), world=MPI.COMM_SELF)
+    assert together.choice == alone.choice
+    assert str(together.evaluation) == str(alone.evaluation)
+
+
+def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
+    monkeypatch.setattr(optimization, "estimated_error", lambda *_: 0.02)
+    scene = small(iterations=1)
+    written = write_result(scene, shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
+    if written is not None:
+        assert written.summary["reduction"]["error_estimate"] == 0.02
+        (warning,) = (w for w in written.summary["warnings"] if "filter" not in w)
+        assert "estimated error of 0.02, above reduction.tolerance = 0.01" in warning
+    WORLD.barrier()
+
+
+# -- other uses ------------------------------------------------------------------------------
+
+
+def test_cases():
+    """Every scene has its own choice: a light payload shakes the arms more than a heavy one."""
+    scenes = [small(f"payload.mass={mass}") for mass in (0.5, 9.0)]
+    light, heavy = (one.choice.coordinates for one in simulate_scenarios(scenes, None))
+    (alone,) = simulate_scenarios(scenes[1:], None)
+    assert light > heavy == alone.choice.coordinates
+    (bases,) = compare(scenes[1:], None)
+    assert [one.arm for one in bases] == ["arm1", "arm2"]
+
+
+@pytest.mark.serial
+def test_commands(tmp_path):
+    """Each says what it chose; a picture drawn anew takes the number from the summary."""
+    from click.testing import CliRunner
+
+    from dolfinopt.cli import commands
+
+    def run(*words: object) -> str:
+        line = [*map(str, words), "--set", "arms.cells=[24,3]", "--set", AUTO]
+        result = CliRunner().invoke(commands, line, obj=WORLD, catch_exceptions=False)
+        return result.output
+
+    sentence = 'reduction.coordinates = "auto": '
+    assert sentence in run("simulate", SCENE, "--no-plots", "--out", tmp_path / "s")
+    summary = json.loads((tmp_path / "s" / "summary.json").read_text())
+    found = summary["reduction"]
+    assert found["error_estimate"] <= 1e-3 == summary["scene"]["reduction"]["tolerance"]
+    assert summary["scene"]["reduction"]["coordinates"] == "auto"
+    assert found["tried"][0]["coordinates"] == 3
+    with np.load(tmp_path / "s" / "trajectory.npz") as data:
+        assert data["q_e"].shape[1] == 2 * found["coordinates"]
+    said = run("export", SCENE, "--out", tmp_path / "e")
+    assert f"{sentence}{found['coordinates']} coordinates an arm" in said
+    assert sentence in run("gradient", SCENE, "--out", tmp_path / "g.npz")
+    from dolfinopt.cli.shared import scene_of
+
+    assert scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
+
+
+@pytest.mark.serial
+def test_arm_from_a_file(tmp_path):
+    """It keeps the coordinates that the file has; the other's are chosen."""
+    from click.testing import CliRunner
+
+    from dolfinopt.cli import commands
+
+    line = ["export", str(SCENE), "--out", str(tmp_path), "--set", "arms.cells=[24,3]"]
+    CliRunner().invoke(commands, line, obj=WORLD, catch_exceptions=False)
+    built = auto(f"arms.arm1.sid={tmp_path / 'arm1.sid'}", tolerance=1e-3)
+    choice = choose(built, built.fields(wave))
+    _, trajectory = built.evaluate(built.fields(wave))
+    sizes = [body.num_modes for body in trajectory.mechanism.bodies]
+    assert sizes == [4, choice.coordinates]

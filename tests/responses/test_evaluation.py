@@ -1,0 +1,438 @@
+"""One pass down the street: shared designs, rigid arms, own materials, frozen loads, the cost."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from bodies import Chain, Cloud
+from mpi4py import MPI
+from remainders import SCENE, build, rates, tip, uneven, wave
+
+import dolfinopt as do
+from dolfinopt.arms.arm import Arm, chain_of
+from dolfinopt.multibody.mechanism import deviation
+from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
+from dolfinopt.responses.evaluation import constraint_gradients, evaluate, evaluate_batch
+from dolfinopt.responses.objective import load_cases, objective
+
+WORLD = MPI.COMM_WORLD
+
+
+def same(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the same design on every arm."""
+    return wave(0, x, y)
+
+
+# -- one design of two arms ------------------------------------------------------------------
+
+SHARED = "arms.arm2.design=arm1"
+CASES = [
+    ["reduction.coordinates=5"],
+    ["reduction.method=modal"],
+    ["objective.kind=deviation", "objective.gradient=exact"],
+    ["objective.kind=deviation"],
+    ["objective.kind=compliance", "objective.gradient=exact"],
+    ["objective.kind=static"],
+    ["objective.kind=eigenfrequency"],
+    ["constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6", "objective.kind=static"],
+]
+
+
+@pytest.mark.parametrize("overrides", CASES, ids=" ".join)
+def test_a_shared_design_is_two_equal_ones(overrides: list[str]) -> None:
+    """The same figures, and the sum of both gradients; the work is counted in test_skip."""
+    found = []
+    for sharing in ([], [SHARED]):
+        built = build(*overrides, *sharing)
+        evaluation, trajectory = built.evaluate(built.fields(same))
+        slopes = built.share.world.allgather(built.gradient(trajectory))
+        rows = [
+            WORLD.allgather(row)
+            for row in constraint_gradients(built.scene, built.share, built.arms)
+        ]
+        found.append((evaluation, slopes, rows))
+    (two, two_slopes, two_rows), (one, one_slopes, one_rows) = found
+    for field in fields(two):
+        # Both arms' numbers are the same ones in the same order; deflections go design by design.
+        if field.name not in ("constraints", "tip_deflections"):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
+    assert set(one.constraints) == set(two.constraints)
+    assert set(one.tip_deflections) == set(two.tip_deflections)
+
+    def total(parts: list[dict[int, np.ndarray]]) -> np.ndarray:
+        return np.sum([slope for part in parts for slope in part.values()], axis=0)
+
+    # Modes' adjoints are iterated to 1e-8, from other right sides here and there.
+    scale = np.abs(total(two_slopes)).max()
+    np.testing.assert_allclose(total(one_slopes), total(two_slopes), rtol=0.0, atol=1e-9 * scale)
+    for j, row in enumerate(one_rows):  # periods arm by arm, deflections design by design
+        expected = total(two_rows[j])
+        np.testing.assert_allclose(total(row), expected, atol=1e-12 * np.abs(expected).max())
+
+
+# -- rigid arms ------------------------------------------------------------------------------
+
+
+def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
+    """The solid arm beside its stiffer and stiffer twin: the difference falls as 1 / E."""
+    quick = ["motion.horizon=2.0", "arms.arm2.young_modulus=70e9", "simulation.tolerance=1e-6"]
+
+    def solid(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.ones(len(x)) if k == 0 else same(k, x, y)
+
+    rigid = build("arms.arm1.rigid=true", *quick)
+    limit, trajectory = rigid.evaluate(rigid.fields(same))
+    assert limit.first_frequencies[0] == np.inf
+    gaps = []
+    for factor in (30.0, 300.0):
+        stiff = build(f"arms.arm1.young_modulus={factor * 70e9}", *quick)
+        evaluation, moved = stiff.evaluate(stiff.fields(solid))
+        gap = [
+            evaluation.objective / limit.objective - 1.0,
+            evaluation.max_deviation / limit.max_deviation - 1.0,
+        ]
+        if WORLD.rank == 0:
+            force = np.abs(trajectory.joint_forces).max(axis=0)
+            gap += list(np.abs(moved.joint_forces - trajectory.joint_forces).max(axis=0) / force)
+        gaps.append(np.abs(gap))
+    assert (gaps[1] < 2e-2).all()
+    np.testing.assert_allclose(np.log10(gaps[0] / gaps[1]), 1.0, atol=0.15)
+
+
+def gauss_cloud(length: float, height: float, mass: float) -> Cloud:
+    """Return a bar's point masses at the 2 x 2 Gauss points: quadratic integrals are exact."""
+    g = 0.5 / np.sqrt(3.0)
+    points = [
+        (length * (0.5 + sx * g), height * sy * g) for sx in (-1.0, 1.0) for sy in (-1.0, 1.0)
+    ]
+    none = np.zeros((0, 0))
+    return Cloud(
+        points=np.array(points),
+        masses=np.full(4, mass / 4.0),
+        modes=np.zeros((4, 2, 0)),
+        K=none,
+        D=none,
+        outboard=np.zeros((3, 0)),
+        reach=np.array([length, 0.0]),
+    )
+
+
+def test_joint_forces_of_rigid_arms() -> None:
+    """A stiff arm behind a rigid one: Lagrange's equations of two bars, to what it still bends.
+
+    200 times the stiffness leaves 1 / 200 of the deflection's effect, a few percent.
+    """
+    built = build(
+        "arms.arm1.rigid=true", "arms.arm2.young_modulus=70e12", "motion.gravity=[0.5,-9.81]"
+    )
+    _, trajectory = built.evaluate(
+        {k: np.ones(arm.mesh.num_cells) for k, arm in built.arms.items()}
+    )
+    if WORLD.rank != 0:
+        return
+    scene, mass = built.scene, 2700.0 * 1.0 * 0.06 * 0.01
+    chain = Chain(
+        (gauss_cloud(1.0, 0.06, mass),) * 2, scene.payload.mass, 0.0, scene.motion.gravity, -0.5
+    )
+    size = np.abs(trajectory.joint_forces).max(axis=0)
+    for i in (1, 400, 950, 1500, 2500):
+        motion = rigid_motion(trajectory.t[i : i + 1], scene)
+        expected = chain.forces(motion.q[0], motion.qd[0], motion.qdd[0])
+        np.testing.assert_allclose(trajectory.joint_forces[i] / size, expected / size, atol=5e-3)
+
+
+def test_a_rigid_bar_is_the_solid_arm() -> None:
+    """Mass, centre and inertia of the meshed solid bar, with the arm's own density."""
+    built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
+    body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0, 1.0)})[0]
+    scene = do.load_scene(SCENE, ("arms.cells=[24,3]", "arms.length=0.8", "material.density=5e3"))
+    meshed = Arm(scene, 0, MPI.COMM_SELF, do.Ledger())
+    twin = meshed.reduce(np.ones(meshed.mesh.num_cells))
+    # Gmsh places nodes to 1e-12 of the length.
+    assert body.mass == pytest.approx(twin.mass, rel=1e-11)
+    np.testing.assert_allclose(body.moment, twin.moment, atol=1e-11 * twin.mass)
+    assert body.inertia == pytest.approx(twin.inertia, rel=1e-11)
+    np.testing.assert_allclose(body.outboard_point, twin.outboard_point, atol=1e-12)
+
+
+# -- own materials ---------------------------------------------------------------------------
+
+
+def body_of(*overrides: str, index: int = 1) -> ShapeIntegrals:
+    """Return one arm's body, on its own ranks."""
+    arm = Arm(
+        do.load_scene(SCENE, ("arms.cells=[24,3]", *overrides)), index, MPI.COMM_SELF, do.Ledger()
+    )
+    return arm.reduce(wave(index, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0])))
+
+
+def test_own_material_scales_one_body() -> None:
+    """A mass density scales all integrals of the mass, a modulus the stiffness, of one arm only."""
+    base = body_of()
+    heavy = body_of("arms.arm2.density=5400.0")
+    stiff = body_of("arms.arm2.young_modulus=140e9")
+    unit = np.sqrt(2.0)  # normal modes have unit mass
+    scale = np.diag([1.0, 1.0, 1.0, 1.0 / unit])
+    np.testing.assert_allclose(heavy.M, 2.0 * scale @ base.M @ scale, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(heavy.C, 2.0 * base.C @ scale, rtol=1e-9, atol=1e-12)
+    assert heavy.mass == pytest.approx(2.0 * base.mass, rel=1e-14)
+    assert heavy.inertia == pytest.approx(2.0 * base.inertia, rel=1e-14)
+    size = np.abs(base.K).max()
+    np.testing.assert_allclose(heavy.K, scale @ base.K @ scale, rtol=1e-9, atol=1e-9 * size)
+    np.testing.assert_allclose(stiff.K, 2.0 * base.K, rtol=1e-9, atol=1e-9 * size)
+    np.testing.assert_allclose(stiff.M, base.M, rtol=1e-9, atol=1e-12)
+    other = body_of("arms.arm2.density=5400.0", "arms.arm2.young_modulus=140e9", index=0)
+    np.testing.assert_array_equal(other.M, body_of(index=0).M)
+    np.testing.assert_array_equal(other.K, body_of(index=0).K)
+
+
+def test_own_materials_of_all_arms_are_the_scenes() -> None:
+    """Stated arm by arm or once: the same bits."""
+    keys = {"density": 5400.0, "young_modulus": 200e9, "poisson_ratio": 0.2}
+    found = []
+    for table in ("arms", "material"):
+        built = build(*(f"{table}.{key}={value}" for key, value in keys.items()))
+        found.append(built.evaluate(built.fields(wave))[0])
+    assert found[0] == found[1]
+
+
+# -- frozen loads ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("overrides", [[], [SHARED], ["arms.arm1.rigid=true"]], ids=str)
+@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
+def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: list[str]) -> None:
+    """Loads f_j = K q_j, modes and instants held: q_j(x) = (V' K(x) V)^-1 f_j, remainders of 2."""
+    built = build(f"objective.kind={kind}", "payload.mass=1.0", *overrides)
+    x = built.fields(wave)
+    _, base = built.evaluate(x)
+    slopes = built.gradient(base)
+    bases = {k: arm.basis for k, arm in built.arms.items()}
+    where = load_cases(base, built.scene) if base is not None else None
+
+    def value(h: float, d) -> float:
+        """Return the frozen problem's objective; every arm's K is asked of the rank that has it."""
+        mine = {}
+        for k, arm in built.arms.items():
+            arm.set_design(x[k] + h * d[k])
+            mine[k] = arm.elastic.energy_matrix(bases[k].V)
+        stiffness = {k: K for part in WORLD.allgather(mine) for k, K in part.items()}
+        result = None
+        if base is not None:
+            q = base.q_e.copy()
+            parts = zip(
+                base.mechanism.slices, base.mechanism.bodies, built.scene.owners, strict=True
+            )
+            changed = []
+            for part, body, owner in parts:
+                K = body.K if owner is None else stiffness[owner]
+                if owner is not None:
+                    q[:, part] = np.linalg.solve(K, body.K @ base.q_e[:, part].T).T
+                changed.append((part, K))
+            if kind == "deviation":
+                e = np.hypot(*deviation(base.mechanism, base.motion, q).T)
+                share = where.weights / where.weights.sum()
+                p = built.scene.objective.exponent
+                result = float((share @ (e / e.max()) ** p) ** (1.0 / p) * e.max())
+            else:
+                result = sum(
+                    float(
+                        where.weights
+                        @ np.einsum(
+                            "ni,ij,nj->n", q[where.indices, part], K, q[where.indices, part]
+                        )
+                    )
+                    for part, K in changed
+                )
+        return WORLD.bcast(result, root=0)
+
+    if base is not None:
+        assert value_close(objective(base, built.scene), value(0.0, x))
+    else:
+        value(0.0, x)
+    for direction in (uneven, tip):
+        d = built.fields(direction)
+        along = built.dot(slopes, d)
+        if along != 0.0:
+            rate = rates(lambda h, d=d: value(h, d), along, (1e-3, 2.5e-4))
+            assert rate == pytest.approx(2.0, abs=0.1)
+
+
+def value_close(a: float, b: float) -> bool:
+    """Compare two figures of the same problem."""
+    return abs(a - b) <= 1e-9 * abs(a)
+
+
+# -- projections -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["heaviside", "robust"])
+@pytest.mark.parametrize("objective_kind", ["static", "eigenfrequency"])
+def test_gradient_by_the_variables_through_a_projection(kind: str, objective_kind: str) -> None:
+    """Symmetry, filter, projection and solid ends: remainders of every design x stands for."""
+    built = build(
+        f"objective.kind={objective_kind}",
+        f"design.projection={kind}",
+        "design.filter_radius=0.05",
+        "arms.passive=0.1",
+        "arms.symmetric=true",
+        cells=(24, 4),
+    )
+    x, d = built.fields(wave), built.fields(uneven)
+    several = {"heaviside": 1, "robust": 3}[kind]
+
+    def realised(h: float, variant: int):
+        return {k: a.realise(x[k] + h * d[k], 4.0, 0.45)[variant] for k, a in built.arms.items()}
+
+    values = []
+    for variant in range(several):
+
+        def value(h: float, variant: int = variant) -> float:
+            x_phys = {k: one.x_phys for k, one in realised(h, variant).items()}
+            return built.evaluate(x_phys)[0].objective
+
+        values.append(value(0.0))
+        slopes, here = built.gradient(), realised(0.0, variant)
+        by_x = {k: arm.chain(slopes[k], here[k]) for k, arm in built.arms.items()}
+        rate = rates(value, built.dot(by_x, d), (1e-3, 2.5e-4))
+        assert rate == pytest.approx(2.0, abs=0.1)
+    if kind == "robust" and objective_kind == "static":
+        eroded, dilated, nominal = values
+        assert dilated < nominal < eroded  # the more material, the stiffer
+
+
+# -- load cases ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("worst", ["compliance", "deviation"])
+def test_load_cases_are_the_worst_instants(worst: str) -> None:
+    """One an interval, found by going through all samples; the objective sums their compliance."""
+    built = build(f"objective.worst={worst}", "objective.load_cases=7")
+    evaluation, trajectory = built.evaluate(built.fields(wave))
+    if WORLD.rank != 0:
+        return
+    distance = np.linalg.norm(trajectory.deviation, axis=1)
+    compliance = trajectory.compliance.sum(axis=1)
+    bad = distance if worst == "deviation" else compliance
+    chosen = []
+    for j in range(7):  # 3000 samples of 1 ms after the first
+        inside = [i for i in range(1, 3001) if j * 3000 < 7 * i <= (j + 1) * 3000]
+        chosen.append(max(inside, key=lambda i: bad[i]))
+    np.testing.assert_array_equal(load_cases(trajectory, built.scene).indices, chosen)
+    assert evaluation.objective == pytest.approx(compliance[chosen].sum(), rel=1e-12)
+    # The summary's figure stays the paper's: it compares designs of different objectives.
+    most = [
+        max(compliance[i] for i in range(1, 3001) if j * 3000 < 7 * i <= (j + 1) * 3000)
+        for j in range(7)
+    ]
+    assert evaluation.compliance == pytest.approx(sum(most), rel=1e-12)
+
+
+# -- constraints -----------------------------------------------------------------------------
+
+
+def test_constraints_say_how_far_a_bound_is_exceeded() -> None:
+    """T^2 f^2 - 1 arm by arm and u / bound - 1; p-means are no more than k^(1/p) too careful."""
+    built = build(
+        "objective.kind=static",
+        "constraints.first_frequency=4.0",
+        "constraints.tip_deflection=1e-4",
+    )
+    evaluation, _ = built.evaluate(built.fields(wave))
+    periods, tips = np.array(evaluation.constraints[:2]), np.array(evaluation.constraints[2:])
+    least = (4.0 / np.array(evaluation.loaded_frequencies)) ** 2
+    assert (1.0 + periods >= least * (1.0 - 1e-14)).all()  # equal but for rounding, if far apart
+    assert (1.0 + periods <= least * 3.0 ** (1.0 / 20.0)).all()
+    for k, arm in built.arms.items():
+        S = arm.elastic.constraint_modes().stiffness
+        largest = max(np.hypot(*np.linalg.solve(S, load)[:2]) for load in np.eye(3)[1:])
+        assert largest / 1e-4 <= (1.0 + tips[k]) * (1.0 + 1e-14)
+        assert 1.0 + tips[k] <= 2.0 ** (1.0 / 20.0) * largest / 1e-4
+
+
+def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None:
+    """An arm set on a mode that is not the lowest: the objective follows it, the bound does not."""
+    built = build(
+        "objective.kind=eigenfrequency", "objective.follow=true", "constraints.first_frequency=1.0"
+    )
+    x = built.fields(wave)
+    first, _ = built.evaluate(x)
+    for arm in built.arms.values():  # the second mode of both arms was the lowest once
+        arm.starts = [start[:, ::-1] for start in arm.starts]
+        arm.set_design(np.ones(arm.mesh.num_cells))
+    second, _ = built.evaluate(x)
+    assert second.objective < 0.5 * first.objective
+    np.testing.assert_allclose(second.constraints, first.constraints, rtol=1e-9)
+    d = built.fields(uneven)
+    for j, row in enumerate(constraint_gradients(built.scene, built.share, built.arms)):
+
+        def value(h: float, j: int = j) -> float:
+            return built.evaluate({k: x[k] + h * d[k] for k in x})[0].constraints[j]
+
+        assert rates(value, built.dot(row, d), (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1)
+
+
+# -- what is left out ------------------------------------------------------------------------
+
+
+def test_a_moving_objective_always_moves() -> None:
+    built = build()
+    evaluation, _ = built.evaluate(built.fields(wave), simulated=False)
+    assert evaluation.objective == pytest.approx(evaluation.compliance, rel=1e-12)
+
+
+def test_loaded_frequencies_are_in_the_order_of_the_arms() -> None:
+    """The inboard arm carries more: slower. A rigid arm has none."""
+    built = build("objective.kind=eigenfrequency")
+    first, second = built.evaluate(built.fields(same))[0].loaded_frequencies
+    assert first < second
+    alone = build("objective.kind=eigenfrequency", "arms.arm1.rigid=true")
+    assert alone.evaluate(alone.fields(same))[0].loaded_frequencies == (second,)
+
+
+# -- what is refused, and what is shared -----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda x: np.where(np.arange(len(x)) == 3, -0.5, x), r"density -0.5 of cell 3: expected"),
+        (lambda x: np.where(np.arange(len(x)) == 3, 1.01, x), r"density 1.01 of cell 3"),
+        (lambda x: np.where(np.arange(len(x)) == 3, np.nan, x), r"density nan of cell 3"),
+        (lambda x: x[:-1], r"densities of shape \(\d+,\): expected \(\d+,\)"),
+        (lambda x: x[:, None], r"densities of shape"),
+    ],
+    ids=["negative", "above one", "nan", "too few", "columns"],
+)
+def test_densities_that_are_none_are_refused(change, reason) -> None:
+    """On all ranks, although one alone has them."""
+    built = build()
+    x = built.fields(same)
+    if 1 in x:
+        x[1] = change(x[1])
+    with pytest.raises(do.InputError, match=f"arm 'arm2': {reason}"):
+        built.evaluate(x)
+    with pytest.raises(do.InputError, match=reason):
+        evaluate_batch([built.scene] * 2, built.share, built.arms, x, do.Ledger())
+
+
+def test_arms_under_another_scene_keep_their_own_design() -> None:
+    """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
+    built = build("objective.kind=static", "constraints.first_frequency=4.0")
+    stiff, weak = built.fields(same), {k: 0.8 * v for k, v in built.fields(same).items()}
+    place = built.scene, built.share
+    expected = [evaluate(*place, built.arms, x, do.Ledger())[0] for x in (weak, stiff)]
+    slopes = built.gradient()
+    other = {k: arm.under(built.scene) for k, arm in built.arms.items()}
+    for _ in range(2):
+        for arms, x, want in ((other, weak, expected[0]), (built.arms, stiff, expected[1])):
+            found = evaluate(*place, arms, x, do.Ledger())[0]
+            assert found.objective == pytest.approx(want.objective, rel=1e-9)
+            assert found.compliance == pytest.approx(want.compliance, rel=1e-6)
+            assert found.constraints == pytest.approx(want.constraints, rel=1e-7)
+    evaluate(*place, other, weak, do.Ledger())
+    for k, slope in built.gradient().items():
+        np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())

@@ -1,0 +1,188 @@
+"""One design under several scenarios: bodies, objectives and gradients."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from remainders import build, tip, uneven, wave
+
+import dolfinopt as do
+from dolfinopt.multibody.shape_integrals import TABLE, of_material
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.parallel import on_root
+from dolfinopt.responses.scenarios import bodies_in, combined, worst_of
+from dolfinopt.scene.load import pose_scenarios, scene_from_dict
+
+WORLD = MPI.COMM_WORLD
+MATERIAL = ("material.density=3100.0", "material.young_modulus=50e9")
+DAMPING = "damping.stiffness_proportional=1e-3"
+PATH = ("motion.flattening=0.5", "motion.horizon=2.5", "payload.mass=8")
+
+# All scenarios share their steps: coordinates differ by the tolerance, their squares by twice that.
+SIMULATED = 2e-4
+
+
+def scenarios(*changes, weights=None):
+    """Return the override that poses scenarios."""
+    weights = weights or [1.0] * len(changes)
+    rows = [
+        f"{{changes={json.dumps(list(one))}, weight={weight:g}}}"
+        for one, weight in zip(changes, weights, strict=True)
+    ]
+    return f"scenarios=[{', '.join(rows)}]"
+
+
+@pytest.mark.parametrize("method", ["craig-bampton", "modal", "krylov", "balanced"])
+def test_scaled_bodies_are_those_reduced_anew(method):
+    """Denser, stiffer, more damped: all integrals scale, whatever the basis.
+
+    The Gramian weighs with the damping and a band of frequencies, so that its basis changes with
+    the material: the same to rounding only where both stay.
+    """
+    changes = (*MATERIAL, DAMPING)
+    if method == "balanced":
+        changes = ("material.density=5400.0", "material.young_modulus=140e9")
+    here = build(f"reduction.method={method}", "reduction.coordinates=5", scenarios(changes))
+    there = build(f"reduction.method={method}", "reduction.coordinates=5", *changes)
+    x = here.fields(wave)
+    (other,) = pose_scenarios(here.scene)
+    for k, arm in here.arms.items():
+        body = bodies_in(here.scene, other, {0: arm.reduce(x[k]), 1: arm.reduce(x[k])})[k]
+        anew = there.arms[k].reduce(x[k])
+        # Modes are normalised to the mass: another density is another length of theirs.
+        size = np.sqrt(np.diag(anew.K) / np.diag(body.K))
+        assert body.mass == pytest.approx(anew.mass, rel=1e-12)
+        np.testing.assert_allclose(body.moment, anew.moment, rtol=1e-12, atol=1e-14)
+        assert body.inertia == pytest.approx(anew.inertia, rel=1e-12)
+        for name in ("C", "outboard", "j", "r"):
+            scaled_rows = getattr(body, name) * size
+            expected = getattr(anew, name)
+            # Eigenvectors are right to 1e-10, see reduction.basis.
+            np.testing.assert_allclose(scaled_rows, expected, atol=1e-8 * np.abs(expected).max())
+        for name in ("M", "K", "D", "G"):
+            expected = getattr(anew, name)
+            got = getattr(body, name) * np.outer(size, size)
+            np.testing.assert_allclose(got, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_a_body_without_change_stays():
+    arm = build().arms
+    for k, one in arm.items():
+        body = one.reduce(np.full(one.mesh.num_cells, 0.3 + 0.1 * k))
+        same = of_material(body, 1.0, 1.0, one.scene.damping.stiffness_proportional)
+        for integral in TABLE:
+            name = integral.name
+            assert np.array_equal(getattr(same, name), getattr(body, name))
+
+
+@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
+def test_figures_are_those_of_the_scenes_alone(kind):
+    """Each scenario is what its scene gives alone; the objective is their weighted sum."""
+    changes = [PATH, (DAMPING,)]
+    kept = f"objective.kind={kind}"
+    several = build(kept, scenarios(*changes, weights=[1.0, 0.25]))
+    found, trajectory = several.evaluate(several.fields(wave))
+    alone = []
+    for one in [(), *changes]:
+        built = build(kept, *one)
+        alone.append(built.evaluate(built.fields(wave))[0])
+    assert found.max_deviation == pytest.approx(alone[0].max_deviation, rel=SIMULATED)
+    for mine, theirs in zip(found.scenarios, alone[1:], strict=True):
+        assert mine.objective == pytest.approx(theirs.objective, rel=SIMULATED)
+        assert mine.compliance == pytest.approx(theirs.compliance, rel=SIMULATED)
+        assert mine.max_deviation == pytest.approx(theirs.max_deviation, rel=SIMULATED)
+    total = alone[1].objective + 0.25 * alone[2].objective
+    assert found.objective == pytest.approx(total, rel=SIMULATED)
+    if WORLD.rank == 0:
+        assert len(trajectory.scenarios) == 2 and len(trajectory.solutions) == 3
+
+
+def test_one_reduction_for_all_scenarios():
+    """Factorisations, eigenproblems and solves do not depend on how many scenarios there are."""
+    counts = []
+    for changes in ([], [PATH], [PATH, MATERIAL, (DAMPING,), ("payload.mass=4",)]):
+        built = build(*([scenarios(*changes)] if changes else []))
+        built.evaluate(built.fields(wave))
+        counted = built.ledger.counts
+        counts.append((counted.assemblies, counted.factorisations, counted.solves))
+    assert counts[0] == counts[1] == counts[2]
+
+
+@pytest.mark.parametrize("combination", ["sum", "worst"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["objective.kind=esl"],
+        ["objective.kind=deviation", "reduction.coordinates=3"],
+        ["arms.arm2.design=arm1", "reduction.method=modal"],
+        ["arms.arm1.rigid=true"],
+    ],
+    ids=" ".join,
+)
+def test_gradient_of_all_scenarios(combination, options):
+    built = build(
+        *options,
+        f"objective.scenarios={combination}",
+        "objective.load_cases=6",
+        scenarios((*MATERIAL, DAMPING), PATH, weights=[1.0, 0.3]),
+        cells=(12, 2),
+    )
+    x = built.fields(wave)
+    test = taylor_test(built.scene, built.share, built.arms, x, built.ledger)
+    assert test.passed, [row.rate for row in test.rows]
+
+
+def test_frozen_gradient_adds_up():
+    changes, weights = [PATH, MATERIAL], [1.0, 0.25]
+    several = build(scenarios(*changes, weights=weights))
+    slopes = several.gradient(several.evaluate(several.fields(wave))[1])
+    total = {k: np.zeros_like(value) for k, value in slopes.items()}
+    for one, weight in zip(changes, weights, strict=True):
+        built = build(*one)
+        mine = built.gradient(built.evaluate(built.fields(wave))[1])
+        total = {k: total[k] + weight * mine[k] for k in total}
+    for k, value in slopes.items():
+        np.testing.assert_allclose(value, total[k], atol=SIMULATED * np.abs(value).max())
+    for direction in (uneven, tip):  # of both arms, also where this rank has none of them
+        assert np.isfinite(several.dot(slopes, several.fields(direction)))
+
+
+def test_worst_case_bounds_and_slopes():
+    values = [3.0, 2.9, 0.1]
+    worst, slopes = worst_of(values, 20.0)
+    assert 3.0 < worst < 3.0 * 3 ** (1 / 20)
+    step = 1e-6
+    for k in range(3):
+        moved = [v + step * (i == k) for i, v in enumerate(values)]
+        back = [v - step * (i == k) for i, v in enumerate(values)]
+        difference = (worst_of(moved, 20.0)[0] - worst_of(back, 20.0)[0]) / (2.0 * step)
+        assert slopes[k] == pytest.approx(difference, abs=1e-8)
+    assert worst_of([5.0], 20.0) == (5.0, [1.0])
+
+
+def test_weights_scale_the_worst_case():
+    data = build(
+        scenarios(PATH, MATERIAL, weights=[2.0, 1.0]), "objective.scenarios=worst"
+    ).scene.to_dict()
+    scene = scene_from_dict(data)
+    value, slopes = combined(scene, [1.0, 1e-3])
+    assert value == pytest.approx(2.0, rel=1e-12) and slopes[0] == pytest.approx(2.0, rel=1e-12)
+
+
+def test_robust_against_two_payloads():
+    """The worst case of a light and a heavy payload is better than that of the nominal design."""
+    fast = ["optimizer.max_iterations=25", "arms.cells=[30,4]", "simulation.tolerance=1e-3"]
+    uses = scenarios(
+        ("payload.mass=2", "motion.flattening=1.0"), ("payload.mass=8",), weights=[8, 1]
+    )
+    scene = do.load_scene("demos/two_arm.toml", [*fast, uses, "objective.scenarios=worst"])
+    robust = do.optimize(scene)
+    nominal = do.optimize(do.load_scene("demos/two_arm.toml", fast))
+    share, arms = robust.share, robust.arms
+    other, _ = do.evaluate(scene, share, arms, nominal.x_phys, do.Ledger())
+    first = on_root(WORLD, lambda: robust.history[0].objective)
+    assert robust.evaluation.objective < 0.2 * first
+    assert robust.evaluation.objective <= other.objective

@@ -1,0 +1,1248 @@
+"""The scene: defaults, inheritance, overrides, and one helpful line for every kind of bad input."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import pickle
+import string
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
+from dolfinopt.scene.load import (
+    MAX_CELLS,
+    Arm,
+    Scene,
+    describe_keys,
+    load_scene,
+    pose_scenarios,
+    resolve_file,
+    scene_from_dict,
+)
+
+pytestmark = pytest.mark.serial  # nothing here knows of ranks
+
+TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+MATERIAL = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}  # Pa, -, kg/m3
+ARM = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}  # m
+FILE = "some/where.toml"
+
+
+def minimal(n_arms=2, **tables):
+    """Return the data of a scene with the required keys only, and `tables`."""
+    arms = [dict(ARM), *({"name": f"arm{i}"} for i in range(2, n_arms + 1))]
+    return {"material": dict(MATERIAL), "arms": arms} | tables
+
+
+def put(data, path, value):
+    """Set `value` at the dotted `path`, unless something other than a table is on the way."""
+    node = data
+    *above, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    for part in above:
+        if isinstance(node, dict):
+            node = node.setdefault(part, {})
+        elif isinstance(node, list) and isinstance(part, int) and part < len(node):
+            node = node[part]
+    if isinstance(node, dict) or (isinstance(node, list) and last in range(len(node))):
+        node[last] = value
+
+
+def changed(path, value):
+    """Return the minimal data with `value` at the dotted `path`."""
+    data = minimal()
+    put(data, path, value)
+    return data
+
+
+def message_of(data, *overrides, source=FILE):
+    """Return the message with which `data` is refused; it must be a single line."""
+    with pytest.raises(InputError) as caught:
+        scene_from_dict(data, source, overrides)
+    return checked_line(caught, source)
+
+
+def checked_line(caught, source):
+    message = str(caught.value)
+    assert message.startswith(str(source))
+    assert len(message.splitlines()) == 1 and message.isprintable()
+    error = caught.value  # no other exception would be printed above it
+    assert error.__context__ is None or error.__suppress_context__
+    return message
+
+
+# --- valid scenes ----------------------------------------------------------------------------
+
+
+def test_demo_holds_the_defaults():
+    demo = load_scene(TWO_ARM)
+    ends = ["arms.passive=0.0"]  # as in the paper
+    assert scene_from_dict(minimal(name="two-arm manipulator"), overrides=ends) == demo
+
+
+def test_demo_values():
+    scene = load_scene(TWO_ARM)
+    assert scene.name == "two-arm manipulator"
+    assert scene.source == str(TWO_ARM)
+    assert (scene.material.young_modulus, scene.material.density) == (70e9, 2700.0)
+    assert [arm.name for arm in scene.arms] == ["arm1", "arm2"]
+    assert scene.arms[1].cells == (200, 12)
+    assert scene.motion.elbow == -1 and scene.motion.gravity == (0.0, 0.0)
+    assert scene.motion.duration == 1.9 and scene.motion.horizon == 3.0
+    assert (scene.payload.mass, scene.damping.stiffness_proportional) == (6.0, 2e-4)
+    assert (scene.reduction.method, scene.reduction.coordinates) == ("craig-bampton", 4)
+    assert (scene.objective.kind, scene.objective.load_cases) == ("esl", 30)
+    assert scene.design.filter_radius == 0.0075 and scene.design.projection is False
+    assert scene.optimizer.max_iterations == 400
+
+
+def test_defaults_of_keys_the_demo_leaves_out():
+    simulation = load_scene(TWO_ARM).simulation
+    assert simulation.integrator == "radau"
+    assert (simulation.rho_inf, simulation.stages, simulation.sample) == (0.8, 4, 1e-3)
+
+
+def test_demo_states_every_other_key():
+    text = TWO_ARM.read_text(encoding="utf-8")
+    stated = {line.split(" =")[0].strip() for line in text.splitlines() if " = " in line}
+    known = {info.key.rpartition(".")[2] for info in describe_keys()}
+    assert known - stated == {
+        "integrator",
+        "rho_inf",
+        "stages",
+        "sample",
+        "shared_volume",
+        "minimum_member",
+        "kkt_tolerance",
+        "exponent",
+        "acceleration_share",
+        "max_speed",
+        "max_acceleration",
+        "max_jerk",
+        "start",
+        "end",
+        "file",
+        "base",
+        "base_position",
+        "shifts",
+        "band",
+        "worst",
+        "loads",
+        "attached",
+        "elbow_angle",
+        "modes",
+        "follow",
+        "first_frequency",
+        "tip_deflection",
+        "sharpness",
+        "continuation",
+        "erosion",
+        "mesh",
+        "mesh_size",
+        "cell_shape",
+        "symmetric",
+        "design",
+        "rigid",
+        "sid",
+        "scenarios",
+        "changes",
+        "weight",
+    }
+
+
+def test_arm_takes_missing_keys_from_the_arm_before():
+    data = minimal(3)
+    data["arms"][0] |= {"cells": [50, 4], "passive": 0.1}
+    data["arms"][1] |= {"length": 0.8, "passive": 0.05}
+    first, second, third = scene_from_dict(data).arms
+    assert first == Arm(**ARM, cells=(50, 4), passive=0.1)
+    assert second == Arm(**ARM | {"name": "arm2", "length": 0.8}, cells=(50, 4), passive=0.05)
+    assert third == second.model_copy(update={"name": "arm3"})
+
+
+def test_input_data_are_left_unchanged():
+    data = minimal()
+    before = copy.deepcopy(data)
+    scene_from_dict(data, overrides=["arms.length=2.0", "payload.mass=1"])
+    assert data == before
+
+
+def test_name_defaults_to_the_file(tmp_path):
+    path = tmp_path / "crane.v2.toml"
+    path.write_text(TWO_ARM.read_text().partition("\n")[2])
+    assert load_scene(path).name == "crane.v2"
+    assert scene_from_dict(minimal()).name == "scene"
+
+
+def test_byte_order_mark_and_windows_line_ends(tmp_path):
+    path = tmp_path / "two_arm.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + TWO_ARM.read_bytes().replace(b"\n", b"\r\n"))
+    assert load_scene(path) == load_scene(TWO_ARM)
+
+
+def test_scene_is_frozen_hashable_and_picklable():
+    scene = load_scene(TWO_ARM)
+    with pytest.raises(ValidationError, match="frozen"):
+        scene.payload.mass = 3.0
+    with pytest.raises(ValidationError, match="frozen"):
+        scene.name = "other"
+    other = load_scene(TWO_ARM, ["payload.mass=3"])
+    assert len({scene, load_scene(TWO_ARM), other}) == 2
+    restored = pickle.loads(pickle.dumps(scene))
+    assert restored == scene and restored.source == scene.source
+
+
+def test_equality_ignores_the_source_only():
+    scene = scene_from_dict(minimal(name="a"), "a.toml")
+    assert scene == scene_from_dict(minimal(name="a"), "b.toml")
+    assert scene != scene_from_dict(minimal(name="b"), "a.toml")
+    assert scene != "a.toml"
+
+
+def test_round_trip_through_json():
+    data = minimal(3, payload={"mass": 4, "inertia": 0.1}, simulation={"integrator": "radau"})
+    data["arms"][1] |= {"length": 0.7, "cells": [70, 6]}
+    scene = scene_from_dict(data, overrides=["motion.gravity=[0, -9.81]"])
+    plain = json.loads(json.dumps(scene.to_dict(), allow_nan=False))
+    assert plain == scene.to_dict()  # lists, not tuples
+    assert scene_from_dict(plain) == scene
+    assert "source" not in plain
+
+
+def test_integer_stands_for_a_number():
+    mass = scene_from_dict(changed("payload.mass", 4)).payload.mass
+    assert mass == 4.0 and type(mass) is float
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("material.poisson_ratio", -0.99),
+        ("interpolation.penalty", 1),
+        ("arms.0.cells", [MAX_CELLS, 1]),
+        ("arms.0.name", "left arm_2-b"),
+        ("arms.0.name", "2nd"),
+        ("motion.flattening", 0),
+        ("motion.horizon", 1.9),  # no rest behind the motion
+        ("motion.elbow", 1),
+        ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
+        ("motion", {"base": "fixed", "base_position": -1.0}),
+        ("payload.mass", 0),
+        ("damping.stiffness_proportional", 0.0),
+        ("simulation.tolerance", 0.1),
+        ("simulation.rho_inf", 1.0),
+        ("simulation.stages", 5),
+        ("simulation.sample", 0.1),
+        ("objective.load_cases", 3000),  # 3 s hold 3000 samples, whatever 3.0/1e-3 rounds to
+        ("design.volume_fraction", 1.0),
+        ("design.initial", 1.0),
+        ("design.filter_radius", 0.0),
+        ("optimizer.max_iterations", 0),
+        ("optimizer.move", 1.0),
+        ("optimizer.tolerance", 0.0),
+        ("name", 200 * "x"),
+        ("reduction.coordinates", 3),
+        ("reduction.coordinates", 5177),  # 2 * 199 * 13 + 3
+        ("reduction", {"method": "modal", "coordinates": 1}),
+        ("reduction", {"coordinates": "auto", "tolerance": 1e-6}),
+        ("design", {"minimum": 0.3, "volume_fraction": 0.3}),
+        ("design.filter_radius", 1.0),  # the longest arm
+    ],
+)
+def test_borders_of_the_ranges_are_allowed(path, value):
+    scene_from_dict(changed(path, value), overrides=["arms.passive=0"])
+
+
+# --- what an arm derives from its keys -------------------------------------------------------
+
+
+def test_reducible_dofs():
+    # 3 x 2 cells: 2 columns of interior nodes with 3 nodes of 2 dofs, and the outboard interface.
+    assert Arm(**ARM, cells=(3, 2)).n_reducible == 2 * 3 * 2 + 3
+    assert Arm(**ARM, cells=(1, 9)).n_reducible == 3
+
+
+@pytest.mark.parametrize("n_along", [1, 2, 3, 7, 200])
+@pytest.mark.parametrize("length", [0.7, 1.0])
+def test_passive_share_counts_centroids(n_along, length):
+    for tenths in range(5 * n_along):  # of a cell
+        if tenths % 10 == 5:
+            continue  # on a centroid, where rounding decides
+        passive = 0.1 * tenths * length / n_along
+        arm = Arm(**ARM | {"length": length}, cells=(n_along, 3), passive=passive)
+        n_solid = sum(10 * i + 5 < tenths for i in range(n_along))  # free of rounding
+        assert arm.passive_columns == n_solid
+        assert arm.passive_share == pytest.approx(2 * n_solid / n_along, abs=1e-15)
+
+
+def test_centroid_on_the_border_is_not_solid():
+    assert Arm(**ARM, cells=(2, 1), passive=0.25).passive_columns == 0
+    assert Arm(**ARM, cells=(2, 1), passive=0.26).passive_columns == 1
+
+
+@pytest.mark.parametrize(
+    ("keys", "length"),
+    [
+        ({}, 0.015),  # a quarter of the height
+        ({"height": 0.8}, 0.1),  # a tenth of the length
+        ({"passive": 0.0}, 0.0),
+        ({"passive": 0.02}, 0.02),
+        ({"mesh": "a.msh"}, 0.0),  # has groups of its own
+        ({"mesh": "a.msh", "passive": 0.02}, 0.02),
+    ],
+)
+def test_ends_are_solid_unless_the_scene_says_otherwise(keys, length):
+    assert Arm(**ARM | keys).solid_ends == pytest.approx(length, rel=1e-15)
+
+
+def test_default_ends_follow_the_height():
+    data = scene_from_dict(minimal()).to_dict()
+    ends = [arm.solid_ends for arm in scene_from_dict(data, overrides=["arms.height=0.1"]).arms]
+    assert ends == [0.025, 0.025]
+
+
+# --- overrides -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("override", "read", "value"),
+    [
+        ("payload.mass=4", lambda s: s.payload.mass, 4.0),
+        ("payload.mass = 4e-1", lambda s: s.payload.mass, 0.4),
+        ("name=crane = big", lambda s: s.name, "crane = big"),
+        ('name="crane"', lambda s: s.name, "crane"),
+        ("objective.kind = compliance", lambda s: s.objective.kind, "compliance"),
+        ("design.projection=false", lambda s: s.design.projection, False),
+        ("motion.gravity=[0, -9.81]", lambda s: s.motion.gravity, (0.0, -9.81)),
+        ("payload={mass=1, inertia=2}", lambda s: (s.payload.mass, s.payload.inertia), (1, 2)),
+        ("arms.0.length=0.8", lambda s: [a.length for a in s.arms], [0.8, 1.0, 1.0]),
+        ("arms.arm2.length=0.8", lambda s: [a.length for a in s.arms], [1.0, 0.8, 1.0]),
+        ("arms.length=0.8", lambda s: [a.length for a in s.arms], [0.8, 0.8, 0.8]),
+        ("arms.2.name=tip", lambda s: [a.name for a in s.arms], ["arm1", "arm2", "tip"]),
+        (
+            "arms.2={name='tip', length=2}",
+            lambda s: (s.arms[2].length, s.arms[2].height),
+            (2, 0.06),
+        ),
+    ],
+)
+def test_override(override, read, value):
+    plain = scene_from_dict(minimal(3))
+    scene = scene_from_dict(minimal(3), overrides=[override])
+    assert read(scene) == value
+    assert scene_from_dict(plain.to_dict(), overrides=[override]) == scene
+    assert scene != plain or override == "design.projection=false"
+
+
+def test_later_override_wins():
+    scene = load_scene(TWO_ARM, ["arms.length=0.5", "arms.arm1.length=0.7", "payload.mass=1"])
+    assert [arm.length for arm in scene.arms] == [0.7, 0.5]
+    assert scene.payload.mass == 1.0
+
+
+def test_override_supplies_missing_keys():
+    data = {"arms": [{"name": "arm1", "height": 0.1, "thickness": 0.01}, {"name": "arm2"}]}
+    overrides = [f"material.{key}={value}" for key, value in MATERIAL.items()]
+    scene = scene_from_dict(data, overrides=[*overrides, "arms.0.length=0.9"])
+    assert [arm.length for arm in scene.arms] == [0.9, 0.9]
+    assert scene.material.density == 2700.0
+
+
+def test_override_finds_an_arm_by_its_new_name():
+    scene = load_scene(TWO_ARM, ["arms.1.name=fore arm", "arms.fore arm.length=0.6"])
+    assert scene.arms[1].length == 0.6
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("payload.mass=-1", ["payload.mass = -1", "a number >= 0", "[kg]"]),
+        ("payload.mass=heavy", ['payload.mass = "heavy"', "a number >= 0"]),
+        ("payload.mass=", ['payload.mass = ""', "a number >= 0"]),
+        ("payload.mass=1\nname='x'", ["payload.mass = ", "a number >= 0"]),
+        ("payload.mass=" + 600 * "[", ["payload.mass = ", "a number >= 0"]),
+        ("payload.mas=1", ["unknown key payload.mas", "did you mean payload.mass?", "inertia"]),
+        ("payload.mass.x=1", ["unknown key payload.mass.x", "set payload.mass as a whole"]),
+        ("motion.gravity.1=1", ["unknown key motion.gravity.1", "an array of two numbers"]),
+        ("payloads.mass=1", ["unknown key payloads", "did you mean payload?", "optimizer"]),
+        ("density=1", ["unknown key density", "did you mean material.density or arms.density?"]),
+        ("source=x", ["unknown key source", "allowed: name, material"]),
+        ("arms.lenght=1", ["unknown key arms.lenght", "did you mean arms.length?", "arm2"]),
+        ("arms.arm3.length=1", ["unknown key arms.arm3", "allowed: 0, 1, arm1, arm2"]),
+        ("arms.2.length=1", ["unknown key arms.2", "allowed: 0, 1, arm1, arm2"]),
+        ("arms.-1.length=1", ["unknown key arms.-1"]),
+        ("arms." + 5000 * "1" + ".length=1", ['unknown key arms."111']),
+        ("arms.1.grid=a.geo", ["unknown key arms.1.grid (arm2)", "allowed: name, length"]),
+        ("arms.1.length=0", ["arms.1.length (arm2) = 0", "a number >= 1e-06", "[m]"]),
+        ("arms.arm2.length=0", ["arms.1.length (arm2) = 0"]),
+        ("arms=3", ["arms = 3", "an array of tables [[arms]]"]),
+        ("material=3", ["material = 3", "a table with the keys young_modulus"]),
+        ("payload.mass", ["expected key.path=value"]),
+        ("=1", ["expected key.path=value"]),
+        ("payload..mass=1", ["expected key.path=value"]),
+        ("", ["expected key.path=value"]),
+    ],
+    ids=lambda value: value[:30] if isinstance(value, str) else "",
+)
+def test_bad_override_is_named(override, parts):
+    message = message_of(minimal(), "payload.inertia=0.1", override)
+    shown = override.replace("\n", "\\n") if len(override) <= 80 else f"{override[:77]}..."
+    for part in [f"{FILE} with --set {shown}: ", *parts]:
+        assert part in message
+
+
+def test_one_output_instant_is_enough():
+    scene = load_scene(TWO_ARM, ["simulation.sample=3.0", "objective.load_cases=1"])
+    assert scene.simulation.sample == scene.motion.horizon
+
+
+def test_override_of_all_arms_is_one_problem():
+    data = minimal(3)
+    data["arms"][1]["length"] = 2.0
+    assert "more)" not in message_of(data, "arms.length=-1")
+    assert message_of(data, "arms.0.length=-1", "arms.1.length=-1").endswith("(and 1 more)")
+
+
+def test_override_of_a_taken_over_key_is_a_problem_of_its_own():
+    data = changed("arms.0.length", -1)
+    assert message_of(data, "arms.1.length=-1").endswith("(and 1 more)")
+
+
+def test_problem_of_the_file_is_not_blamed_on_an_override():
+    message = message_of(changed("payload.mass", -1), "payload.inertia=1", "motion.radius=1")
+    assert message.startswith(f"{FILE}: payload.mass = -1")
+
+
+def test_last_override_of_a_key_is_blamed():
+    message = message_of(minimal(), "payload.mass=1", "payload.mass=-2")
+    assert message.startswith(f"{FILE} with --set payload.mass=-2: payload.mass = -2: ")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "override", "named"),
+    [
+        ("arms", 5, "arms.length=1", "arms = 5: "),
+        ("arms", [5], "arms.0.length=1", "arms.0 = 5: "),
+        ("arms", [5], "arms.length=1", "arms.0 = 5: "),
+        ("material", [1], "material.density=1", "material = [1]: "),
+        ("material", 5, "material.density=1", "material = 5: "),
+    ],
+)
+def test_override_does_not_hide_a_broken_table(path, value, override, named):
+    assert message_of(changed(path, value), override).startswith(f"{FILE}: {named}")
+
+
+# --- bad values ------------------------------------------------------------------------------
+
+BAD_VALUES = [
+    # key, value, the value as shown, what is allowed
+    ("name", "", '""', "printable characters"),
+    ("name", "two\nlines", r'"two\nlines"', "on one line"),
+    ("name", "  ", '"  "', "printable characters"),
+    ("name", 201 * "x", 60 * "x", "1 to 200"),
+    ("name", 5, "5", "a string"),
+    ("material.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
+    ("material.young_modulus", "70e9", '"70e9"', "a number >= 1 and <= 1e+15"),
+    ("material.young_modulus", True, "true", "a number >= 1 and <= 1e+15"),
+    ("material.young_modulus", 10**400, "2**1328...", "a number >= 1 and <= 1e+15"),
+    ("material.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
+    ("material.poisson_ratio", -1.0, "-1.0", "a number >= -0.99 and < 0.5"),
+    ("material.density", -2700.0, "-2700.0", "a number >= 1e-12 and <= 1000000"),
+    ("interpolation.law", "SIMP", '"SIMP"', '"two-material" | "simp" | "pedersen"'),
+    ("interpolation.penalty", 0.9, "0.9", "a number >= 1"),
+    ("interpolation.floor", 0.0, "0.0", "a number >= 1e-12 and < 1"),
+    ("interpolation.floor", 1, "1", "a number >= 1e-12 and < 1"),
+    ("arms.0.name", "a/b", '"a/b"', "letters, digits"),
+    ("arms.0.name", "", '""', "letters, digits"),
+    ("arms.0.name", "-x", '"-x"', "letters, digits"),
+    ("arms.0.name", " x", '" x"', "letters, digits"),
+    ("arms.0.name", "x ", '"x "', "letters, digits"),
+    ("arms.0.name", "x\n", r'"x\n"', "letters, digits"),
+    ("arms.0.name", "..", '".."', "letters, digits"),
+    ("arms.0.name", "ärm", '"ärm"', "letters, digits"),
+    ("arms.0.name", "12", '"12"', "not a digit"),
+    ("arms.0.name", 65 * "a", 65 * "a", "1 to 64"),
+    ("arms.0.name", "ARM2", '"arm2"', "no other arm has"),
+    ("arms.0.length", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
+    ("arms.0.design", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
+    ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
+    ("arms.0.design", 1, "1", "a string"),
+    ("arms.0.rigid", 1, "1", "true or false"),
+    ("arms.0.sid", 1, "1", "a string"),
+    ("arms.0.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
+    ("arms.0.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
+    ("arms.0.density", "steel", '"steel"', "a number >= 1e-12 and <= 1000000"),
+    ("arms.0.height", -0.06, "-0.06", "a number >= 1e-06 and <= 10000"),
+    ("arms.0.thickness", math.inf, "inf", "a finite number >= 1e-06 and <= 10000"),
+    ("arms.0.cells", [0, 12], "[0, 12]", "two integers >= 1"),
+    ("arms.0.cells", [0, 0], "[0, 0]", "two integers >= 1"),
+    ("arms.0.cells", [MAX_CELLS + 1, 1], "[100001, 1]", "<= 100000"),
+    ("arms.0.cells", [200], "[200]", "an array of two integers"),
+    ("arms.0.cells", [200, 12, 1], "[200, 12, 1]", "an array of two integers"),
+    ("arms.0.cells", [200.0, 12], "[200.0, 12]", "two integers"),
+    ("arms.0.cells", "200x12", '"200x12"', "two integers"),
+    ("arms.0.mesh", 1, "1", "a string"),
+    ("arms.0.mesh_size", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
+    ("arms.0.mesh_size", 0.01, "0.01", "only with mesh"),
+    ("arms.0.cell_shape", "hexagon", '"hexagon"', '"quadrilateral" | "triangle"'),
+    ("arms.0.cell_shape", "triangle", '"triangle"', "only with mesh"),
+    ("arms.0.symmetric", 1, "1", "true or false"),
+    ("arms.0.passive", -0.01, "-0.01", "a number >= 0"),
+    ("arms.0.passive", 0.5, "0.5", "less than half of length = 1.0 [m]"),
+    ("arms.0.passive", 0.26, "0.26", "volume_fraction = 0.5 can be met"),
+    ("motion.path", "circle", '"circle"', '"arc" | "line" | "points" | "joints"'),
+    ("motion.path", "joints", "None (default)", 'a table (CSV) with motion.path = "joints"'),
+    ("motion.radius", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
+    ("motion.flattening", -0.1, "-0.1", "a number >= 0 and <= 1"),
+    ("motion.flattening", 1.1, "1.1", "a number >= 0 and <= 1"),
+    ("motion.start", [0.0], "[0.0]", "an array of two numbers"),
+    ("motion.start", [0.0, 1.0], "[0.0, 1.0]", 'the default, with motion.path = "arc"'),
+    ("motion.end", [0.0, math.inf], "[0.0, inf]", "an array of two finite numbers"),
+    ("motion.file", 5, "5", "a string"),
+    ("motion.file", "absent.csv", '"absent.csv"', "found neither /"),
+    ("motion.law", "cubic", '"cubic"', '"quintic" | "septic" | "trapezoidal" | "s-curve"'),
+    ("motion.horizon", 1.0, "1.0", "at least motion.duration = 1.9 [s], the end of the path"),
+    ("motion.acceleration_share", 0.3, "0.3", '0.25, the default, with motion.law = "quintic"'),
+    ("motion.max_speed", 0.0, "0.0", "a number >= 1e-06 and <= 1e+12"),
+    ("motion.max_acceleration", -1.0, "-1.0", "a number >= 1e-06 and <= 1e+12"),
+    ("motion.max_jerk", "fast", '"fast"', "a number >= 1e-06 and <= 1e+12"),
+    ("motion.base", "rail", '"rail"', '"cart" | "fixed"'),
+    ("motion.base_position", 1, "1", '0.0, the default, with motion.base = "cart"'),
+    ("motion.duration", 0.0, "0.0", "a number >= 0.0001 and <= 100000"),
+    ("motion.horizon", 0, "0", "a number >= 0.0001 and <= 100000"),
+    ("motion.cart_follow", math.nan, "nan", "a finite number"),
+    ("motion.joint_height", "low", '"low"', "a number"),
+    ("motion.elbow", 0, "0", "-1 | 1"),
+    ("motion.elbow", 1.0, "1.0", "-1 | 1"),
+    ("motion.elbow", True, "true", "-1 | 1"),
+    ("motion.gravity", -9.81, "-9.81", "an array of two numbers"),
+    ("motion.gravity", [0.0, 0.0, -9.81], "[0.0, 0.0, -9.81]", "an array of two numbers"),
+    ("motion.gravity", [0.0, -math.inf], "[0.0, -inf]", "an array of two finite numbers"),
+    ("motion.gravity", [False, 0.0], "[false, 0.0]", "an array of two numbers"),
+    ("payload.mass", -6.0, "-6.0", "a number >= 0"),
+    ("payload.mass", math.nan, "nan", "a finite number >= 0"),
+    ("payload.mass", None, "None", "a number >= 0"),
+    ("payload.mass", [[[[1.0]]]], "[[[...]]]", "a number >= 0"),
+    ("payload.inertia", -1, "-1", "a number >= 0"),
+    ("damping.stiffness_proportional", -2e-4, "-0.0002", "a number >= 0"),
+    ("reduction.method", "guyan", '"guyan"', '"craig-bampton" | "modal" | "krylov" | "balanced"'),
+    ("reduction.coordinates", 0, "0", 'an integer >= 1 | "auto"'),
+    ("reduction.coordinates", "all", '"all"', 'an integer >= 1 | "auto"'),
+    ("reduction.tolerance", 0.0, "0.0", "a number >= 1e-06 and <= 0.5"),
+    ("reduction.tolerance", 1e-2, "0.01", "0.001, the default, with reduction.coordinates = 4"),
+    ("reduction.coordinates", 2, "2", 'an integer >= 3 with reduction.method = "craig-bampton"'),
+    ("reduction.coordinates", 4.0, "4.0", "an integer >= 1"),
+    ("reduction.coordinates", True, "true", "an integer >= 1"),
+    ("reduction.coordinates", 5178, "5178", "at most 5177"),  # 2*199*13 + 3
+    ("reduction.shifts", 5.0, "5.0", "an array of numbers >= 0"),
+    ("reduction.shifts", [0.0, -1.0], "[0.0, -1.0]", "an array of numbers >= 0"),
+    ("reduction.shifts", [], "[]", "at least one number >= 0, none of them twice"),
+    ("reduction.shifts", [5.0, 5.0], "[5.0, 5.0]", "none of them twice"),
+    ("reduction.shifts", [5.0], "[5.0]", '[0.0], the default, with reduction.method = "craig'),
+    ("reduction.band", [0.0], "[0.0]", "an array of two numbers >= 0"),
+    ("reduction.band", [9.0, 9.0], "[9.0, 9.0]", "the lower of the two frequencies first"),
+    ("reduction.band", [0.0, 9.0], "[0.0, 9.0]", "[0.0, 50.0], the default, with reduction.method"),
+    ("simulation.tolerance", 0.0, "0.0", "a number >= 1e-12 and <= 0.1"),
+    ("simulation.tolerance", 0.11, "0.11", "a number >= 1e-12 and <= 0.1"),
+    ("simulation.integrator", "euler", '"euler"', '"radau" | "generalized-alpha"'),
+    ("simulation.rho_inf", 1.01, "1.01", "a number >= 0 and <= 1"),
+    ("simulation.stages", 1, "1", "an integer >= 2 and <= 5"),
+    ("simulation.stages", 6, "6", "an integer >= 2 and <= 5"),
+    ("simulation.sample", 0.0, "0.0", "a number >= 1e-09 and <= 100000"),
+    ("simulation.sample", 3.1, "3.1", "motion.horizon = 3.0 [s]"),
+    ("simulation.sample", 1e-9, "1e-09", "between 3e-07 and"),
+    ("simulation.sample", 5e-324, "5e-324", "a number >= 1e-09"),
+    ("objective.kind", "strain", '"strain"', '"esl" | "compliance"'),
+    ("objective.load_cases", 0, "0", "an integer >= 1"),
+    ("objective.load_cases", 3001, "3001", "at most 3000"),
+    ("objective.load_cases", 16**5000, "2**20000...", "at most 3000"),
+    ("objective.gradient", "adjoint", '"adjoint"', '"esl" | "exact"'),
+    ("objective.worst", "stress", '"stress"', '"compliance" | "deviation"'),
+    ("objective.loads", [], "[]", "at least one load [F_x, F_y, moment]"),
+    ("objective.loads", [[0, 0, 0]], "[[0, 0, 0]]", "none of them all zero"),
+    ("objective.loads", [[0, 1e-300, 0]], "[[0, 1e-300, 0]]", "between 1e-09 and 1e+09 [N, N m]"),
+    ("objective.loads", [[0, 1e10, 0]], "[[0, 10000000000.0, 0]]", "between 1e-09 and 1e+09"),
+    ("objective.loads", [[0, 1]], "[[0, 1]]", "an array of arrays of three numbers"),
+    ("objective.loads", [0, 1, 0], "[0, 1, 0]", "an array of arrays of three numbers"),
+    ("objective.attached", "springs", '"springs"', '"rigid-body" | "point-mass" | "none"'),
+    ("objective.elbow_angle", "bent", '"bent"', "a number"),
+    ("objective.modes", 0, "0", "an integer >= 1 and <= 50"),
+    ("objective.follow", 1, "1", "true or false"),
+    ("objective.scenarios", "mean", '"mean"', '"sum" | "worst"'),
+    ("constraints.first_frequency", 0.0, "0.0", "a number >= 1e-06 and <= 1000000000"),
+    ("constraints.tip_deflection", -1e-3, "-0.001", "a number >= 1e-15 and <= 10000"),
+    ("objective.exponent", 1.0, "1.0", "a number >= 2"),
+    ("design.volume_fraction", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
+    ("design.volume_fraction", 1.5, "1.5", "a number >= 1e-06 and <= 1"),
+    ("design.volume_fraction", 5e-4, "0.001 (default)", "at most volume_fraction = 0.0005"),
+    ("design.initial", 1.01, "1.01", "a number >= 1e-06 and <= 1"),
+    ("design.initial", 1e-3, "0.001 (default)", "less than initial = 0.001"),
+    ("design.minimum", 0.0, "0.0", "a number >= 1e-09 and < 1"),
+    ("design.filter_radius", 1.001, "1.001", "at most the length of the longest arm, 1.0 [m]"),
+    ("design.filter_radius", -1e-9, "-1e-09", "a number >= 0"),
+    ("design.projection", True, "true", "false"),
+    ("design.projection", 0, "0", "false"),
+    ("design.projection", "tanh", '"tanh"', 'false | "heaviside" | "robust"'),
+    ("design.sharpness", 0.5, "0.5", "a number >= 1"),
+    ("design.continuation", 0, "0", "an integer >= 1"),
+    ("design.minimum_member", -1e-9, "-1e-09", "a number >= 0 and <= 10000"),
+    ("optimizer.kkt_tolerance", -1e-9, "-1e-09", "a number >= 0 and <= 1000000"),
+    ("design.erosion", 0.5, "0.5", "a number >= 0.001 and <= 0.499"),
+    ("design.shared_volume", 1, "1", "true or false"),
+    ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
+    ("optimizer.max_iterations", 16**5000, "2**20000...", "an integer >= 0 and <= 1000000"),
+    ("optimizer.max_iterations", 400.0, "400.0", "an integer >= 0"),
+    ("optimizer.move", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
+    ("optimizer.move", 1.1, "1.1", "a number >= 1e-06 and <= 1"),
+    ("optimizer.tolerance", -1.0, "-1.0", "a number >= 0"),
+    ("material", 5, "5", "a table with the keys young_modulus, poisson_ratio, density"),
+    ("motion", [1, 2], "[1, 2]", "a table with the keys path, radius"),
+    ("arms", {"name": "arm1"}, '{name = "arm1"}', "an array of tables [[arms]], at least one"),
+    ("arms", [], "[]", "an array of tables [[arms]], at least one"),
+    ("arms.1", "arm2", '"arm2"', "a table with the keys name, length"),
+]
+# Where two keys contradict each other the message may show the other one.
+SHOWN_KEY = {
+    ("design.volume_fraction", 5e-4): "design.minimum",
+    ("design.initial", 1e-3): "design.minimum",
+    ("arms.0.name", "ARM2"): "arms.1.name",
+    ("motion.path", "joints"): "motion.file",
+}
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "shown", "allowed"),
+    BAD_VALUES,
+    ids=[f"{path}={shown}" for path, _, shown, _ in BAD_VALUES],
+)
+def test_bad_value(path, value, shown, allowed):
+    message = message_of(changed(path, value))
+    place, _, reason = message.removeprefix(f"{FILE}: ").partition(": expected ")
+    key, _, found = place.partition(" = ")
+    named = key.partition(" (")[0]
+    hashable = value if isinstance(value, (str, int, float)) else None
+    assert named == SHOWN_KEY.get((path, hashable), path)
+    assert found == shown if len(shown) < 60 else shown in found
+    assert allowed in reason
+    assert "more)" not in message
+
+
+def test_a_mesh_excludes_cells():
+    """Where both are stated; one that is stated takes the place of one that is inherited."""
+    bores = "meshes/arm_bores.geo"
+    data = minimal(3)
+    data["arms"][0] |= {"mesh": bores, "mesh_size": 0.01, "cell_shape": "triangle"}
+    data["arms"][2] |= {"cells": [20, 2]}
+    first, second, third = scene_from_dict(data).arms
+    assert first.cells is None and Path(first.mesh).name == "arm_bores.geo"
+    assert second == first.model_copy(update={"name": "arm2"})
+    assert third == Arm(**ARM | {"name": "arm3"}, cells=(20, 2))
+    data["arms"][2] |= {"mesh": bores}
+    assert "not both" in message_of(data)
+    scene = scene_from_dict(minimal(), overrides=[f"arms.mesh={bores}", "arms.1.mesh_size=0.01"])
+    assert [arm.mesh_size for arm in scene.arms] == [None, 0.01]
+    assert scene.cell_counts == {0: 0, 1: 600}
+    restored = scene_from_dict(json.loads(json.dumps(scene.to_dict())))
+    assert restored == scene and restored.arms == scene.arms
+    back = scene_from_dict(scene.to_dict(), overrides=["arms.cells=[20, 2]"])
+    assert back.arms == (Arm(**ARM, cells=(20, 2)), Arm(**ARM | {"name": "arm2"}, cells=(20, 2)))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "keys", "reason"),
+    [
+        (".toml", {}, "ends in .geo, .msh, .step, .stp"),
+        (".msh", {"mesh_size": 0.01}, "a .msh file has its cells"),
+        (".msh", {"cell_shape": "triangle"}, "a .msh file has its cells"),
+        (".geo", {"mesh_size": 0.07}, "at most height = 0.06 [m]: a cell must fit into the arm"),
+    ],
+)
+def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
+    path = tmp_path / f"arm{suffix}"
+    path.write_text("")
+    data = minimal(1)
+    data["arms"][0] |= {"mesh": str(path)} | keys
+    assert reason in message_of(data)
+
+
+def test_every_key_refuses_something():
+    refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
+    refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
+    assert {info.key for info in describe_keys()} <= refused
+
+
+@pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
+@pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov", "balanced"])
+@pytest.mark.parametrize("kind", ["esl", "compliance"])
+def test_all_choices_are_accepted(integrator, method, kind):
+    tables = {"simulation": {"integrator": integrator}, "objective": {"kind": kind}}
+    scene = scene_from_dict(minimal(reduction={"method": method}, **tables))
+    assert (scene.simulation.integrator, scene.reduction.method) == (integrator, method)
+    assert scene.objective.kind == kind
+
+
+@pytest.mark.parametrize(
+    ("n_arms", "motion", "shown", "reason"),
+    [
+        (2, {"path": "line", "radius": 2.0}, "radius = 2.0", "1.0, the default, with motion.path"),
+        (2, {"path": "line", "flattening": 0}, "flattening = 0", "1.0, the default"),
+        (2, {"path": "line", "end": [-1, 0]}, "end = [-1, 0]", "another point than motion.start"),
+        (2, {"base": "fixed", "cart_follow": 0.2}, "cart_follow = 0.2", "0.5, the default"),
+        (2, {"file": str(TWO_ARM)}, "file = ", 'none with motion.path = "arc"'),
+        (2, {"path": "points"}, "file = None (default)", "the path of a table (CSV)"),
+        (2, {"path": "joints", "file": str(TWO_ARM), "elbow": 1}, "elbow = 1", "-1, the default"),
+        (1, {"cart_follow": 0.0}, "cart_follow = 0.0", "0.5, the default, with one arm"),
+        (1, {"base": "fixed"}, 'base = "fixed"', '"cart" with one arm and motion.path = "arc"'),
+    ],
+    ids=str,
+)
+def test_motion_keys_that_do_nothing(n_arms, motion, shown, reason):
+    message = message_of(minimal(n_arms, motion=motion))
+    assert message.startswith(f"{FILE}: motion.{shown}")
+    assert f": expected {reason}" in message and "more)" not in message
+
+
+def test_one_arm_without_choices_is_accepted():
+    assert scene_from_dict(minimal(1)).motion.base == "cart"
+    fixed = {"path": "joints", "file": str(TWO_ARM), "base": "fixed"}
+    assert scene_from_dict(minimal(1, motion=fixed)).motion.base == "fixed"
+
+
+# --- files a scene names ---------------------------------------------------------------------
+
+TABLE = {"path": "points", "file": "table.csv"}
+
+
+def test_file_is_found_beside_the_scene_first_then_in_the_working_directory(tmp_path, monkeypatch):
+    beside, working = tmp_path / "scenes", tmp_path / "working"
+    for folder in (beside, working):
+        folder.mkdir()
+        (folder / "table.csv").write_text("")
+    monkeypatch.chdir(working)
+    source = "../scenes/some.toml"
+    assert scene_from_dict(minimal(motion=TABLE), source).motion.file == str(beside / "table.csv")
+    (beside / "table.csv").unlink()
+    scene = scene_from_dict(minimal(motion=TABLE), source)
+    assert scene.motion.file == str(working / "table.csv")
+    monkeypatch.chdir(tmp_path)  # and loaded again from elsewhere
+    assert scene_from_dict(scene.to_dict(), "results/summary.json") == scene
+
+
+def test_file_of_the_package_is_found_last(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert resolve_file("x.toml", "meshes/arm.geo", "key") == str(mesh_folder() / "arm.geo")
+    with pytest.raises(InputError, match=r"motion\.py"):  # its meshes, not its modules
+        resolve_file("x.toml", "motion.py", "key")
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "arm.geo").write_text("")
+    assert resolve_file("x.toml", "meshes/arm.geo", "key") == str(tmp_path / "meshes" / "arm.geo")
+
+
+def test_missing_file_is_named_with_all_places(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = message_of(minimal(motion=TABLE))
+    assert message.startswith(f'{FILE}: motion.file = "table.csv": expected the path of a file')
+    places = [tmp_path / "some" / "table.csv", tmp_path / "table.csv"]
+    assert message.endswith(f"found neither {places[0]} nor {places[1]}")
+    message = message_of(minimal(), "motion.path=points", "motion.file=table.csv")
+    assert message.startswith(f'{FILE} with --set motion.file=table.csv: motion.file = "table.csv"')
+
+
+@pytest.mark.parametrize("value", ["", ".", "a\0b", 5000 * "x", "\ud800", "/"], ids=range(6))
+def test_what_is_no_file_name_is_refused(value):
+    assert "motion.file = " in message_of(changed("motion.file", value))
+
+
+@pytest.mark.parametrize(
+    ("tables", "shown", "reason"),
+    [
+        (
+            {"reduction": {"method": "krylov", "shifts": [0.0, 9.0], "coordinates": 5}},
+            "reduction.coordinates = 5",
+            "an integer >= 6",
+        ),
+        (
+            {"reduction": {"method": "krylov", "coordinates": 2}},
+            "reduction.coordinates = 2",
+            "an integer >= 3",
+        ),
+        (
+            {"reduction": {"method": "balanced"}, "damping": {"stiffness_proportional": 0.0}},
+            "damping.stiffness_proportional = 0.0",
+            'a number > 0 with reduction.method = "balanced"',
+        ),
+        (
+            {"reduction": {"method": "balanced"}, "objective": {"gradient": "exact"}},
+            'reduction.method = "balanced"',
+            '"craig-bampton", "modal" or "krylov" with objective.gradient = "exact"',
+        ),
+    ],
+    ids=["shifts", "loads", "undamped", "adjoint"],
+)
+def test_reductions_that_cannot_be(tables, shown, reason):
+    message = message_of(minimal(**tables))
+    assert message.startswith(f"{FILE}: {shown}: expected {reason}") and "more)" not in message
+
+
+def test_several_shifts_and_a_band_are_accepted():
+    krylov = {"method": "krylov", "shifts": [0.0, 9, 25.5, 80.0], "coordinates": 12}
+    assert scene_from_dict(minimal(reduction=krylov)).reduction.shifts == (0.0, 9.0, 25.5, 80.0)
+    exact = minimal(reduction=krylov, objective={"gradient": "exact"})
+    assert scene_from_dict(exact).objective.gradient == "exact"
+    balanced = {"method": "balanced", "band": [5, 80.0]}
+    assert scene_from_dict(minimal(reduction=balanced)).reduction.band == (5.0, 80.0)
+
+
+def test_arm_is_named_in_the_path():
+    message = message_of(changed("arms.1.height", -1))
+    assert message.startswith(f"{FILE}: arms.1.height (arm2) = -1: expected a number >= 1e-06 and")
+    assert " (height in the plane of motion" in message
+    assert message.endswith("[m])")
+
+
+def test_too_many_coordinates_for_one_of_the_arms():
+    data = changed("arms.1.cells", [2, 1])
+    message = message_of(data | {"reduction": {"coordinates": 8}})
+    assert 'at most 7, the degrees of freedom of arm "arm2" with cells = [2, 1]' in message
+
+
+def test_several_problems_are_counted():
+    data = changed("payload.mass", -1)
+    data["design"] = {"initial": 2, "filter_radius": "x"}
+    assert message_of(data).endswith("(and 2 more)")
+
+
+def test_taken_over_problem_counts_once():
+    data = minimal(3)
+    data["arms"][0] |= {"length": -1, "cells": [0, 0], "passive": 3}
+    data["arms"][2]["length"] = -2  # its own
+    message = message_of(data)
+    assert message.startswith(f"{FILE}: arms.0.length (arm1) = -1")
+    assert message.endswith("(and 2 more)")  # cells of the first arm, length of the last
+
+
+def test_long_value_is_cut():
+    message = message_of(changed("objective.kind", 10_000 * "x"))
+    assert "..." in message and len(message) < 300
+
+
+def test_line_ends_and_control_characters_are_escaped():
+    with pytest.raises(InputError) as caught:
+        scene_from_dict(changed("objective.kind", "\x1b[31m\u2028\n"), "a\nb\udc80.toml")
+    message = str(caught.value)
+    assert message.startswith(r"a\nb\udc80.toml: objective.kind = ") and message.isprintable()
+    assert r"\u001b[31m\u2028\n" in message
+
+
+@pytest.mark.parametrize(
+    ("data", "found"), [(5, "5"), ([1], "[1]"), (None, "None"), ("name", '"name"')]
+)
+def test_scene_that_is_no_table(data, found):
+    assert f"expected a table of scene keys, found {found}" in message_of(data)
+
+
+# --- unknown and missing keys ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "unknown", "closest", "allowed"),
+    [
+        ("nam", "nam", "name", "name, material, interpolation, arms"),
+        ("payload.mas", "payload.mas", "payload.mass", "mass, inertia"),
+        ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
+        ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
+        ("radius", "radius", "motion.radius", "name, material"),
+        (
+            "tolerance",
+            "tolerance",
+            "reduction.tolerance or simulation.tolerance or optimizer.tolerance",
+            "name, mat",
+        ),
+        ("volum_fraction", "volum_fraction", "design.volume_fraction", "name, material"),
+        ("arms.0.blocks", "arms.0.blocks (arm1)", None, "name, length, height, thickness, cells"),
+        ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
+        ("payload.x y", 'payload."x y"', None, "mass, inertia"),
+        ("payload.", 'payload.""', None, "mass, inertia"),
+        ("source", "source", None, "name, material"),
+        ("_source", "_source", None, "name, material"),
+    ],
+)
+def test_unknown_key(path, unknown, closest, allowed):
+    message = message_of(changed(path, 1))
+    advice = f"; did you mean {closest}? allowed: " if closest else "; allowed: "
+    assert message.startswith(f"{FILE}: unknown key {unknown}{advice}{allowed}")
+
+
+def test_exact_gradient_needs_radau():
+    data = minimal()
+    data["objective"] = {"gradient": "exact"}
+    data["simulation"] = {"integrator": "generalized-alpha"}
+    assert 'simulation.integrator = "generalized-alpha": expected "radau"' in message_of(data)
+
+
+def test_misspelt_key_comes_before_the_missing_one():
+    data = minimal()
+    data["material"]["youngs_modulus"] = data["material"].pop("young_modulus")
+    message = message_of(data)
+    assert "unknown key material.youngs_modulus; did you mean material.young_modulus?" in message
+    assert message.endswith("(and 1 more)")
+
+
+def test_key_that_is_no_string():
+    assert "unknown key payload.1; allowed: mass" in message_of(minimal(payload={1: 2}))
+    assert "unknown key 1; allowed: name" in message_of(minimal() | {1: 2})
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "described"),
+    [
+        ("material", "young_modulus", "[Pa]"),
+        ("material", "poisson_ratio", "ratio"),
+        ("material", "density", "[kg/m3]"),
+        ("arms.0", "name", "unique name"),
+        ("arms.0", "length", "[m]"),
+        ("arms.0", "height", "[m]"),
+        ("arms.0", "thickness", "[m]"),
+        ("arms.1", "name", "unique name"),
+    ],
+)
+def test_missing_key(table, key, described):
+    data = minimal()
+    node = data["arms"][int(table[-1])] if table.startswith("arms") else data[table]
+    del node[key]
+    message = message_of(data)
+    named = f"{table}.{key}" + (" (arm1)" if table == "arms.0" and key != "name" else "")
+    assert message.startswith(f"{FILE}: missing key {named} (")
+    assert described in message and message.endswith(")")
+    assert "more)" not in message  # the arms that would take it over do not count
+
+
+def test_missing_tables():
+    data = minimal()
+    del data["material"]
+    assert "missing key material.young_modulus (" in message_of(data)
+    del data["arms"]
+    data["material"] = dict(MATERIAL)
+    assert "missing key arms (arms from the cart outwards)" in message_of(data)
+
+
+# --- files -----------------------------------------------------------------------------------
+
+
+def load_error(path):
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    return checked_line(caught, path)
+
+
+# The required tables, to follow the lines in question.
+REQUIRED = """
+[material]
+young_modulus = 70e9
+poisson_ratio = 0.33
+density = 2700.0
+[[arms]]
+name = "arm1"
+length = 1.0
+height = 0.06
+thickness = 0.01
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["missing key material.young_modulus"]),
+        ("name = 'a'\n[material\ndensity = 1", ["line 2, column 10: not valid TOML: Expected"]),
+        ("name = ", ["line 1, column 8: not valid TOML: Invalid value"]),
+        ("name = 'a'\nx = [1,\n", ["line 3, column 1: not valid TOML: "]),
+        ("name = 1\nname = 2", ["line 2, column 9: not valid TOML: Cannot overwrite"]),
+        ("name = " + 5000 * "1", ["not valid TOML: Exceeds the limit"]),
+        ("name = " + 2000 * "[", ["nested too deeply"]),
+        ("name = 0x" + 5000 * "f" + REQUIRED, ["name = 2**19999...", "a string"]),
+        ("payload.mass = 1e400" + REQUIRED, ["payload.mass = inf", "a finite number >= 0"]),
+        ("payload.mass = nan" + REQUIRED, ["payload.mass = nan", "a finite number >= 0"]),
+        ("payload.mass = 1979-05-27" + REQUIRED, ["payload.mass = 1979-05-27", "number >= 0"]),
+        ("[[material]]\ndensity = 1", ["material = [{density = 1}]", "a table with the keys"]),
+    ],
+    ids=range(12),
+)
+def test_bad_file_content(tmp_path, text, parts):
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    message = load_error(path)
+    for part in parts:
+        assert part in message
+
+
+def test_required_tables_are_enough(tmp_path):
+    path = tmp_path / "one.toml"
+    path.write_text(REQUIRED)
+    assert load_scene(path) == scene_from_dict(minimal(1, name="one"))
+
+
+def test_file_that_is_not_utf8(tmp_path):
+    path = tmp_path / "latin.toml"
+    path.write_bytes("name = 'a'\n# Länge\n".encode("latin-1"))
+    assert "line 2: not UTF-8" in load_error(path)
+
+
+def test_file_that_is_missing(tmp_path):
+    assert "no such file" in load_error(tmp_path / "absent.toml")
+    assert "is a directory" in load_error(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert "cannot be read (Not a directory)" in load_error(tmp_path / "file" / "scene.toml")
+    assert "cannot be read (File name too long)" in load_error("a" * 5000)
+    assert "is a directory" in load_error(".")
+
+
+def test_file_name_with_a_zero_byte():
+    with pytest.raises(InputError, match=r"^a\\x00b: not a file name; give the path"):
+        load_scene("a\0b")
+
+
+def test_file_that_may_not_be_read(monkeypatch):
+    # The superuser may read every file, so that file modes cannot make this happen.
+    def refuse(self):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    assert "permission denied; make the file readable" in load_error(TWO_ARM)
+
+
+# --- whatever else comes ---------------------------------------------------------------------
+
+KEYS = [info.key for info in describe_keys()]
+TABLES = sorted({key.partition(".")[0] for key in KEYS})
+PATHS = [key.replace("arms.", f"arms.{i}.") for key in KEYS for i in (0, 1)] + ["arms.0", *TABLES]
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.integers(17, 20_000).map(lambda n_bits: 1 << n_bits)
+    | st.floats()
+    | st.text(max_size=20)
+    | st.dates()
+    | st.sampled_from(["esl", "modal", "generalized-alpha", "arm1", b"bytes", {1: 2}]),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.text(max_size=5) | st.sampled_from(["name", "mass"]), inner, max_size=3
+        )
+    ),
+    max_leaves=6,
+)
+
+
+def accept_or_refuse(make):
+    """Call `make`: a scene that survives a round trip, or InputError of one line."""
+    try:
+        scene = make()
+    except InputError as error:
+        assert str(error).isprintable() and str(error)
+        return None
+    assert isinstance(scene, Scene)
+    assert scene_from_dict(json.loads(json.dumps(scene.to_dict(), allow_nan=False))) == scene
+    for arm in scene.arms:
+        assert 0 <= 2 * arm.passive_columns <= arm.cells[0]
+        assert scene.reduction.coordinates <= arm.n_reducible
+    return scene
+
+
+# Mostly within the ranges of single keys, so that what several keys agree on is reached.
+LIKELY = st.floats(0, 1) | st.integers(1, 9) | st.lists(st.integers(1, 9), min_size=2, max_size=2)
+
+
+@given(st.dictionaries(st.sampled_from(PATHS), LIKELY | VALUES, min_size=1, max_size=4))
+@example({"arms.0.cells": [100_000, 1], "arms.0.passive": 1e-320})
+@example({"arms.0.length": 5e-324})
+def test_any_value_is_accepted_or_refused(changes):
+    data = minimal()
+    for path, value in changes.items():
+        put(data, path, value)
+    accept_or_refuse(lambda: scene_from_dict(data))
+
+
+@given(st.dictionaries(st.sampled_from([*KEYS, "x"]) | st.text(max_size=8), VALUES, max_size=3))
+def test_any_data_are_accepted_or_refused(data):
+    accept_or_refuse(lambda: scene_from_dict(data))
+
+
+LETTERS = st.text(string.printable + "é\u2028\0", max_size=12)
+TOML_VALUES = st.floats().map(str) | st.integers().map(str) | LETTERS
+
+
+@given(st.lists(st.tuples(st.sampled_from(PATHS + KEYS) | LETTERS, TOML_VALUES), max_size=3))
+@example([("arms.passive", "0.25"), ("design.volume_fraction", "1")])
+def test_any_override_is_accepted_or_refused(pairs):
+    overrides = [f"{key}={value}" for key, value in pairs]
+    accept_or_refuse(lambda: scene_from_dict(minimal(), overrides=overrides))
+
+
+@given(st.binary(max_size=40) | LETTERS.map(str.encode))
+def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_bytes(content + REQUIRED.encode())
+    accept_or_refuse(lambda: load_scene(path))
+
+
+# --- documentation ---------------------------------------------------------------------------
+
+
+def test_every_key_is_described_with_a_unit():
+    keys = describe_keys()
+    assert len({info.key for info in keys}) == len(keys) == 84
+    for info in keys:
+        assert info.description[-1] == "]" and " [" in info.description, info
+        assert info.allowed and not info.allowed.endswith(" "), info
+
+
+def test_described_defaults():
+    defaults = {info.key: info.default for info in describe_keys()}
+    assert defaults["arms.cells"] == "[200, 12]"
+    assert defaults["reduction.method"] == '"craig-bampton"'
+    required = {key for key, default in defaults.items() if not default}
+    assert required == {
+        "name",  # of the file
+        *(f"material.{key}" for key in MATERIAL),
+        *(f"arms.{key}" for key in ARM),
+        "scenarios.changes",  # of every scenario there is
+    }
+
+
+def test_import_needs_no_mpi_nor_numpy():
+    code = (
+        "import sys, dolfinopt.scene.load; print('numpy' in sys.modules, 'mpi4py' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["False", "False"]
+
+
+# --- scenarios -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scenario", "message"),
+    [
+        ({"changes": 5}, "scenarios.0.changes = 5: expected an array of strings"),
+        ({"changes": [], "weight": 0}, "scenarios.0.weight = 0: expected a number >= 1e-09"),
+        ({"weight": 1.0}, "missing key scenarios.0.changes"),
+        ({"changes": [], "wait": 1.0}, "unknown key scenarios.0.wait; did you mean scenarios.0.w"),
+        ({"changes": ["arms.length=2"]}, "expected keys of motion, payload, damping or material"),
+        ({"changes": ["material.poisson_ratio=0.2"]}, "expected no material.poisson_ratio"),
+        ({"changes": ["payload.mas=2"]}, "with --set payload.mas=2: unknown key payload.mas"),
+        ({"changes": ["payload.mass=-2"]}, "payload.mass = -2: expected a number >= 0"),
+        (5, "expected a table with the keys changes, weight"),
+    ],
+)
+def test_bad_scenario(scenario, message):
+    assert message in message_of(minimal(scenarios=[scenario]))
+
+
+def test_scenarios_change_what_they_name():
+    scene = scene_from_dict(
+        minimal(
+            scenarios=[
+                {"changes": ["payload.mass=4", "motion.flattening=0.5"]},
+                {"changes": ["material.density=2800"], "weight": 0.5},
+            ]
+        )
+    )
+    first, second = pose_scenarios(scene)
+    assert (first.payload.mass, first.motion.flattening) == (4.0, 0.5)
+    assert (second.payload.mass, second.material.density) == (6.0, 2800.0)
+    assert first.scenarios == second.scenarios == ()
+    assert scene_from_dict(scene.to_dict()) == scene
+
+
+def test_scenarios_need_a_motion():
+    scenarios = [{"changes": ["payload.mass=4"]}]
+    for kind in ("static", "eigenfrequency"):
+        message = message_of(minimal(scenarios=scenarios, objective={"kind": kind}))
+        assert '"esl", "compliance" or "deviation" with [[scenarios]]' in message
+
+
+# --- arms that share a design, are rigid, or come from a file --------------------------------
+
+
+def test_who_owns_which_design():
+    data = minimal(4)
+    data["arms"][1]["rigid"] = True
+    data["arms"][3]["design"] = "arm1"
+    scene = scene_from_dict(data)
+    assert scene.owners == (0, None, 2, 0)
+    assert scene.cell_counts == {0: 2400, 2: 2400}
+    assert [arm.rigid for arm in scene.arms] == [False, True, False, False]  # not inherited
+
+
+@pytest.mark.parametrize(
+    ("arm", "reason"),
+    [
+        ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
+        ({"design": "arm1", "density": 1.0}, "arms.1.density (arm2) = 1.0: expected None as arm1"),
+        ({"design": "arm1", "rigid": True}, "only one of design, rigid and sid, found design and"),
+        ({"design": "arm3"}, 'an earlier arm with a design of its own: "arm1"'),
+    ],
+)
+def test_contradictions_of_an_arm(arm, reason):
+    data = minimal()
+    data["arms"][1] |= arm
+    assert reason in message_of(data)
+
+
+def test_something_must_be_designed():
+    data = minimal()
+    for arm in data["arms"]:
+        arm["rigid"] = True
+    assert "at least one arm with a design" in message_of(data)
+
+
+def test_own_material():
+    data = minimal()
+    data["arms"][0] |= {"young_modulus": 210e9}
+    data["arms"][1] |= {"density": 7800.0}
+    scene = scene_from_dict(data)
+    first, second = scene.material_of(0), scene.material_of(1)
+    assert (first.young_modulus, first.density) == (210e9, 2700.0)
+    assert (second.young_modulus, second.density) == (210e9, 7800.0)  # inherited, and its own
+    assert scene.material.young_modulus == 70e9
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"objective": {"kind": "eigenfrequency", "attached": "none"}},
+        {"objective": {"attached": "none"}, "constraints": {"first_frequency": 10.0}},
+    ],
+)
+def test_nothing_attached_needs_solid_ends(tables):
+    data = minimal(**tables)
+    scene_from_dict(data)  # they have them by default
+    data["arms"][0]["passive"] = 0.0
+    assert "arms.0.passive (arm1) = 0.0: expected more than 0" in message_of(data)
+
+
+def test_length_of_a_body_from_a_file(tmp_path):
+    from dolfinopt.exchange.sid import write_sid
+    from dolfinopt.multibody.shape_integrals import rigid_bar
+    from dolfinopt.multibody.standard_input import to_sid
+
+    write_sid(tmp_path / "bar.sid", to_sid(rigid_bar(0.8, 0.05, 0.01, 2700.0)))
+    data = minimal()
+    data["arms"][1]["sid"] = "bar.sid"
+    scene = scene_from_dict(data, str(tmp_path / "scene.toml"))
+    assert scene.arms[1].length == pytest.approx(0.8, rel=1e-12)
+    assert scene.owners == (0, None) and scene.arms[1].sid == str(tmp_path / "bar.sid")
+    assert scene_from_dict(scene.to_dict()) == scene
+    data["arms"][0] = {"name": "arm1", "sid": "bar.sid"}  # needs no geometry at all
+    data["arms"][1] = dict(ARM, name="arm2")
+    first = scene_from_dict(data, str(tmp_path / "scene.toml")).arms[0]
+    assert first.height == first.thickness == pytest.approx(0.04)

@@ -1,0 +1,167 @@
+"""Pictures of studies: what is drawn, and that it can be read."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+from dolfinopt.plots.style import BLUE, ORANGE, look, look_numbers, spread
+from dolfinopt.study.figures import (
+    column_figure,
+    common_looks,
+    line_figure,
+    matrix_figure,
+    tornado_figure,
+)
+from dolfinopt.study.tables import Line, LineFigure, MatrixFigure, Panel, TornadoFigure
+
+
+def test_line_figure():
+    """Axes with units, a legend; equal names look alike; steep curves on a log scale."""
+    x = np.arange(4.0)
+    panels = (
+        Panel("one", "mass [kg]", "compliance [N m]", (Line("a", x, x + 1.0), Line("b", x, x))),
+        Panel("two", "mass [kg]", "deviation [mm]", (Line("b", x, 10.0**x),)),
+    )
+    drawn = line_figure(LineFigure("", "Title", (panels,)))
+    left, right = drawn.axes
+    assert [axes.get_xlabel() for axes in drawn.axes] == ["mass [kg]"] * 2
+    assert [axes.get_ylabel() for axes in drawn.axes] == ["compliance [N m]", "deviation [mm]"]
+    assert left.get_yscale() == "linear" and right.get_yscale() == "log"
+    np.testing.assert_array_equal(left.lines[0].get_ydata(), x + 1.0)
+    assert left.lines[1].get_color() == right.lines[0].get_color() != left.lines[0].get_color()
+    assert [text.get_text() for text in right.texts] == ["b"]
+    assert [text.get_text() for text in left.texts] == ["a"]  # each name once
+    assert left.texts[0].get_color() == left.lines[0].get_color()
+
+
+def test_one_thing_has_one_look_in_all_figures():
+    """Different designs look different although they never meet in one panel or row."""
+    x = np.arange(3.0)
+
+    def row(*names):
+        return (Panel("", "x [-]", "y [-]", tuple(Line(name, x, x) for name in names)),)
+
+    figures = [
+        LineFigure("1", "", (row("initial design"), row("a"), row("b"))),
+        LineFigure("2", "", (row("b", "c"), row("a", "optimised design"))),
+    ]
+    styles = common_looks(figures)
+    seen = [(s["color"], str(s["linestyle"])) for s in styles.values()]
+    assert len(set(seen)) == len(seen) == 5
+    for figure in figures:
+        lines = [line for axes in line_figure(figure, styles).axes for line in axes.lines]
+        for line in lines:
+            assert line.get_color() == styles[line.get_label()]["color"]
+        assert len({line.get_linewidth() for line in lines}) == 1
+        assert len({line.get_markersize() for line in lines}) == 1
+    # What every run's pictures show looks alike in all of them.
+    assert (
+        styles["initial design"]["color"] == ORANGE and styles["optimised design"]["color"] == BLUE
+    )
+
+
+def test_looks_of_a_crowd():
+    """28 before one comes twice; a figure's own differ in colour up to the seventh."""
+    numbers = look_numbers([list("abcdefg"), [f"n{k}" for k in range(19)]])
+    assert len(set(numbers.values())) == 26
+    assert len({look(numbers[name])["color"] for name in "abcdefg"}) == 7
+    more = look_numbers([[f"n{k}" for k in range(60)]])
+    assert len(more) == 60
+
+
+def test_names_at_line_ends_do_not_overlap():
+    np.testing.assert_allclose(spread([0.5, 0.5, 0.9], 0.1), [0.5, 0.6, 0.9])
+    np.testing.assert_allclose(spread([1.0, 0.99], 0.1), [1.0, 0.9])
+    x = np.arange(3.0)
+    lines = tuple(Line(f"name {k}", x, x + 0.001 * k) for k in range(8))
+    drawn = line_figure(LineFigure("", "", ((Panel("", "x [-]", "y [-]", lines),),)))
+    drawn.canvas.draw()
+    boxes = [Text.get_window_extent(text) for text in drawn.axes[0].texts]
+    boxes.sort(key=lambda box: box.y0)
+    assert len(boxes) == 8
+    assert all(low.y1 <= high.y0 + 1.0 for low, high in pairwise(boxes))
+    assert max(box.x1 for box in boxes) <= drawn.bbox.x1
+
+
+def test_pairs_share_their_axes():
+    x = np.arange(1.0, 5.0)
+
+    def panel(y_label, factor):
+        return Panel("", "x [-]", y_label, (Line("a", factor * x, factor * x),))
+
+    drawn = line_figure(
+        LineFigure("", "", ((panel("y [-]", 1.0), panel("y [-]", 2.0)), (panel("z [-]", 3.0),)))
+    )
+    one, other, below = (axes for axes in drawn.axes if axes.get_visible())
+    assert one.get_ylim() == other.get_ylim() and other.get_ylim()[1] >= 8.0
+    assert one.get_xlim() == below.get_xlim() and below.get_xlim()[1] >= 12.0
+
+
+def test_coordinates_double():
+    x = np.array([4.0, 8.0, 16.0])
+    lines = (Line("a", x, x),)
+    drawn = line_figure(LineFigure("", "", ((Panel("", "q [-]", "y [-]", lines, x_log2=True),),)))
+    (axes,) = drawn.axes
+    assert axes.get_xscale() == "log"
+    a, b, c = axes.transData.transform(np.column_stack([x, x]))[:, 0]
+    assert b - a == pytest.approx(c - b)
+    drawn.canvas.draw()
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert {"4", "8", "16"} <= set(labels)
+
+
+def test_legend_names_every_curve():
+    """Also those that only a panel before the last one shows."""
+    x = np.arange(3.0)
+    panels = (
+        Panel("", "x [-]", "y [-]", (Line("a", x, x), Line("b", x, x))),
+        Panel("", "x [-]", "y [-]", (Line("b", x, x),)),
+    )
+    drawn = line_figure(LineFigure("", "", (panels,)))
+    assert [[t.get_text() for t in axes.texts] for axes in drawn.axes] == [["a"], ["b"]]
+    # Where curves end anywhere, a legend names them.
+    short = Panel("", "x [-]", "y [-]", (Line("a", 0.5 * x, x), Line("b", x, x)))
+    drawn = line_figure(LineFigure("", "", ((short,),)))
+    assert [t.get_text() for t in drawn.axes[0].get_legend().get_texts()] == ["a", "b"]
+
+
+def test_column_of_panels():
+    """Below each other, one look a curve, every legend below its panel; sweeps keep a margin."""
+    t, x = np.linspace(0.0, 3.0, 200), np.linspace(0.0, 1.0, 9)
+    rows = (
+        (Panel("", "t [s]", "y [mm]", (Line("a", t, t), Line("b", t, t))),),
+        (Panel("", "s [-]", "y [mm]", tuple(Line(name, x, x) for name in "bcdef")),),
+    )
+    drawn = column_figure(LineFigure("", "", rows))
+    drawn.canvas.draw()
+    first, second = drawn.axes
+    assert first.get_position().x0 == pytest.approx(second.get_position().x0, abs=1e-3)  # aligned
+    assert first.lines[1].get_color() == second.lines[0].get_color()
+    assert first.get_xlim() == (0.0, 3.0) and second.get_xlim()[0] < 0.0
+    for axes, names in zip(drawn.axes, ("ab", "bcdef"), strict=True):
+        legend = axes.get_legend()
+        assert [text.get_text() for text in legend.get_texts()] == list(names)
+        assert legend.get_window_extent().y1 < axes.get_window_extent().y0
+    assert first.get_legend().get_window_extent().y0 > second.get_window_extent().y1
+
+
+def test_losses_have_one_scale():
+    for factor in (0.1, 1.0, 100.0):
+        values = factor * np.array([[0.0, 1.5], [-2.0, 0.0]])
+        panels = (("loss [%]", values),)
+        drawn = matrix_figure(MatrixFigure("", "", "i", "j", ("4", "8"), panels))
+        assert drawn.axes[0].images[0].get_clim() == (-10.0, 10.0)
+
+
+def test_matrix_and_tornado_figures():
+    values = np.array([[0.0, 1.5], [-2.0, 0.0]])
+    drawn = matrix_figure(MatrixFigure("", "T", "made for [kg]", "used at [kg]", ("4", "8"),
+                                       (("loss [%]", values),)))  # fmt: skip
+    texts = [text.get_text() for text in drawn.axes[0].texts]
+    assert texts == ["0.00", "1.50", "-2.00", "0.00"]
+    assert drawn.axes[0].get_ylabel() == "made for [kg]"
+    drawn = tornado_figure(TornadoFigure("", "T", (("panel", (("mass", -3.0, 4.0),)),)))
+    assert [patch.get_width() for patch in drawn.axes[0].patches] == [-3.0, 4.0]
+    assert drawn.axes[0].get_xlabel() == "change [%]"

@@ -1,0 +1,510 @@
+"""Studies: what is planned, the tables and pictures that come of it, and what is refused."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.cli import commands
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.study import presets as topics
+from dolfinopt.study import store as cases
+from dolfinopt.study import studies as study
+from dolfinopt.study import variants
+from dolfinopt.study.tables import TornadoFigure
+from dolfinopt.study.variants import parse_vary
+
+ROOT = Path(__file__).parents[2]
+SCENE = ROOT / "demos" / "two_arm.toml"
+WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
+SMALL = ["arms.cells=[20,3]", "optimizer.max_iterations=3", "simulation.sample=0.01"]
+SETTINGS = [word for value in SMALL for word in ("--set", value)]
+# Of the coordinates, whose square is the compliance. A batch's steps are not those of one scene:
+# both results are right to it.
+TOLERANCE = 1e-4
+# As it was before this process began MPI, which would confuse another mpirun.
+ENVIRONMENT = dict(os.environ)
+
+
+def scene(*overrides):
+    return do.load_scene(SCENE, [*SMALL, *overrides])
+
+
+def run(*arguments, command="sweep"):
+    """Run the command on all ranks."""
+    commands.main([command, *map(str, arguments)], standalone_mode=False, obj=WORLD)
+    WORLD.barrier()
+
+
+def rows_of(path):
+    with open(path, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def column(rows, name):
+    return np.array([float(row[name]) for row in rows])
+
+
+def is_drawn(path):
+    """Tell whether a picture holds more than a blank page."""
+    from PIL import Image
+
+    return np.asarray(Image.open(path).convert("L")).std() > 5.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where the studies of this file keep their cases."""
+    path = tmp_path_factory.mktemp("studies") if WORLD.rank == 0 else None
+    return WORLD.bcast(path, root=0)
+
+
+# -- what is asked ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("payload.mass=4:8:3", ("4", "6", "8")),
+        ("payload.mass=4:5:3", ("4.0", "4.5", "5.0")),
+        ("payload.mass=4.0:8:3", ("4.0", "6.0", "8.0")),
+        ("payload.mass = 8:4:2", ("8", "4")),
+        ("payload.mass=1e-1,2", ("1e-1", "2")),
+        ("payload.mass=2,2", ("2",)),
+        ("reduction.coordinates=3:12:4", ("3", "6", "9", "12")),
+    ],
+)
+def test_vary(text, values):
+    assert parse_vary(text).values == values
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["payload.mass", "=1:2:3", "a=", "a=1:2", "a=1:2:1", "a=1:1:3", "a=1:2:x", "a=one,two", "a=nan",
+     "a=1:inf:3", "a=1:2:3:4", "a=1:2:-3"],
+)  # fmt: skip
+def test_vary_refuses(text):
+    with pytest.raises(InputError, match=r"--vary .*expected"):
+        parse_vary(text)
+
+
+def test_axes_bear_units():
+    units = {
+        "payload.mass": "payload.mass [kg]",
+        "arms.length": "arms.length [m]",
+        "arms.arm2.length": "arms.arm2.length [m]",
+        "motion.flattening": "motion.flattening [-]",
+    }
+    for key, axis in units.items():
+        assert parse_vary(f"{key}=1,2").axis == axis
+
+
+BAD = {
+    "nothing asked": ([], "--vary"),
+    "unknown topic": (["tides"], "tides"),
+    "unknown key": (["--vary", "payload.mas=1,2"], "payload.mass"),
+    "no numbers": (["--vary", "payload.mass=a,b"], "expected"),
+    "out of range": (["--vary", "payload.mass=-1:1:3"], "payload.mass = -1"),
+    "no integer": (["--vary", "reduction.coordinates=4,4.5"], "integer"),
+    "twice": (["--vary", "payload.mass=1,2", "--vary", "payload.mass=3,4"], "twice"),
+    "out of reach": (["--vary", "motion.radius=1,5"], "from the shoulder"),
+    "no design": (["payload", "--design", "nowhere.npz"], "nowhere.npz"),
+    "design of other arms": (["payload", "--design", "OTHER.npz"], "OTHER.npz: missing key"),
+    "given designs do not change": (["--vary", "design.volume_fraction=0.4,0.6"], "--reoptimize"),
+    "arms of another size": (["--vary", "arms.arm2.length=0.9,1"], "--reoptimize"),
+    "coordinates of another key": (["coordinates", "--vary", "payload.mass=1,2"], "only"),
+    "broken coordinates": (["coordinates", "--vary", "reduction.coordinates=4,4.5"], "whole"),
+    "too many coordinates": (["coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
+    "a file that looks like a topic": (["--design", "a.npz", "b.npz"], "b.npz"),
+    "several times reoptimised": (["coordinates", "--reoptimize"], "compare reductions"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line(name, shared_tmp_path):
+    arguments, word = BAD[name]
+    other = shared_tmp_path / "OTHER.npz"
+    if WORLD.rank == 0:
+        np.savez(other, **{"leg/centroid": np.zeros((1, 2)), "leg/density": np.ones(1)})
+    WORLD.barrier()
+    arguments = [str(other) if part == other.name else part for part in arguments]
+    with pytest.raises((InputError, click.UsageError)) as caught:
+        run(SCENE, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
+    error = caught.value
+    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
+    assert "\n" not in message and word in message
+    assert not (shared_tmp_path / "o").exists()
+
+
+# -- sweeps ----------------------------------------------------------------------------------
+
+
+def test_payload(folder, capsys):
+    """Every figure is that of a simulation by itself; the second time nothing is computed."""
+    arguments = (SCENE, "payload", "--vary", "payload.mass=4,6,8", *SETTINGS, "--out", folder)
+    run(*arguments)
+    first = capsys.readouterr()
+    rows = rows_of(folder / "payload.csv")
+    masses = column(rows, "payload.mass [kg]")
+    np.testing.assert_array_equal(masses, [4.0, 6.0, 8.0])
+    result = do.optimize(scene(), world=SELF)
+    for row, mass in zip(rows, masses, strict=True):
+        other = scene(f"payload.mass={mass}")
+        for label, x in (
+            ("initial design", {k: arm.uniform(0.5) for k, arm in result.arms.items()}),
+            ("optimised design", result.x_phys),
+        ):
+            evaluation, _ = do.evaluate(other, result.share, result.arms, x, do.Ledger())
+            assert float(row[f"{label}: compliance [N m]"]) == pytest.approx(
+                evaluation.compliance, rel=4.0 * TOLERANCE
+            )
+            assert float(row[f"{label}: maximal deviation [mm]"]) == pytest.approx(
+                1e3 * evaluation.max_deviation, rel=2.0 * TOLERANCE
+            )
+    for name in ("payload.png", "payload.md", "payload_curves.csv"):
+        assert (folder / name).is_file()
+    assert is_drawn(folder / "payload.png")
+    if WORLD.rank == 0:
+        assert "7 cases computed" in first.out
+        assert (folder / "payload.md").read_text() in first.out
+    WORLD.barrier()
+    before = (folder / "payload.csv").read_bytes()
+    run(*arguments)
+    if WORLD.rank == 0:
+        assert "0 cases computed" in capsys.readouterr().out
+    assert (folder / "payload.csv").read_bytes() == before
+
+
+def test_cross_evaluation(folder):
+    """The matrix holds design i in scenario j, the losses follow from it."""
+    base = scene()
+    done = study.study(base, "payload", ["payload.mass=4,8"], [], folder, WORLD, reoptimize=True,
+                       shown=False)  # fmt: skip
+    tables = {table.name: table for table in done.tables}
+    values = np.array([row[1:] for row in tables["cross_compliance"].rows])
+    loss = np.array([row[1:] for row in tables["cross_compliance_loss"].rows])
+    np.testing.assert_array_equal(loss, 100.0 * (values / np.diag(values) - 1.0))
+    assert (np.diag(loss) == 0.0).all()
+    for i, made in enumerate((4, 8)):
+        design = do.optimize(scene(f"payload.mass={made}"), world=SELF)
+        for j, used in enumerate((4, 8)):
+            other = scene(f"payload.mass={used}")
+            found, _ = do.evaluate(other, design.share, design.arms, design.x_phys, do.Ledger())
+            assert values[i, j] == pytest.approx(found.compliance, rel=4.0 * TOLERANCE)
+    # Those made for each scenario stand in the main table, too.
+    made_for_it = [row[-2] for row in tables[""].rows]
+    np.testing.assert_array_equal(made_for_it, np.diag(values))
+    assert [figure.name for figure in done.figures] == ["", "cross", "designs"]
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
+def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
+    vary = ["payload.mass=4:8:3", "motion.flattening=0.8,1"]
+    alone = study.study(scene(), None, vary, [], tmp_path, SELF, shown=False)
+    together = study.study(scene(), None, vary, [], shared_tmp_path / "all", WORLD, shown=False)
+    assert alone.tables == together.tables
+    assert alone.computed == together.computed == 13
+
+
+def test_grid_of_two(folder):
+    vary = ["payload.mass=4,8", "damping.stiffness_proportional=1e-4,2e-4,4e-4"]
+    design = folder / "given.npz"
+    if WORLD.rank == 0:
+        x, y = np.linspace(0.05, 0.95, 10), np.linspace(-0.02, 0.02, 3)
+        centroid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        arms = ("arm1", "arm2")
+        np.savez(
+            design,
+            **{f"{arm}/centroid": centroid for arm in arms},
+            **{f"{arm}/density": np.full(30, 0.8) for arm in arms},
+        )
+    WORLD.barrier()
+    done = study.study(scene(), None, vary, [design], folder, WORLD, shown=False)
+    [table], [figure] = done.tables, done.figures
+    assert [row[:2] for row in table.rows] == [
+        (m, d) for m in (4.0, 8.0) for d in (1e-4, 2e-4, 4e-4)
+    ]
+    assert "given: compliance [N m]" in table.columns
+    compliance = np.array([row[2] for row in table.rows]).reshape(2, 3)
+    assert (compliance[1] > compliance[0]).all()  # a heavier payload
+    assert (np.diff(compliance) < 0.0).all()  # more damping
+    [[left, _]] = figure.rows
+    np.testing.assert_array_equal([line.y for line in left.lines], compliance.T)
+
+
+def test_three_keys_one_at_a_time(folder):
+    vary = ["payload.mass=5,7", "motion.flattening=0.9,1", "material.density=2600,2800"]
+    done = study.study(scene(), None, vary, [], folder, WORLD, shown=False)
+    assert [table.name for table in done.tables] == ["", *(text.split("=")[0] for text in vary)]
+    tornado = done.figures[0]
+    assert isinstance(tornado, TornadoFigure)
+    _, bars = tornado.panels[0]
+    changes = {bar[0].split()[0]: bar[1:] for bar in bars}
+    assert changes["payload.mass"][0] < 0.0 < changes["payload.mass"][1]
+    assert changes["motion.flattening"][1] == 0.0  # the scene's own value
+    largest = [max(map(abs, bar[1:])) for bar in bars]
+    assert largest == sorted(largest, reverse=True)
+
+
+def test_design_table_needs_reoptimising(folder):
+    """Less material is less stiff when designs are made for it."""
+    done = study.study(
+        scene(), None, ["design.volume_fraction=0.4,0.5"], [], folder, WORLD, reoptimize=True,
+        shown=False,
+    )  # fmt: skip
+    made = [row[-2] for row in done.tables[0].rows]
+    assert made[0] > made[1]
+
+
+def test_arms_of_several_sizes(folder):
+    """Longer arms are made for themselves: no design goes into another's scenario."""
+    done = study.study(
+        scene(), None, ["arms.arm2.length=0.9,1"], [], folder, WORLD, reoptimize=True, shown=False
+    )
+    [table] = done.tables
+    assert [row[0] for row in table.rows] == [0.9, 1.0]
+    assert table.rows[0][1] < table.rows[1][1]  # the initial design, N m
+
+
+# -- names and folders -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("topic", "vary", "name"),
+    [
+        ("payload", [], "payload"),
+        ("payload", ["payload.mass=4,8"], "payload"),
+        ("payload", ["motion.duration=1,2"], "payload_motion.duration"),
+        ("coordinates", ["reduction.coordinates=4,8"], "coordinates"),
+        (None, ["material.density=2600:2800:5"], "material.density"),
+        (
+            None,
+            [" payload.mass = 4", "arms.my arm.height=1"],
+            "payload.mass_arms.my-arm.height",
+        ),
+    ],
+)
+def test_files_are_named_after_what_varies(topic, vary, name):
+    assert study.sweep_name(topic, vary) == name
+
+
+def test_long_names_stay_apart():
+    keys = [f"arms.{'a' * 60}{i}.thickness=1,2" for i in range(2)]
+    names = {study.sweep_name(None, [keys[0], keys[1]]), study.sweep_name(None, keys[::-1])}
+    assert len(names) == 2 and max(map(len, names)) <= 120
+
+
+def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
+    """Each has its files; a sweep that grows computes what is new; another scene is refused."""
+    folder = shared_tmp_path / "o"
+    quick = [*SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder]
+
+    def computed(*arguments):
+        run(SCENE, *arguments, *quick)
+        said = capsys.readouterr().out
+        return int(re.search(r"(\d+) cases computed", said)[1]) if WORLD.rank == 0 else None
+
+    def files():
+        WORLD.barrier()
+        return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+    first = computed("--vary", "payload.mass=4,8")
+    before = files()
+    names = {f"payload.mass{end}" for end in (".csv", ".md", ".json", ".png", "_curves.csv")}
+    assert set(before) == names
+    computed("--vary", "motion.duration=1.9,2.1", "--no-plots")
+    after = files()
+    assert {name: after[name] for name in names} == before
+    others = {f"motion.duration{end}" for end in (".csv", ".md", ".json", "_curves.csv")}
+    assert set(after) == names | others
+    grown = computed("--vary", "payload.mass=4,8,12", "--no-plots")
+    if WORLD.rank == 0:
+        # Two designs by value, all values in one batch; the optimised design is made once.
+        assert (first, grown) == (1 + 4, 6)
+    assert "payload.mass.png" not in files()  # it showed two values
+    assert len(rows_of(folder / "payload.mass.csv")) == 3
+    before = files()
+    other = ["--vary", "payload.mass=4,8", "--set", "motion.horizon=2.5"]
+    with pytest.raises(InputError, match=r"payload\.mass\.\* there belong to another scene"):
+        computed(*other)
+    assert files() == before
+    computed(*other, "--overwrite", "--no-plots")
+    assert files()["payload.mass.csv"] != before["payload.mass.csv"]
+
+
+@pytest.mark.parametrize(
+    ("words", "word"),
+    [
+        (["compare", SCENE], "what"),
+        (["compare", SCENE, "designs"], "objectives"),
+        (["compare", SCENE, "objectives", "--coordinates", "4"], "--coordinates"),
+        (["compare", SCENE, "reductions", "--coordinates", "100000"], "100000"),
+        (["study", SCENE, "payload", "--designs", "a.npz"], "sweep"),
+    ],
+)
+def test_bad_comparison_is_one_line(words, word, shared_tmp_path):
+    more = [] if words[0] == "study" else [*SETTINGS, "--out", shared_tmp_path / "o"]
+    with pytest.raises((InputError, click.UsageError), match=word) as caught:
+        run(*words[1:], *more, command=words[0])
+    assert "\n" not in str(caught.value)
+    assert not (shared_tmp_path / "o").exists()
+
+
+# -- objectives and reductions ---------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_objective(folder):
+    run(SCENE, "objectives", *SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder,
+        command="compare")  # fmt: skip
+    rows = rows_of(folder / "objective.csv")
+    names = [row["objective"] for row in rows]
+    assert names[0] == "initial design" and len(names) == 11
+    assert not any("nothing attached" in name for name in names)  # it needs solid ends
+    assert [row["iterations"] for row in rows] == ["0"] + 10 * ["1"]
+    compliance = column(rows, "compliance [N m]")
+    assert (compliance[1:9] < compliance[0]).all()
+    assert len(set(compliance)) >= 9  # they are different designs
+    for name in ("objective_deviation.png", "objective_designs.png"):
+        assert is_drawn(folder / name)
+    curves = rows_of(folder / "objective_deviation_curves.csv")
+    peaks = {}
+    for row in curves:
+        peak = float(row["deviation [mm]"])
+        peaks[row["line"]] = max(peak, peaks.get(row["line"], 0.0))
+    deviation = dict(zip(names, column(rows, "maximal deviation [mm]"), strict=True))
+    assert peaks == pytest.approx(deviation, rel=1e-9)
+
+
+def test_solid_ends_allow_nothing_attached():
+    plan = topics.objective_plan(scene("arms.passive=0.05"))
+    labels = [case.label for case in plan.cases]
+    assert "eigenfrequency, nothing attached" in labels and len(labels) == 12
+
+
+def test_exact_gradient_only_where_there_is_one():
+    plan = topics.objective_plan(scene("simulation.integrator=generalized-alpha"))
+    assert not any("exact" in case.label for case in plan.cases)
+
+
+@pytest.mark.slow
+def test_reduction(folder, monkeypatch):
+    """Craig-Bampton and Krylov do not depend on q, modal truncation is below and climbs."""
+    monkeypatch.setattr(topics, "SWEPT", (4, 8))
+    monkeypatch.setattr(topics, "COMPARED", (4,))
+    monkeypatch.setattr(variants, "REFERENCE", 8)
+    monkeypatch.setattr(cases, "REFERENCE", 8)
+    run(
+        SCENE, "reductions", "--coordinates", 4, *SETTINGS, "--set",
+        "optimizer.max_iterations=1", "--out", folder, command="compare",
+    )  # fmt: skip
+    main = {row["method"]: row for row in rows_of(folder / "reduction.csv")}
+    assert list(main) == list(variants.METHODS)
+    own, again = "compliance, own model [N m]", "compliance, craig-bampton 8 [N m]"
+    for method, row in main.items():
+        off = float(row["own model off by [%]"])
+        assert off == pytest.approx(100.0 * (float(row[own]) / float(row[again]) - 1.0), abs=1e-6)
+        if method in ("craig-bampton", "krylov"):
+            assert abs(off) < 0.1
+    sweep = rows_of(folder / "reduction_coordinates.csv")
+    value = {
+        (row["method"], int(row["coordinates"])): float(row["initial design: compliance [N m]"])
+        for row in sweep
+    }
+    assert value["craig-bampton", 4] == pytest.approx(value["craig-bampton", 8], rel=1e-4)
+    assert value["krylov", 4] == pytest.approx(value["craig-bampton", 8], rel=1e-4)
+    assert value["modal", 4] < value["modal", 8] < 0.99 * value["craig-bampton", 8]
+    bases = rows_of(folder / "reduction_bases.csv")
+    assert len(bases) == 2 * 2 * 4  # designs, arms, methods
+    for row in bases:
+        lost = float(row["moment [%]"])
+        assert lost > 2.0 if row["method"] == "modal" else lost < 0.1
+    pictures = {path.name for path in folder.glob("reduction*.png")}
+    assert pictures == {
+        f"reduction_{name}.png"
+        for name in ("convergence", "coordinates", "designs", "deviation", "optimised_deviation")
+    }
+    assert all(is_drawn(folder / name) for name in pictures)
+
+
+def test_balanced_where_it_is_possible():
+    """Too few directions are not asked of the Gramian; options of one method stay there."""
+    swept = variants.reductions(scene(), None, (4, 48))
+    pairs = {(s.reduction.method, s.reduction.coordinates) for s in swept}
+    assert ("balanced", 4) in pairs and ("balanced", 48) not in pairs
+    base = scene(
+        "reduction.method=krylov", "reduction.shifts=[0.0,100.0]", "reduction.coordinates=6"
+    )
+    assert variants.reduced(base, "krylov", 8).reduction.shifts == (0.0, 100.0)
+    assert variants.reduced(base, "modal", 8).reduction.shifts == (0.0,)
+
+
+def test_failures_end_with_status_one(folder, monkeypatch):
+    """The table names what failed and holds the rest."""
+    from dolfinopt.responses import evaluation
+
+    whole = evaluation.simulate_batch
+
+    def fail_at_seven(scenes, *args, **options):
+        error = ConvergenceError("no solution")
+        found = whole(scenes, *args, **options)
+        return [error if s.payload.mass == 7.25 else one for s, one in zip(scenes, found)]
+
+    monkeypatch.setattr(evaluation, "simulate_batch", fail_at_seven)
+    with pytest.raises(ConvergenceError, match=r"mass = 7\.25: no solution \(and 1 more\)"):
+        run(SCENE, "payload", "--vary", "payload.mass=4,7.25", *SETTINGS, "--out", folder)
+    WORLD.barrier()
+    rows = rows_of(folder / "payload.csv")
+    assert rows[0]["failed"] == "" and rows[0]["initial design: compliance [N m]"]
+    assert rows[1]["failed"] == "no solution" and not rows[1]["initial design: compliance [N m]"]
+
+
+# -- killed ----------------------------------------------------------------------------------
+
+
+@pytest.mark.serial
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_killed_study_goes_on(tmp_path, ranks):
+    """Killed after some cases, the next call does the rest and ends the same."""
+    overrides = [*SETTINGS, "--set", "optimizer.max_iterations=5", "--no-plots"]
+    words = ["sweep", SCENE, "payload", "--vary", "payload.mass=4:8:4", "--reoptimize", *overrides]
+    line = [sys.executable, "-m", "dolfinopt", *map(str, words), "--out"]
+    if ranks > 1:
+        line = ["mpirun", "-n", str(ranks), *line]
+    options = {"env": ENVIRONMENT, "cwd": ROOT}
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    first = [*line, str(tmp_path / "a")]
+    with subprocess.Popen(first, start_new_session=True, **silent, **options) as begun:
+        limit = time.monotonic() + 60.0
+        while len(list((tmp_path / "a").glob("cases/*/summary.json"))) < 2:
+            assert begun.poll() is None and time.monotonic() < limit
+            time.sleep(0.01)
+        os.killpg(begun.pid, signal.SIGKILL)
+        begun.wait()
+    done = len(list((tmp_path / "a").glob("cases/*/summary.json")))
+    assert 2 <= done < 29
+    for path in (tmp_path / "a").glob("cases/*/summary.json"):
+        json.loads(path.read_text())
+    for name in "ab":
+        ended = subprocess.run([*line, str(tmp_path / name)], capture_output=True, text=True,
+                               timeout=100, **options)  # fmt: skip
+        assert ended.returncode == 0, ended.stderr
+        computed = int(re.search(r"(\d+) cases computed", ended.stdout)[1])
+        # A rank may outlive its killed mpirun for a moment, and finish a case.
+        assert 0 < computed <= 29 - done if name == "a" else computed == 29
+    a, b = (sorted((tmp_path / name).glob("*.csv")) for name in "ab")
+    assert [path.name for path in a] == [path.name for path in b] and len(a) == 6
+    for one, other in zip(a, b, strict=True):
+        assert one.read_bytes() == other.read_bytes()
