@@ -18,7 +18,7 @@ from mkdocs.structure.files import File, Files
 
 import dolfinopt
 from dolfinopt.cli import commands
-from dolfinopt.scene import describe_keys
+from dolfinopt.scene.load import describe_keys
 
 ROOT = Path(__file__).parents[1]
 TABLES = {

@@ -43,6 +43,8 @@ def run(module, tmp_path, *launcher):
         text=True,
         timeout=120,
         env=dict(os.environ),
+        # A test run in the background of a shell ignores the signal, and so would its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 

@@ -20,9 +20,8 @@ from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.mesh import compat
-from dolfinopt.optimization import loop as optimization
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.output import checkpoint, files, summary
+from dolfinopt.output import checkpoint, files, run, summary
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import (
@@ -294,7 +293,7 @@ OPTIMISATIONS = {
     "realise": (LONE, arm.Arm, "realise", 0),
     "chain": (LONE, arm.Arm, "chain", 1),
     "threshold": (LONE, arm.Arm, "preserving_threshold", 0),
-    "history": (0, optimization, "HistoryWriter", 0),
+    "history": (0, run, "HistoryWriter", 0),
     "history row": (0, files.HistoryWriter, "append", 1),
     "checkpoint begun": (0, checkpoint, "write_arrays", 0),
     "checkpoint": (0, checkpoint, "write_arrays", 1),

@@ -684,8 +684,8 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
         made.append((len(stages.h), len(slow)))
         return held_factors(stages, begin, a, slow, single)
 
-    for module in ("radau", "factors", "adjoint"):
-        monkeypatch.setattr(f"dolfinopt.integrators.{module}.factorise", spy)
+    for module in ("radau", "newton_matrix", "adjoint"):
+        monkeypatch.setattr(f"dolfinopt.dynamics.{module}.factorise", spy)
     monkeypatch.setattr("dolfinopt.dynamics.radau.held_factors", held_spy)
     return made
 
