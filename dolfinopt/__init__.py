@@ -1,6 +1,12 @@
 """Topology optimisation of flexible multibody systems on FEniCSx.
 
-The pipeline in ten lines:
+    from dolfinopt import Model
+
+    model = Model("demos/two_arm.toml", "payload.mass=4")
+    result = model.optimize()
+    result.plot().savefig("design.png")
+
+The same step by step, with ranks and profile in hand:
 
     import dolfinopt as do
     from mpi4py import MPI
@@ -10,8 +16,8 @@ The pipeline in ten lines:
     arms = do.build_arms(scene, share, ledger := do.Ledger())       # mesh, elements, filter
     x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}       # physical densities
     evaluation, trajectory = do.evaluate(scene, share, arms, x_phys, ledger)  # reduce, simulate
-    slopes = do.gradient(scene, share, arms, trajectory, ledger)    # d objective / d x_phys
-    result = do.optimize(scene)                                     # again, until it rests
+    gradient = do.gradient(scene, share, arms, trajectory, ledger)  # d objective / d x_phys
+    result = do.optimize(scene)                                     # again, until it converges
 """
 
 from __future__ import annotations
@@ -26,6 +32,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm, build_arms
     from dolfinopt.dynamics.simulation import Trajectory, simulate
     from dolfinopt.errors import ConvergenceError, InputError
+    from dolfinopt.model import Model, OptimizationResult, SimulationResult
     from dolfinopt.optimization.loop import Result
     from dolfinopt.output.files import gather_views
     from dolfinopt.output.run import optimize
@@ -47,6 +54,9 @@ _HOME = {
     "gather_views": "output.files",
     "gather_arms": "parallel",
     "Ledger": "profiling",
+    "Model": "model",
+    "OptimizationResult": "model",
+    "SimulationResult": "model",
     "Result": "optimization.loop",
     "optimize": "output.run",
     "abort_together": "parallel",

@@ -244,7 +244,7 @@ def _views(
         if owner is None:
             views.append(_bar_view(name, scene.arms[index].height, fixed_body(scene, index)))
             continue
-        order = _canonical_order(centroids[owner])
+        order = canonical_order(centroids[owner])
         # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
         around = [0, 1, 3, 2] if corners[owner].shape[1] == 4 else [0, 1, 2]
         views.append(
@@ -284,7 +284,7 @@ def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
     return ArmView(name, corners, corners.mean(axis=1), density, modes, False, length)
 
 
-def _canonical_order(points: np.ndarray) -> np.ndarray:
+def canonical_order(points: np.ndarray) -> np.ndarray:
     """Sort points by x, then y, as equal to 1e-9 of their extent: the same on any partition."""
     size = np.ptp(points, axis=0).max() or 1.0
     rounded = np.round(points / (1e-9 * size))
@@ -325,7 +325,7 @@ def write_gradient(
             return
         arrays: dict[str, Any] = {"objective": objective}
         for index, centroid in centroids.items():
-            order, name = _canonical_order(centroid), scene.arms[index].name
+            order, name = canonical_order(centroid), scene.arms[index].name
             arrays[f"{name}/centroid"] = centroid[order]
             arrays[f"{name}/gradient"] = gathered[index][order]
         unit = OBJECTIVES[scene.objective.kind][1]  # per physical density, which has none

@@ -1,0 +1,491 @@
+"""A scene as an object to work with in scripts and notebooks.
+
+    from dolfinopt import Model
+
+    model = Model("demos/two_arm.toml", "payload.mass=4", "optimizer.max_iterations=20")
+    before = model.simulate()            # the initial design
+    result = model.optimize()
+    print(f"{1e3 * before.max_deviation:.1f} mm before, {1e3 * result.max_deviation:.1f} mm after")
+    result.plot().savefig("design.png")
+    table = model.study("payload.mass=2:6:3", designs=[result])  # a pandas DataFrame
+
+Everything runs alike under `mpirun -n N python script.py`: all ranks call the same methods with the
+same arguments (they are collective). Figures of one number are then known on all ranks; arrays,
+tables of the history and pictures belong to rank 0, other ranks get empty ones, or None.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.arms.arm import Arm, build_arms, fixed_body
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.budget import check_budget
+from dolfinopt.multibody.motion import check_motion
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.output.files import (
+    ArmView,
+    canonical_order,
+    designed,
+    gather_views,
+    read_design,
+    write_arrays,
+)
+from dolfinopt.output.run import optimize
+from dolfinopt.parallel import ArmShare, gather_cells, on_root, share_arms, together
+from dolfinopt.profiling import Ledger
+from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
+from dolfinopt.responses.order_selection import choose_coordinates
+from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
+from dolfinopt.scene.schema import GradientKind
+from dolfinopt.study.studies import Topic, study
+from dolfinopt.units import OBJECTIVES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+Densities = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SimulationResult:
+    """One design, simulated; draws itself where it is the last expression of a notebook's cell.
+
+    Attributes:
+        scene: in which.
+        evaluation: all figures, on all ranks.
+        design: physical densities (n_cells,) of every arm with a design of its own, by its name;
+            cells in the order of `Model.centroids`. On rank 0, empty elsewhere.
+        trajectory: the motion over time; None but on rank 0.
+        views: cells, densities and modes of all arms, for pictures; empty but on rank 0.
+    """
+
+    scene: Scene
+    evaluation: Evaluation
+    design: dict[str, np.ndarray]
+    trajectory: Trajectory | None
+    views: list[ArmView]
+
+    @property
+    def objective(self) -> float:
+        """Value of the scene's objective, in `unit`."""
+        return self.evaluation.objective
+
+    @property
+    def unit(self) -> str:
+        """Unit of the objective."""
+        return OBJECTIVES[self.scene.objective.kind][1]
+
+    @property
+    def compliance(self) -> float:
+        """Sum of the load cases' compliance, N m."""
+        return self.evaluation.compliance
+
+    @property
+    def max_deviation(self) -> float:
+        """Largest distance of the end-effector from its rigid path, m."""
+        return self.evaluation.max_deviation
+
+    def to_frame(self) -> DataFrame | None:
+        """Return deviation (m) and compliance of every arm (N m) over time (s, the index).
+
+        Rank 0; None elsewhere.
+        """
+        if self.trajectory is None:
+            return None
+        from pandas import DataFrame, Index
+
+        motion = self.trajectory
+        x, y = motion.deviation.T
+        columns = {"deviation_x": x, "deviation_y": y, "deviation": np.hypot(x, y)}
+        arms = zip(self.scene.arms, motion.compliance.T, strict=True)
+        columns |= {f"compliance_{arm.name}": values for arm, values in arms}
+        return DataFrame(columns, index=Index(motion.t, name="t"))
+
+    def plot(self) -> Figure | None:
+        """Return the figure of the deviation over time; None but on rank 0, as all figures."""
+        return self.plot_deviation()
+
+    def plot_deviation(self) -> Figure | None:
+        """Return the figure of the end-effector's distance from its rigid path over time."""
+        from dolfinopt.plots.figures import deviation_figure
+
+        if self.trajectory is None:
+            return None
+        return deviation_figure(self.trajectory.t, self.trajectory.deviation, self._initial())
+
+    def plot_design(self) -> Figure | None:
+        """Return the figure of the arms' densities."""
+        from dolfinopt.plots.figures import design_page
+
+        return design_page(designed(self.views), self.scene.name) if self.views else None
+
+    def plot_machine(self) -> Figure | None:
+        """Return the figure of the machine in a few poses along its path."""
+        from dolfinopt.plots.figures import machine_figure
+
+        if self.trajectory is None:
+            return None
+        one = self.trajectory
+        return machine_figure(self.views, one.mechanism, one.t, one.q_r, self.scene.name)
+
+    def _initial(self) -> np.ndarray | None:
+        """Return the deviation (n, 2) of the design to compare with, m."""
+        return None
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.scene.name!r}, objective={self.objective:.4g} "
+            f"{self.unit}, max_deviation={1e3 * self.max_deviation:.4g} mm)"
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the picture that notebooks show."""
+        if (figure := self.plot()) is None:
+            return None
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png")
+        return stream.getvalue()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OptimizationResult(SimulationResult):
+    """An optimised design, and how it came about.
+
+    Attributes:
+        iterations: design updates made.
+        converged: whether the design rests, see `stop_reason`.
+        stop_reason: in words.
+        violated: the constraints that are not met, "" if all are.
+        rows: one a design, the initial one first; rank 0.
+        initial_deviation: (n, 2) of the initial design, m; rank 0.
+    """
+
+    iterations: int = 0
+    converged: bool = False
+    stop_reason: str = ""
+    violated: str = ""
+    rows: list[HistoryRow] = field(default_factory=list)
+    initial_deviation: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
+
+    @property
+    def history(self) -> DataFrame | None:
+        """The columns of history.csv by iteration (the index); None but on rank 0."""
+        if not self.rows:
+            return None
+        from pandas import DataFrame
+
+        frame = DataFrame([row.values for row in self.rows], columns=self.rows[0].columns)
+        return frame.astype({"iteration": int}).set_index("iteration")
+
+    def plot(self) -> Figure | None:
+        """Return the figure of the optimised arms; None but on rank 0, as all figures."""
+        return self.plot_design()
+
+    def plot_history(self) -> Figure | None:
+        """Return the figure of the objective and other figures over the iterations."""
+        from dolfinopt.plots.figures import history_figure
+
+        label = "{} [{}]".format(*OBJECTIVES[self.scene.objective.kind])
+        return history_figure(self.rows, label) if self.rows else None
+
+    def _initial(self) -> np.ndarray | None:
+        return self.initial_deviation if len(self.initial_deviation) else None
+
+
+Design = Densities | SimulationResult | str | Path | None
+
+
+class Model:
+    """A scene to simulate, differentiate, optimise and study; see the example in this module.
+
+    Designs are physical densities in [0, 1], a mapping from the name of every arm with a design of
+    its own to its (n_cells,) values in the order of `centroids`, as design.npz holds them. Methods
+    take them, a result, or the path of a design.npz; without one, the scene's initial design.
+
+    Args:
+        scene: path of a scene file, its content as nested dictionaries, or a `Scene`.
+        *overrides: "key.path=value", as given to --set.
+        comm: the ranks that work on it; by default all.
+
+    Raises:
+        InputError: the scene is not valid; on all ranks, as all errors.
+    """
+
+    def __init__(
+        self,
+        scene: str | os.PathLike[str] | Mapping[str, Any] | Scene,
+        *overrides: str,
+        comm: MPI.Comm | None = None,
+    ):
+        self._world = MPI.COMM_WORLD if comm is None else comm
+        self.scene: Scene = on_root(self._world, _load, scene, overrides)
+        check_budget(self._world, self.scene)
+        self._profile = Ledger()
+        self._built: tuple[ArmShare, dict[int, Arm]] | None = None
+        self._order: dict[int, np.ndarray] = {}
+        self._centroids: dict[str, np.ndarray] = {}
+
+    def __repr__(self) -> str:
+        arms = ", ".join(arm.name for arm in self.scene.arms)
+        return f"Model({self.scene.name!r}, arms: {arms})"
+
+    @property
+    def centroids(self) -> dict[str, np.ndarray]:
+        """Centroids (n_cells, 2) of every designed arm's cells, m; empty but on rank 0."""
+        self._arms()
+        return self._centroids
+
+    def uniform(self, density: float) -> dict[str, np.ndarray]:
+        """Return the design of one density everywhere, solid where the scene says so.
+
+        Args:
+            density: of the design variables, in [0, 1].
+
+        Raises:
+            InputError: it is no such number.
+        """
+        if not 0.0 <= density <= 1.0:
+            raise InputError(f"density {density}: expected a number >= 0 and <= 1")
+        return self._gathered(self._uniform(density))
+
+    def simulate(self, x: Design = None) -> SimulationResult:
+        """Simulate a design.
+
+        Args:
+            x: the design, see the class; None: the initial one.
+
+        Raises:
+            InputError: it does not fit the scene's arms.
+            ConvergenceError: the motion could not be simulated; the message says what to try.
+        """
+        share, arms, x_phys = self._prepared(x)
+        choose_coordinates(self.scene, share, arms, x_phys, self._profile)
+        evaluation, trajectory = evaluate(self.scene, share, arms, x_phys, self._profile)
+        views = gather_views(self.scene, share, arms, x_phys)
+        return SimulationResult(self.scene, evaluation, self._gathered(x_phys), trajectory, views)
+
+    def gradient(self, x: Design = None, kind: str | None = None) -> dict[str, np.ndarray]:
+        """Return the objective's gradient by the physical densities, as a design is given.
+
+        Args:
+            x: the design, see the class; None: the initial one.
+            kind: "esl" freezes the equivalent static loads, "exact" follows the whole dynamics;
+                None: the scene's objective.gradient.
+
+        Raises:
+            InputError, ConvergenceError: as `simulate` does.
+        """
+        if kind not in (None, *get_args(GradientKind)):
+            raise InputError(f"kind {kind!r}: expected one of {', '.join(get_args(GradientKind))}")
+        scene = self.scene
+        if kind is not None:
+            objective = scene.objective.model_copy(update={"gradient": kind})
+            scene = scene.model_copy(update={"objective": objective})
+        share, arms, x_phys = self._prepared(x)
+        if scene.objective.simulated:
+            choose_coordinates(scene, share, arms, x_phys, self._profile)
+        _, trajectory = evaluate(scene, share, arms, x_phys, self._profile, simulated=False)
+        return self._gathered(gradient(scene, share, arms, trajectory, self._profile))
+
+    def optimize(
+        self,
+        folder: str | Path | None = None,
+        *,
+        resume: bool = False,
+        report: Callable[[HistoryRow], None] | None = None,
+    ) -> OptimizationResult:
+        """Optimise the scene's arms from its initial design.
+
+        Args:
+            folder: existing one for history.csv and the checkpoint; None: nothing is written.
+            resume: go on from the folder's checkpoint.
+            report: called on rank 0 with every row of the history.
+
+        Raises:
+            InputError: there is no fitting checkpoint to go on from.
+            ConvergenceError: a simulation failed.
+        """
+        place = None if folder is None else Path(folder)
+        found = optimize(self.scene, place, resume=resume, world=self._world, report=report)
+        self._arms()  # the order of the cells
+        return OptimizationResult(
+            self.scene,
+            found.evaluation,
+            self._gathered(found.x_phys, found.share),
+            found.trajectory,
+            gather_views(self.scene, found.share, found.arms, found.x_phys),
+            found.iterations,
+            found.converged,
+            found.stop_reason,
+            found.violated,
+            found.history,
+            found.initial_deviation,
+        )
+
+    def study(
+        self,
+        *vary: str,
+        topic: Topic | None = None,
+        designs: Sequence[Densities | SimulationResult | str | Path] = (),
+        reoptimize: bool = False,
+        folder: str | Path | None = None,
+        shown: bool = False,
+    ) -> DataFrame:
+        """Simulate designs for a range of scene values; return the table, on all ranks.
+
+        Args:
+            *vary: "key.path=start:stop:count" or "key.path=a,b,c"; two make a grid.
+            topic: "payload", "flattening" or "coordinates" for their usual ranges; "objective" or
+                "reduction" to compare all of them.
+            designs: to simulate, in place of the initial and the optimised one.
+            reoptimize: optimise a design for every value, too.
+            folder: where all cases are kept, so that a study that grows takes them from there;
+                None: nowhere.
+            shown: draw the progress.
+
+        Raises:
+            InputError: something asked for is not possible.
+        """
+        from pandas import DataFrame
+
+        with self._folder(folder) as place:
+            paths = [self._design_file(one, place, k) for k, one in enumerate(designs, 1)]
+            found = study(
+                self.scene, topic, vary, paths, place, self._world,
+                reoptimize=reoptimize, shown=shown,
+            )  # fmt: skip
+            table = found.tables[0]
+            columns, rows = self._world.bcast((table.columns, table.rows), root=0)
+        return DataFrame(list(rows), columns=list(columns))
+
+    # -- designs over the ranks ----------------------------------------------------------------
+
+    def _arms(self) -> tuple[ArmShare, dict[int, Arm]]:
+        """Return which ranks do which arm, and this rank's, meshed at first use (collective)."""
+        if self._built is None:
+            share = share_arms(self._world, self.scene.cell_counts)
+            arms = build_arms(self.scene, share, self._profile)
+            whole = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
+            self._order = {k: canonical_order(points) for k, points in whole.items()}
+            names = self.scene.arms
+            self._centroids = {names[k].name: whole[k][o] for k, o in self._order.items()}
+            self._built = share, arms
+        return self._built
+
+    def _uniform(self, density: float) -> dict[int, np.ndarray]:
+        share, arms = self._arms()
+        with together(share.world):
+            return {k: arm.uniform(density) for k, arm in arms.items()}
+
+    def _prepared(self, x: Design) -> tuple[ArmShare, dict[int, Arm], dict[int, np.ndarray]]:
+        """Return the arms, which forget earlier designs, and the densities of this rank's cells.
+
+        A search for modes that set out from another design's would end in other last digits.
+        """
+        share, arms = self._arms()
+        for arm in arms.values():
+            arm.start, arm.loaded_starts = None, {}
+        if x is None:
+            return share, arms, self._uniform(self.scene.design.initial)
+        if isinstance(x, SimulationResult):
+            x = x.design
+        if isinstance(x, (str, os.PathLike)):
+            return share, arms, read_design(Path(x), share, arms)
+        whole = on_root(self._world, self._checked, x)
+        sizes = {k: share.comm.allgather(arm.mesh.num_cells) for k, arm in arms.items()}
+        parts = {k: np.cumsum([0, *size])[share.comm.rank :] for k, size in sizes.items()}
+        return share, arms, {k: whole[k][part[0] : part[1]] for k, part in parts.items()}
+
+    def _checked(self, x: Densities) -> dict[int, np.ndarray]:
+        """Return a user's densities in the order of the ranks' cells (root only)."""
+        names = [self.scene.arms[k].name for k in self._order]
+        if not isinstance(x, Mapping) or sorted(x) != sorted(names):
+            found = ", ".join(map(str, x)) if isinstance(x, Mapping) else type(x).__name__
+            raise InputError(f"design: expected densities of {', '.join(names)}, found {found}")
+        whole = {}
+        for (k, order), name in zip(self._order.items(), names, strict=True):
+            values = np.asarray(x[name], dtype=float)
+            if values.shape != order.shape:
+                raise InputError(
+                    f"design: arm {name!r}: expected densities of shape {order.shape}, "
+                    f"found {values.shape}"
+                )
+            whole[k] = np.empty_like(values)
+            whole[k][order] = values
+        return whole
+
+    def _gathered(
+        self, cells: Mapping[int, np.ndarray], share: ArmShare | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return whole arrays by the arms' names on the root, empty elsewhere (collective)."""
+        whole = gather_cells(share or self._arms()[0], cells)
+        return {self.scene.arms[k].name: one[self._order[k]] for k, one in whole.items()}
+
+    @contextmanager
+    def _folder(self, folder: str | Path | None) -> Iterator[Path]:
+        """Hand out a folder, or one that is removed in the end (collective)."""
+        if folder is not None:
+            yield Path(folder)
+            return
+        held: list[TemporaryDirectory[str]] = []
+
+        def make() -> Path:
+            held.append(TemporaryDirectory(prefix="dolfinopt-"))
+            return Path(held[0].name)
+
+        try:
+            yield on_root(self._world, make)
+            self._world.barrier()
+        finally:
+            for one in held:
+                one.cleanup()
+
+    def _design_file(
+        self, x: Densities | SimulationResult | str | Path, folder: Path, number: int
+    ) -> Path:
+        """Return the path of a design.npz with the design (collective)."""
+        if isinstance(x, (str, os.PathLike)):
+            return Path(x)
+        self._arms()
+
+        def write() -> Path:
+            values = x.design if isinstance(x, SimulationResult) else x
+            self._checked(values)
+            path = folder / f"design{number}.npz"
+            folder.mkdir(parents=True, exist_ok=True)
+            arrays = {f"{name}/density": np.asarray(one) for name, one in values.items()}
+            arrays |= {f"{name}/centroid": one for name, one in self._centroids.items()}
+            write_arrays(path, arrays)
+            return path
+
+        return on_root(self._world, write)
+
+
+def _load(
+    scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, overrides: Sequence[str]
+) -> Scene:
+    """Read and check a scene (root only)."""
+    if isinstance(scene, Scene):
+        loaded = scene_from_dict(scene.to_tree(), scene.source, overrides) if overrides else scene
+    elif isinstance(scene, Mapping):
+        loaded = scene_from_dict(scene, overrides=overrides)
+    else:
+        loaded = load_scene(scene, overrides)
+    check_motion(loaded)
+    for index, arm in enumerate(loaded.arms):
+        if arm.sid is not None:
+            fixed_body(loaded, index)
+    return loaded

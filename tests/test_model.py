@@ -1,0 +1,143 @@
+"""dolfinopt.Model: the same figures as the functions below it, on any number of ranks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt import Model, OptimizationResult
+
+WORLD = MPI.COMM_WORLD
+ROOT = WORLD.rank == 0
+SCENE = Path(__file__).parents[1] / "demos/two_arm.toml"
+SMALL = "arms.cells=[24,4]", "simulation.sample=0.01", "optimizer.max_iterations=2"
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return Model(SCENE, *SMALL)
+
+
+@pytest.fixture(scope="module")
+def result(model: Model) -> OptimizationResult:
+    return model.optimize()
+
+
+def test_simulate_is_evaluate(model: Model) -> None:
+    """The initial design by name, by default, and by the functions give the same bits."""
+    scene = do.load_scene(SCENE, SMALL)
+    share = do.share_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, share, ledger := do.Ledger())
+    x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    evaluation, _ = do.evaluate(scene, share, arms, x_phys, ledger)
+    assert model.simulate().evaluation == evaluation
+    found = model.simulate(model.uniform(0.5))
+    assert found.evaluation == evaluation
+    assert found.objective == evaluation.objective
+    assert found.compliance == pytest.approx(found.objective, rel=1e-14)  # summed otherwise
+    frame = found.to_frame()
+    if ROOT:
+        assert frame["deviation"].max() == found.max_deviation
+        assert frame.index[-1] == pytest.approx(scene.motion.horizon)
+        assert list(found.design) == ["arm1", "arm2"]
+    else:
+        assert frame is None and found.design == {}
+
+
+def test_a_design_comes_back_in_the_order_it_was_given(model: Model) -> None:
+    x = {name: 0.3 + 0.4 * points[:, 0] for name, points in model.centroids.items()}
+    found = model.simulate(x)
+    again = model.simulate(found)
+    for name, values in x.items():
+        assert np.array_equal(found.design[name], values)
+        assert np.array_equal(again.design[name], values)
+    assert again.evaluation == found.evaluation
+
+
+def test_gradient_predicts_the_change(model: Model) -> None:
+    """Central differences of the objective along a direction that tells the cells apart."""
+    step = {n: 1e-3 * (1.0 + np.sin(7.0 * p[:, 0] + 40.0 * p[:, 1])) for n, p in
+            model.centroids.items()}  # fmt: skip
+    middle = model.uniform(0.5)
+    objective = Model(model.scene, "objective.kind=compliance", "simulation.tolerance=1e-7")
+    ends = [
+        objective.simulate({n: middle[n] + sign * h for n, h in step.items()}).objective
+        for sign in (1.0, -1.0)
+    ]
+    exact = objective.gradient(middle, kind="exact")
+    slope = WORLD.bcast(sum(exact[name] @ step[name] for name in step), root=0)
+    # Of a slope in which stiffness and mass nearly cancel, the step's third order is 4e-4.
+    assert 0.5 * (ends[0] - ends[1]) == pytest.approx(slope, rel=1e-3)
+    frozen = objective.gradient(middle)
+    other = WORLD.bcast(sum(frozen[name] @ step[name] for name in step), root=0)
+    assert abs(other - slope) > 0.1 * abs(slope)
+
+
+def test_optimize_has_history_design_and_pictures(result: OptimizationResult) -> None:
+    assert result.iterations == 2
+    assert not result.converged
+    assert "max_iterations = 2" in result.stop_reason
+    if not ROOT:
+        assert result.history is None and result.plot() is None
+        return
+    history = result.history
+    assert list(history.index) == [0, 1, 2]
+    assert history["objective"].iloc[-1] == result.objective < history["objective"].iloc[0]
+    assert history["max_deviation"].iloc[-1] == result.max_deviation
+    assert result._repr_png_()[:8] == b"\x89PNG\r\n\x1a\n"
+    for figure in (result.plot_history(), result.plot_machine()):
+        assert figure.axes
+    curves = result.plot_deviation().axes[0].lines
+    assert max(curves[1].get_ydata()) == pytest.approx(1e3 * result.max_deviation)
+
+
+def test_the_optimised_design_simulates_to_the_same_figures(
+    model: Model, result: OptimizationResult
+) -> None:
+    """Within the tolerance of the simulation, which sets out from another design's here."""
+    found = model.simulate(result)
+    assert found.objective == pytest.approx(result.objective, rel=model.scene.simulation.tolerance)
+
+
+def test_study_is_a_table(model: Model, result: OptimizationResult) -> None:
+    frame = model.study("payload.mass=2,6", designs=[result])
+    assert len(frame) == 2
+    compliance = [name for name in frame if "compliance" in name]
+    assert len(compliance) == 1
+    small, nominal = frame[compliance[0]]
+    assert small < nominal
+    assert nominal == pytest.approx(result.compliance, rel=model.scene.simulation.tolerance)
+
+
+def test_scenes_from_dictionaries_and_scenes() -> None:
+    data = do.load_scene(SCENE).to_tree() if ROOT else {}
+    model = Model(data, "payload.mass=4")
+    assert model.scene.payload.mass == 4.0
+    assert Model(model.scene, "payload.mass=5").scene.payload.mass == 5.0
+    assert "arm1" in repr(model)
+
+
+@pytest.mark.parametrize(
+    ("x", "words"),
+    [
+        ({"arm1": np.zeros(96)}, "expected densities of arm1, arm2"),
+        ({"arm1": np.zeros(95), "arm2": np.zeros(96)}, r"arm 'arm1'.*\(96,\).*\(95,\)"),
+        ({"arm1": np.full(96, 2.0), "arm2": np.zeros(96)}, "density 2"),
+    ],
+)
+def test_designs_that_do_not_fit_are_refused_on_all_ranks(model: Model, x, words) -> None:
+    with pytest.raises(do.InputError, match=words):
+        model.simulate(x)
+
+
+def test_bad_arguments_are_refused(model: Model) -> None:
+    with pytest.raises(do.InputError, match="kind 'fast': expected one of esl, exact"):
+        model.gradient(kind="fast")
+    with pytest.raises(do.InputError, match="density"):
+        model.uniform(1.5)
+    with pytest.raises(do.InputError, match=r"payload\.masse"):
+        Model(SCENE, "payload.masse=4")
