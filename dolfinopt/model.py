@@ -359,17 +359,14 @@ class Model:
         Raises:
             InputError: something asked for is not possible.
         """
-        from pandas import DataFrame
-
         with self._folder(folder) as place:
             paths = [self._design_file(one, place, k) for k, one in enumerate(designs, 1)]
             found = study(
                 self.scene, topic, vary, paths, place, self._world,
                 reoptimize=reoptimize, shown=shown,
             )  # fmt: skip
-            table = found.tables[0]
-            columns, rows = self._world.bcast((table.columns, table.rows), root=0)
-        return DataFrame(list(rows), columns=list(columns))
+            frame: DataFrame = self._world.bcast(found.tables[0].frame, root=0)
+        return frame
 
     # -- designs over the ranks ----------------------------------------------------------------
 

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from time import perf_counter
 
+import pandas as pd
+
 from dolfinopt.bench import mesh, peers, reduction, solvers, time, tolerance, whole
 from dolfinopt.bench.common import Diagram, Goal, Plan, Tell, measured, write_diagram
 from dolfinopt.output.files import write_text
@@ -77,7 +79,8 @@ def _goal_table(goals: list[Goal], plan: Plan) -> str:
         if plan.quick
         else ""
     )
-    table = Table("goals", "", ("goal", "measured", "met"), tuple(goal.cells() for goal in goals))
+    frame = pd.DataFrame([goal.cells() for goal in goals], columns=["goal", "measured", "met"])
+    table = Table("goals", "", frame)
     return f"## Goals\n\n{quick}{table.markdown().strip()}\n"
 
 

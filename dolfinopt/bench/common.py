@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import pandas as pd
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -162,7 +163,7 @@ def _plain(cell: Cell) -> Cell:
 
 def write_diagram(diagram: Diagram, rows: Sequence[Row], folder: Path) -> str:
     """Write <name>.csv and <name>.png; return the diagram's part of the summary in Markdown."""
-    table = Table(diagram.name, "", diagram.columns, tuple(rows))
+    table = Table(diagram.name, "", pd.DataFrame(rows, columns=[*diagram.columns]))
     write_text(folder / f"{diagram.name}.csv", table.csv())
     panels = diagram.panels(rows)
     if panels:

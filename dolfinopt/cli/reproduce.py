@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from dolfinopt.cli.options import out_option, plots_option, set_option
+from dolfinopt.cli.shared import warn
 from dolfinopt.cli.start import start
 from dolfinopt.errors import ConvergenceError
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.command()
 @out_option("figures, report.html and cases; default: results/paper")
 @click.option("--check", is_flag=True, help="end with status 1 where a main finding fails")
-@click.option("--coarse", is_flag=True, help="100 x 6 cells and 60 iterations: a minute")
+@click.option(
+    "--coarse",
+    is_flag=True,
+    help="100 x 6 cells, a filter of two of them and 60 iterations: a minute",
+)
 @set_option
 @plots_option
 def reproduce(
@@ -34,20 +35,27 @@ def reproduce(
     interrupted goes on.
     """
     world = start()
+    from dolfinopt.output.summary import filter_warnings
     from dolfinopt.paper.checks import broken
     from dolfinopt.paper.page import write_reproduction
-    from dolfinopt.paper.reproduction import Plan, load_paper
+    from dolfinopt.paper.reproduction import Plan, cell_sizes, load_paper
     from dolfinopt.paper.reproduction import reproduce as run
     from dolfinopt.parallel import on_root
 
     folder = out or Path("results") / "paper"
-    done = run(Plan(on_root(world, load_paper, coarse, overrides)), folder, world)
+    scene = on_root(world, load_paper, coarse, overrides)
     if world.rank == 0:
+        warn(filter_warnings(scene, cell_sizes(scene)))
+    done = run(Plan(scene), folder, world)
+
+    def conclude() -> None:
         write_reproduction(done, folder, plots=plots)
         for finding in done.findings:
             click.echo(f"{finding.name} (paper: {finding.paper}). {finding.sentence}")
         page = " and report.html" if plots else ""
         click.echo(f"{done.outcomes.computed} cases computed; figures{page} in {folder}")
+
+    on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
     failures = [f"{o.case.label}: {o.failure}" for o in done.outcomes.failures]
     wrong = [*failures, *(broken(done.findings) if check else ())]
     if wrong:

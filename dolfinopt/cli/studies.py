@@ -62,7 +62,8 @@ def carry_out(
     if not overwrite:
         on_root(world, check_question, folder, name, question)
     done = run()
-    if world.rank == 0:
+
+    def conclude() -> None:
         remove_listed(folder, name)
         written = write_study(done, folder)
         if plots:
@@ -72,6 +73,8 @@ def carry_out(
         write_question(folder, name, question, [path.name for path in written])
         click.echo(done.markdown())
         click.echo(f"{done.computed} cases computed; tables and pictures in {folder}")
+
+    on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
     if done.failures:
         more = f" (and {len(done.failures) - 1} more)" if len(done.failures) > 1 else ""
         raise ConvergenceError(f"{done.failures[0]}{more}")

@@ -124,7 +124,7 @@ def summarise(
                 *(note for mesh_notes in notes.values() for note in mesh_notes),
                 *_warnings(scene, evaluation),
                 *_too_few(scene, choice),
-                *(_filter_warnings(scene, sides) if iterations else ()),
+                *(filter_warnings(scene, sides) if iterations else ()),
             ],
             "iterations": iterations,
             "converged": converged,
@@ -231,7 +231,7 @@ def _cell_size(scene: Scene, index: int, arm: Arm) -> float:
     return float(np.sqrt(area / count)) if known is None else known
 
 
-def _filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
+def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
     """Return a sentence where cells are too large for the filter, about the largest ones."""
     radius, (k, size) = scene.design.radius, max(sizes.items(), key=lambda item: item[1])
     if radius >= FILTER_CELLS * size * (1.0 - 1e-9):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -17,11 +16,12 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from dolfinopt.data import page_folder
 from dolfinopt.paper.checks import Ends, Finding, Made, Measured, Swept, mm, percent
-from dolfinopt.paper.reproduction import INITIAL, OPTIMUM, Numbered, Reproduction
-from dolfinopt.study.tables import Cell, DesignFigure, LineFigure, Table
+from dolfinopt.paper.reproduction import INITIAL, OPTIMUM, Numbered, Reproduction, cell_sizes
+from dolfinopt.study.tables import DesignFigure, LineFigure, Table, as_text
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
@@ -154,22 +154,10 @@ def _scrolling(content: str, name: str) -> str:
 
 def _table(table: Table) -> str:
     """Return a table of figures."""
-    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in table.columns)
-    rows = (
-        "<tr>" + "".join(f"<td>{escape(_shown(cell))}</td>" for cell in row) + "</tr>"
-        for row in table.rows
-    )
+    cells = as_text(table.frame, 4, missing="–").to_html(index=False, border=0)
+    _, _, body = cells.partition(">")
     caption = f"<caption><span>{escape(table.title)}</span></caption>"
-    content = (
-        f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    )
-    return _scrolling(content, table.title)
-
-
-def _shown(cell: Cell) -> str:
-    if isinstance(cell, float):
-        return "–" if math.isnan(cell) else f"{cell:.4g}"
-    return str(cell)
+    return _scrolling(f"<table>{caption}{body}", table.title)
 
 
 # -- sections --------------------------------------------------------------------------------
@@ -241,9 +229,9 @@ def _extras(numbers: Sequence[int], done: Reproduction, gallery: _Gallery) -> li
 
 
 def _reduction_table(measured: Measured) -> Table:
-    columns = ("made with", "coordinates", "compliance, own model [N m]", "compliance [N m]",
+    columns = ["made with", "coordinates", "compliance, own model [N m]", "compliance [N m]",
                "maximal deviation [mm]", "cells on the other side of one half [%]",
-               "iterations")  # fmt: skip
+               "iterations"]  # fmt: skip
     rows = tuple(
         (r.method, r.coordinates, r.own, r.compliance, 1e3 * r.deviation, 100.0 * r.apart,
          r.iterations)
@@ -251,30 +239,28 @@ def _reduction_table(measured: Measured) -> Table:
     )  # fmt: skip
     finest = measured.reductions[-1].coordinates
     title = f"Designs by reduction, all simulated with {finest} Craig-Bampton coordinates"
-    return Table("", title, columns, rows)
+    return Table("", title, pd.DataFrame(rows, columns=columns))
 
 
 def _ends_table(ends: Ends) -> Table:
     """Return all designs with solid ends, by what they were made for and with."""
     initial = ends.objectives[0].deviation
-    columns = ("made for or with", "compliance [N m]", "maximal deviation [mm]",
-               "of the initial design's [%]")  # fmt: skip
+    columns = ["made for or with", "compliance [N m]", "maximal deviation [mm]",
+               "of the initial design's [%]"]  # fmt: skip
     made = [(m.label, m.compliance, m.deviation) for m in ends.objectives]
     made += [(f"{r.method} {r.coordinates}", r.compliance, r.deviation) for r in ends.reductions]
-    rows = tuple((name, c, 1e3 * d, 100.0 * d / initial) for name, c, d in made)
-    return Table("", f"{ends.words}; nothing else differs", columns, rows)
+    rows = [(name, c, 1e3 * d, 100.0 * d / initial) for name, c, d in made]
+    frame = pd.DataFrame(rows, columns=columns)
+    return Table("", f"{ends.words}; nothing else differs", frame)
 
 
 def _loss_table(sweep: Swept) -> Table:
     labels = [f"{used.made_for:g}" for used in sweep.optima]
-    columns = [f"made for {sweep.axis}"]
-    columns += [f"{q} lost at {at} [%]" for q in ("compliance", "deviation") for at in labels]
-    losses = [100.0 * sweep.loss(quantity) for quantity in ("compliance", "deviation")]
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (label, *map(float, losses[0][i]), *map(float, losses[1][i]))
-        for i, label in enumerate(labels)
-    )
-    return Table("", "Loss against the design made for the payload", tuple(columns), rows)
+    frame = pd.DataFrame({f"made for {sweep.axis}": labels})
+    for quantity in ("compliance", "deviation"):
+        columns = [f"{quantity} lost at {label} [%]" for label in labels]
+        frame[columns] = 100.0 * sweep.loss(quantity)
+    return Table("", "Loss against the design made for the payload", frame)
 
 
 def _method(done: Reproduction) -> str:
@@ -288,17 +274,27 @@ def _method(done: Reproduction) -> str:
     seconds = sum(o.seconds for o in optimised if not o.failure)
     cells = " x ".join(map(str, done.measured.cells)) or "a mesh of"
     m = scene.motion
+    damping = scene.damping.stiffness_proportional
     return (
         f"<p>{len(outcomes.by_case)} cases: {len(optimised)} optimisations of at most "
         f"{scene.optimizer.max_iterations} iterations, which took {seconds:.0f} s of one core "
         f"together, and {len(outcomes.by_case) - len(optimised)} simulations; {cells} cells an "
-        f"arm. The paper does not state everything. Fixed here: duration {m.duration:g} s, the "
-        f"cart follows {m.cart_follow:g} of the end-effector’s x, shoulder at "
-        f"y = {m.joint_height:g} m, damping {scene.damping.stiffness_proportional:g} s times the "
-        f"stiffness, {scene.objective.load_cases} load cases in {m.horizon:g} s. Nothing was tuned "
+        f"arm{_filter(scene)}. The paper does not state everything. Fixed here: "
+        f"duration {m.duration:g} s, the cart follows {m.cart_follow:g} of the end-effector’s x, "
+        f"shoulder at y = {m.joint_height:g} m, damping {damping:g} s times the stiffness, "
+        f"{scene.objective.load_cases} load cases in {m.horizon:g} s. Nothing was tuned "
         f"towards the paper’s figures. Where several of its figures show one thing, which of them "
         f"shows what is our choice.</p>{_overridden(scene)}{failed}"
     )
+
+
+def _filter(scene: Scene) -> str:
+    """Return the filter's radius in cells, in words."""
+    size = max(cell_sizes(scene).values(), default=0.0)
+    if not size:
+        return ""
+    radius = scene.design.radius
+    return f", a filter with a radius of {1e3 * radius:.3g} mm, {radius / size:.3g} cells"
 
 
 def _overridden(scene: Scene) -> str:

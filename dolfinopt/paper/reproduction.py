@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from dolfinopt.data import paper_scene
+from dolfinopt.output.summary import FILTER_CELLS
 from dolfinopt.paper.checks import (
     CRAIG_BAMPTON,
     MODAL,
@@ -34,7 +36,7 @@ from dolfinopt.paper.checks import (
 from dolfinopt.scene.load import Scene, load_scene
 from dolfinopt.study.plans import design_figure, deviation_panels
 from dolfinopt.study.store import Case, Outcome, Outcomes, run_cases
-from dolfinopt.study.tables import Cell, Figure, Line, LineFigure, MatrixFigure, Panel, Table
+from dolfinopt.study.tables import Figure, Line, LineFigure, MatrixFigure, Panel, Table
 from dolfinopt.study.variants import OBJECTIVES, changed, reduced, reference_scene
 
 if TYPE_CHECKING:
@@ -59,6 +61,8 @@ INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
 SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
 NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")
+# Both set the filter's radius; where neither is asked for, coarse cells get `FILTER_CELLS` of it.
+FILTER_KEYS = ("design.filter_radius", "design.minimum_member")
 
 
 # -- cases -----------------------------------------------------------------------------------
@@ -285,7 +289,9 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     """Return the paper's scene.
 
     Args:
-        coarse: `COARSE` cells and iterations.
+        coarse: `COARSE` cells and iterations, and a filter of at least `FILTER_CELLS` cells unless
+            the overrides set one: with the paper's radius, 0.75 of a coarse cell, the arms would
+            hang together by the corners of cells.
         overrides: "key.path=value" each.
 
     Raises:
@@ -294,8 +300,17 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     from dolfinopt.multibody.motion import check_motion
 
     scene = load_scene(paper_scene(), (*(COARSE if coarse else ()), *overrides))
+    asked = {text.partition("=")[0].strip() for text in overrides}
+    if coarse and asked.isdisjoint(FILTER_KEYS):
+        radius = max(scene.design.radius, FILTER_CELLS * max(cell_sizes(scene).values()))
+        scene = changed(scene, f"design.filter_radius={radius!r}")
     check_motion(scene)
     return scene
+
+
+def cell_sizes(scene: Scene) -> dict[int, float]:
+    """Return the longest side of a cell by arm, m, 0 where a mesh file decides it."""
+    return {k: arm.cell_size or 0.0 for k, arm in enumerate(scene.arms) if arm.flexible}
 
 
 def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) -> Reproduction:
@@ -474,8 +489,8 @@ def _objective_figures(plan: Plan, outcomes: Outcomes, measured: Measured) -> li
     paper = [o for o in good if o.case.label in (INITIAL, SHOWN[0])]
     panels = (*deviation_panels("", paper), *deviation_panels("", shown))
     title = "Deviation of the end-effector by objective"
-    columns = ("made for", "compliance [N m]", "maximal deviation [mm]", "grayness [-]",
-               "iterations", "ended by")  # fmt: skip
+    columns = ["made for", "compliance [N m]", "maximal deviation [mm]", "grayness [-]",
+               "iterations", "ended by"]  # fmt: skip
     rows = tuple(
         (m.label, m.compliance, 1e3 * m.deviation, m.grayness, m.iterations, m.note)
         for m in measured.objectives
@@ -484,7 +499,7 @@ def _objective_figures(plan: Plan, outcomes: Outcomes, measured: Measured) -> li
     return [
         Numbered(3, title, _histories(title, *panels)),
         Numbered(4, designs, design_figure("", designs, good),
-                 Table("", designs, columns, rows)),
+                 Table("", designs, pd.DataFrame(rows, columns=columns))),
     ]  # fmt: skip
 
 
@@ -579,10 +594,9 @@ def _loss_figures(sweep: Swept, number: int) -> list[Numbered]:
         loss = 100.0 * sweep.loss(quantity)
         title = f"Loss of {quantity} against the design made for the path [%]"
         made, used = f"made for {sweep.axis}", f"used at {sweep.axis}"
-        rows: tuple[tuple[Cell, ...], ...] = tuple(
-            (label, *map(float, row)) for label, row in zip(labels, loss)
-        )
-        table = Table("", title, (made, *(f"used at {label}" for label in labels)), rows)
+        frame = pd.DataFrame(loss, columns=[f"used at {label}" for label in labels])
+        frame.insert(0, made, labels)
+        table = Table("", title, frame)
         matrix = MatrixFigure("", title, made, used, labels, (("", loss),))
         numbered.append(Numbered(number + len(numbered), title, matrix, table))
     return numbered

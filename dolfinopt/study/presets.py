@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
@@ -22,7 +23,7 @@ from dolfinopt.study.plans import (
     given_designs,
 )
 from dolfinopt.study.store import Case, Outcome, Outcomes
-from dolfinopt.study.tables import Cell, Figure, Line, LineFigure, Panel, Table
+from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table
 from dolfinopt.study.variants import (
     METHODS,
     OBJECTIVES,
@@ -52,31 +53,21 @@ class _Objectives(Plan):
 
     def report(self, outcomes: Outcomes) -> Report:
         found = [outcomes[case] for case in self.cases]
-        columns = (
-            "objective",
-            "compliance [N m]",
-            "maximal deviation [mm]",
-            "at [s]",
-            "grayness [-]",
-            "iterations",
-            "seconds",
-            "ended by",
-        )
-        rows = tuple(
-            (
-                o.case.label,
-                o.compliance,
-                1e3 * o.max_deviation,
-                o.max_deviation_time,
-                o.grayness,
-                o.iterations,
-                o.seconds,
-                ended(o),
-            )
+        frame = pd.DataFrame(
+            {
+                "objective": o.case.label,
+                "compliance [N m]": o.compliance,
+                "maximal deviation [mm]": 1e3 * o.max_deviation,
+                "at [s]": o.max_deviation_time,
+                "grayness [-]": o.grayness,
+                "iterations": o.iterations,
+                "seconds": o.seconds,
+                "ended by": ended(o),
+            }
             for o in found
         )
         title = "Designs optimised for every objective, simulated in the scene."
-        table = Table("", title, columns, rows)
+        table = Table("", title, frame)
         good = [o for o in found if not o.failure]
         moved = [o for o in good if o.case.scene.objective.simulated and o.case != self.initial]
         others = [o for o in good if o not in moved]
@@ -121,19 +112,19 @@ class _Coordinates(Plan):
         return [self.case(*one, scene) for one in self.designs for scene in self.scenes]
 
     def report(self, outcomes: Outcomes) -> Report:
-        quantities = ("compliance [N m]", "maximal deviation [mm]")
-        columns = ["method", "coordinates"]
-        columns += [f"{label}: {what}" for label, _ in self.designs for what in quantities]
         rows = []
         for scene in self.scenes:
-            row: list[Cell] = [scene.reduction.method, scene.reduction.coordinates]
+            row: dict[str, object] = {
+                "method": scene.reduction.method,
+                "coordinates": scene.reduction.coordinates,
+            }
             for label, design in self.designs:
-                o = outcomes[self.case(label, design, scene)]
-                row += [o.compliance, 1e3 * o.max_deviation]
-            rows.append(tuple(row))
+                outcome = outcomes[self.case(label, design, scene)]
+                row |= {f"{label}: {what}": take(outcome) for what, take in QUANTITIES}
+            rows.append(row)
         name = "" if self.name == "coordinates" else "coordinates"
         title = "Given designs against the number of elastic coordinates of each arm."
-        table = Table(name, title, tuple(columns), tuple(rows))
+        table = Table(name, title, pd.DataFrame(rows))
         figure = LineFigure("coordinates" if name else "", title, self._panels(outcomes))
         return [table], [figure, *self._deviations(outcomes)]
 
@@ -221,37 +212,25 @@ class _Reductions(Plan):
 
     def _main(self, outcomes: Outcomes) -> Table:
         called = reduction_name(self.reference)
-        columns = (
-            "method",
-            "coordinates",
-            "compliance, own model [N m]",
-            f"compliance, {called} [N m]",
-            "own model off by [%]",
-            f"maximal deviation, {called} [mm]",
-            "grayness [-]",
-            "iterations",
-            "seconds",
-            "ended by",
-        )
         rows = []
         for scene in self.scenes:
             own, again = outcomes[self.optimised(scene)], outcomes[self.again(scene)]
             rows.append(
-                (
-                    scene.reduction.method,
-                    scene.reduction.coordinates,
-                    own.compliance,
-                    again.compliance,
-                    100.0 * (own.compliance / again.compliance - 1.0),
-                    1e3 * again.max_deviation,
-                    own.grayness,
-                    own.iterations,
-                    own.seconds,
-                    ended(own if own.failure or not again.failure else again),
-                )
+                {
+                    "method": scene.reduction.method,
+                    "coordinates": scene.reduction.coordinates,
+                    "compliance, own model [N m]": own.compliance,
+                    f"compliance, {called} [N m]": again.compliance,
+                    "own model off by [%]": 100.0 * (own.compliance / again.compliance - 1.0),
+                    f"maximal deviation, {called} [mm]": 1e3 * again.max_deviation,
+                    "grayness [-]": own.grayness,
+                    "iterations": own.iterations,
+                    "seconds": own.seconds,
+                    "ended by": ended(own if own.failure or not again.failure else again),
+                }
             )
         title = f"Designs optimised with every reduction, simulated with {called} as well."
-        return Table("", title, columns, tuple(rows))
+        return Table("", title, pd.DataFrame(rows))
 
     def _bases(self, outcomes: Outcomes) -> Table:
         """Return what the bases miss of the reference's."""
@@ -259,7 +238,7 @@ class _Reductions(Plan):
         columns += [f"frequency {k} off by [%]" for k in (1, 2, 3)]
         columns += [f"MAC {k} [-]" for k in (1, 2, 3)]
         columns += ["largest angle [deg]", "tip compliance lost, F_y [%]", "moment [%]"]
-        rows: list[tuple[Cell, ...]] = []
+        rows = []
         for label, design in self.sweep.designs:
             for scene in self.compared:
                 for b in outcomes[self.comparison(label, design, scene)].bases:
@@ -280,7 +259,7 @@ class _Reductions(Plan):
         title = (
             f"What the bases miss of {reduction_name(self.reference)}: first natural modes and tip."
         )
-        return Table("bases", title, tuple(columns), tuple(rows))
+        return Table("bases", title, pd.DataFrame(rows, columns=columns))
 
 
 def _percent(share: float) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
+import pandas as pd
 from pydantic.fields import FieldInfo
 
 from dolfinopt.errors import InputError
@@ -312,9 +313,9 @@ def _input_table(asked: _Asked) -> Table:
                 round(100.0 * law.cut_off, 6),
             )
         )
-    columns = ("input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]")
+    columns = ["input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"]
     title = "Random values, independent of one another, cut off where the key's range ends."
-    return Table("inputs", title, columns, tuple(rows))
+    return Table("inputs", title, pd.DataFrame(rows, columns=columns))
 
 
 def _statistics_table(columns: Sequence[tuple[str, Responses]], used: int) -> Table:
@@ -342,7 +343,7 @@ def _statistics_table(columns: Sequence[tuple[str, Responses]], used: int) -> Ta
         f"Designs under {used} samples, with {INTERVAL} confidence intervals as for independent "
         "samples."
     )
-    return Table("statistics", title, tuple(header), tuple(rows))
+    return Table("statistics", title, pd.DataFrame(rows, columns=header))
 
 
 def _cells(one: Estimate) -> list[Cell]:
@@ -366,22 +367,18 @@ def _indices_table(
                 rows.append(tuple(row))
     how = "of a polynomial fitted to the samples" if fitted else "by Saltelli's scheme"
     title = f"Sobol' indices, shares of the variance, {how}, with {INTERVAL} confidence intervals."
-    return Table("indices", title, tuple(header), tuple(rows))
+    return Table("indices", title, pd.DataFrame(rows, columns=header))
 
 
 def _sample_table(asked: _Asked, columns: Sequence[tuple[str, Responses]]) -> Table:
     """Return a row a sample."""
-    header = ["sample", *(one.axis for one in asked.inputs)]
-    for label, _ in columns:
-        header += [f"{label}: {what}" for what, _ in QUANTITIES] + [f"{label}: at [s]"]
-    rows: list[tuple[Cell, ...]] = []
-    for i, values in enumerate(asked.samples.values, 1):
-        row: list[Cell] = [i, *values.tolist()]
-        for _, found in columns:
-            row += [float(take(found)[i]) for _, take in QUANTITIES]
-            row.append(float(found.max_deviation_time[i]))
-        rows.append(tuple(row))
-    return Table("", "All samples.", tuple(header), tuple(rows))
+    frame = pd.DataFrame(asked.samples.values, columns=[one.axis for one in asked.inputs])
+    frame.insert(0, "sample", np.arange(1, 1 + len(frame)))
+    for label, found in columns:
+        for what, take in QUANTITIES:
+            frame[f"{label}: {what}"] = take(found)[1:]
+        frame[f"{label}: at [s]"] = found.max_deviation_time[1:]
+    return Table("", "All samples.", frame)
 
 
 def _histograms(columns: Sequence[tuple[str, Responses]], used: int) -> HistogramFigure:

@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
@@ -23,7 +24,6 @@ from dolfinopt.study.plans import (
 )
 from dolfinopt.study.store import Case, Outcome, Outcomes
 from dolfinopt.study.tables import (
-    Cell,
     Figure,
     Line,
     LineFigure,
@@ -100,21 +100,19 @@ class _Sweep(Plan):
 
     def report(self, outcomes: Outcomes) -> Report:
         shown = self.shown(outcomes)
-        columns = [vary.axis for vary in self.keys]
-        columns += [f"{label}: {what}" for label, _ in shown for what, _ in QUANTITIES]
-        rows: list[tuple[Cell, ...]] = []
-        for i, point in enumerate(self.points):
-            row: list[Cell] = [float(value) for value in point.values]
-            for _, found in shown:
-                row += [take(found[i]) for _, take in QUANTITIES]
-            notes = dict.fromkeys(found[i].failure for _, found in shown if found[i].failure)
-            rows.append((*row, "; ".join(notes)))
-        columns.append("failed")
-        if not any(row[-1] for row in rows):
-            columns.pop()
-            rows = [row[:-1] for row in rows]
+        frame = pd.DataFrame(
+            [[float(value) for value in point.values] for point in self.points],
+            columns=[vary.axis for vary in self.keys],
+        )
+        for label, found in shown:
+            for what, take in QUANTITIES:
+                frame[f"{label}: {what}"] = [take(outcome) for outcome in found]
+        by_point = zip(*(found for _, found in shown))
+        failed = ["; ".join(dict.fromkeys(filter(None, (o.failure for o in p)))) for p in by_point]
+        if any(failed):
+            frame["failed"] = failed
         title = f"Designs by {' and '.join(vary.axis for vary in self.keys)}."
-        tables = [Table(self.prefix, title, tuple(columns), tuple(rows))]
+        tables = [Table(self.prefix, title, frame)]
         figures: list[Figure] = [LineFigure(self.prefix, title, self._panels(shown))]
         if self.reoptimised and self.fits:
             more = self._cross(outcomes)
@@ -163,16 +161,14 @@ class _Sweep(Plan):
             )
             loss = 100.0 * (values / np.diag(values) - 1.0)
             quantity = what.partition(" [")[0]
-            columns = (f"made for {axis}", *(f"used at {label}" for label in labels))
             for name, title, matrix in (
                 ("", f"{what} of design i in scenario j.", values),
                 ("_loss", f"Loss of {quantity} against the design made for j [%].", loss),
             ):
-                rows: tuple[tuple[Cell, ...], ...] = tuple(
-                    (labels[i], *map(float, row)) for i, row in enumerate(matrix)
-                )
+                frame = pd.DataFrame(matrix, columns=[f"used at {label}" for label in labels])
+                frame.insert(0, f"made for {axis}", labels)
                 name = joined(self.prefix, f"cross_{quantity.replace(' ', '_')}{name}")
-                tables.append(Table(name, title[0].upper() + title[1:], columns, rows))
+                tables.append(Table(name, title[0].upper() + title[1:], frame))
             panels.append((f"loss of {quantity} [%]", loss))
         figure = MatrixFigure(
             joined(self.prefix, "cross"),
@@ -210,7 +206,7 @@ class _Several(Plan):
         for sweep in self.sweeps:
             more = sweep.report(outcomes)
             tables, figures = tables + more[0], figures + more[1]
-        rows: list[tuple[Cell, ...]] = []
+        rows = []
         panels = []
         for label, case in self.base:
             for what, take in QUANTITIES:
@@ -226,8 +222,8 @@ class _Several(Plan):
                 rows += [(label, quantity, *bar) for bar in bars]
                 panels.append((f"{label}: {quantity}", tuple(bars)))
         title = "Change at both ends of each key, the others as in the scene."
-        columns = ("design", "quantity", "key", "at its first value [%]", "at its last [%]")
-        tables.insert(0, Table("", title, columns, tuple(rows)))
+        columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
+        tables.insert(0, Table("", title, pd.DataFrame(rows, columns=columns)))
         figures.insert(0, TornadoFigure("tornado", title, tuple(panels)))
         return tables, figures
 

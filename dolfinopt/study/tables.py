@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import math
 import re
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from dolfinopt.scene.load import Scene
 
@@ -19,33 +18,39 @@ Cell = str | int | float
 LONGEST = 120  # characters of a study's name, which file names begin with
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of figures.
+    """A data frame with a title.
 
     Attributes:
         name: of its file, "" for the study's main table.
         title: a sentence.
-        columns: with units.
-        rows: one cell a column; nan is left empty.
+        frame: columns with units; nan is left empty in files.
     """
 
     name: str
     title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    frame: pd.DataFrame
 
     def markdown(self) -> str:
         """Return the table in Markdown, four digits a number."""
-        shown = [[_shown(cell) for cell in row] for row in self.rows]
-        widths = [max(map(len, column)) for column in zip(self.columns, *shown)]
-        lines = [self.columns, ["-" * width for width in widths], *shown]
-        body = ["| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines]
-        return "\n".join([self.title, "", *body]) + "\n"
+        cells = as_text(self.frame, 4).replace(r"\|", r"\\|", regex=True)
+        return f"{self.title}\n\n{cells.to_markdown(index=False, disable_numparse=True)}\n"
 
     def csv(self) -> str:
         """Return the table as CSV, ten digits a number."""
-        return _csv(self.columns, self.rows)
+        return str(as_text(self.frame, 10).to_csv(index=False, lineterminator="\n"))
+
+
+def as_text(frame: pd.DataFrame, digits: int, missing: str = "") -> pd.DataFrame:
+    """Return all cells as strings: floats with so many significant digits, `missing` for nan."""
+
+    def text(cell: Any) -> str:
+        if isinstance(cell, float):
+            return missing if math.isnan(cell) else f"{cell:.{digits}g}"
+        return str(cell)
+
+    return frame.apply(lambda column: column.map(text))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +106,7 @@ class LineFigure:
         first = self.rows[0][0]
         one = len({(p.x_label, p.y_label) for row in self.rows for p in row}) == 1
         labels = (first.x_label, first.y_label) if one else ("x", "y")
-        return _csv(("panel", "line", *labels), points)
+        return Table("", "", pd.DataFrame(points, columns=["panel", "line", *labels])).csv()
 
 
 @dataclass(frozen=True)
@@ -250,19 +255,3 @@ def file_name(*parts: str) -> str:
 def joined(*parts: str) -> str:
     """Return the parts of a file name that are not empty, with _ between them."""
     return "_".join(part for part in parts if part)
-
-
-def _shown(cell: Cell) -> str:
-    if isinstance(cell, float):
-        return "" if math.isnan(cell) else f"{cell:.4g}"
-    return str(cell).replace("|", "\\|")
-
-
-def _csv(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
-    for row in rows:
-        writer.writerow([f"{c:.10g}" if isinstance(c, float) and c == c else
-                         ("" if c != c else c) for c in row])  # fmt: skip
-    return stream.getvalue()

@@ -14,7 +14,7 @@ from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.members import thinnest
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.optimization.loop import _Evaluated, _Run
-from dolfinopt.output.summary import _filter_warnings, _widths
+from dolfinopt.output.summary import _widths, filter_warnings
 
 WORLD = MPI.COMM_WORLD
 SCENE = str(Path(__file__).parents[2] / "demos/two_arm.toml")
@@ -182,6 +182,6 @@ def test_widths_that_cannot_be(overrides, reason):
 @pytest.mark.parametrize(("radius", "count"), [(0.0075, 1), (0.01, 0), (0.0, 1)])
 def test_a_filter_of_less_than_two_cells_warns(radius, count):
     scene = do.load_scene(SCENE, (f"design.filter_radius={radius}",))
-    found = _filter_warnings(scene, {0: 0.005, 1: 0.005})
+    found = filter_warnings(scene, {0: 0.005, 1: 0.005})
     assert len(found) == count
     assert all("set design.filter_radius = 0.01 or more" in text for text in found)

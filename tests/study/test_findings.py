@@ -4,6 +4,7 @@ import csv
 import io
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from dolfinopt.study.tables import Line, LineFigure, Panel, Study, Table, write_study
@@ -12,7 +13,9 @@ pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
 
 def test_table():
-    table = Table("", "Title.", ("a|b [m]", "n", "x"), (("one|two", 3, 1.23456), ("", 4, np.nan)))
+    columns = ["a|b [m]", "n", "x"]
+    rows = [("one|two", 3, 1.23456), ("", 4, np.nan)]
+    table = Table("", "Title.", pd.DataFrame(rows, columns=columns))
     lines = table.markdown().splitlines()
     assert lines[0] == "Title." and len({len(line) for line in lines[2:]}) == 1
     assert r"one\|two" in lines[4] and "1.235" in lines[4]
@@ -38,8 +41,8 @@ def test_curves_as_csv():
 
 
 def test_files(tmp_path):
-    one = Table("", "First.", ("a",), ((1,),))
-    other = Table("more", "Second.", ("b",), ((2.5,),))
+    one = Table("", "First.", pd.DataFrame({"a": [1]}))
+    other = Table("more", "Second.", pd.DataFrame({"b": [2.5]}))
     line = Line("l", np.array([0.0]), np.array([1.0]))
     figure = LineFigure("f", "", ((Panel("", "x [s]", "y [m]", (line,)),),))
     study = Study("name", (one, other), (figure,), (), 0)

@@ -41,6 +41,10 @@ def rows_of(path):
         return list(csv.DictReader(stream))
 
 
+def cells_of(table):
+    return list(table.frame.itertuples(index=False, name=None))
+
+
 def column(rows, name):
     return np.array([float(row[name]) for row in rows])
 
@@ -195,7 +199,7 @@ def test_small_scatter_is_linear(folder, given):
     centre = {"payload.mass": 6.0, "material.young_modulus": 70e9, "arms.thickness": 0.01}
     texts = [f"{key}=normal:{centre[key]!r}:{s!r}" for key, s in spread.items()]
     done = study(given, folder, *texts, base=fine, samples=64)
-    found = {row[:2]: row[2] for row in tables_of(done)["statistics"].rows}
+    found = {row[:2]: row[2] for row in cells_of(tables_of(done)["statistics"])}
 
     def simulate(key, value):
         other = scene("simulation.tolerance=1e-4", "motion.horizon=2.2", f"{key}={value!r}")
@@ -216,7 +220,7 @@ def test_small_scatter_is_linear(folder, given):
         # 64 net points give a normal law's standard deviation to some 2 %.
         assert found[quantity, "standard deviation"] == pytest.approx(expected[j], rel=0.04)
         name = quantity.partition(" [")[0]
-        rows = [row for row in tables_of(done)["indices"].rows if row[1] == name]
+        rows = [row for row in cells_of(tables_of(done)["indices"]) if row[1] == name]
         # The polynomial knows the distributions themselves.
         np.testing.assert_allclose([row[3] for row in rows], shares[:, j], atol=0.01)
 
@@ -226,8 +230,8 @@ def test_both_ways_to_the_indices(folder, given):
     fitted = study(given, folder / "i", MASS, YOUNG, samples=32)
     direct = study(given, folder / "i", MASS, YOUNG, samples=32, indices="saltelli", seed=3)
     assert direct.computed == 1 + 16 * (2 + 2)
-    assert len(direct.data[0].rows) == 64
-    ours, theirs = (tables_of(done)["indices"].rows for done in (fitted, direct))
+    assert len(cells_of(direct.data[0])) == 64
+    ours, theirs = (cells_of(tables_of(done)["indices"]) for done in (fitted, direct))
     assert len(ours) == len(theirs) == 4
     for one, other in zip(ours, theirs, strict=True):
         assert one[:3] == other[:3]
@@ -275,7 +279,7 @@ def test_failures_end_with_status_1(folder, given, monkeypatch):
 @pytest.mark.serial
 def test_pictures_show_the_samples(folder, given):
     done = study(given, folder / "i", MASS, YOUNG, samples=32)
-    values = np.array([row[3:5] for row in done.data[0].rows], dtype=float)
+    values = np.array([row[3:5] for row in cells_of(done.data[0])], dtype=float)
     histogram, bars, scatter = done.figures
     assert isinstance(histogram, HistogramFigure)
     assert isinstance(bars, BarFigure) and isinstance(scatter, ScatterFigure)
@@ -286,7 +290,7 @@ def test_pictures_show_the_samples(folder, given):
         np.testing.assert_array_equal(curve.get_xdata(), np.sort(values[:, j]))
         assert curve.get_ydata()[-1] == 1.0
     heights = [patch.get_height() for patch in draw(bars).axes[0].patches]
-    rows = [row for row in tables_of(done)["indices"].rows if row[1] == "compliance"]
+    rows = [row for row in cells_of(tables_of(done)["indices"]) if row[1] == "compliance"]
     np.testing.assert_allclose(heights, [row[3] for row in rows] + [row[6] for row in rows])
     axes = draw(scatter).axes
     assert len(axes) == 4

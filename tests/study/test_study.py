@@ -52,6 +52,10 @@ def rows_of(path):
         return list(csv.DictReader(stream))
 
 
+def cells_of(table):
+    return list(table.frame.itertuples(index=False, name=None))
+
+
 def column(rows, name):
     return np.array([float(row[name]) for row in rows])
 
@@ -192,8 +196,8 @@ def test_cross_evaluation(folder):
     done = study.study(base, "payload", ["payload.mass=4,8"], [], folder, WORLD, reoptimize=True,
                        shown=False)  # fmt: skip
     tables = {table.name: table for table in done.tables}
-    values = np.array([row[1:] for row in tables["cross_compliance"].rows])
-    loss = np.array([row[1:] for row in tables["cross_compliance_loss"].rows])
+    values = np.array([row[1:] for row in cells_of(tables["cross_compliance"])])
+    loss = np.array([row[1:] for row in cells_of(tables["cross_compliance_loss"])])
     np.testing.assert_array_equal(loss, 100.0 * (values / np.diag(values) - 1.0))
     assert (np.diag(loss) == 0.0).all()
     for i, made in enumerate((4, 8)):
@@ -203,7 +207,7 @@ def test_cross_evaluation(folder):
             found, _ = do.evaluate(other, design.share, design.arms, design.x_phys, do.Ledger())
             assert values[i, j] == pytest.approx(found.compliance, rel=4.0 * TOLERANCE)
     # Those made for each scenario stand in the main table, too.
-    made_for_it = [row[-2] for row in tables[""].rows]
+    made_for_it = [row[-2] for row in cells_of(tables[""])]
     np.testing.assert_array_equal(made_for_it, np.diag(values))
     assert [figure.name for figure in done.figures] == ["", "cross", "designs"]
 
@@ -232,11 +236,11 @@ def test_grid_of_two(folder):
     WORLD.barrier()
     done = study.study(scene(), None, vary, [design], folder, WORLD, shown=False)
     [table], [figure] = done.tables, done.figures
-    assert [row[:2] for row in table.rows] == [
+    assert [row[:2] for row in cells_of(table)] == [
         (m, d) for m in (4.0, 8.0) for d in (1e-4, 2e-4, 4e-4)
     ]
-    assert "given: compliance [N m]" in table.columns
-    compliance = np.array([row[2] for row in table.rows]).reshape(2, 3)
+    assert "given: compliance [N m]" in table.frame.columns
+    compliance = np.array([row[2] for row in cells_of(table)]).reshape(2, 3)
     assert (compliance[1] > compliance[0]).all()  # a heavier payload
     assert (np.diff(compliance) < 0.0).all()  # more damping
     [[left, _]] = figure.rows
@@ -263,7 +267,7 @@ def test_design_table_needs_reoptimising(folder):
         scene(), None, ["design.volume_fraction=0.4,0.5"], [], folder, WORLD, reoptimize=True,
         shown=False,
     )  # fmt: skip
-    made = [row[-2] for row in done.tables[0].rows]
+    made = [row[-2] for row in cells_of(done.tables[0])]
     assert made[0] > made[1]
 
 
@@ -273,8 +277,8 @@ def test_arms_of_several_sizes(folder):
         scene(), None, ["arms.arm2.length=0.9,1"], [], folder, WORLD, reoptimize=True, shown=False
     )
     [table] = done.tables
-    assert [row[0] for row in table.rows] == [0.9, 1.0]
-    assert table.rows[0][1] < table.rows[1][1]  # the initial design, N m
+    assert [row[0] for row in cells_of(table)] == [0.9, 1.0]
+    assert cells_of(table)[0][1] < cells_of(table)[1][1]  # the initial design, N m
 
 
 # -- names and folders -----------------------------------------------------------------------
