@@ -6,7 +6,7 @@ usage() {
   cat <<'TEXT'
 usage: ./dolfinopt.sh [-n RANKS] COMMAND ...               run a command, with -n under mpirun
        ./dolfinopt.sh [-n RANKS] python FILE ...           run a script with the same interpreter
-       ./dolfinopt.sh [-n RANKS] test [PYTEST ARGUMENTS]   ruff, mypy, pytest alone and on RANKS (2)
+       ./dolfinopt.sh [-n RANKS] test [PYTEST ARGUMENTS]   ruff, mypy, pytest on one rank and on RANKS (2)
        ./dolfinopt.sh --help                               list the commands
 
 The first call sets up what is missing: on Debian 12 or 13 DOLFINx and its libraries with apt
@@ -198,7 +198,8 @@ run_tests() {
   check "ruff format" "$python" -m ruff format --check .
   check "mypy" "$python" -m mypy
   check "imports" "$venv/bin/lint-imports" --no-cache
-  check "pytest" "$python" -m pytest "$@"
+  # One rank a test, in as many processes; the tests of a file share what they build.
+  check "pytest" "$python" -m pytest -n "$ranks" --dist loadfile "$@"
   # What takes long need not take it twice; a -m among the arguments wins.
   check "pytest, $ranks ranks" /usr/bin/mpirun -n "$ranks" "$python" -m pytest -m "not slow" "$@"
   printf '== summary\n%s' "$summary"

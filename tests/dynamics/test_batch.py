@@ -29,6 +29,8 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rig
 from dolfinopt.paths.time_laws import quintic
 from dolfinopt.profiling import Ledger
 
+pytestmark = pytest.mark.serial  # arrays of one process
+
 TOLERANCE = 1e-4
 LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
 DAMPING = 1e-3  # s

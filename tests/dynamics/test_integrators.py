@@ -36,6 +36,8 @@ from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.paths.time_laws import Limits, law_for, quintic
 from dolfinopt.profiling import Ledger
 
+pytestmark = pytest.mark.serial  # arrays of one process
+
 Motion = Callable[[np.ndarray], RigidMotion]
 BOTH = pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
 HOMES = np.array([0.0, 0.6, 0.8, -0.5])  # m, rad: where the motions begin

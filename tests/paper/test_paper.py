@@ -367,7 +367,7 @@ main()
 def test_killed_run_continues(tmp_path):
     """On two ranks: the next call does the rest, and every file is that of one that ran through."""
     program = tmp_path / "program.py"
-    program.write_text(PROGRAM.format(tests=str(Path(__file__).parents[1])))
+    program.write_text(PROGRAM.format(tests=str(Path(__file__).parent)))
     settings = [word for value in TINY for word in ("--set", value)]
     ranks = ["mpirun", "--oversubscribe", "-n", "2"]
     line = [*ranks, sys.executable, str(program), "reproduce", "--no-plots", *settings, "--out"]

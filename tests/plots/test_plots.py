@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from dolfinopt.output.files import ArmView
 from dolfinopt.plots import figures as plots
 from dolfinopt.plots import style
 
+TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LENGTHS = (1.0, 0.7, 0.4)  # m
 
 
@@ -483,7 +485,7 @@ def test_real_arms_join():
     from dolfinopt.scene.load import load_scene
 
     cells = ["arms.0.cells=[20,4]", "arms.1.cells=[16,4]", "reduction.coordinates=5"]
-    scene = load_scene("demos/two_arm.toml", cells)
+    scene = load_scene(TWO_ARM, cells)
     share = share_arms(MPI.COMM_SELF, {0: 80, 1: 64})
     arms = build_arms(scene, share, Ledger())
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}

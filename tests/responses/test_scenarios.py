@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import build, tip, uneven, wave
+from remainders import SCENE, build, tip, uneven, wave
 
 import dolfinopt as do
 from dolfinopt.multibody.shape_integrals import TABLE, of_material
@@ -178,9 +178,9 @@ def test_robust_against_two_payloads():
     uses = scenarios(
         ("payload.mass=2", "motion.flattening=1.0"), ("payload.mass=8",), weights=[8, 1]
     )
-    scene = do.load_scene("demos/two_arm.toml", [*fast, uses, "objective.scenarios=worst"])
+    scene = do.load_scene(SCENE, [*fast, uses, "objective.scenarios=worst"])
     robust = do.optimize(scene)
-    nominal = do.optimize(do.load_scene("demos/two_arm.toml", fast))
+    nominal = do.optimize(do.load_scene(SCENE, fast))
     share, arms = robust.share, robust.arms
     other, _ = do.evaluate(scene, share, arms, nominal.x_phys, do.Ledger())
     first = on_root(WORLD, lambda: robust.history[0].objective)

@@ -14,7 +14,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.parallel import ArmShare, sum_over_arms
 from dolfinopt.scene.load import Scene
 
-SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 Cells = Mapping[int, np.ndarray]
 
 

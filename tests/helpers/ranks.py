@@ -1,0 +1,107 @@
+"""Tests alone and under mpirun: ranks agree on every outcome, and nothing hangs.
+
+Under mpirun every rank runs every test. After each phase of a test the ranks exchange how it went;
+a failure on one of them is a failure on all, reported by rank 0. A rank that failed while others
+wait for it inside a collective call would wait for ever: after a grace period it ends the run.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import time
+from collections.abc import Iterator
+
+import pytest
+from mpi4py import MPI
+
+TIME_LIMIT = 180.0  # s a test, unless marked timeout(seconds)
+GRACE = 10.0  # s a failed rank waits for the others
+
+
+class Ranks:
+    """Hooks that make one run of all ranks' pytest processes.
+
+    Attributes:
+        comm: the ranks, apart from the messages of the tests.
+        stderr: standard error, which pytest captures in tests.
+        unread: what went wrong in reading test files.
+    """
+
+    def __init__(self, config: pytest.Config) -> None:
+        self.comm = MPI.COMM_WORLD.Dup()
+        self.stderr = os.fdopen(os.dup(2), "w")
+        self.unread: list[str] = []
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_configure(self, config: pytest.Config) -> None:
+        """Silence all ranks but the first."""
+        if self.comm.rank > 0:
+            reporter = config.pluginmanager.get_plugin("terminalreporter")
+            reporter._tw._file = open(os.devnull, "w")  # for the life of the process
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Skip tests marked `serial` when there are more ranks."""
+        if self.comm.size > 1:
+            for item in items:
+                if item.get_closest_marker("serial"):
+                    item.add_marker(pytest.mark.skip(reason="needs a single rank"))
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Keep what went wrong in reading a test file."""
+        if report.failed:
+            self.unread.append(report.longreprtext)
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        """Stop unless all ranks run the same tests: else they would wait for one another."""
+        plan = [item.nodeid for item in session.items], len(self.unread)
+        plans = self.comm.allgather(plan)
+        if any(other != plans[0] for other in plans):
+            print(*self.unread, sep="\n", file=self.stderr, flush=True)
+            status = pytest.ExitCode.USAGE_ERROR
+            pytest.exit("the ranks collected different tests", returncode=status)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """End the process, with all stacks printed, when a test exceeds its time limit.
+
+        The watchdog is a thread of faulthandler: it works while a library holds the interpreter
+        (pytest-timeout's signal and thread wait for it), and mpirun then ends the other ranks.
+        """
+        marker = item.get_closest_marker("timeout")
+        limit = float(marker.args[0]) if marker else TIME_LIMIT
+        faulthandler.dump_traceback_later(limit, exit=True, file=self.stderr)
+        try:
+            return (yield)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_runtest_makereport(self, item: pytest.Item, call: pytest.CallInfo) -> Iterator[None]:
+        """Agree with the other ranks on how a phase (setup, call, teardown) of a test went."""
+        report = yield
+        self._meet(item, report)
+        texts = self.comm.allgather((report.outcome, report.longreprtext))
+        if len({outcome for outcome, _ in texts}) > 1 and not report.failed:
+            report.outcome = "failed"
+            report.longrepr = "\n".join(
+                f"{outcome} on rank {rank}, not on all\n{text}"
+                for rank, (outcome, text) in enumerate(texts)
+                if outcome != "passed"
+            )
+        return report
+
+    def _meet(self, item: pytest.Item, report: pytest.TestReport) -> None:
+        """Wait for all ranks; a rank that failed waits `GRACE` and then ends them all."""
+        request = self.comm.Ibarrier()
+        give_up = time.monotonic() + GRACE
+        while not request.Test():
+            if report.failed and time.monotonic() > give_up:
+                print(
+                    f"{report.longreprtext}\n{item.nodeid} failed on rank {self.comm.rank} while "
+                    f"others wait for it: ending the run",
+                    file=self.stderr,
+                    flush=True,
+                )
+                self.comm.Abort(1)
+            time.sleep(1e-4)
