@@ -86,10 +86,7 @@ def folder(tmp_path, monkeypatch):
 
 def made_small(scene: str) -> str:
     """Return the text of a scene with few cells, iterations and samples."""
-    keeps = {"cells"} if "minimum_member" in scene else set()  # of at least three cells
     for key, value in SETTINGS.items():
-        if key in keeps:
-            continue
         scene = re.sub(rf"^{key} = \S.*?(?=\s*#|$)", f"{key} = {value}", scene, flags=re.MULTILINE)
     for table, line in (
         ("optimizer", f"max_iterations = {SETTINGS['max_iterations']}"),
