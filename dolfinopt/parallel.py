@@ -21,7 +21,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed, OutputError
 from dolfinopt.interrupt import INTERRUPTED
@@ -37,12 +36,6 @@ CLOSED = (errno.EPIPE, errno.ENOSPC)
 # Arms of fewer cells are faster on one rank than on two (see `share_arms`). One factorisation and
 # 18 solves, as an iteration needs, at 800 x 48 cells: 470 ms on one rank, 340 ms on two.
 SPLIT_CELLS = 40_000
-# From so many rows on nested dissection beats the narrow band in PETSc's Cholesky. One
-# factorisation and 18 solves on one rank and thread, 400 x 24 cells: 47 against 43 ms, MUMPS 97,
-# CHOLMOD 57; 800 x 48: 330 against 460 ms, MUMPS 520, CHOLMOD 490; 1600 x 96: 2.2 against 5.5 s,
-# MUMPS 2.7, CHOLMOD 2.3 (`dolfinopt bench`, solvers). A second thread helps CHOLMOD alone: 0.37 and
-# 2.1 s.
-NESTED_ROWS = 30_000
 
 
 @dataclass(frozen=True)
@@ -313,52 +306,3 @@ def _all_arrive(comm: MPI.Comm, status: int, limit: float | None) -> np.ndarray 
             return None
         time.sleep(0.01)
     return statuses
-
-
-@contextmanager
-def obeying_options(prefix: str) -> Iterator[None]:
-    """Name the user's PETSc options of this prefix where PETSc or SLEPc refuses them.
-
-    Raises:
-        InputError: PETSc failed, and there are such options.
-    """
-    try:
-        yield
-    except PETSc.Error as error:
-        given = PETSc.Options(prefix).getAll()
-        if not given:
-            raise
-        options = " ".join(f"-{prefix}{key} {value}".strip() for key, value in given.items())
-        raise InputError(
-            f"PETSc options {options}: PETSc refuses them or fails with them (error {error.ierr})"
-        ) from None
-
-
-def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str) -> PETSc.KSP:
-    """Return a Cholesky solver: PETSc's own on one rank, MUMPS across ranks.
-
-    PETSc options that begin with the prefix replace these choices.
-
-    Args:
-        mat: symmetric positive definite, marked so.
-        ordering: PETSc's name of the elimination order of a small matrix on one rank; large ones
-            take nested dissection, MUMPS chooses its own.
-        prefix: of the options, e.g. "dolfinopt_stiffness_".
-
-    Raises:
-        InputError: PETSc refuses the user's options.
-    """
-    ksp = PETSc.KSP().create(mat.comm)
-    ksp.setOptionsPrefix(prefix)
-    ksp.setOperators(mat)
-    ksp.setType(PETSc.KSP.Type.PREONLY)
-    pc = ksp.getPC()
-    pc.setType(PETSc.PC.Type.CHOLESKY)
-    if mat.comm.size == 1:
-        pc.setFactorSolverType("petsc")
-        pc.setFactorOrdering(ordering if mat.getSize()[0] < NESTED_ROWS else "nd")
-    else:
-        pc.setFactorSolverType("mumps")
-    with obeying_options(prefix):
-        ksp.setFromOptions()
-    return ksp

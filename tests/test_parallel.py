@@ -19,7 +19,6 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.parallel import (
     SPLIT_CELLS,
     abort_together,
-    direct_solver,
     gather_arms,
     gather_cells,
     on_root,
@@ -209,30 +208,6 @@ def test_ranks_end_together(body, status, line):
     # What the user can mend needs no traceback, what he cannot has one.
     assert ("Traceback" in run.stderr) == ("RuntimeError" in body)
     assert run.stdout == ""
-
-
-@pytest.mark.parametrize("ordering", ["natural", "rcm", "nd"])
-def test_direct_solver(ordering):
-    """A chain of springs, distributed: exact up to rounding, on any number of ranks."""
-    size = 30
-    mat = PETSc.Mat().createAIJ((size, size), nnz=3, comm=COMM)
-    for row in range(*mat.getOwnershipRange()):
-        for col, value in ((row - 1, -1.0), (row, 2.5), (row + 1, -1.0)):
-            if 0 <= col < size:
-                mat.setValue(row, col, value)
-    mat.assemble()
-    for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
-        mat.setOption(option, True)
-    x, b = mat.createVecs()
-    first, last = mat.getOwnershipRange()
-    x.array = np.sin(np.arange(first, last))
-    mat.mult(x, b)
-    solver = direct_solver(mat, ordering, "test_")
-    found = x.duplicate()
-    solver.solve(b, found)
-    assert np.abs(found.array_r - x.array_r).max(initial=0.0) < 1e-14 * 9.0  # the condition
-    kind = solver.getPC().getFactorSolverType()
-    assert kind == ("petsc" if COMM.size == 1 else "mumps")
 
 
 # -- PETSc's options -------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from dolfinopt.arms import arm
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.mesh import compat
 from dolfinopt.optimization.gradient_check import taylor_test
@@ -263,7 +264,12 @@ def test_gradient(place, monkeypatch):
 
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(mesh, "mesh_geo"), (mesh, "_arm_mesh"), (arm, "element_operators"), (arm, "ElasticArm")],
+    [
+        (mesh, "mesh_geo"),
+        (mesh, "_arm_mesh"),
+        (LagrangeElement, "operators"),
+        (arm, "Substructure"),
+    ],
 )
 def test_arms_are_built(owner, name, monkeypatch):
     fail_on(monkeypatch, LONE, owner, name)

@@ -18,7 +18,8 @@ from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
 from dolfinopt.density.symmetry import AxisSymmetry
 from dolfinopt.errors import InputError
-from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.fem.elasticity import ElasticArm, Substructure
+from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar, shape_integrals
@@ -69,7 +70,7 @@ class Arm:
         arm = scene.arms[index]
         self._x_phys = np.empty(0)
         self._material: Interpolated | None = None
-        self._young = self._density = np.empty(0)  # of every cell of the current design, Pa, kg/m3
+        self._elastic: ElasticArm | None = None
         self.scene = scene
         self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
         self.solid = scene.material_of(index)
@@ -77,17 +78,20 @@ class Arm:
             self.mesh = arm_mesh(comm, arm)
             self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
         with ledger.phase("element operators"):
-            operators = element_operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
-            self._elastic = ElasticArm(self.mesh, operators, ledger)
+            operators = ELEMENTS["linear"].operators(
+                self.mesh, arm.thickness, self.solid.poisson_ratio
+            )
+            self.substructure = Substructure(self.mesh, operators, ledger)
             design = scene.design
             # A member along an edge would be half as thin if the filter mirrored it there.
             self.filter = HelmholtzFilter(self.mesh, design.radius, design.minimum_member > 0.0)
         self.coordinates = scene.reduction.count or None
         # Of a mesh file known only now.
-        if self.coordinates is not None and self.coordinates > self.elastic.num_dofs:
+        if self.coordinates is not None and self.coordinates > self.substructure.T.num_dofs:
             raise InputError(
                 f"{scene.source}: reduction.coordinates = {self.coordinates}: expected "
-                f"at most {self.elastic.num_dofs}, the degrees of freedom of arm {arm.name!r}"
+                f"at most {self.substructure.T.num_dofs}, the degrees of freedom of arm "
+                f"{arm.name!r}"
             )
         self.ledger = ledger
         self.basis: Basis | None = None
@@ -98,12 +102,8 @@ class Arm:
 
     @property
     def elastic(self) -> ElasticArm:
-        """Stiffness and mass of the current design.
-
-        Arms `under` other scenes share them: they hold the design of the one that is asked.
-        """
-        if self._material is not None:
-            self._elastic.set_design(self._young, self._density)
+        """Stiffness and mass of the current design."""
+        assert self._elastic is not None
         return self._elastic
 
     def physical(self, x: np.ndarray) -> np.ndarray:
@@ -199,8 +199,10 @@ class Arm:
             if reason := self.refusal(x_phys):
                 raise InputError(reason)
             self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
-        self._young = self.solid.young_modulus * self._material.stiffness
-        self._density = self.solid.density * self._material.mass
+        self._elastic = self.substructure.at(
+            self.solid.young_modulus * self._material.stiffness,
+            self.solid.density * self._material.mass,
+        )
         self._x_phys = x_phys.copy()
         self.basis = self._body = None
         self._loaded = {}
@@ -291,7 +293,7 @@ class Arm:
     @property
     def starts(self) -> list[np.ndarray]:
         """`start` and every place's `loaded_starts`; without columns where there is none yet."""
-        empty = np.empty((self.elastic.num_interior, 0))
+        empty = np.empty((self.substructure.T.num_interior, 0))
         loaded = [self.loaded_starts.get(place, empty) for place in self.places]
         return [empty if self.start is None else self.start, *loaded]
 

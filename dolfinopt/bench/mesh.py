@@ -11,7 +11,8 @@ from mpi4py import MPI
 
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, curves, tidy, timed
 from dolfinopt.dynamics.simulation import simulate
-from dolfinopt.fem.elasticity import ElasticArm, ElementOperators, element_operators
+from dolfinopt.fem.elasticity import ElasticArm, Substructure
+from dolfinopt.fem.elements import ElementOperators, LagrangeElement, plane_stress, strains
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.compat import cell_coordinates, local_cell_counts
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency, shape_integrals
@@ -101,39 +102,50 @@ def grid_arm(
     )
 
 
-def incompatible_operators(
-    mesh: ArmMesh, thickness: float, poisson_ratio: float
-) -> ElementOperators:
-    """Return bilinear quadrilaterals with Wilson's incompatible modes, condensed: QM6.
+@dataclass(frozen=True)
+class IncompatibleModes(LagrangeElement):
+    """Bilinear quadrilaterals with Wilson's incompatible modes, condensed: QM6.
 
     1 - xi^2 and 1 - eta^2 in both components let an element bend without shear; their gradients
     are those at its centre, which keeps the patch test on any quadrilateral. Source: Taylor,
     Beresford & Wilson (1976), doi:10.1002/nme.1620100602.
-
-    Args:
-        mesh: of quadrilaterals.
-        thickness: m.
-        poisson_ratio: of plane stress.
     """
-    plain = element_operators(mesh, thickness, poisson_ratio)
-    corners = plain.points[plain.cells]  # tensor-product order
-    nu = poisson_ratio
-    law = np.array([[1.0, nu, 0.0], [nu, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - nu)]]) / (1.0 - nu**2)
+
+    def operators(self, mesh: ArmMesh, thickness: float, poisson_ratio: float) -> ElementOperators:
+        """Return the condensed matrices, see `fem.elements.Element`."""
+        plain = super().operators(mesh, thickness, poisson_ratio)
+        corners = plain.points[plain.cells]  # tensor-product order
+        law = plane_stress(poisson_ratio)
+        total = np.zeros((len(corners), 12, 12))
+        gauss = 1.0 / np.sqrt(3.0)
+        for xi in (-gauss, gauss):
+            for eta in (-gauss, gauss):
+                jacobian = _jacobian(corners, xi, eta)
+                weight = np.abs(np.linalg.det(jacobian))
+                nodal = _slopes(xi, eta) @ np.linalg.inv(jacobian)
+                B = strains(np.concatenate([nodal, _inner(corners, xi, eta)], axis=1))
+                total += weight[:, None, None] * (B.transpose(0, 2, 1) @ law @ B)
+        coupling = total[:, 8:, :8]
+        recovery = -np.linalg.solve(total[:, 8:, 8:], coupling)
+        stiffness = total[:, :8, :8] + coupling.transpose(0, 2, 1) @ recovery
+        return replace(plain, stiffness=thickness * stiffness, recovery=recovery)
+
+    def strain_operator(
+        self, mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
+    ) -> np.ndarray:
+        """Return B, the condensed modes' strains included, see `fem.elements.Element`."""
+        B = super().strain_operator(mesh, operators, points)
+        corners = operators.points[operators.cells]
+        for k, (xi, eta) in enumerate(2.0 * points - 1.0):
+            B[:, k] += strains(_inner(corners, xi, eta)) @ operators.recovery
+        return B
+
+
+def _inner(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
+    """Return the gradients (n, 2, 2) of the incompatible modes."""
     centre = _jacobian(corners, 0.0, 0.0)
-    at_centre, size = np.linalg.inv(centre), np.linalg.det(centre)
-    total = np.zeros((len(corners), 12, 12))
-    gauss = 1.0 / np.sqrt(3.0)
-    for xi in (-gauss, gauss):
-        for eta in (-gauss, gauss):
-            jacobian = _jacobian(corners, xi, eta)
-            weight = np.linalg.det(jacobian)
-            nodal = _slopes(xi, eta) @ np.linalg.inv(jacobian)
-            inner = np.diag([-2.0 * xi, -2.0 * eta]) @ at_centre * (size / weight)[:, None, None]
-            B = _strains(np.concatenate([nodal, inner], axis=1))
-            total += np.abs(weight)[:, None, None] * (B.transpose(0, 2, 1) @ law @ B)
-    coupling = total[:, 8:, :8]
-    inside = coupling.transpose(0, 2, 1) @ np.linalg.solve(total[:, 8:, 8:], coupling)
-    return replace(plain, stiffness=thickness * (total[:, :8, :8] - inside))
+    ratio = np.linalg.det(centre) / np.linalg.det(_jacobian(corners, xi, eta))
+    return np.diag([-2.0 * xi, -2.0 * eta]) @ np.linalg.inv(centre) * ratio[:, None, None]
 
 
 def _slopes(xi: float, eta: float) -> np.ndarray:
@@ -146,15 +158,6 @@ def _slopes(xi: float, eta: float) -> np.ndarray:
 def _jacobian(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
     """Return dX_i/dxi_k (n, 2, 2)."""
     return np.einsum("eni,nk->eik", corners, _slopes(xi, eta))
-
-
-def _strains(gradients: np.ndarray) -> np.ndarray:
-    """Return B (n, 3, 2m): strains xx, yy, 2 xy by displacements, from gradients (n, m, 2)."""
-    count, m, _ = gradients.shape
-    B = np.zeros((count, 3, 2 * m))
-    B[:, 0, 0::2] = B[:, 2, 1::2] = gradients[:, :, 0]
-    B[:, 1, 1::2] = B[:, 2, 0::2] = gradients[:, :, 1]
-    return B
 
 
 Operators = Callable[[ArmMesh, float, float], ElementOperators]
@@ -174,18 +177,14 @@ class Element:
         return grid_arm(length, height, cells, self.triangles, self.graded)
 
 
-def _degree(degree: int) -> Operators:
-    return lambda mesh, t, nu: element_operators(mesh, t, nu, degree)
-
-
 ELEMENTS = (
-    Element("Q1", False, _degree(1)),
-    Element("QM6, incompatible modes", False, incompatible_operators),
-    Element("Q2", False, _degree(2)),
-    Element("P1 triangles", True, _degree(1)),
-    Element("P2 triangles", True, _degree(2)),
+    Element("Q1", False, LagrangeElement(1).operators),
+    Element("QM6, incompatible modes", False, IncompatibleModes().operators),
+    Element("Q2", False, LagrangeElement(2).operators),
+    Element("P1 triangles", True, LagrangeElement(1).operators),
+    Element("P2 triangles", True, LagrangeElement(2).operators),
 )
-FINER = Element("Q3", False, _degree(3), graded=True)
+FINER = Element("Q3", False, LagrangeElement(3).operators, graded=True)
 
 
 # -- measuring -------------------------------------------------------------------------------
@@ -215,33 +214,37 @@ def respond(scene: Scene, element: Element, cells: tuple[int, int], repeats: int
     """Discretise the scene's first arm, solid, reduce it, and move a mechanism of such arms."""
     arm, solid = scene.arms[0], scene.material_of(0)
 
-    def set_up() -> ElasticArm:
+    def set_up() -> Substructure:
         mesh = element.arm(arm.length, arm.height, cells)
         operators = element.operators(mesh, arm.thickness, solid.poisson_ratio)
-        return ElasticArm(mesh, operators, Ledger())
+        return Substructure(mesh, operators, Ledger())
 
-    setup, elastic = timed(set_up, 1)
-    ones = np.ones(elastic.mesh.num_cells)
+    setup, substructure = timed(set_up, 1)
+    ones = np.ones(substructure.mesh.num_cells)
     damping = scene.damping.stiffness_proportional
 
+    def at(scale: float) -> ElasticArm:
+        return substructure.at(scale * solid.young_modulus * ones, scale * solid.density * ones)
+
     def reduce() -> ShapeIntegrals:
-        elastic.set_design(solid.young_modulus * ones, solid.density * ones)
+        elastic = at(1.0)
         basis = METHODS["craig-bampton"].reduce(elastic, Options(COORDINATES), None)
         return shape_integrals(elastic, basis, damping)
 
     seconds = np.inf
     # The first one analyses the matrix for the whole run.
-    for _ in range(2 if elastic.num_dofs > LARGE else repeats + 1):
-        elastic.set_design(0.5 * solid.young_modulus * ones, 0.5 * solid.density * ones)
+    dofs = substructure.T.num_dofs
+    for _ in range(2 if dofs > LARGE else repeats + 1):
+        at(0.5)
         now, body = timed(reduce, 1)
         seconds = min(seconds, now)
-    flexibility = np.linalg.inv(elastic.constraint_modes().stiffness)
+    flexibility = np.linalg.inv(at(1.0).constraint_modes().stiffness)
     moved = simulate(scene, [body] * len(scene.arms), Ledger())
     return Response(
         float(flexibility[1, 1]),
         first_frequency(body),
         moved.max_deviation[0],
-        elastic.num_dofs,
+        dofs,
         seconds,
         setup,
     )

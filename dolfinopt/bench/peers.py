@@ -27,7 +27,7 @@ from dolfinopt.bench.statics import Iteration, StaticArm, dolfinx_iteration, pym
 from dolfinopt.bench.whole import mpirun, run_worker
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.multibody.mechanism import end_effector
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import shape_integrals
@@ -137,9 +137,10 @@ def _moved(scene: Scene, element: Element, cells: tuple[int, int]) -> Trajectory
     arm, solid = scene.arms[0], scene.material_of(0)
     mesh = element.arm(arm.length, arm.height, cells)
     operators = element.operators(mesh, arm.thickness, solid.poisson_ratio)
-    elastic = ElasticArm(mesh, operators, Ledger())
     ones = np.ones(mesh.num_cells)
-    elastic.set_design(solid.young_modulus * ones, solid.density * ones)
+    elastic = Substructure(mesh, operators, Ledger()).at(
+        solid.young_modulus * ones, solid.density * ones
+    )
     basis = METHODS["craig-bampton"].reduce(elastic, Options(COORDINATES), None)
     body = shape_integrals(elastic, basis, scene.damping.stiffness_proportional)
     return simulate(scene, [body] * len(scene.arms), Ledger())

@@ -80,11 +80,11 @@ def _in_process(scene: Scene, threads: int, left_out: set[str]) -> list[tuple[st
 
 def measured_here(scene: Scene, left_out: Sequence[str]) -> Iterator[tuple[str, float, float]]:
     """Yield solver and order, seconds of a factorisation and of the solves; fewest of some."""
-    arm = arms_of(scene)[0].elastic
+    arm = arms_of(scene)[0]
     ones = np.ones(arm.mesh.num_cells)
     material = scene.material_of(0)
-    arm.set_design(material.young_modulus * ones, material.density * ones)
-    K = arm.interior_stiffness()
+    solid = arm.substructure.at(material.young_modulus * ones, material.density * ones)
+    K = solid.interior_stiffness()
     for solver, order in CHOICES:
         name = f"{solver}, {order}"
         if name in left_out:

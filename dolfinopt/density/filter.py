@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
-from dolfinopt.parallel import direct_solver
+from dolfinopt.solver import direct_solver
 
 # Distance of a facet's midpoint from the foot of the perpendicular through the cell's centroid, in
 # lengths of the facet, up to which a cell counts as a rectangle or an equilateral triangle. Gmsh

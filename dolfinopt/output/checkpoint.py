@@ -163,13 +163,14 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
 
 def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
-    inner = arm.elastic.num_interior
+    inner = arm.substructure.T.num_interior
     whole = modes[j] if j < len(modes) else np.empty((inner, 0))
     return whole[:inner], whole[inner:]
 
 
 def _interior_points(arm: Arm) -> np.ndarray:
-    return arm.elastic.points[arm.elastic.interior_nodes]
+    substructure = arm.substructure
+    return substructure.operators.points[substructure.T.interior_nodes]
 
 
 def _match(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:

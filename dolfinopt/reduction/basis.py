@@ -11,7 +11,7 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.parallel import obeying_options
+from dolfinopt.solver import obeying_options
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs

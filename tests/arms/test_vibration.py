@@ -132,8 +132,7 @@ def test_rigid_integrals_of_a_bar() -> None:
     arm = arm_of((20, 2))
     for share in (1.0, 0.5):
         solid = arm.mesh.centroid[:, 0] < share
-        elastic = arm.elastic
-        elastic.set_design(np.ones(len(solid)), 2700.0 * solid)
+        elastic = arm.substructure.at(np.ones(len(solid)), 2700.0 * solid)
         found, m = rigid_integrals(elastic), 2700.0 * 0.06 * 0.01 * share
         assert found.mass == pytest.approx(m, rel=1e-11)
         assert found.moment == pytest.approx(0.5 * m * share, rel=1e-11)

@@ -19,7 +19,7 @@ from dolfinopt.dynamics.modal_coordinates import modes_of
 from dolfinopt.dynamics.problem import ElasticProblem, even_steps
 from dolfinopt.dynamics.simulation import build_mechanism
 from dolfinopt.errors import InputError
-from dolfinopt.fem.elasticity import element_operators
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.multibody.mechanism import inverse_dynamics
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.paper.reproduction import load_paper
@@ -55,8 +55,8 @@ def test_incompatible_modes_pass_the_patch_test():
     x = grid.mesh.geometry.x
     inside = (x[:, 0] > 0.1) & (x[:, 0] < 0.9) & (np.abs(x[:, 1]) < 0.1)
     x[inside, :2] += [0.08, -0.06]
-    plain = element_operators(grid, 0.01, 0.3)
-    better = meshes.incompatible_operators(grid, 0.01, 0.3)
+    plain = LagrangeElement().operators(grid, 0.01, 0.3)
+    better = meshes.IncompatibleModes().operators(grid, 0.01, 0.3)
     linear = plain.points @ np.array([[0.3, -0.2], [0.7, 0.4]])
     u = linear[plain.cells].reshape(len(plain.cells), 8, 1)
 

@@ -7,7 +7,8 @@ import pytest
 import scipy.linalg
 from mpi4py import MPI
 
-from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.fem.elasticity import Substructure
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.shape_integrals import first_frequency, plane_body, shape_integrals
 from dolfinopt.profiling import Ledger
@@ -26,7 +27,7 @@ ROUNDING = 1e-12
 
 def make_arm(cells=(10, 3), comm=COMM):
     mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
-    return ElasticArm(mesh, element_operators(mesh, THICKNESS, POISSON), Ledger())
+    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Ledger())
 
 
 def uneven(place):
@@ -39,16 +40,14 @@ def uneven(place):
 def uniform_arm():
     arm = make_arm()
     ones = np.ones(arm.mesh.num_cells)
-    arm.set_design(YOUNG * ones, DENSITY * ones)
-    return arm
+    return arm.at(YOUNG * ones, DENSITY * ones)
 
 
 @pytest.fixture(scope="module")
 def uneven_arm():
     arm = make_arm()
     x = uneven(arm.mesh.centroid)
-    arm.set_design(YOUNG * x**3, DENSITY * x)
-    return arm
+    return arm.at(YOUNG * x**3, DENSITY * x)
 
 
 def test_rigid_integrals_of_a_rectangle(uniform_arm):

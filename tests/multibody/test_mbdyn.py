@@ -11,7 +11,8 @@ from mpi4py import MPI
 from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
-from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.fem.elasticity import Substructure
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mbdyn import (
     ModalElement,
@@ -36,12 +37,12 @@ PLACING = 1e-10
 def reduced(cells, comm=MPI.COMM_SELF, uneven=False):
     """Return the body, its moments and nodes; nodes are None but on the first rank."""
     mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
-    elastic = ElasticArm(mesh, element_operators(mesh, THICKNESS, 0.33), Ledger())
+    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Ledger())
     x = np.ones(mesh.num_cells)
     if uneven:
         place = np.round(mesh.centroid, 9)
         x = 0.5 + 0.4 * np.sin(30.0 * place[:, 0] + 170.0 * place[:, 1])
-    elastic.set_design(70e9 * x**3, 2700.0 * x)
+    elastic = substructure.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(4))
     body = shape_integrals(elastic, basis, 2e-4)
     return body, spatial_moments(elastic, basis, THICKNESS), lumped_nodes(elastic, basis)

@@ -10,7 +10,8 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import Taylor, read_sid, read_sid_npz, write_sid, write_sid_npz
-from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.fem.elasticity import Substructure
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mechanism import Mechanism, inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
@@ -59,10 +60,10 @@ def same(body: ShapeIntegrals, other: ShapeIntegrals) -> None:
 @pytest.fixture(scope="module")
 def arm():
     mesh = structured_arm(COMM, "arm", 1.2, 0.3, (10, 3))
-    elastic = ElasticArm(mesh, element_operators(mesh, THICKNESS, 0.33), Ledger())
+    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Ledger())
     place = np.round(mesh.centroid, 9)
     x = 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
-    elastic.set_design(70e9 * x**3, 2700.0 * x)
+    elastic = substructure.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(5))
     return elastic, basis, shape_integrals(elastic, basis, 2e-4)
 
@@ -248,8 +249,8 @@ def test_moments_of_an_arm_agree_with_its_planar_integrals(arm):
 def test_moments_of_a_plate_in_closed_form():
     """A uniform 1.2 m x 0.3 m plate of 2 cm under rigid motions: cuboid's moments of inertia."""
     mesh = structured_arm(COMM, "arm", 1.2, 0.3, (6, 2))
-    elastic = ElasticArm(mesh, element_operators(mesh, THICKNESS, 0.33), Ledger())
-    elastic.set_design(np.full(mesh.num_cells, 70e9), np.full(mesh.num_cells, 2700.0))
+    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Ledger())
+    elastic = substructure.at(np.full(mesh.num_cells, 70e9), np.full(mesh.num_cells, 2700.0))
     basis = craig_bampton(elastic, Options(3))
     data = to_sid(shape_integrals(elastic, basis, 0.0), spatial_moments(elastic, basis, THICKNESS))
     mass, (a, b, c) = 2700.0 * 1.2 * 0.3 * THICKNESS, (1.2, 0.3, THICKNESS)

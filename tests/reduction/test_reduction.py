@@ -15,7 +15,8 @@ from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.elasticity import ElasticArm, element_operators
+from dolfinopt.fem.elasticity import ElasticArm, Substructure
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.profiling import Ledger
@@ -49,12 +50,13 @@ DENSE = 1e-7
 
 def make_arm(cells=(20, 4), comm=SELF, length=LENGTH):
     mesh = structured_arm(comm, "arm", length, HEIGHT, cells)
-    return ElasticArm(mesh, element_operators(mesh, THICKNESS, POISSON), Ledger())
+    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Ledger())
 
 
-def set_densities(arm, x):
-    """Interpolate as in the scenes; x (n_cells,)."""
-    arm.set_design(YOUNG * (1e-6 + x**3), DENSITY * (1e-6 + x))
+def with_densities(arm, x):
+    """Return the arm with densities x (n_cells,), interpolated as in the scenes."""
+    substructure = getattr(arm, "substructure", arm)
+    return substructure.at(YOUNG * (1e-6 + x**3), DENSITY * (1e-6 + x))
 
 
 def uniform(place):
@@ -119,8 +121,9 @@ def own_arm():
 
 @pytest.mark.parametrize("design", DESIGNS)
 def test_constraint_modes_are_statically_exact(shared_arm, own_arm, design):
-    for arm in (shared_arm, own_arm):
-        set_densities(arm, design(arm.mesh.centroid))
+    shared_arm, own_arm = (
+        with_densities(one, design(one.mesh.centroid)) for one in (shared_arm, own_arm)
+    )
     K, _ = dense(own_arm)
     exact = np.linalg.inv(K)[-3:, -3:]
     scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))  # units of m, m, rad
@@ -137,8 +140,9 @@ def test_constraint_modes_are_statically_exact(shared_arm, own_arm, design):
 
 @pytest.mark.parametrize("design", DESIGNS)
 def test_craig_bampton_modes(shared_arm, own_arm, design):
-    for arm in (shared_arm, own_arm):
-        set_densities(arm, design(arm.mesh.centroid))
+    shared_arm, own_arm = (
+        with_densities(one, design(one.mesh.centroid)) for one in (shared_arm, own_arm)
+    )
     q = 9
     basis = craig_bampton(shared_arm, Options(q))
     K, M = products(shared_arm, basis)
@@ -155,8 +159,9 @@ def test_craig_bampton_modes(shared_arm, own_arm, design):
 
 @pytest.mark.parametrize("design", DESIGNS)
 def test_modal_modes(shared_arm, own_arm, design):
-    for arm in (shared_arm, own_arm):
-        set_densities(arm, design(arm.mesh.centroid))
+    shared_arm, own_arm = (
+        with_densities(one, design(one.mesh.centroid)) for one in (shared_arm, own_arm)
+    )
     q = 6
     basis = modal(shared_arm, Options(q))
     K, M = products(shared_arm, basis)
@@ -172,7 +177,7 @@ def test_modal_modes(shared_arm, own_arm, design):
 @pytest.mark.parametrize("method", sorted(ALL))
 def test_modes_keep_the_interfaces(shared_arm, method):
     arm = shared_arm
-    set_densities(arm, graded(arm.mesh.centroid))
+    arm = with_densities(arm, graded(arm.mesh.centroid))
     basis = ALL[method](arm, Options(7))
     assert basis.V.shape == basis.MV.shape == (len(arm.points), 2, 7)
     assert basis.start.shape[0] in (arm.num_interior, arm.num_interior + 3)
@@ -187,8 +192,7 @@ def test_modes_keep_the_interfaces(shared_arm, method):
 def test_a_hundred_coordinates(method):
     """All of the first 100 modes, none twice, none missed, on any number of ranks."""
     arm, own = make_arm((48, 6), COMM), make_arm((48, 6))
-    for one in (arm, own):
-        set_densities(one, graded(one.mesh.centroid))
+    arm, own = (with_densities(one, graded(one.mesh.centroid)) for one in (arm, own))
     basis = REDUCTORS[method](arm, Options(100))
     first = 3 if method == "craig-bampton" else 0
     K, M = dense(own)
@@ -207,8 +211,7 @@ def test_every_degree_of_freedom(method):
     """As many coordinates as the arm has: the reduced model is the full one."""
     arm = make_arm((3, 1), COMM)
     own = make_arm((3, 1))
-    for one in (arm, own):
-        set_densities(one, graded(one.mesh.centroid))
+    arm, own = (with_densities(one, graded(one.mesh.centroid)) for one in (arm, own))
     body = shape_integrals(arm, ALL[method](arm, Options(arm.num_dofs)), 0.0)
     reduced = scipy.linalg.eigvalsh(body.K, body.M)
     assert arm.num_dofs == 11
@@ -217,7 +220,7 @@ def test_every_degree_of_freedom(method):
 
 def test_too_many_modes_are_an_error_that_says_so():
     arm = make_arm((2, 1))
-    set_densities(arm, uniform(arm.mesh.centroid))
+    arm = with_densities(arm, uniform(arm.mesh.centroid))
     K, M = arm.interior_stiffness(), arm.interior_mass()
     with pytest.raises(ConvergenceError, match=r"arm 'arm': only \d+ of 5.*reduction\.coordinates"):
         lowest_eigenpairs(arm, K, M, arm.solve_vector, 5, None)
@@ -229,7 +232,7 @@ def test_too_many_modes_are_an_error_that_says_so():
 def test_counts():
     arm = make_arm(comm=COMM)
     counts = arm.ledger.counts
-    set_densities(arm, graded(arm.mesh.centroid))
+    arm = with_densities(arm, graded(arm.mesh.centroid))
 
     def tally():
         return counts.assemblies, counts.factorisations, counts.eigenproblems
@@ -241,7 +244,7 @@ def test_counts():
     assert tally() == (2, 1, 1)
     modal(arm, Options(4))
     assert tally() == (2, 1, 2)
-    set_densities(arm, uniform(arm.mesh.centroid))
+    arm = with_densities(arm, uniform(arm.mesh.centroid))
     modal(arm, Options(1))
     assert tally() == (4, 2, 3)
 
@@ -256,9 +259,9 @@ def test_a_warm_start_finds_the_same_modes_with_less_work(shared_arm, method, q)
     arm = shared_arm
     counts = arm.ledger.counts
     x = graded(arm.mesh.centroid)
-    set_densities(arm, 0.97 * x)
+    arm = with_densities(arm, 0.97 * x)
     before = REDUCTORS[method](arm, Options(q))
-    set_densities(arm, x)
+    arm = with_densities(arm, x)
     begin = counts.solves
     cold = REDUCTORS[method](arm, Options(q))
     middle = counts.solves
@@ -274,7 +277,7 @@ def test_a_warm_start_finds_the_same_modes_with_less_work(shared_arm, method, q)
 def test_the_start_decides_nothing(shared_arm, method):
     """From any one mode, or with signs reversed, the search ends with the same basis."""
     arm = shared_arm
-    set_densities(arm, hollow(arm.mesh.centroid))
+    arm = with_densities(arm, hollow(arm.mesh.centroid))
     q = 9
     cold = REDUCTORS[method](arm, Options(q))
     size = np.abs(cold.V).max(axis=(0, 1), initial=1e-30)
@@ -295,7 +298,7 @@ def test_a_mode_of_another_symmetry_becomes_the_lowest():
     kinds = set()
     for core in (1.0, 0.5, 0.2, 0.1):
         x = np.where(np.abs(arm.mesh.centroid[:, 1]) < HEIGHT / 3.0, core, 1.0)
-        set_densities(arm, x)
+        arm = with_densities(arm, x)
         basis = craig_bampton(arm, Options(4), start)
         start = basis.start
         K, M = dense(arm)
@@ -310,7 +313,7 @@ def test_modes_point_the_same_way_on_any_mesh():
     seen = {method: [] for method in ALL}
     for cells in ((20, 2), (40, 4), (60, 6)):
         arm = make_arm(cells, COMM)
-        set_densities(arm, uniform(arm.mesh.centroid))
+        arm = with_densities(arm, uniform(arm.mesh.centroid))
         owned = arm.operators.space.dofmap.index_map.size_local
         # No mode counted here rests at a quarter of the length.
         place = np.abs(arm.points[:owned] - [0.25 * LENGTH, 0.5 * HEIGHT]).max(axis=1) < 1e-6
@@ -348,7 +351,7 @@ def rows(arm, basis):
 @pytest.mark.parametrize("design", DESIGNS)
 @pytest.mark.parametrize("q", [3, 4, 8, 12])
 def test_ritz_vectors_are_orthonormal(shared_arm, method, design, q):
-    set_densities(shared_arm, design(shared_arm.mesh.centroid))
+    shared_arm = with_densities(shared_arm, design(shared_arm.mesh.centroid))
     basis = SUBSPACES[method](shared_arm, Options(q))
     K, M = products(shared_arm, basis)
     assert np.abs(M - np.eye(q)).max() < 1e-12  # measured: 3e-15
@@ -374,7 +377,7 @@ def test_moments_match_at_the_shifts(stubby_arm, design, blocks, places):
     K - w^2 M is indefinite.
     """
     arm = stubby_arm
-    set_densities(arm, design(arm.mesh.centroid))
+    arm = with_densities(arm, design(arm.mesh.centroid))
     (K, M), B = dense(arm), inputs(arm)
     values = scipy.linalg.eigvalsh(K, M)
     centres = [0.5 * (values[n - 1] + values[n]) if n else 0.0 for n in places]
@@ -400,8 +403,9 @@ def test_moments_match_at_the_shifts(stubby_arm, design, blocks, places):
 
 
 def test_krylov_at_zero_is_statically_exact(shared_arm, own_arm):
-    for arm in (shared_arm, own_arm):
-        set_densities(arm, graded(arm.mesh.centroid))
+    shared_arm, own_arm = (
+        with_densities(one, graded(one.mesh.centroid)) for one in (shared_arm, own_arm)
+    )
     K, _ = dense(own_arm)
     exact = np.linalg.inv(K)[-3:, -3:]
     scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
@@ -430,7 +434,7 @@ def dense_gramian(arm, options):
 @pytest.mark.parametrize("band", [(0.0, 1000.0), (1000.0, 4000.0)])
 def test_balanced_is_the_dense_gramians_dominant_space(stubby_arm, design, band):
     arm = stubby_arm
-    set_densities(arm, design(arm.mesh.centroid))
+    arm = with_densities(arm, design(arm.mesh.centroid))
     options = Options(6, band=band, damping=1e-5)  # resonances wide enough for one Gauss rule
     K, P = dense_gramian(arm, options)
     lower = np.linalg.cholesky(K)
@@ -469,7 +473,7 @@ def test_quadrature_resolves_resonances(low, high):
 def test_more_coordinates_bring_the_full_arm(shared_arm):
     """Natural modes against 40 of them, compliance against constraint modes, of every method."""
     arm = shared_arm
-    set_densities(arm, graded(arm.mesh.centroid))
+    arm = with_densities(arm, graded(arm.mesh.centroid))
     modes, static = modal(arm, Options(40)), craig_bampton(arm, Options(3))
     bases = {
         method: [reduce(arm, Options(q)) for q in (4, 6, 8, 12)] for method, reduce in ALL.items()
@@ -504,8 +508,9 @@ def test_more_coordinates_bring_the_full_arm(shared_arm):
 
 
 def test_mac_tells_modes_apart(shared_arm, own_arm):
-    for arm in (shared_arm, own_arm):
-        set_densities(arm, graded(arm.mesh.centroid))
+    shared_arm, own_arm = (
+        with_densities(one, graded(one.mesh.centroid)) for one in (shared_arm, own_arm)
+    )
     one, other = modal(shared_arm, Options(4)), craig_bampton(shared_arm, Options(5))
     assert np.abs(mac(shared_arm, one.V, -3.0 * one.V) - np.eye(4)).max() < 1e-11
     _, M = dense(own_arm)
@@ -521,11 +526,11 @@ def test_mac_tells_modes_apart(shared_arm, own_arm):
 def test_subspaces_repeat_themselves_and_ignore_the_start(own_arm, method):
     """To the last bit, on every rank."""
     arm = own_arm
-    set_densities(arm, hollow(arm.mesh.centroid))
+    arm = with_densities(arm, hollow(arm.mesh.centroid))
     first = SUBSPACES[method](arm, Options(8))
-    set_densities(arm, graded(arm.mesh.centroid))
+    arm = with_densities(arm, graded(arm.mesh.centroid))
     SUBSPACES[method](arm, Options(5))
-    set_densities(arm, hollow(arm.mesh.centroid))
+    arm = with_densities(arm, hollow(arm.mesh.centroid))
     again = SUBSPACES[method](arm, Options(8), first.V[arm.interior_nodes, 0])
     for ours, theirs in zip(dataclasses.astuple(again), dataclasses.astuple(first)):
         assert np.array_equal(ours, theirs)
@@ -535,7 +540,7 @@ def test_subspaces_repeat_themselves_and_ignore_the_start(own_arm, method):
 def test_what_subspaces_cost():
     arm = make_arm(comm=COMM)
     counts = arm.ledger.counts
-    set_densities(arm, graded(arm.mesh.centroid))
+    arm = with_densities(arm, graded(arm.mesh.centroid))
     krylov(arm, Options(3))
     assert (counts.factorisations, counts.eigenproblems, counts.solves) == (1, 0, 3)
     krylov(arm, Options(8))  # as many as coordinates: no load at the interface needs one of its own
@@ -551,14 +556,13 @@ def test_what_subspaces_cost():
 
 def test_what_subspaces_cannot_do():
     arm = make_arm((2, 1), COMM)
-    set_densities(arm, graded(arm.mesh.centroid))
+    arm = with_densities(arm, graded(arm.mesh.centroid))
     with pytest.raises(ConvergenceError, match=r"arm 'arm': only 7 of 8 Krylov .*coordinates"):
         krylov(arm, Options(8))
     with pytest.raises(ConvergenceError, match=r"only 7 of 8 directions.*reduction\.band"):
         balanced(arm, Options(8))
     arm, own = make_arm(comm=COMM), make_arm()
-    for one in (arm, own):
-        set_densities(one, graded(one.mesh.centroid))
+    arm, own = (with_densities(one, graded(one.mesh.centroid)) for one in (arm, own))
     first = float(np.sqrt(scipy.linalg.eigvalsh(*dense(own))[0]) / (2.0 * np.pi))
     with pytest.raises(ConvergenceError, match=r"close to a natural frequency.*reduction\.shifts"):
         krylov(arm, Options(6, (first,)))
@@ -670,8 +674,9 @@ def test_exact_gradient_of_krylov(q, shifts):
     [("craig-bampton", 3), ("craig-bampton", 8), ("modal", 6), ("krylov", 8), ("balanced", 6)],
 )
 def test_ranks_agree_with_one_rank(shared_arm, own_arm, method, q):
-    for arm in (shared_arm, own_arm):
-        set_densities(arm, graded(arm.mesh.centroid))
+    shared_arm, own_arm = (
+        with_densities(one, graded(one.mesh.centroid)) for one in (shared_arm, own_arm)
+    )
     together, alone = (ALL[method](arm, Options(q)) for arm in (shared_arm, own_arm))
     pairs = [
         (together.stiffness, alone.stiffness),
@@ -702,7 +707,7 @@ def beams():
     compliance, modes, reduced = [], [], []
     for cells in REFINEMENT:
         arm = make_arm(cells)
-        arm.set_design(np.full(arm.mesh.num_cells, YOUNG), np.full(arm.mesh.num_cells, DENSITY))
+        arm = arm.at(np.full(arm.mesh.num_cells, YOUNG), np.full(arm.mesh.num_cells, DENSITY))
         C = tip_compliance(craig_bampton(arm, Options(3)))
         compliance.append([C[0, 0], C[1, 1], C[2, 2], C[1, 2]])
         modes.append(_frequencies(arm, modal(arm, Options(5))))

@@ -1,0 +1,107 @@
+"""Assembly of K(x) and M(x) into fixed sparsity patterns, and their interior parts in PETSc."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+from petsc4py import PETSc
+
+
+class AffineMatrix:
+    """sum_e s_e A_e as a SciPy CSR matrix over local dofs, assembled by one sparse product.
+
+    `values = P @ s`: column e of P holds the entries of A_e at their places in the pattern.
+
+    Attributes:
+        pattern: (size, size) matrix of ones.
+    """
+
+    def __init__(self, dofs: np.ndarray, elements: np.ndarray, size: int):
+        """Set up the pattern from element dofs (n_cells, n) and matrices (n_cells, n, n)."""
+        count, width = dofs.shape
+        rows = np.repeat(dofs, width, axis=1).ravel().astype(np.int64)
+        keys = rows * size + np.tile(dofs, (1, width)).ravel()
+        unique, place = np.unique(keys, return_inverse=True)
+        cell = np.repeat(np.arange(count), width * width)
+        self._assembly = sp.csr_matrix(
+            (elements.ravel(), (place, cell)), shape=(len(unique), count)
+        )
+        row_of = unique // size
+        indptr = np.searchsorted(row_of, np.arange(size + 1))
+        self.pattern = sp.csr_matrix(
+            (np.ones(len(unique)), (unique % size).astype(np.int32), indptr.astype(np.int32)),
+            shape=(size, size),
+        )
+
+    def assemble(self, scale: np.ndarray) -> sp.csr_matrix:
+        """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""
+        pattern = self.pattern
+        values = self._assembly @ scale
+        return sp.csr_matrix((values, pattern.indices, pattern.indptr), pattern.shape)
+
+
+class InteriorMatrix:
+    """The interior rows and columns of a local CSR matrix as a PETSc matrix."""
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        pattern: sp.csr_matrix,
+        components: int,
+        numbers: np.ndarray,
+        owned: int,
+    ):
+        """Select the pattern.
+
+        Args:
+            comm: the arm's ranks.
+            pattern: of the matrix over local dofs, or over local nodes when `components` is 2
+                and the matrix acts on both displacement components alike.
+            components: 1 or 2, see `pattern`.
+            numbers: (n_local_dofs,) global interior number of each local dof, -1 for others.
+            owned: number of interior dofs this rank owns.
+        """
+        rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+        spread = [components * rows + c for c in range(components)]
+        rows = numbers[np.concatenate(spread)]
+        cols = numbers[
+            np.concatenate([components * pattern.indices + c for c in range(components)])
+        ]
+        source = np.tile(np.arange(pattern.nnz), components)
+        keep = np.flatnonzero((rows >= 0) & (cols >= 0))
+        keep = keep[np.lexsort((cols[keep], rows[keep]))]
+        rows, cols, self._source = rows[keep], cols[keep].astype(PETSc.IntType), source[keep]
+        self._serial = comm.size == 1
+        if self._serial:
+            indptr = np.searchsorted(rows, np.arange(owned + 1)).astype(PETSc.IntType)
+            self._values = np.zeros(len(rows))
+            # The matrix shares this array: no copy an assembly.
+            self._kept = (indptr, cols, self._values)
+            self.mat = PETSc.Mat().createAIJWithArrays((owned, owned), self._kept, comm=comm)
+        else:
+            # Local rows of all ranks; PETSc ships what belongs to others at assembly.
+            row_ids, starts = np.unique(rows, return_index=True)
+            self._kept = (
+                np.append(starts, len(rows)).astype(PETSc.IntType),
+                cols,
+                row_ids.astype(PETSc.IntType),
+            )
+            self.mat = PETSc.Mat().createAIJ(((owned, None), (owned, None)), nnz=40, comm=comm)
+            self.mat.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+
+    def update(self, data: np.ndarray) -> None:
+        """Set the values from the data array of a local matrix of that pattern."""
+        if self._serial:
+            np.take(data, self._source, out=self._values)
+            self.mat.stateIncrease()
+        else:
+            indptr, cols, row_ids = self._kept
+            self.mat.zeroEntries()
+            self.mat.setValuesIJV(
+                indptr, cols, data[self._source], addv=PETSc.InsertMode.ADD_VALUES, rowmap=row_ids
+            )
+        self.mat.assemble()
+        # Forgotten whenever values change; without them MUMPS pivots.
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setOption(PETSc.Mat.Option.SPD, True)

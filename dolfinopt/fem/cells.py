@@ -1,0 +1,50 @@
+"""Nodal fields on cells, and energies cell by cell: derivatives by the material of each cell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dolfinopt.fem.elements import ElementOperators
+
+
+def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
+    """Return the cells' nodal values (n_cells, 2n, k) less their mean, which has no energy.
+
+    Rounding is then relative to the differences within a cell, not to its displacement.
+
+    Args:
+        operators: of the arm.
+        field: (n_nodes, 2, k).
+    """
+    cells = operators.cells
+    values = field[cells]
+    values -= values.mean(axis=1, keepdims=True)
+    return values.reshape(len(cells), 2 * cells.shape[1], field.shape[2])
+
+
+def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
+    """Return the nodal field (n_nodes, 2, k) of the cells' forces (n_cells, n, 2, k)."""
+    field = np.zeros((len(operators.points), *forces.shape[2:]))
+    np.add.at(field, operators.cells, forces)
+    return field
+
+
+def stiffness_products(
+    operators: ElementOperators, left: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+    return _products(
+        operators.stiffness, cell_values(operators, left), cell_values(operators, right)
+    )
+
+
+def mass_products(operators: ElementOperators, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+    cells = operators.cells
+    shape = (*cells.shape, -1)  # both components and all columns alike
+    return _products(operators.mass, left[cells].reshape(shape), right[cells].reshape(shape))
+
+
+def _products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return sum_k left' A_e right (n_cells,) for (n_cells, n, n) and (n_cells, n, k)."""
+    return np.einsum("eik,eik->e", left, elements @ right)

@@ -1,0 +1,159 @@
+"""Static fields of unit displacements of the outboard interface; what rounding does to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.cells import cell_values, sum_at_nodes
+from dolfinopt.fem.floating import HARMLESS, extremes
+
+if TYPE_CHECKING:
+    from dolfinopt.fem.elasticity import ElasticArm
+
+# Largest relative error that rounding may make in the stiffness of a design in which solids float:
+# a tenth of what an optimiser's step changes. Against long double errors are 0.03 to 0.35 of the
+# estimate.
+MOST_ROUNDING = 1e-3
+# Part of a cell's displacement as a rigid translation in that estimate. The energy does not know
+# translations, the assembled matrix does: where they are lost in it, refinement fails.
+TRANSLATION = 0.03
+POWER_STEPS = 6  # of the estimate; four give two digits
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintModes:
+    """One arm under unit displacements (u_x, u_y, theta) of its outboard interface.
+
+    Attributes:
+        interior: (num_interior, 3) owned interior rows.
+        field: (n_nodes, 2, 3) nodal field.
+        stiffness: (3, 3) S, force and moment at the interface by its displacement.
+        coupling: (num_interior, 3) K_Ib.
+        corner: (3, 3) K_bb.
+    """
+
+    interior: np.ndarray
+    field: np.ndarray
+    stiffness: np.ndarray
+    coupling: np.ndarray
+    corner: np.ndarray
+
+
+def static_modes(arm: ElasticArm) -> ConstraintModes:
+    """Return Psi = [-K_II^-1 K_Ib; I] and S = Psi' K Psi: three solves with the factor at hand.
+
+    Collective on the arm's ranks.
+
+    Raises:
+        ConvergenceError: the contrast between solid and void is too large for this design.
+    """
+    coupling, corner = arm.restrict(arm.stiffness_times(arm.rigid))
+    modes = _with_energies(arm, arm.solve(-coupling), coupling, corner)
+    if floats(arm):
+        modes = _refined(arm, modes)
+    if not _is_stiffness(modes.stiffness):
+        raise _lost_in_rounding(arm)
+    return modes
+
+
+def floats(arm: ElasticArm) -> bool:
+    """Return whether void that is softer by orders of magnitude holds solid cells (collective)."""
+    low, high = extremes(arm.comm, arm.young)
+    return low < 0.1 / HARMLESS * high and arm.connectivity.floats(arm.young)
+
+
+def _with_energies(
+    arm: ElasticArm, interior: np.ndarray, coupling: np.ndarray, corner: np.ndarray
+) -> ConstraintModes:
+    field = arm.expand(interior, np.eye(3))
+    return ConstraintModes(interior, field, arm.energy_matrix(field), coupling, corner)
+
+
+def _refined(arm: ElasticArm, modes: ConstraintModes) -> ConstraintModes:
+    """Return constraint modes after one step of iterative refinement, if rounding allows.
+
+    Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below
+    the rounding of their own. The residual is summed cell by cell without rigid motion, which
+    knows them better than the assembled matrix.
+
+    Raises:
+        ConvergenceError: the void's stiffness is lost in the rounding of the solid's.
+    """
+    if not _is_stiffness(modes.stiffness):
+        raise _lost_in_rounding(arm)
+    operators = arm.operators
+    values = cell_values(operators, modes.field)
+    forces = (operators.stiffness @ values) * arm.young[:, None, None]
+    forces = forces.reshape(*operators.cells.shape, 2, 3)
+    residual, _ = arm.restrict(sum_at_nodes(operators, forces))
+    better = modes.interior - arm.solve(residual)
+    refined = _with_energies(arm, better, modes.coupling, modes.corner)
+    if not (_is_stiffness(refined.stiffness) and rounding_error(arm, refined) <= MOST_ROUNDING):
+        raise _lost_in_rounding(arm)
+    return refined
+
+
+def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
+    """Return an estimate of the relative error of S by rounding.
+
+    An element matrix is known to eps times its diagonal D_e, so the energy of any field is to
+    eps u' D u, and relative to it to eps times the largest eigenvalue of D u = mu T'KT u.
+    Inverse iteration finds it from random numbers: void that holds solids sets it
+    orders of magnitude apart from all others. What it returns is too small only where mu
+    exceeds 1 / eps, far beyond `MOST_ROUNDING`, because the factorised matrix is off by then.
+    """
+    operators = arm.operators
+    diagonal = np.einsum("eii->ei", operators.stiffness) * arm.young[:, None]
+    diagonal = diagonal.reshape(*operators.cells.shape, 2, 1)
+
+    def weighted(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return T' D T u."""
+        values = field[operators.cells]
+        forces = diagonal * (values - kept * values.mean(axis=1, keepdims=True))
+        forces -= kept * forces.mean(axis=1, keepdims=True)
+        return arm.restrict(sum_at_nodes(operators, forces))
+
+    kept = 1.0 - TRANSLATION
+    x, y = arm.points.T / arm.mesh.outboard_point[0]
+    # By place, so that numbers are random and yet the same on any number of ranks.
+    noise = np.sin(np.outer(1e4 * x + 7e4 * y + 1.0, [12.9898, 78.233])) * 43758.5453
+    guess = (np.modf(np.abs(noise))[0] - 0.5)[:, :, None]
+    loads, outboard = weighted(
+        arm.expand(guess[arm.interior_nodes].reshape(-1, 1), np.full((3, 1), 0.5))
+    )
+    ratio = np.inf
+    for _ in range(POWER_STEPS):
+        lift = arm.comm.allreduce(modes.interior.T @ loads)
+        tip = np.linalg.solve(modes.stiffness, outboard + lift)
+        interior = arm.solve(loads) + modes.interior @ tip
+        work = arm.comm.allreduce(np.sum(interior * loads)) + np.sum(tip * outboard)
+        loads, outboard = weighted(arm.expand(interior, tip))
+        energy = arm.comm.allreduce(np.sum(interior * loads)) + np.sum(tip * outboard)
+        ratio = abs(float(energy / work))
+        scale = max(energy, np.finfo(float).tiny) ** -0.5
+        loads, outboard = scale * loads, scale * outboard
+    return ratio * float(np.finfo(float).eps)
+
+
+def _lost_in_rounding(arm: ElasticArm) -> ConvergenceError:
+    low, high = extremes(arm.comm, arm.young)
+    return ConvergenceError(
+        f"arm {arm.mesh.name!r}: solid parts of the design float in a void "
+        f"{low / high:.1g} times as stiff, lost in their rounding; raise "
+        "interpolation.floor or design.minimum, or connect the design to both interfaces"
+    )
+
+
+def _is_stiffness(matrix: np.ndarray) -> bool:
+    """Return whether a symmetric matrix is finite and positive definite."""
+    if not np.isfinite(matrix).all():
+        return False
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
