@@ -28,7 +28,7 @@ def try_lock(lock: Callable[..., None], *arguments: Any) -> bool:
     """Return whether this process gets a lock, False if another has it.
 
     Args:
-        lock: `fcntl.flock` or `fcntl.lockf`.
+        lock: `fcntl.lockf`.
         arguments: its file, operation and range; the operation does not wait.
 
     Raises:
@@ -72,12 +72,11 @@ def has_locks(folder: Path, world: MPI.Comm) -> bool:
 
 
 def _missing_locks(folder: Path) -> str:
-    """Return why a file in the folder can have neither kind of lock, "" if it can."""
+    """Return why a file in the folder cannot be locked, "" if it can."""
     path = folder / f".lock-test-{os.getpid()}"
     try:
         with writing(path), open(path, "wb") as stream:
             try:
-                try_lock(fcntl.flock, stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 try_lock(fcntl.lockf, stream, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, 0)
             except OSError as error:
                 if error.errno in ABSENT:

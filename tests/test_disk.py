@@ -166,13 +166,12 @@ def test_no_lock_is_not_one_that_another_holds(number):
         try_lock(without(number))
 
 
-@pytest.mark.parametrize("name", ["flock", "lockf"])
 @pytest.mark.parametrize("number", locks.ABSENT)
-def test_a_file_system_without_locks_is_told(name, number, shared_tmp_path, monkeypatch, capsys):
+def test_a_file_system_without_locks_is_told(number, shared_tmp_path, monkeypatch, capsys):
     assert has_locks(shared_tmp_path, COMM)
     assert capsys.readouterr().err == ""
     COMM.Barrier()
-    monkeypatch.setattr(fcntl, name, without(number))
+    monkeypatch.setattr(fcntl, "lockf", without(number))
     if COMM.size > 1:
         with pytest.raises(InputError, match=r"has no locks.*use one rank"):
             has_locks(shared_tmp_path, COMM)
@@ -184,14 +183,13 @@ def test_a_file_system_without_locks_is_told(name, number, shared_tmp_path, monk
 
 
 def test_other_errors_of_locks_are_errors(tmp_path, monkeypatch):
-    monkeypatch.setattr(fcntl, "flock", without(errno.EIO))
+    monkeypatch.setattr(fcntl, "lockf", without(errno.EIO))
     with pytest.raises(OutputError, match="Input/output error"):
         has_locks(tmp_path, SELF)
 
 
 def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
     """It hung: a lock that is missing was taken for one that somebody holds."""
-    monkeypatch.setattr(fcntl, "flock", without(errno.ENOLCK))
     monkeypatch.setattr(fcntl, "lockf", without(errno.ENOTSUP))
     scene = load_scene(paper_scene(), COARSE)
     outcomes = run_cases([Case(scene)], tmp_path, SELF, shown=False)

@@ -7,19 +7,16 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from dolfinopt.data import page_folder
-from dolfinopt.paper.checks import Ends, Finding, Made, Measured, Swept, mm, percent
+from dolfinopt.paper.checks import Ends, Measured, Swept, mm, percent
 from dolfinopt.paper.reproduction import INITIAL, OPTIMUM, Numbered, Reproduction, cell_sizes
 from dolfinopt.study.tables import DesignFigure, LineFigure, Table, as_text
 
@@ -72,160 +69,99 @@ def write_reproduction(done: Reproduction, folder: Path, *, plots: bool = True) 
 
 def page(done: Reproduction, folder: Path) -> str:
     """Return report.html; the figures' pictures lie in the folder."""
-    gallery = _Gallery(done)
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     used = {number for _, numbers in SECTIONS for number in numbers}
     assert used == {numbered.number for numbered in done.figures}
-    return _template("report.html").substitute(
-        style=_text("report.css"),
-        machine=escape(done.measured.setting.machine),
-        headline=_headline(done),
-        player=_player(done),
-        summary=_summary(done.findings),
-        sections="\n".join(
-            _section(title, numbers, done, gallery, folder) for title, numbers in SECTIONS
-        ),
-        method=_method(done),
+    gallery, outcomes, scene = _Gallery(done), done.outcomes, done.plan.scene
+    optimised = [o for case, o in outcomes.by_case.items() if case.action == "optimize"]
+    size = max(cell_sizes(scene).values(), default=0.0)
+    templates = Environment(
+        loader=FileSystemLoader(page_folder()),
+        autoescape=lambda name: str(name).endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
     )
-
-
-def _template(name: str) -> Template:
-    return Template(_text(name))
-
-
-def _text(name: str) -> str:
-    return (page_folder() / name).read_text(encoding="utf-8")
+    text = templates.get_template("report.html").render(
+        as_text=as_text,
+        measured=done.measured,
+        cards=_cards(done),
+        player=_player(done),
+        checks=done.findings,
+        sections=[_section(title, n, done, gallery, folder) for title, n in SECTIONS],
+        scene=scene,
+        cases=outcomes.by_case,
+        optimised=optimised,
+        seconds=sum(o.seconds for o in optimised if not o.failure),
+        filter_cells=scene.design.radius / size if size else 0.0,
+        overridden=_overridden(scene),
+        failures=outcomes.failures,
+    )
+    return text.lstrip()
 
 
 # -- words and tables ------------------------------------------------------------------------
 
 
-def _headline(done: Reproduction) -> str:
-    """Return the figures one looks for first."""
-    initial, best = _ends(done.measured)
+def _cards(done: Reproduction) -> list[tuple[str, str]]:
+    """Return names and values of the figures one looks for first."""
+    initial = done.measured.objectives[0]
+    best = next(m for m in done.measured.objectives if m.kind == "esl")
     holds = sum(finding.holds for finding in done.findings)
-    cards = (
+    return [
         ("compliance", f"{initial.compliance:.4g} → {best.compliance:.4g} N m"),
         ("largest deviation", f"{1e3 * initial.deviation:.3g} → {1e3 * best.deviation:.3g} mm"),
         ("material", percent(done.plan.scene.design.volume_fraction).replace(".0 %", " %")),
         ("of the paper’s statements hold", f"{holds} of {len(done.findings)}"),
-    )
-    items = (f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in cards)
-    return f'<dl class="cards">{"".join(items)}</dl>'
-
-
-def _ends(measured: Measured) -> tuple[Made, Made]:
-    """Return the initial design and the paper's optimised one."""
-    return measured.objectives[0], next(m for m in measured.objectives if m.kind == "esl")
-
-
-def _verdict(finding: Finding) -> str:
-    word, kind = ("holds", "yes") if finding.holds else ("does not hold", "no")
-    return f'<strong class="{kind}">{word}</strong>'
-
-
-def _summary(findings: Iterable[Finding]) -> str:
-    """Return the table of all findings."""
-    rows = (
-        f'<tr><td>{_numbers(f.figures)}</td><td><a href="#{_anchor(f)}">{escape(f.statement)}</a>'
-        f"</td><td>{_verdict(f)}</td><td>{escape(f.paper)}</td><td>{escape(f.ours)}</td></tr>"
-        for f in findings
-    )
-    head = "<tr><th>figure</th><th>the paper finds</th><th></th><th>paper</th><th>here</th></tr>"
-    return _scrolling(
-        f'<table class="words"><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table>',
-        "all findings",
-    )
-
-
-def _numbers(numbers: Sequence[int]) -> str:
-    first, last = numbers[0], numbers[-1]
-    return str(first) if first == last else f"{first}–{last}"
-
-
-def _anchor(finding: Finding) -> str:
-    return "".join(c if c.isalnum() else "-" for c in finding.name)
-
-
-def _scrolling(content: str, name: str) -> str:
-    """Return a box of its own that scrolls where the content is wider than the page."""
-    label = escape(name, quote=True)
-    return f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">{content}</div>'
-
-
-def _table(table: Table) -> str:
-    """Return a table of figures."""
-    cells = as_text(table.frame, 4, missing="–").to_html(index=False, border=0)
-    _, _, body = cells.partition(">")
-    caption = f"<caption><span>{escape(table.title)}</span></caption>"
-    return _scrolling(f"<table>{caption}{body}", table.title)
-
-
-# -- sections --------------------------------------------------------------------------------
+    ]
 
 
 def _section(
     title: str, numbers: Sequence[int], done: Reproduction, gallery: _Gallery, folder: Path
-) -> str:
-    """Return one part of the paper: its findings, our figures, tables and designs."""
-    findings = [f for f in done.findings if set(f.figures) <= set(numbers)]
+) -> dict[str, Any]:
+    """Return one part of the paper: its statements, our figures, tables and designs."""
+    plan, measured = done.plan, done.measured
     shown = [numbered for numbered in done.figures if numbered.number in numbers]
-    parts = [_finding(f) for f in findings]
-    plots = [_picture(n, folder) for n in shown if not isinstance(n.figure, DesignFigure)]
-    parts.append(f'<div class="plots">{"".join(plots)}</div>')
-    parts += [_table(n.table) for n in shown if n.table is not None]
-    parts += _extras(numbers, done, gallery)
-    return f"<section><h2>{escape(title)}</h2>{''.join(parts)}</section>"
-
-
-def _finding(finding: Finding) -> str:
-    return (
-        f'<article class="finding" id="{_anchor(finding)}">'
-        f"<h3>{escape(finding.statement)} <small>(figure {_numbers(finding.figures)})</small></h3>"
-        f'<dl class="pair"><div><dt>paper</dt><dd>{escape(finding.paper)}</dd></div>'
-        f"<div><dt>here</dt><dd>{escape(finding.ours)}</dd></div></dl>"
-        f"<p>{_verdict(finding)} {escape(finding.reason if not finding.holds else '')}</p>"
-        f'<p class="criterion">Holds if: {escape(finding.criterion)}.</p></article>'
-    )
-
-
-def _picture(numbered: Numbered, folder: Path) -> str:
-    """Return a figure with its picture inside."""
-    data = (folder / f"{numbered.name}.png").read_bytes()
-    about = numbered.title
-    if isinstance(numbered.figure, LineFigure):
-        panels = [panel for row in numbered.figure.rows for panel in row]
-        curves = dict.fromkeys(line.label for panel in panels for line in panel.lines)
-        about = f"{about}: {panels[0].y_label} over {panels[0].x_label} of {', '.join(curves)}"
-    return (
-        f"<figure>{_image(data, about)}<figcaption><b>Figure {numbered.number}.</b> "
-        f"{escape(numbered.title)}.</figcaption></figure>"
-    )
-
-
-def _image(data: bytes, alt: str) -> str:
-    """Return a PNG as part of the page."""
-    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # of its header
-    text = base64.b64encode(data).decode()
-    return (
-        f'<img src="data:image/png;base64,{text}" width="{width}" height="{height}" '
-        f'alt="{escape(alt, quote=True)}">'
-    )
-
-
-def _extras(numbers: Sequence[int], done: Reproduction, gallery: _Gallery) -> list[str]:
-    """Return the designs and tables that a section has beside its figures."""
-    plan = done.plan
+    tables = [numbered.table for numbered in shown if numbered.table is not None]
+    designs: tuple[str, Iterable[Case]] = ("", ())
     if 4 in numbers:
-        designs = gallery.show("Designs by objective", (plan.initial, *plan.objectives))
-        return [designs, _table(_ends_table(done.measured.ends))]
-    if 5 in numbers:
-        designs = gallery.show("Designs by reduction", plan.reductions)
-        return [_table(_reduction_table(done.measured)), designs]
-    if 10 in numbers:
-        return [_table(_loss_table(done.measured.payload))]
-    if 12 in numbers:
-        return [gallery.show("Designs by path", plan.paths)]
-    return []
+        designs = "Designs by objective", (plan.initial, *plan.objectives)
+        tables.append(_ends_table(measured.ends))
+    elif 5 in numbers:
+        designs = "Designs by reduction", plan.reductions
+        tables.append(_reduction_table(measured))
+    elif 10 in numbers:
+        tables.append(_loss_table(measured.payload))
+    elif 12 in numbers:
+        designs = "Designs by path", plan.paths
+    return {
+        "title": title,
+        "checks": [f for f in done.findings if set(f.figures) <= set(numbers)],
+        "plots": [
+            (n, _png((folder / f"{n.name}.png").read_bytes()), _about(n))
+            for n in shown
+            if not isinstance(n.figure, DesignFigure)
+        ],
+        "tables": tables,
+        "designs_title": designs[0],
+        "designs": gallery.show(designs[1]),
+    }
+
+
+def _about(numbered: Numbered) -> str:
+    """Return what a figure shows, for those who do not see it."""
+    if not isinstance(numbered.figure, LineFigure):
+        return numbered.title
+    panels = [panel for row in numbered.figure.rows for panel in row]
+    curves = dict.fromkeys(line.label for panel in panels for line in panel.lines)
+    axes = f"{panels[0].y_label} over {panels[0].x_label}"
+    return f"{numbered.title}: {axes} of {', '.join(curves)}"
+
+
+def _png(data: bytes) -> dict[str, Any]:
+    """Return a PNG as the page embeds it."""
+    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # of its header
+    return {"data": base64.b64encode(data).decode(), "width": width, "height": height}
 
 
 def _reduction_table(measured: Measured) -> Table:
@@ -263,53 +199,16 @@ def _loss_table(sweep: Swept) -> Table:
     return Table("", "Loss against the design made for the payload", frame)
 
 
-def _method(done: Reproduction) -> str:
-    """Return what was computed, and what the paper leaves open."""
-    scene, outcomes = done.plan.scene, done.outcomes
-    failures = "".join(
-        f"<li>{escape(o.case.label)}: {escape(o.failure)}</li>" for o in outcomes.failures
-    )
-    failed = f"<p>Without result:</p><ul>{failures}</ul>" if failures else ""
-    optimised = [o for c, o in outcomes.by_case.items() if c.action == "optimize"]
-    seconds = sum(o.seconds for o in optimised if not o.failure)
-    cells = " x ".join(map(str, done.measured.cells)) or "a mesh of"
-    m = scene.motion
-    damping = scene.damping.stiffness_proportional
-    return (
-        f"<p>{len(outcomes.by_case)} cases: {len(optimised)} optimisations of at most "
-        f"{scene.optimizer.max_iterations} iterations, which took {seconds:.0f} s of one core "
-        f"together, and {len(outcomes.by_case) - len(optimised)} simulations; {cells} cells an "
-        f"arm{_filter(scene)}. The paper does not state everything. Fixed here: "
-        f"duration {m.duration:g} s, the cart follows {m.cart_follow:g} of the end-effector’s x, "
-        f"shoulder at y = {m.joint_height:g} m, damping {damping:g} s times the stiffness, "
-        f"{scene.objective.load_cases} load cases in {m.horizon:g} s. Nothing was tuned "
-        f"towards the paper’s figures. Where several of its figures show one thing, which of them "
-        f"shows what is our choice.</p>{_overridden(scene)}{failed}"
-    )
-
-
-def _filter(scene: Scene) -> str:
-    """Return the filter's radius in cells, in words."""
-    size = max(cell_sizes(scene).values(), default=0.0)
-    if not size:
-        return ""
-    radius = scene.design.radius
-    return f", a filter with a radius of {1e3 * radius:.3g} mm, {radius / size:.3g} cells"
-
-
-def _overridden(scene: Scene) -> str:
-    """Say where the scene is another than the paper's, which every figure here is compared with."""
+def _overridden(scene: Scene) -> list[str]:
+    """Return where the scene is not the paper's, which every figure here is compared with."""
     from dolfinopt.paper.reproduction import load_paper
 
     theirs, ours = _flat(load_paper().to_dict()), _flat(scene.to_dict())
-    changed = [
+    return [
         f"{key} = {ours.get(key)} in place of {theirs.get(key)}"
         for key in dict.fromkeys([*theirs, *ours])
         if theirs.get(key) != ours.get(key)
     ]
-    if not changed:
-        return ""
-    return f"<p>Not as in the paper’s scene: {escape('; '.join(changed))}.</p>"
 
 
 def _flat(data: Any, key: str = "") -> dict[str, Any]:
@@ -348,33 +247,23 @@ class _Gallery:
         x_phys = read_design(outcome.design, self.share, self.arms)
         return designed(gather_views(self.scene, self.share, self.arms, x_phys))
 
-    def show(self, title: str, cases: Iterable[Case]) -> str:
-        """Return the designs below each other, all to one scale."""
+    def show(self, cases: Iterable[Case]) -> list[dict[str, Any]]:
+        """Return the designs, all to one scale; those without a result are left out."""
         items = []
         for case in dict.fromkeys(cases):
             outcome = self.outcomes[case]
             if outcome.failure:
                 continue
             views = self.views(outcome)
-            longest = max(float(np.ptp(view.corners[..., 0])) for view in views)
-            arms = "".join(_arm(view, longest, case.label) for view in views)
+            lengths = [float(np.ptp(view.corners[..., 0])) for view in views]
+            arms = []
+            for view, length in zip(views, lengths):
+                part = length / max(lengths)
+                png = _png(arm_picture(view, round(WIDTH * part)))
+                arms.append({"name": view.name, "width": f"{100.0 * part:.4g}", "png": png})
             figures = f"{outcome.compliance:.4g} N m, {mm(outcome.max_deviation)}"
-            items.append(
-                f'<figure class="design"><figcaption>{escape(case.label)} '
-                f'<span class="figures">{figures}</span></figcaption>'
-                f'<div class="arms">{arms}</div></figure>'
-            )
-        return (
-            f'<h3>{escape(title)}</h3><p class="criterion">Dark is solid, light is void; to scale, '
-            f"the joint towards the cart on the left. Compliance and largest deviation as the "
-            f'design’s own model sees them.</p><div class="gallery">{"".join(items)}</div>'
-        )
-
-
-def _arm(view: ArmView, longest: float, design: str) -> str:
-    share = float(np.ptp(view.corners[..., 0])) / longest
-    image = _image(arm_picture(view, round(WIDTH * share)), f"{view.name} of the {design}")
-    return f'<div style="width:{100.0 * share:.4g}%">{image}</div>'
+            items.append({"label": case.label, "figures": figures, "arms": arms})
+        return items
 
 
 def arm_picture(view: ArmView, width: int) -> bytes:
@@ -459,19 +348,19 @@ def _point(place: complex) -> str:
     return f"{place.real:.4f},{place.imag:.4f}"
 
 
-def _player(done: Reproduction) -> str:
-    """Return the moving mechanism, initial and optimised design together."""
+def _player(done: Reproduction) -> dict[str, Any] | None:
+    """Return the moving mechanism, initial and optimised design together; None without results."""
     from dolfinopt.plots.figures import round_magnification
     from dolfinopt.study.store import simulate_scenarios
 
     optimum = done.outcomes[done.plan.optimum]
     if optimum.failure:
-        return ""
+        return None
     moved = []
     for design in (None, optimum.design):
         simulated = next(iter(simulate_scenarios([done.plan.scene], design)))
         if isinstance(simulated, Exception) or simulated.trajectory is None:
-            return ""
+            return None
         moved.append(simulated.trajectory)
     t = moved[0].t
     at = np.unique(np.round(np.linspace(0, len(t) - 1, FRAMES)).astype(int))
@@ -480,13 +369,13 @@ def _player(done: Reproduction) -> str:
     magnification = round_magnification(largest, reach)
     before, after = (strip(one, at, magnification) for one in moved)
     rigid = strip(moved[1], at, 0.0)
-    return _svg(t[at], before, after, rigid, magnification, moved[0].mechanism.joint_height)
+    return _frames(t[at], before, after, rigid, magnification, moved[0].mechanism.joint_height)
 
 
-def _svg(
+def _frames(
     t: np.ndarray, before: Strip, after: Strip, rigid: Strip, magnification: float, joint: float
-) -> str:
-    """Return the player: complete without its script, which only moves it."""
+) -> dict[str, Any]:
+    """Return what player.html shows: complete without its script, which only moves it."""
     places = np.concatenate([s.tips for s in (before, after, rigid)])
     left = float(min(places[:, 0].min(), rigid.carts.min())) - 0.16
     right = float(max(places[:, 0].max(), rigid.carts.max())) + 0.16
@@ -505,30 +394,29 @@ def _svg(
         "delay": 1e3 * SLOWER * float(t[-1] - t[0]) / (len(t) - 1),
     }
     path = "M" + "L".join(_point(complex(x, y)) for x, y in rigid.tips)
-    return _template("player.html").substitute(
-        script=_text("player.js"),
-        box=f"{left:.3f} {-high:.3f} {width:.3f} {height:.3f}",
-        left=f"{left:.3f}",
-        right=f"{right:.3f}",
-        ground=f"{joint - 0.075:.3f}",
-        cart_y=f"{joint - 0.06:.3f}",
-        cart=f"{rigid.carts[here]:.4f}",
-        path=path,
-        before=before.arms[here],
-        after=after.arms[here],
-        bx=f"{before.tips[here, 0]:.4f}",
-        by=f"{before.tips[here, 1]:.4f}",
-        ax=f"{after.tips[here, 0]:.4f}",
-        ay=f"{after.tips[here, 1]:.4f}",
-        last=len(t) - 1,
-        here=here,
-        said=_said(float(t[here]), float(before.deviation[here]), float(after.deviation[here])),
-        magnification=f"{magnification:g}",
-        slower=f"{SLOWER:g}",
-        frames=json.dumps(frames, separators=(",", ":")),
-        initial=INITIAL,
-        optimised=OPTIMUM,
-    )
+    return {
+        "box": f"{left:.3f} {-high:.3f} {width:.3f} {height:.3f}",
+        "left": f"{left:.3f}",
+        "right": f"{right:.3f}",
+        "ground": f"{joint - 0.075:.3f}",
+        "cart_y": f"{joint - 0.06:.3f}",
+        "cart": f"{rigid.carts[here]:.4f}",
+        "path": path,
+        "before": before.arms[here],
+        "after": after.arms[here],
+        "bx": f"{before.tips[here, 0]:.4f}",
+        "by": f"{before.tips[here, 1]:.4f}",
+        "ax": f"{after.tips[here, 0]:.4f}",
+        "ay": f"{after.tips[here, 1]:.4f}",
+        "last": len(t) - 1,
+        "here": here,
+        "said": _said(float(t[here]), float(before.deviation[here]), float(after.deviation[here])),
+        "magnification": f"{magnification:g}",
+        "slower": f"{SLOWER:g}",
+        "frames": frames,
+        "initial": INITIAL,
+        "optimised": OPTIMUM,
+    }
 
 
 def _said(t: float, before: float, after: float) -> str:

@@ -1,4 +1,4 @@
-"""One display for many cases on many ranks: a live board on a terminal, plain lines elsewhere.
+"""One display for many cases on many ranks: live bars on a terminal, plain lines elsewhere.
 
 Every rank tells the root what it does; the root listens whenever it has a moment. Nothing that is
 computed depends on it. A rank that fails tells all others, who give up their work when they next
@@ -46,7 +46,7 @@ class News:
 
 
 @dataclass
-class Board:
+class Progress:
     """Owns the messages under way and what was heard so far.
 
     Attributes:
@@ -137,8 +137,8 @@ class Board:
 
 
 @contextmanager
-def open_board(world: MPI.Comm, total: int, shown: bool = True) -> Iterator[Board]:
-    """Yield a board for `total` cases, and wait for all ranks at the block's end (collective).
+def open_progress(world: MPI.Comm, total: int, shown: bool = True) -> Iterator[Progress]:
+    """Yield the progress of `total` cases, and wait for all ranks at the block's end (collective).
 
     What the block raises on one rank is raised on all, see `parallel.together`; the others give
     up their work.
@@ -150,69 +150,64 @@ def open_board(world: MPI.Comm, total: int, shown: bool = True) -> Iterator[Boar
     """
     from dolfinopt.parallel import together
 
-    board = Board(world.Dup(), total)
+    progress = Progress(world.Dup(), total)
     try:
-        with together(world), _display(board, world.rank == 0 and shown and total > 0):
+        with together(world), _display(progress, world.rank == 0 and shown and total > 0):
             try:
-                yield board
+                yield progress
             except OthersFailed:
                 raise
             except BaseException:
-                board.stop_others()
+                progress.stop_others()
                 raise
             finally:
-                board.wait_for_all()
+                progress.wait_for_all()
     finally:
-        board.close()
+        progress.close()
 
 
-def _display(board: Board, shown: bool) -> AbstractContextManager[None]:
+def _display(progress: Progress, shown: bool) -> AbstractContextManager[None]:
     """Show the news on a terminal, or in lines."""
     if shown and sys.stderr.isatty():
-        return _live(board)
-    board._show = _print_line if shown else None
+        return _live(progress)
+    progress._show = _print_line if shown else None
     return nullcontext()
 
 
-def _print_line(board: Board, news: News) -> None:
+def _print_line(progress: Progress, news: News) -> None:
     """Print a line for every case that ends."""
     if news.finished:
-        width = len(str(board.total))
-        count = f"{board.finished:>{width}}/{board.total}"
+        width = len(str(progress.total))
+        count = f"{progress.finished:>{width}}/{progress.total}"
         print(f"{count}  {news.label}: {news.text}", file=sys.stderr, flush=True)
 
 
 @contextmanager
-def _live(board: Board) -> Iterator[None]:
+def _live(progress: Progress) -> Iterator[None]:
     """Show one bar for the whole and a line a rank."""
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
     from rich.table import Column
 
-    words = TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1))
-    progress = Progress(words, BarColumn(bar_width=20), TimeElapsedColumn(), expand=True,
-                        console=Console(stderr=True))  # fmt: skip
-    with progress:
-        whole = progress.add_task(f"0/{board.total} cases", total=board.total)
-        lines: dict[int, TaskID] = {}
+    words = rich.TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1))
+    columns = words, rich.BarColumn(bar_width=20), rich.TimeElapsedColumn()
+    with rich.Progress(*columns, expand=True, console=Console(stderr=True)) as display:
+        whole = display.add_task(f"0/{progress.total} cases", total=progress.total)
+        lines: dict[int, rich.TaskID] = {}
 
-        def show(board: Board, news: News) -> None:
+        def show(progress: Progress, news: News) -> None:
             if news.finished:
-                progress.update(
-                    whole,
-                    completed=board.finished,
-                    description=f"{board.finished}/{board.total} cases",
-                )
+                count = f"{progress.finished}/{progress.total} cases"
+                display.update(whole, completed=progress.finished, description=count)
             if news.rank not in lines:
-                lines[news.rank] = progress.add_task("", total=None)
-            line = lines[news.rank]
-            progress.update(
-                line,
+                lines[news.rank] = display.add_task("", total=None)
+            display.update(
+                lines[news.rank],
                 description=f"  {news.label}: {news.text}",
                 total=news.total or None,
                 completed=news.done,
                 visible=not news.last,
             )
 
-        board._show = show
+        progress._show = show
         yield

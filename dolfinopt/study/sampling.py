@@ -2,38 +2,35 @@
 
 Every sample starts from the nominal scene's solution, which every rank finds for itself: its bits
 depend neither on the number of ranks nor on what was computed before. A chunk is known by the
-scene's content, the design, its samples and the program; its file comes when it is complete. Ranks,
-and several runs, take chunks by locks that end with their process.
+scene's content, the design, its samples and the program; its file comes when it is complete.
 """
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import re
 import time
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 from uuid import uuid4
 
 import numpy as np
 
-from dolfinopt.disk import make_folder, writing
+from dolfinopt.disk import make_folder
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.profiling import Ledger
 from dolfinopt.responses.objective import worst_instants
 from dolfinopt.responses.scenarios import bodies_in
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.progress import IDLE, Board, open_board
+from dolfinopt.study.progress import Progress
 from dolfinopt.study.store import Case, simulate_scenarios
+from dolfinopt.study.tasks import do_tasks
 from dolfinopt.study.variants import changed
 
 if TYPE_CHECKING:
@@ -41,7 +38,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.output.run_folder import Simulated
 
-FOLDER, LOCK = "samples", ".lock"
+FOLDER = "samples"
 # Keys that leave the reduced bodies as they are, or scale them: in plane stress mass and stiffness
 # are linear in the thickness.
 SCALING = r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
@@ -212,9 +209,12 @@ def respond(
 
     done, run = on_root(world, look)
     missing = [chunk for chunk, there in zip(chunks, done, strict=True) if not there]
-    locked = has_locks(place, world)
-    with open_board(world, len(missing), shown) as board:
-        _work(missing, place, run, board, locked)
+    nominal = _Nominals()
+    tasks = [_ChunkTask(chunk, place, run, nominal) for chunk in missing]
+    # Every rank begins elsewhere: with several designs each reduces those it needs.
+    begin = len(tasks) * world.rank // world.size
+    tasks = [*tasks[begin:], *tasks[:begin]]
+    do_tasks(tasks, place, world, len(missing), shown=shown)
     responses = []
     with together(world):
         found = {chunk: _read(place, chunk, run) for chunk in chunks}
@@ -224,59 +224,54 @@ def respond(
     return responses, sum(chunk.last - chunk.first for chunk in missing)
 
 
-def _work(chunks: Sequence[_Chunk], place: Path, run: str, board: Board, locked: bool) -> None:
-    """Take chunks until none is left; the other ranks do the same."""
-    comm = board.comm
-    # Every rank begins elsewhere: with several designs each reduces those it needs.
-    begin = len(chunks) * comm.rank // comm.size
-    left = [*chunks[begin:], *chunks[:begin]]
-    nominal: _Nominal | None = None
-    with writing(place / LOCK):
-        locks = open(place / LOCK, "a+b")
-    with locks:
-        while left:
-            for chunk in left:
-                if _read(place, chunk, run) is not None:
-                    left.remove(chunk)
-                    break
-                with _claim(locks, chunk, locked) as mine:
-                    if not mine:
-                        continue
-                    if _read(place, chunk, run) is None:
-                        if nominal is None or nominal.design != chunk.design:
-                            scene = chunk.samples.scene
-                            nominal = _Nominal(scene, chunk.design, chunk.samples.scaling)
-                        _do(chunk, nominal, place, run, board)
-                left.remove(chunk)
-                break
-            else:
-                board.listen()
-                time.sleep(IDLE)
+class _Nominals:
+    """The design that this rank has at hand; owns its reduction and simulation."""
+
+    def __init__(self) -> None:
+        self._last: _Nominal | None = None
+
+    def of(self, chunk: _Chunk) -> _Nominal:
+        """Return the chunk's design in the nominal scene, the last one's if it is the same."""
+        if self._last is None or self._last.design != chunk.design:
+            self._last = _Nominal(chunk.samples.scene, chunk.design, chunk.samples.scaling)
+        return self._last
 
 
-@contextmanager
-def _claim(locks: IO[bytes], chunk: _Chunk, locked: bool) -> Iterator[bool]:
-    """Yield whether this process has the chunk's byte of the lock file, until the block ends.
+@dataclass(frozen=True, eq=False)
+class _ChunkTask:
+    """A chunk to simulate, see `tasks.Task`."""
 
-    Without locks it always has.
-    """
-    place = int(chunk.key[:12], 16)
-    mine = not locked or try_lock(fcntl.lockf, locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
-    try:
-        yield mine
-    finally:
-        if locked and mine:
-            fcntl.lockf(locks, fcntl.LOCK_UN, 1, place)
+    chunk: _Chunk
+    place: Path
+    run: str
+    nominals: _Nominals
+
+    @property
+    def key(self) -> str:
+        """That of the chunk."""
+        return self.chunk.key
+
+    def is_done(self) -> bool:
+        """Tell whether this run need not simulate it any more."""
+        return _read(self.place, self.chunk, self.run) is not None
+
+    def is_ready(self) -> bool:
+        """A chunk needs nothing but its design, which is there."""
+        return True
+
+    def do(self, progress: Progress) -> None:
+        """Simulate it."""
+        _do(self.chunk, self.nominals.of(self.chunk), self.place, self.run, progress)
 
 
-def _do(chunk: _Chunk, nominal: _Nominal, place: Path, run: str, board: Board) -> None:
+def _do(chunk: _Chunk, nominal: _Nominal, place: Path, run: str, progress: Progress) -> None:
     """Simulate a chunk's samples and write what they gave."""
     from dolfinopt.output.files import write_arrays
 
     begun = time.perf_counter()
     label = f"{chunk.label}, samples {chunk.first} to {chunk.last - 1}"
     scenes = chunk.scenes()
-    board.tell(label, text="...")
+    progress.tell(label, text="...")
     rows, messages = [], []
     for done, found in enumerate(nominal.simulate(scenes), 1):
         if isinstance(found, ConvergenceError):
@@ -285,7 +280,7 @@ def _do(chunk: _Chunk, nominal: _Nominal, place: Path, run: str, board: Board) -
         else:
             messages.append("")
             rows.append(_response(found))
-        board.tell(label, done, len(scenes))
+        progress.tell(label, done, len(scenes))
     compliance, deviation, when = np.array(rows).T
     arrays = {
         "compliance": compliance,
@@ -296,7 +291,7 @@ def _do(chunk: _Chunk, nominal: _Nominal, place: Path, run: str, board: Board) -
     }
     write_arrays(place / f"{chunk.key}.npz", arrays)
     each = 1e3 * (time.perf_counter() - begun) / len(scenes)
-    board.tell(label, text=f"{each:.0f} ms each", finished=1)
+    progress.tell(label, text=f"{each:.0f} ms each", finished=1)
 
 
 def _response(trajectory: Trajectory) -> tuple[float, float, float]:

@@ -3,23 +3,22 @@
 A case is known by what it computes: a hash of the scene's content, of the design and of the program
 that computes, never a name, a path or a date. Its results are the usual files in DIR/cases/<key>/;
 the summary comes last and tells that the case is done. Every case runs on one rank alone, so that
-its bits do not depend on how many there are. Ranks take cases by locking their folders: a lock ends
-with its process, and several runs may work on the same DIR.
+its bits do not depend on how many there are.
 
-All that a run asks of one design with one reduction is simulated at once. Such a batch shares its
-steps, which each of its cases depends on within the tolerance: they are kept under the key of case
-and company, and one that is missing is computed with all the others.
+All that a run lacks of one design with one reduction is simulated at once. Such a batch shares its
+steps, which each of its cases depends on within the tolerance. Which cases were in it is kept
+beside each: after an interruption the missing ones are computed with the same others, to the same
+bits. What is done is done: a study that grows computes the new cases alone.
 """
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby, pairwise
@@ -29,12 +28,12 @@ from uuid import uuid4
 
 import numpy as np
 
-from dolfinopt.disk import make_folder, writing
+from dolfinopt.disk import make_folder
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.scene.contents import file_digest, program, with_digests
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.progress import IDLE, Board, open_board
+from dolfinopt.study.progress import Progress
+from dolfinopt.study.tasks import do_tasks
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
 Action = Literal["optimize", "simulate", "compare"]
 
 CASES = "cases"  # folder of all cases
-SUMMARY, FAILURE, LOCK = "summary.json", "failure.json", ".lock"
+SUMMARY, FAILURE, BATCH = "summary.json", "failure.json", "batch.json"
 # Craig-Bampton with this many coordinates stands for the unreduced arm.
 REFERENCE_METHOD, REFERENCE = "craig-bampton", 48
 MODES = 3  # natural modes that "compare" looks at
@@ -251,14 +250,6 @@ class _Batch:
 
     cases: tuple[Case, ...]
 
-    @cached_property
-    def names(self) -> dict[Case, str]:
-        """Every case's folder: its key, and where it has company the company's."""
-        if len(self.cases) == 1:
-            return {case: case.key for case in self.cases}
-        company = [case.key for case in self.cases]
-        return {case: _digest([case.key, company]) for case in self.cases}
-
     @property
     def cost(self) -> float:
         """Rough measure of the time it takes; the reduced equations' cost grows with q^2."""
@@ -270,40 +261,19 @@ class _Batch:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """What one rank does in one go: an optimisation, or one design in many scenes."""
-
-    batches: tuple[_Batch, ...]
-
-    @property
-    def first(self) -> Case:
-        """All others have its action and its design."""
-        return self.batches[0].cases[0]
-
-    @property
-    def cost(self) -> float:
-        """See `_Batch.cost`."""
-        return sum(batch.cost for batch in self.batches)
-
-
-@dataclass(frozen=True)
 class _Place:
     """Where the cases of this run are kept.
 
     Attributes:
         folder: of all cases.
         run: what tells this run's failures from those of earlier ones.
-        names: every case's folder in it.
-        locked: False where the file system has no locks, and this is the only rank.
     """
 
     folder: Path
     run: str
-    names: Mapping[Case, str]
-    locked: bool
 
     def __getitem__(self, case: Case) -> Path:
-        return self.folder / self.names[case]
+        return self.folder / case.key
 
     def failure(self, case: Case) -> str:
         """Return why the case failed in this run, "" if it did not."""
@@ -312,6 +282,62 @@ class _Place:
     def has(self, case: Case) -> bool:
         """Tell whether the case is done, or has failed in this run."""
         return (self[case] / SUMMARY).exists() or bool(self.failure(case))
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What one rank does in one go: an optimisation, or one design in many scenes."""
+
+    batches: tuple[_Batch, ...]
+    place: _Place
+
+    @property
+    def first(self) -> Case:
+        """All others have its action and its design."""
+        return self.batches[0].cases[0]
+
+    @property
+    def key(self) -> str:
+        """That of its first case."""
+        return self.first.key
+
+    @property
+    def cost(self) -> float:
+        """See `_Batch.cost`."""
+        return sum(batch.cost for batch in self.batches)
+
+    @property
+    def missing(self) -> list[Case]:
+        """Cases that have neither been done nor failed."""
+        return [case for batch in self.batches for case in batch.cases if not self.place.has(case)]
+
+    def is_done(self) -> bool:
+        """Tell whether no case is missing."""
+        return not self.missing
+
+    def is_ready(self) -> bool:
+        """Tell whether the design is there, or will not be."""
+        given = self.first.design
+        return not isinstance(given, Case) or self.place.has(given)
+
+    def do(self, progress: Progress) -> None:
+        """Do the cases that are missing; without their design they fail."""
+        given, missing = self.first.design, self.missing
+        if isinstance(given, Case):
+            if reason := self.place.failure(given):
+                for case in missing:
+                    label = given.label or given.key
+                    _fail(self.place[case], self.place.run, f"{label}: {reason}")
+                    progress.tell(case.label, text="its design is missing", finished=1)
+                return
+            given = self.place[given] / "design.npz"
+        if self.first.action == "optimize":
+            for case in missing:
+                make_folder(self.place[case])
+                _optimise(case, self.place[case], self.place.run, progress)
+        else:
+            batches = [one for one in self.batches if not set(missing).isdisjoint(one.cases)]
+            _examine(batches, missing, given, self.place, progress)
 
 
 def run_cases(
@@ -334,19 +360,21 @@ def run_cases(
     from dolfinopt.parallel import on_root, together
 
     wanted = _with_dependencies(cases)
-    batches = _batches(wanted)
-    names = {case: name for batch in batches for case, name in batch.names.items()}
-    run = on_root(world, lambda: uuid4().hex)
-    on_root(world, make_folder, folder / CASES)
-    place = _Place(folder / CASES, run, names, has_locks(folder / CASES, world))
-    done = on_root(world, lambda: [_is_done(place[case]) for case in wanted])
-    missing = {case for case, there in zip(wanted, done, strict=True) if not there}
-    left = [batch for batch in batches if not missing.isdisjoint(batch.cases)]
-    with open_board(world, len(missing), shown) as board:
-        _work(_jobs(left, world.size), place, board)
+    place = _Place(folder / CASES, on_root(world, lambda: uuid4().hex))
+
+    def look() -> tuple[list[bool], list[list[int]]]:
+        done = [_is_done(place[case]) for case in wanted]
+        batches = _batches([c for c, there in zip(wanted, done) if not there], wanted, place)
+        numbers = {case: i for i, case in enumerate(wanted)}
+        return done, [[numbers[case] for case in batch] for batch in batches]
+
+    done, found = on_root(world, look)
+    batches = [_Batch(tuple(wanted[i] for i in batch)) for batch in found]
+    missing = len(done) - sum(done)
+    do_tasks(_jobs(batches, place, world.size), place.folder, world, missing, shown=shown)
     with together(world):
         outcomes = {case: _read(case, place) for case in wanted}
-    return Outcomes(outcomes, len(missing))
+    return Outcomes(outcomes, missing)
 
 
 def _with_dependencies(cases: Iterable[Case]) -> list[Case]:
@@ -359,15 +387,41 @@ def _with_dependencies(cases: Iterable[Case]) -> list[Case]:
     return list(found)
 
 
-def _batches(cases: Iterable[Case]) -> list[_Batch]:
-    """Return all cases, those that can be done at once together."""
-    groups: dict[str, list[Case]] = {}
-    for case in cases:
-        groups.setdefault(case.batch_key, []).append(case)
-    return [_Batch(tuple(sorted(group, key=lambda case: case.key))) for group in groups.values()]
+def _batches(
+    missing: Sequence[Case], wanted: Sequence[Case], place: _Place
+) -> list[tuple[Case, ...]]:
+    """Return what is to be done at once, and keep it beside the cases (root only).
+
+    Those that an earlier run had begun together stay so if all of them are wanted again.
+    """
+    from dolfinopt.output.files import write_text
+
+    known = {case.key: case for case in wanted}
+    groups: dict[tuple[str, ...] | str, list[Case]] = {}
+    for case in missing:
+        before = _read_batch(place[case])
+        again = case.key in before and known.keys() >= {*before}
+        groups.setdefault(before if again else case.batch_key, []).append(case)
+    batches = []
+    for name, group in groups.items():
+        keys = list(name) if isinstance(name, tuple) else sorted(case.key for case in group)
+        batches.append(tuple(known[key] for key in keys))
+        if isinstance(name, str) and len(keys) > 1:
+            for case in group:
+                make_folder(place[case])
+                write_text(place[case] / BATCH, json.dumps(keys) + "\n")
+    return batches
 
 
-def _jobs(batches: Iterable[_Batch], ranks: int) -> list[_Job]:
+def _read_batch(folder: Path) -> tuple[str, ...]:
+    """Return the keys of the cases that this one was begun with, none where it was not."""
+    try:
+        return tuple(map(str, json.loads((folder / BATCH).read_text(encoding="utf-8"))))
+    except (OSError, ValueError, TypeError):
+        return ()
+
+
+def _jobs(batches: Iterable[_Batch], place: _Place, ranks: int) -> list[_Job]:
     """Return the jobs, optimisations first, as others wait for them, and longest first.
 
     Batches of the same arms and design are one job, so that these are built once, unless that
@@ -382,73 +436,14 @@ def _jobs(batches: Iterable[_Batch], ranks: int) -> list[_Job]:
     for group in groups.values():
         parts = ranks if len(groups) < ranks else 1
         cuts = np.linspace(0, len(group), min(parts, len(group)) + 1).astype(int)
-        jobs += [_Job(tuple(group[a:b])) for a, b in pairwise(cuts)]
+        jobs += [_Job(tuple(group[a:b]), place) for a, b in pairwise(cuts)]
     return sorted(jobs, key=lambda job: (job.first.action != "optimize", -job.cost))
-
-
-def _work(jobs: Sequence[_Job], place: _Place, board: Board) -> None:
-    """Take jobs until none is left; the other ranks do the same."""
-    left = list(jobs)
-    while left:
-        for job in left:
-            if not _missing(job, place) or _do(job, place, board):
-                left.remove(job)
-                break
-        else:
-            board.listen()
-            time.sleep(IDLE)
-
-
-def _missing(job: _Job, place: _Place) -> list[Case]:
-    """Return the job's cases that have neither been done nor failed."""
-    return [case for batch in job.batches for case in batch.cases if not place.has(case)]
-
-
-def _do(job: _Job, place: _Place, board: Board) -> bool:
-    """Do a job if it is ready and nobody else is at it; return whether it is done."""
-    given = job.first.design
-    if isinstance(given, Case):
-        if reason := place.failure(given):
-            for case in _missing(job, place):
-                _fail(place[case], place.run, f"{given.label or given.key}: {reason}")
-                board.tell(case.label, text="its design is missing", finished=1)
-            return True
-        if not (place[given] / SUMMARY).exists():
-            return False
-        given = place[given] / "design.npz"
-    with _claim(place[job.first], place.locked) as mine:
-        if not mine:
-            return False
-        missing = _missing(job, place)
-        if job.first.action == "optimize":
-            for case in missing:
-                _optimise(case, place[case], place.run, board)
-        elif missing:
-            batches = [batch for batch in job.batches if not set(missing).isdisjoint(batch.cases)]
-            _examine(batches, missing, given, place, board)
-    return True
-
-
-@contextmanager
-def _claim(folder: Path, locked: bool = True) -> Iterator[bool]:
-    """Yield whether this process has the folder's lock, which ends with the block or with it.
-
-    Without locks it always has.
-    """
-    make_folder(folder)
-    if not locked:
-        yield True
-        return
-    with writing(folder / LOCK):
-        stream = open(folder / LOCK, "w")
-    with stream:
-        yield try_lock(fcntl.flock, stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 # -- what is done ----------------------------------------------------------------------------
 
 
-def _optimise(case: Case, folder: Path, run: str, board: Board) -> None:
+def _optimise(case: Case, folder: Path, run: str, progress: Progress) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
     from mpi4py import MPI
 
@@ -471,19 +466,19 @@ def _optimise(case: Case, folder: Path, run: str, board: Board) -> None:
 
     def report(row: HistoryRow) -> None:
         text = f"{row.iteration}/{limit} objective {row.objective:.4g}"
-        board.tell(case.label, row.iteration, limit, text)
+        progress.tell(case.label, row.iteration, limit, text)
 
     try:
         result = optimize(scene, folder, resume=resume, world=MPI.COMM_SELF, report=report)
     except ConvergenceError as error:
         _fail(folder, run, str(error))
-        board.tell(case.label, text=f"failed: {error}", finished=1)
+        progress.tell(case.label, text=f"failed: {error}", finished=1)
         return
     wall = earlier + time.perf_counter() - begun
     write_result(scene, folder, result, wall, paraview=False)
     end = result.evaluation
     text = f"{result.iterations} iterations, {_figures(end.compliance, end.max_deviation)}"
-    board.tell(case.label, text=f"{text}, {wall:.1f} s", finished=1)
+    progress.tell(case.label, text=f"{text}, {wall:.1f} s", finished=1)
 
 
 def _examine(
@@ -491,13 +486,13 @@ def _examine(
     missing: Sequence[Case],
     design: Path | None,
     place: _Place,
-    board: Board,
+    progress: Progress,
 ) -> None:
     """Simulate or compare one design in many scenes; write what is missing."""
     from dolfinopt.output.run_folder import write_simulation
 
     cases = [case for batch in batches for case in batch.cases]
-    board.tell(missing[0].label, text="...")
+    progress.tell(missing[0].label, text="...")
     scenes = [_unnamed(case) for case in cases]
     results: Iterator[Simulated | tuple[BasisFigures, ...] | ConvergenceError]
     if cases[0].action == "simulate":
@@ -506,7 +501,7 @@ def _examine(
         results = compare(scenes, design)
     begun = time.perf_counter()
     for case, scene, found in zip(cases, scenes, results, strict=True):
-        if case not in missing:  # it was needed as company
+        if case not in missing:  # it is there already, and shares the steps of those that are not
             continue
         folder, wall = place[case], time.perf_counter() - begun
         make_folder(folder)
@@ -519,7 +514,7 @@ def _examine(
         else:
             write_simulation(folder, found, wall, paraview=False)
             text = _figures(found.evaluation.compliance, found.evaluation.max_deviation)
-        board.tell(case.label, text=f"{text}, {wall:.1f} s", finished=1)
+        progress.tell(case.label, text=f"{text}, {wall:.1f} s", finished=1)
         begun = time.perf_counter()
 
 

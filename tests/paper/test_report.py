@@ -118,13 +118,13 @@ def test_page_is_sound(page):
 
 def test_every_finding_is_told(folder):
     """With the paper's figure, ours, and the verdict."""
-    from html import escape
+    from html import unescape
 
-    text = (folder / "report.html").read_text(encoding="utf-8")
+    text = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for finding in find(read_measured((folder / "measured.json").read_text())):
         for words in (finding.statement, finding.paper, finding.ours, finding.criterion):
-            assert escape(words) in text
-        assert finding.holds or escape(finding.reason) in text
+            assert words in text
+        assert finding.holds or finding.reason in text
 
 
 def test_page_without_some_results(made, tmp_path):

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.optimization import loop as optimization
-from dolfinopt.output import checkpoint
+from dolfinopt.output import checkpoint, run
 from dolfinopt.responses import evaluation
 from dolfinopt.study import store as cases
 from dolfinopt.study.store import Case, run_cases, scene_content, simulate_scenarios
@@ -42,7 +44,7 @@ def forbid(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("computed again")
 
-    for module, name in ((optimization, "optimize"), (evaluation, "simulate_batch")):
+    for module, name in ((run, "optimize"), (evaluation, "simulate_batch")):
         monkeypatch.setattr(module, name, refuse)
 
 
@@ -156,7 +158,7 @@ def test_files_and_outcomes(plan, done):
     folder, outcomes = done
     assert outcomes.computed == 8 and not outcomes.failures  # the optimisation was implied
     made = plan[0].design
-    files = {path.name for path in outcomes[made].folder.iterdir()} - {".lock"}
+    files = {path.name for path in outcomes[made].folder.iterdir()}
     assert files == {
         "checkpoint.npz", "design.npz", "history.csv", "summary.json", "trajectory.csv",
         "trajectory.npz",
@@ -318,17 +320,19 @@ def test_chosen_coordinates_are_those_of_each_scene():
     assert Case(strict).batch_key == Case(strict).key
 
 
-def test_company_is_part_of_where_a_case_is_kept(plan, done, tmp_path, batches):
-    """What a case gives does not depend on what was there before, but on what is asked with it."""
+def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batches):
+    """What is there stays as it is, and all are right to the tolerance in any company."""
     _, outcomes = done
     [case, *_] = together = plan[3:6]
     alone = run_cases([case], tmp_path, SELF, shown=False)
-    assert alone[case].folder.name == case.key != outcomes[case].folder.name
-    assert_close(alone[case], outcomes[case])
+    kept = alone[case].design.stat().st_mtime_ns
     after = run_cases(together, tmp_path, SELF, shown=False)
-    assert batches == [1, 3] and after.computed == 3
+    assert batches == [1, 2] and after.computed == 2
+    assert after[case].design.stat().st_mtime_ns == kept
+    assert after[case].compliance == alone[case].compliance
     for one in together:
-        assert after[one].compliance == outcomes[one].compliance
+        assert_close(after[one], outcomes[one])
+    assert run_cases(plan[3:5], tmp_path, SELF, shown=False).computed == 0
 
 
 def test_batch_interrupted_while_it_is_written(plan, done, shared_tmp_path, monkeypatch, batches):
@@ -389,7 +393,7 @@ def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
     class Killed(Exception):
         pass
 
-    def tell(board, label="", done=0, *args, **kwargs):
+    def tell(progress, label="", done=0, *args, **kwargs):
         if done == stop and not kwargs:
             raise Killed
 
@@ -397,7 +401,7 @@ def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(cases.Board, "tell", tell)
+        patch.setattr(cases.Progress, "tell", tell)
         if stop is None:
             from dolfinopt.output import run_folder as results
 
@@ -462,17 +466,26 @@ def test_design_that_was_not_found(plan, shared_tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise do.ConvergenceError("no way")
 
-    monkeypatch.setattr(optimization, "optimize", fail)
+    monkeypatch.setattr(run, "optimize", fail)
     outcomes = run_cases(plan[:4], shared_tmp_path, WORLD, shown=False)
     assert [one.failure for one in outcomes.failures] == ["no way"] + 3 * ["made: no way"]
     assert outcomes[plan[3]].compliance > 0.0
 
 
+# Another program that does a case: its folder's name is the key.
+OWNER = """
+import fcntl, pathlib, sys, time
+place = pathlib.Path(sys.argv[1])
+with open(place.parent / ".lock", "a+b") as stream:
+    fcntl.lockf(stream, fcntl.LOCK_EX, 1, int(place.name[:12], 16))
+    print("locked", flush=True)
+    time.sleep(0.3)
+    (place / "part").rename(place / "summary.json")
+"""
+
+
 def test_case_in_other_hands_is_waited_for(plan, done, shared_tmp_path):
     """A locked case is left to its owner, whose result is taken."""
-    import fcntl
-    import threading
-
     _, outcomes = done
     case = plan[3]
     if WORLD.rank > 0:
@@ -480,19 +493,12 @@ def test_case_in_other_hands_is_waited_for(plan, done, shared_tmp_path):
         return
     place = shared_tmp_path / "cases" / case.key
     place.mkdir(parents=True)
-    lock = open(place / ".lock", "w")
-    fcntl.flock(lock, fcntl.LOCK_EX)
-
-    def finish():
-        data = json.loads((outcomes[case].folder / "summary.json").read_text())
-        (place / "part").write_text(json.dumps(data | {"compliance": 12345.0}))
-        (place / "part").rename(place / "summary.json")
-        lock.close()
-
-    timer = threading.Timer(0.3, finish)
-    timer.start()
-    found = run_cases([case], shared_tmp_path, WORLD, shown=False)
-    timer.join()
+    data = json.loads((outcomes[case].folder / "summary.json").read_text())
+    (place / "part").write_text(json.dumps(data | {"compliance": 12345.0}))
+    owner = [sys.executable, "-c", OWNER, str(place)]
+    with subprocess.Popen(owner, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "locked\n"
+        found = run_cases([case], shared_tmp_path, WORLD, shown=False)
     assert found[case].compliance == 12345.0
     assert outcomes[case].compliance != 12345.0
 

@@ -4,7 +4,7 @@ import sys
 
 from mpi4py import MPI
 
-from dolfinopt.study.progress import open_board
+from dolfinopt.study.progress import open_progress
 
 WORLD = MPI.COMM_WORLD
 
@@ -28,32 +28,32 @@ class Terminal:
 
 def tell_all(shown=True):
     """Let every rank work on two cases of three steps."""
-    with open_board(WORLD, 2 * WORLD.size, shown) as board:
+    with open_progress(WORLD, 2 * WORLD.size, shown) as progress:
         for k in range(2):
             label = f"case {WORLD.rank}.{k}"
             for step in range(3):
-                board.tell(label, step, 3, f"step {step}")
-            board.tell(label, text="found", finished=1)
-    return board
+                progress.tell(label, step, 3, f"step {step}")
+            progress.tell(label, text="found", finished=1)
+    return progress
 
 
 def test_root_hears_everything(capsys):
-    board = tell_all()
+    progress = tell_all()
     lines = capsys.readouterr().err.splitlines()
     if WORLD.rank > 0:
-        assert lines == [] and board.finished == 0
+        assert lines == [] and progress.finished == 0
         return
     total = 2 * WORLD.size
-    assert board.finished == total and board.ended == WORLD.size
+    assert progress.finished == total and progress.ended == WORLD.size
     assert [line.split("/")[0].strip() for line in lines] == [str(k + 1) for k in range(total)]
     told = sorted(line.split("  ", 1)[1] for line in lines)
     assert told == [f"case {rank}.{k}: found" for rank in range(WORLD.size) for k in range(2)]
 
 
 def test_silent_when_told_to(capsys):
-    board = tell_all(shown=False)
+    progress = tell_all(shown=False)
     assert capsys.readouterr().err == ""
-    assert board.finished == (2 * WORLD.size if WORLD.rank == 0 else 0)
+    assert progress.finished == (2 * WORLD.size if WORLD.rank == 0 else 0)
 
 
 def test_terminal(monkeypatch):
@@ -70,6 +70,6 @@ def test_terminal(monkeypatch):
 
 
 def test_nothing_to_do(capsys):
-    with open_board(WORLD, 0):
+    with open_progress(WORLD, 0):
         pass
     assert capsys.readouterr().err == ""
