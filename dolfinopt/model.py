@@ -47,10 +47,10 @@ from dolfinopt.parallel import ArmShare, gather_cells, on_root, share_arms, toge
 from dolfinopt.profiling import Ledger
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
+from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.schema import GradientKind
 from dolfinopt.study.studies import Topic, study
-from dolfinopt.units import OBJECTIVES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,7 +86,7 @@ class SimulationResult:
     @property
     def unit(self) -> str:
         """Unit of the objective."""
-        return OBJECTIVES[self.scene.objective.kind][1]
+        return objective_of(self.scene).unit
 
     @property
     def compliance(self) -> float:
@@ -198,7 +198,8 @@ class OptimizationResult(SimulationResult):
         """Return the figure of the objective and other figures over the iterations."""
         from dolfinopt.plots.figures import history_figure
 
-        label = "{} [{}]".format(*OBJECTIVES[self.scene.objective.kind])
+        minimised = objective_of(self.scene)
+        label = f"{minimised.label} [{minimised.unit}]"
         return history_figure(self.rows, label) if self.rows else None
 
     def _initial(self) -> np.ndarray | None:
@@ -295,7 +296,7 @@ class Model:
             objective = scene.objective.model_copy(update={"gradient": kind})
             scene = scene.model_copy(update={"objective": objective})
         share, arms, x_phys = self._prepared(x)
-        if scene.objective.simulated:
+        if needs(scene, "motion"):
             choose_coordinates(scene, share, arms, x_phys, self._profile)
         _, trajectory = evaluate(scene, share, arms, x_phys, self._profile, simulated=False)
         return self._gathered(gradient(scene, share, arms, trajectory, self._profile))

@@ -32,7 +32,7 @@ from dolfinopt.parallel import (
     share_arms,
     together,
 )
-from dolfinopt.responses import evaluation
+from dolfinopt.responses import eigenfrequency, evaluation, motion, static, tip_deflection
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study import sampling
@@ -184,11 +184,11 @@ class Model:
 EVALUATIONS = {
     "interpolation": (arm, "interpolate", ()),
     "reduction": (arm, "shape_integrals", ()),
-    "statics": (evaluation, "static_response", ('objective.kind="static"',)),
-    "deflections": (evaluation, "static_response", ("constraints.tip_deflection=1.0",)),
-    "rigid integrals": (evaluation, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
+    "statics": (static, "static_response", ('objective.kind="static"',)),
+    "deflections": (tip_deflection, "static_response", ("constraints.tip_deflection=1.0",)),
+    "rigid integrals": (eigenfrequency, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
     "loaded modes": (arm, "loaded_modes", ("constraints.first_frequency=1.0",)),
-    "squared period": (evaluation, "squared_period", ('objective.kind="eigenfrequency"',)),
+    "squared period": (eigenfrequency, "squared_period", ('objective.kind="eigenfrequency"',)),
 }
 
 
@@ -238,15 +238,15 @@ def test_a_batch_under_other_scenes(monkeypatch):
 
 
 GRADIENTS = {
-    "frozen loads": (evaluation, "esl_gradient", ()),
-    "moments": (evaluation, "_frozen_moments", ()),
-    "exact": (evaluation, "exact_gradient", ('objective.gradient="exact"',)),
-    "adjoint": (evaluation, "_body_slopes", ('objective.gradient="exact"',)),
-    "statics": (evaluation, "static_gradient", ('objective.kind="static"',)),
-    "period": (evaluation, "period_gradient", ('objective.kind="eigenfrequency"',)),
-    "carried": (evaluation, "rigid_gradient", ('objective.kind="eigenfrequency"',)),
-    "deflection": (evaluation, "deflection_gradient", ("constraints.tip_deflection=1.0",)),
-    "frequency": (evaluation, "period_gradient", ("constraints.first_frequency=1.0",)),
+    "frozen loads": (motion, "esl_gradient", ()),
+    "moments": (motion, "_load_case_moments", ()),
+    "exact": (motion, "exact_gradient", ('objective.gradient="exact"',)),
+    "adjoint": (motion, "_cotangents", ('objective.gradient="exact"',)),
+    "statics": (static, "static_gradient", ('objective.kind="static"',)),
+    "period": (eigenfrequency, "period_gradient", ('objective.kind="eigenfrequency"',)),
+    "carried": (eigenfrequency, "rigid_gradient", ('objective.kind="eigenfrequency"',)),
+    "deflection": (tip_deflection, "deflection_gradient", ("constraints.tip_deflection=1.0",)),
+    "frequency": (eigenfrequency, "period_gradient", ("constraints.first_frequency=1.0",)),
 }
 
 

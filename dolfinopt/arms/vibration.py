@@ -210,21 +210,3 @@ def loaded_modes(
     order = [followed, *(k for k in range(count) if k != followed)]
     field = arm.expand(interior, outboard)
     return LoadedModes(values, field, outboard, vectors[:, order], followed)
-
-
-def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
-    """Return (sum_k T_k^(2 p))^(1/p) in s2, and its slope by the eigenvalues (k,).
-
-    At least the longest period squared, and smooth: a symmetric function of the eigenvalues has a
-    gradient where they cross or coincide. With `follow` the followed mode's alone.
-    """
-    squared = 4.0 * np.pi**2 / modes.values
-    if follow:
-        weight = np.zeros(len(squared))
-        weight[modes.followed] = 1.0
-        return float(squared[modes.followed]), -weight * squared / modes.values
-    relative = squared / squared.max()
-    total = float(np.sum(relative**exponent))
-    value = squared.max() * total ** (1.0 / exponent)
-    by_squared = relative ** (exponent - 1.0) * total ** (1.0 / exponent - 1.0)
-    return float(value), -by_squared * squared / modes.values

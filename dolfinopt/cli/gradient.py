@@ -11,7 +11,6 @@ import click
 from dolfinopt.cli.options import design_option, overwrite_option, scene_argument, set_option
 from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.units import OBJECTIVES
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -60,6 +59,7 @@ def gradient(
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes
     from dolfinopt.responses.order_selection import choose_coordinates
+    from dolfinopt.responses.response import needs, objective_of
 
     claim(world, out.parent, overwrite, [out.name])
     if check:
@@ -67,14 +67,15 @@ def gradient(
     ledger = Ledger()
     share, arms, x_phys = design_of(world, loaded, design, ledger)
     prepare(world, out.parent)
-    if loaded.objective.simulated:
+    moves = needs(loaded, "motion")
+    if moves:
         tell(world, choose_coordinates(loaded, share, arms, x_phys, ledger))
     evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger, simulated=False)
     by_cell = slopes(loaded, share, arms, trajectory, ledger)
     write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
     if world.rank == 0:
-        unit = OBJECTIVES[loaded.objective.kind][1]
-        name = loaded.objective.gradient if loaded.objective.simulated else "exact"
+        unit = objective_of(loaded).unit
+        name = loaded.objective.gradient if moves else "exact"
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
     if check:
         _check_gradient(world, loaded, share, arms, x_phys, ledger)

@@ -17,7 +17,7 @@ import click
 from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
 from dolfinopt.output.folders import RUN_FILES, check_unused, prepare_folder
-from dolfinopt.units import NOT_MET, OBJECTIVES
+from dolfinopt.units import NOT_MET
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -144,8 +144,10 @@ def draw(
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.files import designed
     from dolfinopt.plots import figures as plots
+    from dolfinopt.responses.response import objective_of
 
-    label = "{} [{}]".format(*OBJECTIVES[scene.objective.kind])
+    minimised = objective_of(scene)
+    label = f"{minimised.label} [{minimised.unit}]"
     plots.draw_design(folder / "design.png", designed(views), scene.name)
     if history:
         plots.draw_history(folder / "history.png", history, label)
@@ -177,16 +179,19 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
 
 def _minimised(summary: Mapping[str, Any]) -> str:
     """Return name, value and unit of the objective, and the frequencies that it stands for."""
+    from dolfinopt.responses.response import find
+
     options, scenarios = summary["scene"]["objective"], summary["scenarios"]
-    name, unit = OBJECTIVES[options["kind"]]
+    response = find(options["kind"])
+    name = response.label
     if scenarios:
         how = "weighted sum" if options["scenarios"] == "sum" else "worst"
         name += f" ({how} of {len(scenarios)} scenarios)"
-    text = f"{name} {summary['objective']:.4g} {unit}"
-    if options["kind"] == "eigenfrequency":
+    text = f"{name} {summary['objective']:.4g} {response.unit}"
+    if response.stands_for:
         frequencies = summary["loaded_frequency"].items()
-        found = ", ".join(f"{arm} {value:.4g} Hz" for arm, value in frequencies)
-        text += f" (first frequency of {found})"
+        found = ", ".join(f"{arm} {value:.4g} {response.limit_unit}" for arm, value in frequencies)
+        text += f" ({response.stands_for} of {found})"
     return text
 
 

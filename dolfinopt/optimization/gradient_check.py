@@ -16,6 +16,7 @@ from dolfinopt.profiling import Ledger
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.objective import load_cases, objective
+from dolfinopt.responses.response import needs
 from dolfinopt.responses.scenarios import combined
 from dolfinopt.scene.load import Scene
 
@@ -90,7 +91,7 @@ def taylor_test(
     evaluation, base = evaluate(exact, share, arms, x_phys, ledger, simulated=False)
     slope = _by_x(share, arms, gradient(exact, share, arms, base, ledger), x)
     frozen = None
-    if scene.objective.simulated:
+    if needs(scene, "motion"):
         esl = _with(scene, gradient="esl")
         frozen = _by_x(share, arms, gradient(esl, share, arms, base, ledger), x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
@@ -115,7 +116,7 @@ def taylor_test(
 
 def check_exact(scene: Scene) -> None:
     """Raise InputError, of one line, where the objective has no exact gradient to test."""
-    if not scene.objective.simulated:
+    if not needs(scene, "motion"):
         return
     method, integrator = scene.reduction.method, scene.simulation.integrator
     if METHODS[method].adjoint is None:
@@ -172,7 +173,7 @@ def _fixed_objective(
         evaluation, trajectory = evaluate(
             scene, share, arms, x_phys, ledger, start, simulated=False
         )
-        if not scene.objective.simulated:
+        if not needs(scene, "motion"):
             return evaluation.objective
 
         def at_base_instants() -> float:

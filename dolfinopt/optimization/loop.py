@@ -23,6 +23,7 @@ from dolfinopt.profiling import Counts, Ledger
 from dolfinopt.responses.constraints import Limit, limits_of, violated, worst_limits
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
 from dolfinopt.responses.order_selection import Choice, choose_coordinates, estimated_error
+from dolfinopt.responses.response import needs
 from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.units import NOT_MET
@@ -247,6 +248,7 @@ class _Run:
         self.scene, self.share, self.arms, self.ledger = scene, share, arms, ledger
         self.recorder = recorder
         self.report = report
+        self.moves = needs(scene, "motion")  # else only the result is simulated
         self.variables = _Variables(scene, share, arms)
         self.x = np.maximum(np.full(self.variables.size, scene.design.initial), self.variables.xmin)
         self.state = initial_state(self.x)
@@ -274,7 +276,7 @@ class _Run:
         """Iterate until the design rests or the iterations are spent."""
         if memory is not None:
             self._restore(memory)
-        elif self.scene.objective.simulated:
+        elif self.moves:
             x = self._realised(self.x)
             self.choice = self._choose({k: one[-1].x_phys for k, one in x.items()}, RESERVE)
         if self.recorder is not None:
@@ -422,7 +424,8 @@ class _Run:
     def _slopes(self, realised: Mapping[int, Realised]) -> _Slopes:
         """Return the gradients by x of the design evaluated last (collective)."""
         place = self.scene, self.share, self.arms
-        slopes = [gradient(*place, self.trajectory, self.ledger), *constraint_gradients(*place)]
+        analysed = *place, self.trajectory, self.ledger
+        slopes = [gradient(*analysed), *constraint_gradients(*analysed)]
         with together(self.share.world):
             objective, *rows = (self.variables.by_x(slope, realised) for slope in slopes)
             return _Slopes(objective, np.array(rows).reshape(len(rows), self.variables.size))
@@ -509,7 +512,7 @@ class _Run:
         self._assess_choice(x_phys)
         # A followed mode is known by those before it: the initial and the crisp design's are not.
         starts = {k: arm.starts for k, arm in self.arms.items()}
-        if not self.scene.objective.simulated:
+        if not self.moves:
             with together(self.share.world):
                 initial = {k: a.uniform(self.scene.design.initial) for k, a in self.arms.items()}
             _, trajectory = self._evaluate_one(initial, simulated=True)
@@ -518,7 +521,7 @@ class _Run:
         if self.scene.design.projection:
             cut = {k: np.where(x > 0.5, 1.0, 0.0) for k, x in x_phys.items()}
             crisp, _ = self._evaluate_one(cut, simulated=True)
-        if crisp is not None or not self.scene.objective.simulated:
+        if crisp is not None or not self.moves:
             for k, arm in self.arms.items():
                 arm.starts = starts[k]
             evaluation, self.trajectory = self._evaluate_one(x_phys, simulated=True)
@@ -526,7 +529,7 @@ class _Run:
 
     def _assess_choice(self, x_phys: Mapping[int, np.ndarray]) -> None:
         """Estimate anew what the chosen coordinates miss; choose where nothing moved so far."""
-        if not self.scene.objective.simulated:
+        if not self.moves:
             self.choice = self._choose(x_phys, 1.0)
         elif self.choice is not None:
             place = self.scene, self.share, self.arms

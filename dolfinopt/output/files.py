@@ -22,8 +22,8 @@ from dolfinopt.multibody.motion import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.parallel import ArmShare, gather_cells, on_root, together
+from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.units import OBJECTIVES
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
@@ -328,7 +328,7 @@ def write_gradient(
             order, name = canonical_order(centroid), scene.arms[index].name
             arrays[f"{name}/centroid"] = centroid[order]
             arrays[f"{name}/gradient"] = gathered[index][order]
-        unit = OBJECTIVES[scene.objective.kind][1]  # per physical density, which has none
+        unit = objective_of(scene).unit  # per physical density, which has none
         arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
         write_arrays(path, arrays)
 

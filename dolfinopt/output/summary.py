@@ -21,9 +21,10 @@ from dolfinopt.profiling import Counts, Ledger
 from dolfinopt.responses.constraints import Limit, limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import Choice
+from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.plausibility import implausible
-from dolfinopt.units import HISTORY, OBJECTIVES, SUMMARY
+from dolfinopt.units import HISTORY, SUMMARY
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -156,7 +157,7 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
 
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
-    unit = OBJECTIVES[scene.objective.kind][1]
+    unit = objective_of(scene).unit
     units: dict[str, Any] = {"objective": unit, **SUMMARY}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     units["history.csv"] = {"objective": unit, **HISTORY}

@@ -34,7 +34,7 @@ from dolfinopt.plots.style import (
     save,
     spread,
 )
-from dolfinopt.units import constraint_label
+from dolfinopt.responses.constraints import constraint_label
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dolfinopt.responses.evaluation import Evaluation
+from dolfinopt.responses.response import constraints_of, find
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import Constraints
 
 # Relative violation up to which a constraint counts as met: MMA meets an active one to a fraction
 # of its last change.
@@ -19,10 +21,10 @@ class Limit:
     """One constraint and what a design makes of it.
 
     Attributes:
-        quantity: "volume_fraction", "first_frequency" or "tip_deflection".
+        quantity: "volume_fraction", or the name of a response.
         arm: whose; "" of all together.
         value, limit: in `unit`.
-        unit: "-", "Hz" or "m".
+        unit: of both.
         least: whether the limit is a lower one.
     """
 
@@ -89,24 +91,38 @@ def limits_of(
         volume_fractions: of every designed arm, or of all together with `design.shared_volume`.
     """
     designed = [scene.arms[owner].name for owner in scene.cell_counts]
-    flexible = [arm.name for arm in scene.arms if arm.flexible]
     names = [""] if scene.design.shared_volume else designed
     limit = scene.design.volume_fraction
     limits = [
         Limit("volume_fraction", name, float(value), limit, "-")
         for name, value in zip(names, volume_fractions, strict=True)
     ]
-    if (least := scene.constraints.first_frequency) is not None:
+    # The objective's values come first: it may be the response of a limit, too.
+    for bound, found in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
+        response = bound.response
         limits += [
-            Limit("first_frequency", name, float(value), least, "Hz", least=True)
-            for name, value in zip(flexible, evaluation.loaded_frequencies, strict=False)
-        ]
-    if (largest := scene.constraints.tip_deflection) is not None:
-        limits += [
-            Limit("tip_deflection", name, float(value), largest, "m")
-            for name, value in zip(designed, evaluation.tip_deflections, strict=True)
+            Limit(
+                response.name,
+                arm,
+                float(value),
+                bound.limit,
+                response.limit_unit or response.unit,
+                response.lower,
+            )
+            for arm, value in zip(found.arms, found.values, strict=True)
         ]
     return tuple(limits)
+
+
+def constraint_label(name: str) -> str:
+    """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
+    for quantity in ("volume_fraction", *Constraints.model_fields):
+        if name.startswith(quantity):
+            response = None if quantity == "volume_fraction" else find(quantity)
+            unit = "-" if response is None else response.limit_unit or response.unit
+            arm = name[len(quantity) + 1 :]
+            return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
+    return name
 
 
 def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import fixed_body
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, scaled
+from dolfinopt.responses.p_norm import p_norm
 from dolfinopt.scene.load import Scene
 
 
@@ -77,11 +78,10 @@ def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[floa
     Kreisselmeier and Steinhauser's function of the logarithms.
     Source: Kreisselmeier & Steinhauser (1979), doi:10.1016/S1474-6670(17)65584-8.
     """
-    largest = max(values)
-    if len(values) == 1 or largest == 0.0:
-        return largest, [1.0] * len(values)
-    worst = largest * sum((f / largest) ** exponent for f in values) ** (1.0 / exponent)
-    return worst, [(f / worst) ** (exponent - 1.0) for f in values]
+    if len(values) == 1 or max(values) == 0.0:
+        return max(values), [1.0] * len(values)
+    worst, by_values = p_norm(np.array(values), exponent)
+    return worst, by_values.tolist()
 
 
 def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, squared_period
+from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, mass_partners, rigid_body
 from dolfinopt.reduction import METHODS, frame_fields
 from dolfinopt.responses.statics import StaticResponse
@@ -29,7 +29,7 @@ def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
 
     Args:
         arm: with the design reduced.
-        A: (q, q) see `objective.frozen_moments`.
+        A: (q, q) see `motion.MotionResponse.load_case_moments`.
 
     Returns:
         (n_cells,) over this rank's cells.
@@ -114,10 +114,12 @@ class PeriodGradient:
     carried: np.ndarray
 
 
-def period_gradient(arm: Arm, modes: LoadedModes, exponent: float, follow: bool) -> PeriodGradient:
-    """Differentiate `squared_period`: d lambda = phi' (dK - lambda dM) phi, phi of unit mass."""
+def period_gradient(arm: Arm, modes: LoadedModes, by_values: np.ndarray) -> PeriodGradient:
+    """Differentiate a function of the eigenvalues, given its derivative by them (k,).
+
+    d lambda = phi' (dK - lambda dM) phi, phi of unit mass.
+    """
     with arm.ledger.phase("gradient"):
-        _, by_values = squared_period(modes, exponent, follow)
         weighted = modes.field * by_values
         energies = arm.elastic.cell_stiffness_products(weighted, modes.field)
         masses = arm.elastic.cell_mass_products(weighted * modes.values, modes.field)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.responses.p_norm import p_norm_of_lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,18 +34,12 @@ class StaticResponse:
 
     def deflection(self, exponent: float) -> float:
         """Return (sum_k |u_k|^p)^(1/p) of the outboard point, m: at least the largest |u_k|."""
-        size = np.hypot(self.tip[0], self.tip[1])
-        largest = size.max()
-        return float(largest * np.sum((size / largest) ** exponent) ** (1.0 / exponent))
+        return p_norm_of_lengths(self.tip[:2].T, exponent)[0]
 
     def deflection_slope(self, exponent: float) -> np.ndarray:
-        """Return the slope (3, k) of `deflection` by the displacements."""
-        size = np.hypot(self.tip[0], self.tip[1])
-        # |u|^(p - 2) u / value^(p - 1), in ratios that neither over- nor underflow for p >= 2.
-        value = self.deflection(exponent)
-        slope = (size / value) ** (exponent - 2.0) * self.tip / value
-        slope[2] = 0.0
-        return slope
+        """Return the derivative (3, k) of `deflection` by the displacements."""
+        _, by_displacement = p_norm_of_lengths(self.tip[:2].T, exponent)
+        return np.vstack([by_displacement.T, np.zeros(self.tip.shape[1])])
 
 
 def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:

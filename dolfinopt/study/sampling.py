@@ -25,7 +25,7 @@ from dolfinopt.disk import make_folder
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.profiling import Ledger
-from dolfinopt.responses.objective import worst_instants
+from dolfinopt.responses.motion import worst_instants
 from dolfinopt.responses.scenarios import bodies_in
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.progress import Progress

@@ -408,7 +408,7 @@ def no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
             for body in bodies
         ]
 
-    monkeypatch.setattr("dolfinopt.responses.objective.trajectory_slopes", none)
+    monkeypatch.setattr("dolfinopt.responses.motion.trajectory_slopes", none)
 
 
 def no_start(monkeypatch: pytest.MonkeyPatch) -> None:

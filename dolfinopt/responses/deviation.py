@@ -1,0 +1,40 @@
+"""Deviation of the end-effector from its rigid path."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.multibody.mechanism import end_effector_slopes
+from dolfinopt.responses.motion import LoadCases, MotionResponse
+from dolfinopt.responses.p_norm import p_norm_of_lengths
+from dolfinopt.responses.response import register
+
+
+@register
+class Deviation(MotionResponse):
+    """(1/T int |e|^p dt)^(1/p), m: close to the largest deviation, and smooth.
+
+    With e from eq. (6) of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
+    """
+
+    name, label, unit = "deviation", "p-mean of the deviation", "m"
+
+    def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
+        """Return the p-mean."""
+        return self._mean(trajectory, cases)[0]
+
+    def derivatives(
+        self, trajectory: Trajectory, cases: LoadCases
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return its derivatives through the outboard interfaces' modes."""
+        _, by_deviation = self._mean(trajectory, cases)
+        q = trajectory.q_e[cases.indices]
+        by_q, by_outboard = end_effector_slopes(
+            trajectory.mechanism, trajectory.motion, q, by_deviation
+        )
+        return by_q, [{"outboard": part} for part in by_outboard]
+
+    def _mean(self, trajectory: Trajectory, cases: LoadCases) -> tuple[float, np.ndarray]:
+        weights = cases.weights / cases.weights.sum()
+        return p_norm_of_lengths(trajectory.deviation, self.options.exponent, weights)

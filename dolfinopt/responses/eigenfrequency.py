@@ -1,0 +1,155 @@
+"""First natural frequency of every flexible arm with what it carries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+
+from dolfinopt.arms.arm import Arm, fixed_body
+from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
+from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.parallel import on_root, together
+from dolfinopt.responses.p_norm import p_norm
+from dolfinopt.responses.response import (
+    Analysis,
+    CellGradient,
+    Measured,
+    Need,
+    Response,
+    by_owner,
+    on_all_ranks,
+    register,
+)
+from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
+
+NOTHING = RigidIntegrals(0.0, 0j, 0.0)
+
+
+def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
+    """Return (sum_k T_k^(2 p))^(1/p) in s2, and its derivative by the eigenvalues (k,).
+
+    At least the longest period squared, and smooth: a symmetric function of the eigenvalues has a
+    gradient where they cross or coincide. With `follow` the followed mode's alone.
+    """
+    squared = 4.0 * np.pi**2 / modes.values
+    if follow:
+        weight = np.zeros(len(squared))
+        weight[modes.followed] = 1.0
+        return float(squared[modes.followed]), -weight * squared / modes.values
+    value, by_squared = p_norm(squared, exponent)
+    return value, -by_squared * squared / modes.values
+
+
+@register
+class Eigenfrequency(Response):
+    """Squared longest period of every flexible arm, s2; its true value is the frequency, Hz."""
+
+    name, label, unit = "eigenfrequency", "squared longest periods", "s2"
+    limit_unit = "Hz"
+    lower = True
+    needs: ClassVar[frozenset[Need]] = frozenset({"mass", "eigenproblem"})
+    stands_for = "first frequency"
+
+    @property
+    def follow(self) -> bool:
+        """Whether it is the followed mode's period, whichever mode is lowest."""
+        return self.options.follow
+
+    def measure(self, analysis: Analysis) -> Measured:
+        """Return squared period and first frequency of every flexible arm (collective)."""
+        scene, share, arms = analysis.scene, analysis.share, analysis.arms
+        chain = _chain(analysis)
+        with together(share.world):
+            mine = {
+                place: (squared_period(one, self.options.exponent, self.follow)[0], one.frequency)
+                for place, one in _modes(arms, chain).items()
+            }
+        found = on_all_ranks(share, mine)
+        periods, frequencies = zip(*found.values(), strict=True)
+        names = tuple(scene.arms[place].name for place in found)
+        return Measured(self.name, names, frequencies, periods)
+
+    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+        """Return the gradient of every flexible arm's squared period (collective).
+
+        What an arm carries depends on the designs outboard of it.
+        """
+        scene, share, arms = analysis.scene, analysis.share, analysis.arms
+        chain = _chain(analysis)
+        with together(share.world):
+            modes = _modes(arms, chain)
+            own = {}
+            for owner in arms:
+                for place in arms[owner].places:
+                    _, by_values = squared_period(modes[place], self.options.exponent, self.follow)
+                    own[place] = period_gradient(arms[owner], modes[place], by_values)
+        by_carried = on_all_ranks(share, {place: one.carried for place, one in own.items()})
+        rows = []
+        zero = [np.zeros((3, 3))] * len(scene.arms)
+        with together(share.world):
+            for place, matrix in by_carried.items():
+                carried = [*zero[:place], matrix, *zero[place + 1 :]]
+                by_body = by_owner(scene, chain.body_slopes(carried))
+                row = {
+                    k: np.zeros(arm.mesh.num_cells)  # it is not outboard of this place
+                    if by_body[k] == NOTHING
+                    else rigid_gradient(arm, by_body[k])
+                    for k, arm in arms.items()
+                }
+                owner = scene.owners[place]
+                if owner in row:
+                    row[owner] = row[owner] + own[place].cells
+                rows.append(row)
+        return rows
+
+    def constraint(self, smooth: np.ndarray, limit: float) -> np.ndarray:
+        """Return T^2 f^2 - 1 of squared periods and the least frequency."""
+        return smooth * limit**2 - 1.0
+
+    def constraint_gradient(self, gradient: np.ndarray, limit: float) -> np.ndarray:
+        """Return its gradient from the squared period's."""
+        return limit**2 * gradient
+
+
+def _chain(analysis: Analysis) -> Chain:
+    """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
+    scene, share = analysis.scene, analysis.share
+    with together(share.world):
+        mine = {k: rigid_integrals(arm.elastic) for k, arm in analysis.arms.items()}
+    owned = on_all_ranks(share, mine)
+
+    def freeze() -> Chain:
+        bodies, reach = [], []
+        for place, owner in enumerate(scene.owners):
+            if owner is not None:
+                bodies.append(owned[owner])
+                reach.append(complex(scene.arms[place].length, 0.0))
+            else:
+                body = fixed_body(scene, place)
+                bodies.append(RigidIntegrals(body.mass, complex(*body.moment), body.inertia))
+                reach.append(complex(*body.outboard_point))
+        angle = scene.objective.elbow_angle
+        if angle is None:
+            middle = np.array([0.5 * scene.motion.duration])
+            angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
+        else:
+            angles = [angle] * len(bodies)
+        load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.inertia)
+        return Chain(bodies, reach, angles, load, scene.objective.attached)
+
+    return on_root(share.world, freeze)
+
+
+def _modes(arms: Mapping[int, Arm], chain: Chain) -> dict[int, LoadedModes]:
+    """Return the loaded modes of every arm of the chain that has one of this rank's designs.
+
+    Within `together`.
+    """
+    carried = chain.carried()
+    return {
+        place: arms[owner].loaded_modes(place, carried[place])
+        for owner in arms
+        for place in arms[owner].places
+    }

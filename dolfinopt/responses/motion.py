@@ -1,0 +1,237 @@
+"""Responses of a simulated motion: values and cotangents of one trajectory, and of scenarios."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from dolfinopt.dynamics.adjoint import trajectory_slopes
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.parallel import on_root, together
+from dolfinopt.responses.response import (
+    Analysis,
+    CellGradient,
+    Measured,
+    Need,
+    Response,
+    by_owner,
+    find,
+)
+from dolfinopt.responses.scenarios import combined, factors, slopes_back
+from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
+from dolfinopt.scene.load import WorstBy
+
+
+@dataclass(frozen=True, eq=False)
+class LoadCases:
+    """Instants that make up a response, and how much each counts.
+
+    Attributes:
+        indices: (n,) samples.
+        weights: (n,) 1 for equivalent static loads, s for an integral over the horizon.
+    """
+
+    indices: np.ndarray
+    weights: np.ndarray
+
+
+def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "compliance") -> np.ndarray:
+    """Return the worst sample of each of `count` intervals.
+
+    The worst has the largest compliance, arms together, or the largest deviation. (0, horizon] is
+    cut into equal intervals, open below, closed above; intervals that hold no sample give none.
+    Source: Seifried, Moghadasi & Held (2015), text below eq. (9).
+    """
+    if worst == "compliance":
+        badness = trajectory.compliance.sum(axis=1)
+    else:
+        badness = np.hypot(trajectory.deviation[:, 0], trajectory.deviation[:, 1])
+    horizon = trajectory.scene.motion.horizon
+    # The tolerance keeps a sample on an interval's end in that interval, whatever the rounding.
+    interval = np.ceil(trajectory.t / horizon * count - 1e-9).astype(int) - 1
+    order = np.lexsort((-badness, interval))
+    order = order[interval[order] >= 0]
+    first = np.unique(interval[order], return_index=True)[1]
+    return np.sort(order[first])
+
+
+def all_samples(trajectory: Trajectory) -> LoadCases:
+    """Return all samples with the weights of the trapezoidal rule, s."""
+    steps = np.diff(trajectory.t)
+    weights = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+    return LoadCases(np.arange(len(weights)), weights)
+
+
+class MotionResponse(Response):
+    """A response of the motion: one value of the machine, of all scenarios together."""
+
+    needs: ClassVar[frozenset[Need]] = frozenset({"motion", "mass"})
+
+    def load_cases(self, trajectory: Trajectory) -> LoadCases:
+        """Return the instants that make it up; by default all samples."""
+        return all_samples(trajectory)
+
+    @abstractmethod
+    def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
+        """Return the value of one motion at given instants."""
+
+    @abstractmethod
+    def derivatives(
+        self, trajectory: Trajectory, cases: LoadCases
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return the derivatives of `value` at held instants.
+
+        Returns:
+            By the elastic coordinates of the instants (n, N), and of every body by the fields of
+            its `ShapeIntegrals` on which it depends directly.
+        """
+
+    def cotangents(self, trajectory: Trajectory) -> list[ShapeIntegrals]:
+        """Return the exact derivatives by the shape integrals of every body, of one motion.
+
+        Its own, with the coordinates held, and the trajectory's, whose coordinates follow. The
+        choice of instants is held: where two of an interval are equally bad there is a kink.
+        """
+        cases = self.load_cases(trajectory)
+        by_q, own = self.derivatives(trajectory, cases)
+        followed = trajectory_slopes(
+            trajectory.problem, trajectory.solution, trajectory.t[cases.indices], by_q
+        )
+        return [
+            replace(whole, **{key: getattr(whole, key) + part for key, part in fields.items()})
+            for whole, fields in zip(followed, own, strict=True)
+        ]
+
+    def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
+        """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
+
+        With the equivalent static loads K q_j held, a change of stiffness gives
+        dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j.
+        """
+        cases = self.load_cases(trajectory)
+        by_q, _ = self.derivatives(trajectory, cases)
+        mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
+        return [
+            np.linalg.solve(body.K, by_q[:, part].T) @ q[:, part]
+            for body, part in zip(mechanism.bodies, mechanism.slices, strict=True)
+        ]
+
+    def of_motion(self, trajectory: Trajectory) -> float:
+        """Return the value of one motion, at the instants that it chooses (root only)."""
+        return self.value(trajectory, self.load_cases(trajectory))
+
+    def of_trajectory(self, trajectory: Trajectory) -> float:
+        """Return the value of a motion, or of its scenarios together (root only)."""
+        if not trajectory.scenarios:
+            return self.of_motion(trajectory)
+        return combined(trajectory.scene, self._of_scenarios(trajectory.scenarios))[0]
+
+    def _of_scenarios(self, scenarios: Sequence[Trajectory]) -> list[float]:
+        return [self.of_motion(one) for one in scenarios]
+
+    def measure(self, analysis: Analysis) -> Measured:
+        """Return the value of the analysis's motion (collective)."""
+
+        def value() -> float:
+            assert analysis.trajectory is not None
+            return self.of_trajectory(analysis.trajectory)
+
+        found = on_root(analysis.share.world, value)
+        return Measured(self.name, ("",), (found,), (found,))
+
+    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+        """Return the gradient by the physical densities, see `objective.gradient` (collective)."""
+        scene, share, arms = analysis.scene, analysis.share, analysis.arms
+        ledger, trajectory = analysis.ledger, analysis.trajectory
+
+        def moments() -> dict[int, np.ndarray]:
+            assert trajectory is not None
+            return by_owner(scene, _load_case_moments(self, trajectory))
+
+        def cotangents() -> dict[int, ShapeIntegrals]:
+            assert trajectory is not None
+            ledger.counts.adjoints += max(1, len(trajectory.scenarios))
+            with ledger.phase("adjoint"):
+                return by_owner(scene, _cotangents(self, trajectory))
+
+        if self.options.gradient == "esl":
+            A = on_root(share.world, moments)
+            with together(share.world):
+                return [{k: esl_gradient(arm, A[k]) for k, arm in arms.items()}]
+        by_body = on_root(share.world, cotangents)
+        with together(share.world):
+            return [{k: exact_gradient(arm, by_body[k]) for k, arm in arms.items()}]
+
+
+class ComplianceResponse(MotionResponse):
+    """A weighted sum of q' K q of all arms over instants."""
+
+    def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
+        """Return sum_j w_j q_j' K q_j."""
+        return float(cases.weights @ trajectory.compliance[cases.indices].sum(axis=1))
+
+    def derivatives(
+        self, trajectory: Trajectory, cases: LoadCases
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return 2 w_j K q_j, and the second moments of q by K."""
+        q = trajectory.q_e[cases.indices]
+        by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
+        return by_q, [{"K": Q} for Q in second_moments(trajectory, cases)]
+
+    def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
+        """Return the second moments: lambda_j = w_j q_j with the loads frozen."""
+        return second_moments(trajectory, self.load_cases(trajectory))
+
+
+def second_moments(trajectory: Trajectory, cases: LoadCases) -> list[np.ndarray]:
+    """Return Q = sum_j weight_j q_j q_j' (q, q) of every arm."""
+    moments = []
+    for part in trajectory.mechanism.slices:
+        q = trajectory.q_e[cases.indices, part]
+        moments.append(q.T @ (cases.weights[:, None] * q))
+    return moments
+
+
+def _load_case_moments(response: MotionResponse, trajectory: Trajectory) -> list[np.ndarray]:
+    """Return `load_case_moments`, of all scenarios together where there are any."""
+    scene, others = trajectory.scene, trajectory.scenarios
+    if not others:
+        return response.load_case_moments(trajectory)
+    _, weights = combined(scene, response._of_scenarios(others))
+    total: list[np.ndarray] = []
+    for weight, one in zip(weights, others, strict=True):
+        parts = [
+            # Of its stiffness; rigid arms and bodies from files have no gradient.
+            weight * factors(scene, one.scene, index).stiffness * part
+            for index, part in enumerate(response.load_case_moments(one))
+        ]
+        total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
+    return total
+
+
+def _cotangents(response: MotionResponse, trajectory: Trajectory) -> list[ShapeIntegrals]:
+    """Return `cotangents` by the scene's bodies, of all scenarios together if there are any."""
+    scene, others = trajectory.scene, trajectory.scenarios
+    if not others:
+        return response.cotangents(trajectory)
+    _, weights = combined(scene, response._of_scenarios(others))
+    total: list[ShapeIntegrals] = []
+    for weight, one in zip(weights, others, strict=True):
+        parts = [
+            slopes_back(by_body, factors(scene, one.scene, index), weight)
+            for index, by_body in enumerate(response.cotangents(one))
+        ]
+        total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
+    return total
+
+
+def motion_objective(trajectory: Trajectory) -> MotionResponse | None:
+    """Return the objective of the trajectory's scene; None where it is no motion's."""
+    options = trajectory.scene.objective
+    response = find(options.kind)(options)
+    return response if isinstance(response, MotionResponse) else None

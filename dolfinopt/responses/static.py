@@ -1,0 +1,54 @@
+"""Compliance under given static loads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dolfinopt.parallel import together
+from dolfinopt.responses.response import (
+    Analysis,
+    CellGradient,
+    Measured,
+    Response,
+    occurrences,
+    on_all_ranks,
+    register,
+)
+from dolfinopt.responses.sensitivity import static_gradient
+from dolfinopt.responses.statics import static_response
+
+
+@register
+class StaticCompliance(Response):
+    """Compliance of every design under `objective.loads`, times the arms that have it, N m."""
+
+    name, label, unit = "static", "compliance under static loads", "N m"
+
+    def measure(self, analysis: Analysis) -> Measured:
+        """Return the compliance of every design (collective)."""
+        scene, uses, loads = analysis.scene, occurrences(analysis.scene), self._loads
+        with together(analysis.share.world):
+            mine = {
+                k: uses[k] * static_response(arm.elastic, loads).compliance
+                for k, arm in analysis.arms.items()
+            }
+        found = on_all_ranks(analysis.share, mine)
+        values = tuple(found.values())
+        return Measured(self.name, tuple(scene.arms[k].name for k in found), values, values)
+
+    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+        """Return the gradient of every design's compliance (collective)."""
+        uses, arms = occurrences(analysis.scene), analysis.arms
+        rows = []
+        with together(analysis.share.world):
+            for owner in analysis.scene.cell_counts:
+                row: CellGradient = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
+                if owner in arms:
+                    response = static_response(arms[owner].elastic, self._loads)
+                    row[owner] = static_gradient(arms[owner], response) * uses[owner]
+                rows.append(row)
+        return rows
+
+    @property
+    def _loads(self) -> np.ndarray:
+        return np.array(self.options.loads)

@@ -1,0 +1,227 @@
+"""Responses as users of the package write them: one class, registered, as objective or limit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from remainders import SCENE, Built, build, rates, uneven, wave
+
+import dolfinopt as do
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.parallel import together
+from dolfinopt.responses import response as registry
+from dolfinopt.responses.evaluation import constraint_gradients
+from dolfinopt.responses.motion import LoadCases, MotionResponse
+from dolfinopt.responses.p_norm import p_norm, p_norm_of_lengths
+from dolfinopt.responses.response import (
+    Analysis,
+    CellGradient,
+    Measured,
+    Response,
+    constraints_of,
+    find,
+    needs,
+    objective_of,
+    on_all_ranks,
+)
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import Constraints
+
+
+class Roughness(Response):
+    """Integral of (x - x0)^2 over every design's cells, m2: least where x is x0 everywhere."""
+
+    name, label, unit = "roughness", "distance from even filling", "m2"
+    level = 0.3
+
+    def measure(self, analysis: Analysis) -> Measured:
+        with together(analysis.share.world):
+            mine = {
+                k: float(arm.mesh.area @ (arm._x_phys - self.level) ** 2)
+                for k, arm in analysis.arms.items()
+            }
+        found = on_all_ranks(analysis.share, mine)
+        values = tuple(found.values())
+        return Measured(
+            self.name, tuple(analysis.scene.arms[k].name for k in found), values, values
+        )
+
+    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+        return [
+            {
+                k: 2.0 * arm.mesh.area * (arm._x_phys - self.level) * float(k == owner)
+                for k, arm in analysis.arms.items()
+            }
+            for owner in analysis.scene.cell_counts
+        ]
+
+
+class MeanSquare(MotionResponse):
+    """Integral of |e|^2 over the horizon, m2 s, given by its derivatives alone."""
+
+    name, label, unit = "mean_square", "integral of the squared deviation", "m2 s"
+
+    def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
+        return float(cases.weights @ (trajectory.deviation[cases.indices] ** 2).sum(axis=1))
+
+    def derivatives(
+        self, trajectory: Trajectory, cases: LoadCases
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        from dolfinopt.responses import deviation
+
+        by_deviation = 2.0 * cases.weights[:, None] * trajectory.deviation[cases.indices]
+        by_q, by_outboard = deviation.end_effector_slopes(
+            trajectory.mechanism, trajectory.motion, trajectory.q_e[cases.indices], by_deviation
+        )
+        return by_q, [{"outboard": part} for part in by_outboard]
+
+
+class MoreConstraints(Constraints):
+    """The keys that a new response would add to the scene."""
+
+    roughness: float | None = None
+    deviation: float | None = None
+    mean_square: float | None = None
+
+
+@pytest.fixture(autouse=True)
+def _registered() -> Iterator[None]:
+    for one in (Roughness, MeanSquare):
+        registry.register(one)
+    yield
+    for one in (Roughness, MeanSquare):
+        del registry._known[one.name]
+
+
+def minimised(scene: Scene, kind: str) -> Scene:
+    """Return the scene with an objective that the literal of its key does not have."""
+    objective = scene.objective.model_copy(update={"kind": kind})
+    return scene.model_copy(update={"objective": objective})
+
+
+def limited(scene: Scene, **limits: float) -> Scene:
+    """Return the scene with other constraints."""
+    return scene.model_copy(update={"constraints": MoreConstraints(**limits)})
+
+
+def rebuilt(built: Built, scene: Scene) -> Built:
+    return Built(scene, built.share, built.arms, built.ledger)
+
+
+QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
+
+
+def test_a_new_response_is_minimised() -> None:
+    """The optimiser finds what is known: x0 everywhere; nothing but the result is simulated."""
+    scene = minimised(do.load_scene(SCENE, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
+    result = do.optimize(scene)  # no limit is active: there is no gradient left to be balanced
+    for k, x in result.x_phys.items():
+        # The filter smooths away what is left at the solid ends, if any.
+        free = ~result.arms[k].mesh.passive
+        np.testing.assert_allclose(x[free], Roughness.level, atol=2e-3)
+    assert result.counts.simulations == 0
+
+
+def test_a_new_response_is_a_limit() -> None:
+    """Of the stiffest design that is nearly even: the limit is met and in its row's name."""
+    options = [*QUICK, "optimizer.max_iterations=60", "objective.kind=static"]
+    scene = do.load_scene(SCENE, [*options, "design.initial=0.4"])
+    limit = 2e-4
+    free, kept = do.optimize(scene), do.optimize(limited(scene, roughness=limit))
+    values = {one.name: one for one in kept.limits}
+    assert set(values) == {
+        *(f"volume_fraction_{arm.name}" for arm in scene.arms),
+        *(f"roughness_{arm.name}" for arm in scene.arms),
+    }
+    for arm in scene.arms:
+        one = values[f"roughness_{arm.name}"]
+        assert one.unit == "m2" and one.met
+        assert one.value == pytest.approx(limit, rel=0.02)  # active
+    assert kept.evaluation.objective > 1.05 * free.evaluation.objective
+    assert kept.evaluation.values_of("roughness") == tuple(
+        values[f"roughness_{arm.name}"].value for arm in scene.arms
+    )
+
+
+def test_a_new_response_of_the_motion_has_an_exact_gradient() -> None:
+    """From its derivatives by coordinates and bodies alone, to second order."""
+    built = build(*QUICK, "objective.gradient=exact")
+    built = rebuilt(built, minimised(built.scene, "mean_square"))
+    x = built.fields(wave)
+    test = taylor_test(built.scene, built.share, built.arms, x, built.ledger)
+    assert test.passed, test
+
+
+@pytest.mark.parametrize("name", ["deviation", "mean_square"])
+def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
+    """The same class on the other side: value over limit less 1, with the gradient of that."""
+    built = build(*QUICK, "objective.kind=static", "objective.gradient=exact",
+                  "simulation.tolerance=1e-7")  # fmt: skip
+    built = rebuilt(built, limited(built.scene, **{name: 0.01}))
+    assert needs(built.scene, "motion")
+    x, d = built.fields(wave), built.fields(uneven)
+    _, trajectory = built.evaluate(x)
+    [row] = constraint_gradients(built.scene, built.share, built.arms, trajectory, built.ledger)
+
+    def value(h: float) -> float:
+        moved = {k: x[k] + h * d[k] for k in x}
+        return built.evaluate(moved)[0].constraints[0]
+
+    evaluation, _ = built.evaluate(x)
+    [own] = (one for one in evaluation.responses if one.response == name)
+    assert evaluation.constraints == (own.smooth[0] / 0.01 - 1.0,)
+    # Steps at which what is left of the time error, 1e-7, stays below the remainders.
+    assert rates(value, built.dot(row, d), (4e-2, 1e-2)) == pytest.approx(2.0, abs=0.2)
+
+
+def test_needs_are_stated_by_the_responses() -> None:
+    """What the scenes' words say of themselves; the work itself is counted in test_skip."""
+    asked = {
+        kind: find(kind).needs
+        for kind in ("esl", "compliance", "deviation", "static", "eigenfrequency")
+    }
+    assert {kind for kind, one in asked.items() if "motion" in one} == {
+        "esl", "compliance", "deviation"
+    }  # fmt: skip
+    assert asked["eigenfrequency"] == {"mass", "eigenproblem"} == find("first_frequency").needs
+    assert asked["static"] == frozenset() == find("tip_deflection").needs
+    built = build("constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6")
+    names = [one.response.name for one in constraints_of(built.scene)]
+    assert names == ["first_frequency", "tip_deflection"]
+    assert objective_of(built.scene).unit == "N m"
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1.0, 1e150])
+@pytest.mark.parametrize("exponent", [2.0, 20.0, 200.0])
+def test_p_norm(scale: float, exponent: float) -> None:
+    """Between the largest value and its bound, derivative by differences; no over- or underflow."""
+    rng = np.random.default_rng(3)
+    values = scale * rng.uniform(0.5, 1.0, 5)
+    value, by_values = p_norm(values, exponent)
+    assert values.max() <= value <= values.max() * 5.0 ** (1.0 / exponent) * (1.0 + 1e-15)
+    assert by_values @ values == pytest.approx(value, rel=1e-13)  # of degree one
+    weights = rng.uniform(0.0, 1.0, 5)
+    weights /= weights.sum()
+    mean, _ = p_norm(values, exponent, weights)
+    assert mean <= values.max()
+    h = 1e-6 * scale
+    for k in range(5):
+        for w, derivative in ((None, by_values), (weights, p_norm(values, exponent, weights)[1])):
+            there, back = (p_norm(values + s * h * np.eye(5)[k], exponent, w)[0] for s in (1, -1))
+            assert derivative[k] == pytest.approx((there - back) / (2.0 * h), abs=1e-7)
+    vectors = values[:, None] * [0.6, 0.8]
+    vectors[0] = 0.0
+    norm, by_vectors = p_norm_of_lengths(vectors, exponent)
+    lengths, by_lengths = p_norm(np.hypot(*vectors.T), exponent)
+    assert norm == pytest.approx(lengths, rel=1e-14)
+    assert by_vectors[1:] @ [0.6, 0.8] == pytest.approx(by_lengths[1:], rel=1e-12)
+    assert not by_vectors[0].any()
+
+
+def test_p_norm_of_nothing() -> None:
+    assert p_norm(np.zeros(3), 20.0)[0] == 0.0
+    assert not p_norm(np.zeros(3), 20.0)[1].any()
+    assert p_norm_of_lengths(np.zeros((3, 2)), 20.0)[0] == 0.0
