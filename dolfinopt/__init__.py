@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory, simulate
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
-    from dolfinopt.optimization.loop import Result
+    from dolfinopt.optimization.result import Result
     from dolfinopt.output.files import gather_views
     from dolfinopt.output.run import optimize
     from dolfinopt.parallel import abort_together, gather_arms, share_arms
@@ -57,7 +57,7 @@ _HOME = {
     "Model": "model",
     "OptimizationResult": "model",
     "SimulationResult": "model",
-    "Result": "optimization.loop",
+    "Result": "optimization.result",
     "optimize": "output.run",
     "abort_together": "parallel",
     "share_arms": "parallel",

@@ -19,7 +19,7 @@ from dolfinopt.cli.shared import claim, conclude, draw, elapsed, load, prepare, 
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from dolfinopt.optimization.loop import Result
+    from dolfinopt.optimization.result import Result
     from dolfinopt.output.files import ArmView
     from dolfinopt.scene.load import Scene
 

@@ -1,4 +1,4 @@
-"""The optimisation loop, nothing else."""
+"""The optimisation loop: evaluate, differentiate, update by MMA, until the design converges."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from mpi4py import MPI
 from dolfinopt.dynamics.problem import Solution
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.continuation import Continuation
+from dolfinopt.optimization.convergence import ending, stop_reason
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.optimality import kkt_residual
+from dolfinopt.optimization.result import Result
+from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import ArmShare, sum_over_arms, together
-from dolfinopt.profiling import Counts, Ledger
+from dolfinopt.profiling import Ledger
 from dolfinopt.responses.constraints import Limit, limits_of, violated, worst_limits
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
 from dolfinopt.responses.order_selection import Choice, choose_coordinates, estimated_error
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.units import NOT_MET
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm, Realised
@@ -35,131 +38,11 @@ if TYPE_CHECKING:
 # writing (some ms) stays below a percent of the run.
 CHECKPOINT_INTERVAL = 2.0  # s
 
-# Sharpness of the projection from which on the move limit falls with its square root.
-GENTLE = 4.0
-
-# A change of more than this part of the move limit is not small, whatever the tolerance.
-MOVING = 0.5
 # "auto" chooses coordinates for the initial design, so many times better than asked for: those of
 # an optimised one err 1.7 to 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
 RESERVE = 3.0
-# Grayness above which a projection has not done its work.
-GREY = 0.02
 
 Report = Callable[[HistoryRow], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """An optimised design.
-
-    Attributes:
-        share, arms: which ranks did what, and this rank's arms with the final design reduced.
-        x_phys: physical densities (n_cells,) of this rank's arms.
-        evaluation: of the final design.
-        trajectory: of the final design; on the root only.
-        crisp: evaluation of the final design cut at x_phys = 1/2; None without a projection.
-        initial_deviation: (n, 2) of the initial design, m; on the root only.
-        history: one row a design, the initial one first; on the root only.
-        iterations: design updates made.
-        converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
-            within their tolerances and every constraint is met.
-        stop_reason: in words.
-        kkt: the residual of the final design, see `optimality.kkt_residual`.
-        limits: every constraint and its value.
-        ledger: seconds and counts of this rank.
-        counts: those of the iterations alone, on this rank.
-        choice: of the coordinates, and the error that they make of the final design's motion;
-            None where the scene states a number.
-    """
-
-    share: ArmShare
-    arms: Mapping[int, Arm]
-    x_phys: Mapping[int, np.ndarray]
-    evaluation: Evaluation
-    crisp: Evaluation | None
-    trajectory: Trajectory | None
-    initial_deviation: np.ndarray
-    history: list[HistoryRow]
-    iterations: int
-    converged: bool
-    stop_reason: str
-    kkt: float
-    limits: tuple[Limit, ...]
-    ledger: Ledger
-    counts: Counts
-    choice: Choice | None = None
-
-    @property
-    def violated(self) -> str:
-        """Which constraints the final design does not meet, in one line; "" if it meets all."""
-        return violated(self.limits)
-
-
-class _Variables:
-    """This rank's design variables as one vector, arms one behind the other, and the volumes."""
-
-    def __init__(self, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
-        self.arms = arms
-        self.share = share
-        sizes = [arm.mesh.num_cells for arm in arms.values()]
-        ends = np.cumsum([0, *sizes])
-        # Whole arms add up in the same order on any number of ranks; parts of one are numbered on.
-        first = share.comm.rank * len(scene.arms)
-        self.pieces = {first + k: size for k, size in zip(arms, sizes, strict=True)}
-        self.slices = {k: slice(a, b) for k, a, b in zip(arms, ends[:-1], ends[1:], strict=True)}
-        self.size = int(ends[-1])
-        self.xmin = np.full(self.size, scene.design.minimum)
-        self.xmax = np.ones(self.size)
-        for k, part in self.slices.items():
-            self.xmin[part][arms[k].mesh.passive] = 1.0
-        # Volume constraints sum V x_phys / (fraction sum V) - 1 <= 0, one a design or one for all.
-        owners = list(scene.cell_counts)
-        shared = scene.design.shared_volume
-        self.rows = {k: 0 if shared else row for row, k in enumerate(owners)}
-        self.count = 1 if shared else len(owners)
-        # Arms of one design weigh in as often as they occur, and by their thickness.
-        self.volume = {
-            k: scene.owners.count(k) * scene.arms[k].thickness * arm.mesh.area
-            for k, arm in arms.items()
-        }
-        self.limit = scene.design.volume_fraction * self._volumes(
-            {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
-        )
-
-    def split(self, x: np.ndarray) -> dict[int, np.ndarray]:
-        """Return each arm's part."""
-        return {k: x[part] for k, part in self.slices.items()}
-
-    def join(self, parts: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return the parts as one vector."""
-        return np.concatenate([parts[k] for k in self.slices] or [np.empty(0)])
-
-    def volume_constraints(self, x_phys: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return f (m,), below zero where there is volume left (collective)."""
-        return self._volumes(x_phys) / self.limit - 1.0
-
-    def volume_slopes(self, realised: Mapping[int, Realised]) -> np.ndarray:
-        """Return the gradients of `volume_constraints` by x (m, n)."""
-        slopes = np.zeros((self.count, self.size))
-        for k, part in self.slices.items():
-            row = self.rows[k]
-            slopes[row, part] = self.arms[k].chain(self.volume[k], realised[k]) / self.limit[row]
-        return slopes
-
-    def by_x(
-        self, slopes: Mapping[int, np.ndarray], realised: Mapping[int, Realised]
-    ) -> np.ndarray:
-        """Return a gradient by x (n,) from that by the physical densities."""
-        return self.join({k: arm.chain(slopes[k], realised[k]) for k, arm in self.arms.items()})
-
-    def _volumes(self, x_phys: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return sum V x_phys of each constraint's arms (m,), m3."""
-        volume = {}
-        for k in self.arms:
-            volume[k] = np.zeros(self.count)
-            volume[k][self.rows[k]] = self.volume[k] @ x_phys[k]
-        return sum_over_arms(self.share, volume)
 
 
 class Recorder(Protocol):
@@ -203,7 +86,7 @@ def run(
 
 
 @dataclass(frozen=True, eq=False)
-class _Slopes:
+class _Gradients:
     """Gradients by this rank's design variables: objective (n,), constraints (k, n)."""
 
     objective: np.ndarray
@@ -211,7 +94,7 @@ class _Slopes:
 
 
 @dataclass(frozen=True, eq=False)
-class _Posed:
+class _Problem:
     """The problem at the current design, as MMA takes it: values f (m,) and gradients by x."""
 
     df0dx: np.ndarray
@@ -225,7 +108,7 @@ class _Evaluated:
 
     realised: Mapping[int, Realised]
     evaluation: Evaluation
-    slopes: _Slopes
+    gradients: _Gradients
 
     @property
     def x_phys(self) -> dict[int, np.ndarray]:
@@ -249,7 +132,8 @@ class _Run:
         self.recorder = recorder
         self.report = report
         self.moves = needs(scene, "motion")  # else only the result is simulated
-        self.variables = _Variables(scene, share, arms)
+        self.variables = Variables(scene, share, arms)
+        self.continuation = Continuation(scene, share, arms)
         self.x = np.maximum(np.full(self.variables.size, scene.design.initial), self.variables.xmin)
         self.state = initial_state(self.x)
         self.solutions: tuple[Solution, ...] = ()
@@ -265,32 +149,28 @@ class _Run:
         self.limits: tuple[Limit, ...] = ()
         self.grayness = 0.0  # of the nominal design; known on the root
         self.finished = ""
-        self.sharpness = 1.0  # the projection's beta; grows to design.sharpness
-        # Held during a step: a threshold that followed x would be one more way to stay grey.
-        self.thresholds = dict.fromkeys(arms, 0.5)
         self.choice: Choice | None = None
         self.earlier = 0.0  # seconds spent before a resume
         self.begun = self.saved = time.perf_counter()
 
     def go(self, memory: Memory | None) -> Result:
-        """Iterate until the design rests or the iterations are spent."""
+        """Iterate until the design converges or the iterations are spent."""
         if memory is not None:
             self._restore(memory)
         elif self.moves:
-            x = self._realised(self.x)
+            x = self.continuation.realise(self.variables.split(self.x))
             self.choice = self._choose({k: one[-1].x_phys for k, one in x.items()}, RESERVE)
         if self.recorder is not None:
             self.recorder.begin(self.history)
-        limit = self.scene.optimizer.max_iterations
         designs = self._evaluate()
-        posed = self._posed(designs)
+        problem = self._problem(designs)
         if memory is None:
-            self._record(designs, posed)
-        while not self._finished(limit):
-            self._update(posed)
+            self._record(designs, problem)
+        while not self._finished():
+            self._update(problem)
             designs = self._evaluate()
-            posed = self._posed(designs)
-            self._record(designs, posed)
+            problem = self._problem(designs)
+            self._record(designs, problem)
             self._checkpoint(force=False)
         self._checkpoint(force=True)
         counts = replace(self.ledger.counts)
@@ -307,7 +187,14 @@ class _Run:
             history=self.history,
             iterations=self.iteration,
             converged=converged,
-            stop_reason=self._stop_reason(),
+            stop_reason=stop_reason(
+                self.scene,
+                self.finished,
+                self.change,
+                self.kkt,
+                violated(self.limits),
+                self.grayness,
+            ),
             kkt=self.kkt,
             limits=self.limits,
             ledger=self.ledger,
@@ -315,71 +202,23 @@ class _Run:
             choice=self.choice,
         )
 
-    def _stop_reason(self) -> str:
-        """Say in words why the iterations ended, and which constraints are not met."""
-        options = self.scene.optimizer
-        reason = f"largest change {self.change:.3g} <= {self._small_change:g}"
-        if self.finished == "converged":
-            reason += f", residual {self.kkt:.2g} <= {options.kkt_tolerance:g}"
-        elif self.finished == "limit":
-            reason = f"optimizer.max_iterations = {options.max_iterations}"
-        if broken := violated(self.limits):
-            reason += f"{NOT_MET}{broken}"
-        if self.scene.design.projection and self.grayness > GREY:
-            reason += f"; the projected design is still grey ({self.grayness:.2g})"
-        return reason
-
-    def _finished(self, limit: int) -> bool:
+    def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
-        rests = self.iteration > 0 and self.change <= self._small_change and self._final_sharpness
-        if rests and violated(self.limits):
-            self.finished = "infeasible"  # no step mends it: MMA would take it
-        elif rests and self.kkt <= self.scene.optimizer.kkt_tolerance:
-            self.finished = "converged"
-        elif self.iteration >= limit:
-            self.finished = "limit"
-        else:
-            self.finished = ""
+        self.finished = ending(
+            self.scene,
+            self.iteration,
+            self.change,
+            self.kkt,
+            violated(self.limits),
+            self.continuation.complete,
+        )
         return bool(self.finished)
-
-    @property
-    def _small_change(self) -> float:
-        """Return the change up to which a design rests; one that the move limit made does not."""
-        options = self.scene.optimizer
-        return min(options.tolerance, MOVING * options.move)
-
-    @property
-    def _final_sharpness(self) -> bool:
-        design = self.scene.design
-        return not design.projection or self.sharpness >= design.sharpness
-
-    def _sharpen(self) -> None:
-        """Raise the projection's beta, and move its threshold so that the volume stays.
-
-        A little in every iteration: doubled at once, beta cuts members whose x is near the
-        threshold (200 x 12 cells, 2.2 N m: 709 N m after the step from 16 to 32).
-        """
-        if self._final_sharpness:
-            return
-        design = self.scene.design
-        self.sharpness = min(2.0 ** (1.0 / design.continuation) * self.sharpness, design.sharpness)
-        x = self.variables.split(self.x)
-        with together(self.share.world):
-            self.thresholds = {
-                k: arm.preserving_threshold(x[k], self.sharpness) for k, arm in self.arms.items()
-            }
-
-    @property
-    def _move(self) -> float:
-        """Return the move limit, shorter where the projection is steep and x_phys would leap."""
-        move = self.scene.optimizer.move
-        return move * min(1.0, (GENTLE / self.sharpness) ** 0.5)
 
     def _evaluate(self) -> list[_Evaluated]:
         """Evaluate the design that x stands for, or all of them; the nominal one last."""
         self.start = self.solutions
         self.modes = {k: arm.starts for k, arm in self.arms.items()}
-        realised = self._realised(self.x)
+        realised = self.continuation.realise(self.variables.split(self.x))
         several = self.scene.design.projection == "robust"
         designs = []
         for variant in range(3 if several else 1):
@@ -389,19 +228,10 @@ class _Run:
                 self.solutions = trajectory.solutions
             self.trajectory = trajectory
             # Taken now, with this design's factorisation at hand.
-            designs.append(_Evaluated(mine, evaluation, self._slopes(mine)))
+            designs.append(_Evaluated(mine, evaluation, self._gradients(mine)))
         if self.trajectory is not None and len(self.initial_deviation) == 0:
             self.initial_deviation = self.trajectory.deviation
         return designs
-
-    def _realised(self, x: np.ndarray) -> dict[int, tuple[Realised, ...]]:
-        """Return the designs that x stands for, the nominal one last (collective)."""
-        parts = self.variables.split(x)
-        with together(self.share.world):
-            return {
-                k: arm.realise(parts[k], self.sharpness, self.thresholds[k])
-                for k, arm in self.arms.items()
-            }
 
     def _choose(self, x_phys: Mapping[int, np.ndarray], reserve: float) -> Choice | None:
         return choose_coordinates(
@@ -421,37 +251,39 @@ class _Run:
             simulated=simulated,
         )
 
-    def _slopes(self, realised: Mapping[int, Realised]) -> _Slopes:
+    def _gradients(self, realised: Mapping[int, Realised]) -> _Gradients:
         """Return the gradients by x of the design evaluated last (collective)."""
         place = self.scene, self.share, self.arms
         analysed = *place, self.trajectory, self.ledger
-        slopes = [gradient(*analysed), *constraint_gradients(*analysed)]
+        rows = [gradient(*analysed), *constraint_gradients(*analysed)]
         with together(self.share.world):
-            objective, *rows = (self.variables.by_x(slope, realised) for slope in slopes)
-            return _Slopes(objective, np.array(rows).reshape(len(rows), self.variables.size))
+            objective, *limits = (self.variables.by_x(row, realised) for row in rows)
+            return _Gradients(objective, np.array(limits).reshape(len(limits), self.variables.size))
 
     def _objective(self, designs: Sequence[_Evaluated]) -> tuple[float, list[float]]:
-        """Return the objective of all designs together, and its slopes by theirs."""
+        """Return the objective of all designs together, and its derivatives by theirs."""
         values = [one.evaluation.objective for one in designs]
         return worst_of(values, self.scene.objective.exponent)
 
-    def _posed(self, designs: Sequence[_Evaluated]) -> _Posed:
+    def _problem(self, designs: Sequence[_Evaluated]) -> _Problem:
         """Return the problem at the current design (collective); keep its limits."""
         _, weights = self._objective(designs)
-        slopes = [one.slopes for one in designs]
-        volume, by_volume = self._volume(designs)
+        gradients = [one.gradients for one in designs]
+        realised = [one.realised for one in designs]
+        width = self.scene.design.minimum_member
+        volume, by_volume = self.variables.limited_volume(realised, width)
         fractions = (1.0 + volume) * self.scene.design.volume_fraction
         self.limits = worst_limits(
             [limits_of(self.scene, one.evaluation, fractions.tolist()) for one in designs]
         )
         constraints = [value for one in designs for value in one.evaluation.constraints]
-        return _Posed(
-            np.sum([w * s.objective for w, s in zip(weights, slopes, strict=True)], axis=0),
+        return _Problem(
+            np.sum([w * s.objective for w, s in zip(weights, gradients, strict=True)], axis=0),
             np.append(volume, constraints),
-            np.vstack([by_volume, *(one.constraints for one in slopes)]),
+            np.vstack([by_volume, *(one.constraints for one in gradients)]),
         )
 
-    def _residual(self, posed: _Posed) -> float:
+    def _residual(self, problem: _Problem) -> float:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
         variables = self.variables
         with self.ledger.phase("kkt residual"):
@@ -459,25 +291,25 @@ class _Run:
                 self.x,
                 variables.xmin,
                 variables.xmax,
-                posed.df0dx,
-                posed.f,
-                posed.dfdx,
+                problem.df0dx,
+                problem.f,
+                problem.dfdx,
                 variables.slices,
                 partial(sum_over_arms, self.share),
             )[0]
 
-    def _update(self, posed: _Posed) -> None:
+    def _update(self, problem: _Problem) -> None:
         """Make one MMA step."""
         with self.ledger.phase("mma"):
             x, self.state = mma_step(
                 self.x,
-                posed.df0dx,
-                posed.f,
-                posed.dfdx,
+                problem.df0dx,
+                problem.f,
+                problem.dfdx,
                 self.variables.xmin,
                 self.variables.xmax,
                 self.state,
-                move=self._move,
+                move=self.continuation.move,
                 comm=self.share.world,
                 pieces=self.variables.pieces,
             )
@@ -485,26 +317,7 @@ class _Run:
         self.change = float(self.share.world.allreduce(change, op=MPI.MAX))
         self.x = x
         self.iteration += 1
-        self._sharpen()
-
-    def _volume(self, designs: Sequence[_Evaluated]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the volume constraints and their gradients by x.
-
-        Of robust designs with a `minimum_member` the dilated one carries the limit, chosen anew in
-        every step so that the nominal one meets its own: V_dilated / (V_dilated / V_nominal limit)
-        - 1, the quotient held.
-        Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
-        The nominal one otherwise: a filter of few cells leaves so few grey ones that, once the
-        projection is sharp, the dilated volume does not see where the nominal one changes (200 x 12
-        cells, radius 1.5 cells, beta 64: the worst compliance climbs from 2.3 to 2.5 N m).
-        """
-        nominal = self.variables.volume_constraints(designs[-1].x_phys)
-        alone = len(designs) == 1 or not self.scene.design.minimum_member
-        limited = designs[-1] if alone else designs[1]
-        ratio = (1.0 + nominal) / (1.0 + self.variables.volume_constraints(limited.x_phys))
-        with together(self.share.world):
-            slopes = self.variables.volume_slopes(limited.realised)
-        return nominal, slopes if alone else ratio[:, None] * slopes
+        self.continuation.advance(self.variables.split(self.x))
 
     def _assess(self, designs: Sequence[_Evaluated]) -> tuple[Evaluation, Evaluation | None]:
         """Evaluate what the iterations left out: motions not simulated, and the crisp design."""
@@ -539,9 +352,9 @@ class _Run:
                 error = np.inf
             self.choice = replace(self.choice, error=error)
 
-    def _record(self, designs: Sequence[_Evaluated], posed: _Posed) -> None:
+    def _record(self, designs: Sequence[_Evaluated], problem: _Problem) -> None:
         """Add a row to the history; collective, kept on the root."""
-        self.kkt = self._residual(posed)
+        self.kkt = self._residual(problem)
         nominal = designs[-1]
         parts = {}
         for k, volume in self.variables.volume.items():
@@ -599,8 +412,8 @@ class _Run:
             history=self.history,
             initial_deviation=self.initial_deviation,
             finished=self.finished,
-            sharpness=self.sharpness,
-            thresholds=self.thresholds,
+            sharpness=self.continuation.beta,
+            thresholds=self.continuation.thresholds,
             choice=self.choice,
         )
 
@@ -624,8 +437,8 @@ class _Run:
         self.history = memory.history if self.share.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
         self.iteration = memory.iteration
-        self.sharpness = memory.sharpness
-        self.thresholds = dict(memory.thresholds)
+        self.continuation.beta = memory.sharpness
+        self.continuation.thresholds = dict(memory.thresholds)
         self.change = memory.history[-1].change
         self.kkt = memory.history[-1].kkt
         self.grayness = memory.history[-1].grayness

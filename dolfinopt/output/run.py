@@ -10,8 +10,9 @@ from mpi4py import MPI
 
 from dolfinopt.optimization import loop
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.loop import Report, Result
+from dolfinopt.optimization.loop import Report
 from dolfinopt.optimization.memory import Memory
+from dolfinopt.optimization.result import Result
 from dolfinopt.output import checkpoint
 from dolfinopt.output.files import HistoryWriter
 from dolfinopt.parallel import ArmShare, on_root, share_arms, together

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.optimization.loop import Result
+from dolfinopt.optimization.result import Result
 from dolfinopt.output.files import (
     ArmView,
     gather_views,

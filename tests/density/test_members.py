@@ -13,7 +13,8 @@ import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.members import thinnest
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.optimization.loop import _Evaluated, _Run
+from dolfinopt.optimization.continuation import Continuation
+from dolfinopt.optimization.variables import Variables
 from dolfinopt.output.summary import _widths, filter_warnings
 
 WORLD = MPI.COMM_WORLD
@@ -139,18 +140,19 @@ def test_which_design_carries_the_volume(width):
     """With a width the dilated one, scaled so that the nominal one meets its limit; else that."""
     scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}"))
     share = do.share_arms(WORLD, scene.cell_counts)
-    ledger = do.Ledger()
-    arms = do.build_arms(scene, share, ledger)
-    run = _Run(scene, share, arms, ledger, None, None)
-    run.sharpness = 4.0
-    x = np.linspace(0.1, 0.9, run.variables.size)
-    realised = run._realised(x)
-    designs = [_Evaluated({k: one[i] for k, one in realised.items()}, None, None) for i in range(3)]
-    value, slopes = run._volume(designs)
-    _, dilated, nominal = (run.variables.volume_constraints(one.x_phys) for one in designs)
+    arms = do.build_arms(scene, share, do.Ledger())
+    variables, continuation = Variables(scene, share, arms), Continuation(scene, share, arms)
+    continuation.beta = 4.0
+    realised = continuation.realise(variables.split(np.linspace(0.1, 0.9, variables.size)))
+    designs = [{k: one[i] for k, one in realised.items()} for i in range(3)]
+    value, slopes = variables.limited_volume(designs, width)
+    _, dilated, nominal = (
+        variables.volume_constraints({k: one.x_phys for k, one in design.items()})
+        for design in designs
+    )
     assert value == pytest.approx(nominal)
     assert dilated > nominal
-    expected = run.variables.volume_slopes(designs[1 if width else 2].realised)
+    expected = variables.volume_gradients(designs[1 if width else 2])
     factor = (1.0 + nominal) / (1.0 + dilated) if width else np.ones(len(nominal))
     np.testing.assert_allclose(slopes, expected * factor[:, None], rtol=1e-14)
 

@@ -1,0 +1,67 @@
+"""The projection's steepness and thresholds, as they change over the iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.parallel import ArmShare, together
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm, Realised
+
+# Steepness from which on the move limit falls with its square root: up to it the projection's
+# slope, about beta / 2, moves x_phys by no more than twice what x moves.
+GENTLE = 4.0
+
+
+class Continuation:
+    """Owns the projection's beta and thresholds; without a projection both stay as they are.
+
+    Attributes:
+        beta: steepness; grows from 1 to design.sharpness.
+        thresholds: eta of every arm of this rank. Held during a step: a threshold that followed x
+            would be one more way to stay grey.
+    """
+
+    def __init__(self, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
+        """Begin with the gentlest projection."""
+        self.scene, self.share, self.arms = scene, share, arms
+        self.beta = 1.0
+        self.thresholds: dict[int, float] = dict.fromkeys(arms, 0.5)
+
+    @property
+    def complete(self) -> bool:
+        """Whether beta has reached its final value."""
+        design = self.scene.design
+        return not design.projection or self.beta >= design.sharpness
+
+    @property
+    def move(self) -> float:
+        """Move limit, shorter where the projection is steep and x_phys would leap."""
+        return self.scene.optimizer.move * min(1.0, (GENTLE / self.beta) ** 0.5)
+
+    def realise(self, x: Mapping[int, np.ndarray]) -> dict[int, tuple[Realised, ...]]:
+        """Return the designs that x stands for, the nominal one last (collective)."""
+        with together(self.share.world):
+            return {
+                k: arm.realise(x[k], self.beta, self.thresholds[k]) for k, arm in self.arms.items()
+            }
+
+    def advance(self, x: Mapping[int, np.ndarray]) -> None:
+        """Raise beta, and move the thresholds so that the volume of x stays (collective).
+
+        A little in every iteration: doubled at once, beta cuts members whose x is near the
+        threshold.
+        """
+        if self.complete:
+            return
+        design = self.scene.design
+        self.beta = min(2.0 ** (1.0 / design.continuation) * self.beta, design.sharpness)
+        with together(self.share.world):
+            self.thresholds = {
+                k: arm.preserving_threshold(x[k], self.beta) for k, arm in self.arms.items()
+            }

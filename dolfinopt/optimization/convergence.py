@@ -1,0 +1,64 @@
+"""When the iterations end, and how that is said."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from dolfinopt.scene.load import Scene
+from dolfinopt.units import NOT_MET
+
+# A change above this part of the move limit was cut off by it and tells nothing about convergence.
+MOVING = 0.5
+# Grayness above which a projection has not done its work: as if 2 % of the cells stood at 1/2.
+GREY = 0.02
+
+Ending = Literal["", "converged", "infeasible", "limit"]
+
+
+def small_change(scene: Scene) -> float:
+    """Return the change of the design variables up to which a design counts as converged."""
+    return min(scene.optimizer.tolerance, MOVING * scene.optimizer.move)
+
+
+def ending(
+    scene: Scene, iteration: int, change: float, kkt: float, violated: str, complete: bool
+) -> Ending:
+    """Return why the iterations end here, "" where they go on.
+
+    Args:
+        scene: with the tolerances.
+        iteration: design updates made.
+        change: largest change of a design variable in the last one.
+        kkt: Karush-Kuhn-Tucker residual of the design.
+        violated: the constraints that it does not meet, "" if it meets all.
+        complete: whether the continuation of the projection has come to its end.
+    """
+    rests = iteration > 0 and change <= small_change(scene) and complete
+    if rests and violated:
+        return "infeasible"  # no step mends it: MMA would take it
+    if rests and kkt <= scene.optimizer.kkt_tolerance:
+        return "converged"
+    return "limit" if iteration >= scene.optimizer.max_iterations else ""
+
+
+def stop_reason(
+    scene: Scene, end: str, change: float, kkt: float, violated: str, grayness: float
+) -> str:
+    """Say in words why the iterations ended, and which constraints are not met.
+
+    Args:
+        scene, change, kkt, violated: as for `ending`.
+        end: what that returned.
+        grayness: of the design.
+    """
+    options = scene.optimizer
+    reason = f"largest change {change:.3g} <= {small_change(scene):g}"
+    if end == "converged":
+        reason += f", residual {kkt:.2g} <= {options.kkt_tolerance:g}"
+    elif end == "limit":
+        reason = f"optimizer.max_iterations = {options.max_iterations}"
+    if violated:
+        reason += f"{NOT_MET}{violated}"
+    if scene.design.projection and grayness > GREY:
+        reason += f"; the projected design is still grey ({grayness:.2g})"
+    return reason

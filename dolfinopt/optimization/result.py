@@ -1,0 +1,67 @@
+"""What an optimisation returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.parallel import ArmShare
+from dolfinopt.profiling import Counts, Ledger
+from dolfinopt.responses.constraints import Limit, violated
+from dolfinopt.responses.evaluation import Evaluation
+from dolfinopt.responses.order_selection import Choice
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """An optimised design.
+
+    Attributes:
+        share, arms: which ranks did what, and this rank's arms with the final design reduced.
+        x_phys: physical densities (n_cells,) of this rank's arms.
+        evaluation: of the final design.
+        trajectory: of the final design; on the root only.
+        crisp: evaluation of the final design cut at x_phys = 1/2; None without a projection.
+        initial_deviation: (n, 2) of the initial design, m; on the root only.
+        history: one row a design, the initial one first; on the root only.
+        iterations: design updates made.
+        converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
+            within their tolerances and every constraint is met.
+        stop_reason: in words.
+        kkt: the residual of the final design, see `optimality.kkt_residual`.
+        limits: every constraint and its value.
+        ledger: seconds and counts of this rank.
+        counts: those of the iterations alone, on this rank.
+        choice: of the coordinates, and the error that they make of the final design's motion;
+            None where the scene states a number.
+    """
+
+    share: ArmShare
+    arms: Mapping[int, Arm]
+    x_phys: Mapping[int, np.ndarray]
+    evaluation: Evaluation
+    crisp: Evaluation | None
+    trajectory: Trajectory | None
+    initial_deviation: np.ndarray
+    history: list[HistoryRow]
+    iterations: int
+    converged: bool
+    stop_reason: str
+    kkt: float
+    limits: tuple[Limit, ...]
+    ledger: Ledger
+    counts: Counts
+    choice: Choice | None = None
+
+    @property
+    def violated(self) -> str:
+        """Which constraints the final design does not meet, in one line; "" if it meets all."""
+        return violated(self.limits)
