@@ -50,7 +50,7 @@ from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.schema import GradientKind
-from dolfinopt.study.studies import Topic, study
+from dolfinopt.study.studies import Preset, study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -339,7 +339,7 @@ class Model:
     def study(
         self,
         *vary: str,
-        topic: Topic | None = None,
+        preset: Preset | None = None,
         designs: Sequence[Densities | SimulationResult | str | Path] = (),
         reoptimize: bool = False,
         folder: str | Path | None = None,
@@ -349,7 +349,7 @@ class Model:
 
         Args:
             *vary: "key.path=start:stop:count" or "key.path=a,b,c"; two make a grid.
-            topic: "payload", "flattening" or "coordinates" for their usual ranges; "objective" or
+            preset: "payload", "flattening" or "coordinates" for their usual ranges; "objective" or
                 "reduction" to compare all of them.
             designs: to simulate, in place of the initial and the optimised one.
             reoptimize: optimise a design for every value, too.
@@ -363,7 +363,7 @@ class Model:
         with self._folder(folder) as place:
             paths = [self._design_file(one, place, k) for k, one in enumerate(designs, 1)]
             found = study(
-                self.scene, topic, vary, paths, place, self._world,
+                self.scene, preset, vary, paths, place, self._world,
                 reoptimize=reoptimize, shown=shown,
             )  # fmt: skip
             frame: DataFrame = self._world.bcast(found.tables[0].frame, root=0)

@@ -13,12 +13,12 @@ from dolfinopt.cli.shared import load
 from dolfinopt.cli.studies import asked_of, carry_out, folder_of, study_out_option
 from dolfinopt.errors import InputError
 
-TOPICS = {"objectives": "objective", "reductions": "reduction"}
+PRESETS = {"objectives": "objective", "reductions": "reduction"}
 
 
 @click.command()
 @scene_argument
-@click.argument("what", type=click.Choice(list(TOPICS)))
+@click.argument("what", type=click.Choice(list(PRESETS)))
 @click.option(
     "--coordinates",
     multiple=True,
@@ -49,9 +49,9 @@ def compare(
     world, loaded = load(scene, overrides)
     from dolfinopt.study.studies import study
 
-    topic: Any = TOPICS[what]
+    preset: Any = PRESETS[what]
     folder = folder_of(scene, out)
     vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
-    run = partial(study, loaded, topic, vary, [], folder, world)
+    run = partial(study, loaded, preset, vary, [], folder, world)
     question = asked_of(world, loaded, [])
-    carry_out(world, folder, topic, question, run, overwrite=overwrite, plots=plots)
+    carry_out(world, folder, preset, question, run, overwrite=overwrite, plots=plots)

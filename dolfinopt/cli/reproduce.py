@@ -14,7 +14,7 @@ from dolfinopt.errors import ConvergenceError
 
 @click.command()
 @out_option("figures, report.html and cases; default: results/paper")
-@click.option("--check", is_flag=True, help="end with status 1 where a main finding fails")
+@click.option("--check", is_flag=True, help="end with status 1 if one of the main checks fails")
 @click.option(
     "--coarse",
     is_flag=True,
@@ -29,14 +29,14 @@ def reproduce(
     overrides: tuple[str, ...],
     plots: bool,
 ) -> None:
-    """Recreate figures 3 to 15 of the paper, and a page that compares the findings.
+    """Recreate figures 3 to 15 of the paper, and a page that compares its statements with ours.
 
     What is computed is kept in DIR/cases and taken from there the next time; a call that was
     interrupted goes on.
     """
     world = start()
     from dolfinopt.output.summary import filter_warnings
-    from dolfinopt.paper.checks import broken
+    from dolfinopt.paper.checks import failed_checks
     from dolfinopt.paper.page import write_reproduction
     from dolfinopt.paper.reproduction import Plan, cell_sizes, load_paper
     from dolfinopt.paper.reproduction import reproduce as run
@@ -50,13 +50,13 @@ def reproduce(
 
     def conclude() -> None:
         write_reproduction(done, folder, plots=plots)
-        for finding in done.findings:
-            click.echo(f"{finding.name} (paper: {finding.paper}). {finding.sentence}")
+        for check in done.checks:
+            click.echo(f"{check.name} (paper: {check.paper}). {check.sentence}")
         page = " and report.html" if plots else ""
         click.echo(f"{done.outcomes.computed} cases computed; figures{page} in {folder}")
 
     on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
     failures = [f"{o.case.label}: {o.failure}" for o in done.outcomes.failures]
-    wrong = [*failures, *(broken(done.findings) if check else ())]
+    wrong = [*failures, *(failed_checks(done.checks) if check else ())]
     if wrong:
         raise ConvergenceError("; ".join(wrong))

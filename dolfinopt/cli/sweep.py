@@ -13,12 +13,12 @@ from dolfinopt.cli.shared import load
 from dolfinopt.cli.studies import asked_of, carry_out, designs_option, folder_of, study_out_option
 from dolfinopt.errors import InputError
 
-TOPICS = ("payload", "flattening", "coordinates")
+PRESETS = ("payload", "flattening", "coordinates")
 
 
 @click.command()
 @scene_argument
-@click.argument("topic", required=False, type=click.Choice(TOPICS))
+@click.argument("preset", required=False, type=click.Choice(PRESETS))
 @click.option(
     "--vary",
     multiple=True,
@@ -33,7 +33,7 @@ TOPICS = ("payload", "flattening", "coordinates")
 @plots_option
 def sweep(
     scene: Path,
-    topic: Any,
+    preset: Any,
     vary: tuple[str, ...],
     designs: tuple[Path, ...],
     reoptimize: bool,
@@ -48,7 +48,7 @@ def sweep(
     whatever --vary names. What is computed is kept in DIR: a sweep that was interrupted, or that
     grows, takes it from there.
     """
-    if topic is None and not vary:
+    if preset is None and not vary:
         raise InputError(
             "sweep: name payload, flattening or coordinates, or what to --vary "
             "(see dolfinopt sweep --help)"
@@ -57,11 +57,11 @@ def sweep(
     from dolfinopt.study.studies import study, sweep_name
 
     folder = folder_of(scene, out)
-    run = partial(study, loaded, topic, vary, designs, folder, world, reoptimize=reoptimize)
+    run = partial(study, loaded, preset, vary, designs, folder, world, reoptimize=reoptimize)
     carry_out(
         world,
         folder,
-        sweep_name(topic, vary),
+        sweep_name(preset, vary),
         asked_of(world, loaded, designs),
         run,
         overwrite=overwrite,

@@ -63,7 +63,7 @@ def uncertainty(
     interrupted goes on.
     """
     world, loaded = load(scene, overrides)
-    from dolfinopt.study.random_study import Plan, random_name, study_random
+    from dolfinopt.study.uncertainty import Plan, random_name, study_random
 
     folder = folder_of(scene, out)
     plan = Plan(samples, seed, sampler, indices)

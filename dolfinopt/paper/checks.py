@@ -1,4 +1,4 @@
-"""What the paper found, what was found here, and whether the one holds for the other.
+"""Checks of the paper's statements against the figures computed here.
 
 Every verdict follows from figures by a criterion that stands beside it; only the reasons for known
 differences are written out. Paper: Seifried, Moghadasi & Held, Procedia IUTAM 13 (2015) 71-81,
@@ -11,7 +11,6 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -36,7 +35,7 @@ MANY = 3.0  # from here on "n times" reads better than per cent
 
 
 @dataclass(frozen=True)
-class Made:
+class DesignResult:
     """A design and what it does in the scene.
 
     Attributes:
@@ -57,7 +56,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Reduced:
+class ReducedResult:
     """A design optimised with one reduction, simulated with the reference as well.
 
     Attributes:
@@ -79,7 +78,7 @@ class Reduced:
 
 
 @dataclass(frozen=True)
-class Resolved:
+class CoordinateSweep:
     """A given design, simulated with one method and more and more coordinates.
 
     Attributes:
@@ -99,7 +98,7 @@ class Resolved:
 
 
 @dataclass(frozen=True)
-class Used:
+class SweptDesign:
     """A design in every scenario of a sweep.
 
     Attributes:
@@ -115,7 +114,7 @@ class Used:
 
 
 @dataclass(frozen=True)
-class Swept:
+class ValueSweep:
     """Designs over the values of one key; the initial design first, the solid one second if any.
 
     Attributes:
@@ -126,15 +125,15 @@ class Swept:
 
     axis: str
     values: tuple[float, ...]
-    designs: tuple[Used, ...]
+    designs: tuple[SweptDesign, ...]
 
     @property
-    def initial(self) -> Used:
+    def initial(self) -> SweptDesign:
         """The initial design."""
         return self.designs[0]
 
     @property
-    def optima(self) -> list[Used]:
+    def optima(self) -> list[SweptDesign]:
         """Those made for one of the values, in their order."""
         return [used for used in self.designs if not math.isnan(used.made_for)]
 
@@ -165,8 +164,8 @@ class Ends:
     """
 
     length: float
-    objectives: tuple[Made, ...]
-    reductions: tuple[Reduced, ...]
+    objectives: tuple[DesignResult, ...]
+    reductions: tuple[ReducedResult, ...]
 
     @property
     def words(self) -> str:
@@ -201,7 +200,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Measured:
-    """All figures that the findings rest on.
+    """All figures that the checks rest on.
 
     Attributes:
         cells: along and across an arm; empty for other meshes.
@@ -216,11 +215,11 @@ class Measured:
 
     cells: tuple[int, ...]
     iterations: int
-    objectives: tuple[Made, ...]
-    reductions: tuple[Reduced, ...]
-    coordinates: tuple[Resolved, ...]
-    payload: Swept
-    path: Swept
+    objectives: tuple[DesignResult, ...]
+    reductions: tuple[ReducedResult, ...]
+    coordinates: tuple[CoordinateSweep, ...]
+    payload: ValueSweep
+    path: ValueSweep
     ends: Ends
     setting: Setting = Setting()
 
@@ -229,41 +228,11 @@ class Measured:
         return json.dumps(asdict(self), indent=1) + "\n"
 
 
-def read_measured(text: str) -> Measured:
-    """Return what `Measured.json` wrote."""
-    data = json.loads(text)
-
-    def swept(one: dict[str, Any]) -> Swept:
-        return Swept(one["axis"], tuple(one["values"]), _rows(Used, one["designs"]))
-
-    return Measured(
-        tuple(data["cells"]),
-        data["iterations"],
-        _rows(Made, data["objectives"]),
-        _rows(Reduced, data["reductions"]),
-        _rows(Resolved, data["coordinates"]),
-        swept(data["payload"]),
-        swept(data["path"]),
-        Ends(
-            data["ends"]["length"],
-            _rows(Made, data["ends"]["objectives"]),
-            _rows(Reduced, data["ends"]["reductions"]),
-        ),
-        Setting(**data.get("setting", {})),
-    )
-
-
-def _rows(kind: Any, rows: Iterable[dict[str, Any]]) -> Any:
-    """Return dataclasses with tuples where JSON has lists."""
-    fixed = ({k: tuple(v) if isinstance(v, list) else v for k, v in row.items()} for row in rows)
-    return tuple(kind(**row) for row in fixed)
-
-
-# -- findings --------------------------------------------------------------------------------
+# -- checks --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Finding:
+class Check:
     """One statement of the paper.
 
     Attributes:
@@ -297,8 +266,8 @@ class Finding:
         return f"Does not hold: {self.ours}. {self.reason}".strip()
 
 
-def find(measured: Measured) -> tuple[Finding, ...]:
-    """Return all findings, in the order of the paper's figures."""
+def check_paper(measured: Measured) -> tuple[Check, ...]:
+    """Return all checks, in the order of the paper's figures."""
     return (
         *_objectives(measured),
         *_reductions(measured),
@@ -310,12 +279,12 @@ def find(measured: Measured) -> tuple[Finding, ...]:
     )
 
 
-def broken(findings: Iterable[Finding]) -> list[str]:
+def failed_checks(checks: Iterable[Check]) -> list[str]:
     """Return what `--check` demands and is not so, one line each."""
     return [
-        f"{finding.name}: expected {finding.asserted}; found {finding.ours}"
-        for finding in findings
-        if finding.asserted and not finding.stands
+        f"{check.name}: expected {check.asserted}; found {check.ours}"
+        for check in checks
+        if check.asserted and not check.stands
     ]
 
 
@@ -342,7 +311,7 @@ def span(values: Iterable[float]) -> float:
     return float((found.max() - found.min()) / found.max())
 
 
-def _objectives(measured: Measured) -> list[Finding]:
+def _objectives(measured: Measured) -> list[Check]:
     initial, more = measured.objectives[0], measured.setting.solid
     dynamic = _dynamic(measured.objectives)
     others = [made for made in measured.objectives if made.kind in ("static", "eigenfrequency")]
@@ -352,7 +321,7 @@ def _objectives(measured: Measured) -> list[Finding]:
     best = min(others, key=lambda made: _or_infinite(made.compliance))
     low, high = min(ratios.values()), max(ratios.values())
     return [
-        Finding(
+        Check(
             "initial deviation",
             (3, 4),
             "The initial design deviates by 50 to 60 mm at most.",
@@ -364,7 +333,7 @@ def _objectives(measured: Measured) -> list[Finding]:
             "between 50 and 60 mm",
             0.050 <= initial.deviation <= 0.060,
         ),
-        Finding(
+        Check(
             "static and eigenfrequency designs",
             (3, 4),
             "Designs for static compliance or for the first eigenfrequency deviate by about one "
@@ -380,7 +349,7 @@ def _objectives(measured: Measured) -> list[Finding]:
             "members meet in one point of the tip, a hinge that turns under the moment of arm 2. "
             + _solid_ends(measured.ends),
         ),
-        Finding(
+        Check(
             "dynamic loads",
             (3, 4),
             "The design for the dynamic loads deviates far less, by less than 7 mm.",
@@ -407,7 +376,7 @@ def _objectives(measured: Measured) -> list[Finding]:
     ]
 
 
-def _dynamic(made: Sequence[Made]) -> Made:
+def _dynamic(made: Sequence[DesignResult]) -> DesignResult:
     """Return the paper's own design: load cases, frozen loads."""
     return next(one for one in made if one.kind == "esl")
 
@@ -435,7 +404,7 @@ def _or_infinite(value: float) -> float:
     return math.inf if math.isnan(value) else value
 
 
-def _reductions(measured: Measured) -> list[Finding]:
+def _reductions(measured: Measured) -> list[Check]:
     few_cms, many_cms = _of(measured, CRAIG_BAMPTON)
     few, many = _of(measured, MODAL)
     worse = few.deviation / few_cms.deviation
@@ -443,7 +412,7 @@ def _reductions(measured: Measured) -> list[Finding]:
     differs = few_cms.compliance / many_cms.compliance - 1.0
     same, alike = few_cms.apart <= SAME, abs(differs) <= FLAT
     return [
-        Finding(
+        Check(
             "modal truncation with few coordinates",
             (5, 6),
             f"Modal truncation with {few.coordinates} coordinates is unacceptable.",
@@ -457,7 +426,7 @@ def _reductions(measured: Measured) -> list[Finding]:
             "a deviation more than twice as large",
             worse > 2.0,
         ),
-        Finding(
+        Check(
             "Craig-Bampton designs",
             (5, 6),
             f"Craig-Bampton (CMS) gives the same topology with {few_cms.coordinates} and with "
@@ -474,7 +443,7 @@ def _reductions(measured: Measured) -> list[Finding]:
             f"compliances that differ by at most {percent(FLAT)}",
             alike,
         ),
-        Finding(
+        Check(
             "modal truncation with many coordinates",
             (5, 6),
             f"Modal truncation with {many.coordinates} coordinates comes close.",
@@ -490,7 +459,7 @@ def _reductions(measured: Measured) -> list[Finding]:
     ]
 
 
-def _of(measured: Measured, method: str) -> tuple[Reduced, Reduced]:
+def _of(measured: Measured, method: str) -> tuple[ReducedResult, ReducedResult]:
     """Return the designs made with the fewest and the most coordinates of a method."""
     mine = [one for one in measured.reductions if one.method == method]
     key = lambda one: one.coordinates  # noqa: E731
@@ -512,7 +481,7 @@ def _designs(measured: Measured) -> list[str]:
     return list(dict.fromkeys(one.design for one in measured.coordinates))
 
 
-def _resolved(measured: Measured, design: str) -> tuple[Resolved, Resolved]:
+def _resolved(measured: Measured, design: str) -> tuple[CoordinateSweep, CoordinateSweep]:
     """Return a design's Craig-Bampton and modal sweep."""
     mine = [one for one in measured.coordinates if one.design == design]
     return (
@@ -521,7 +490,7 @@ def _resolved(measured: Measured, design: str) -> tuple[Resolved, Resolved]:
     )
 
 
-def _coordinates(measured: Measured, design: str) -> Finding:
+def _coordinates(measured: Measured, design: str) -> Check:
     cms, modal = _resolved(measured, design)
     first = design == _designs(measured)[0]
     flat = span(cms.compliance)
@@ -530,7 +499,7 @@ def _coordinates(measured: Measured, design: str) -> Finding:
     level, start = (27.5, 24.0) if first else (1.9, 1.5)
     near = abs(cms.compliance[-1] / level - 1.0) <= 0.05
     holds = flat <= FLAT and below and climbs and modal.compliance[-1] > modal.compliance[0]
-    return Finding(
+    return Check(
         f"coordinates, {design}",
         (7,),
         f"Compliance of the {design} against the number of coordinates: Craig-Bampton is flat at "
@@ -551,12 +520,12 @@ def _coordinates(measured: Measured, design: str) -> Finding:
     )
 
 
-def _histories(measured: Measured) -> Finding:
+def _histories(measured: Measured) -> Check:
     cms, modal = _resolved(measured, _designs(measured)[-1])
     apart = max(cms.apart)
     low = [1.0 - modal.deviation[i] / cms.deviation[-1] for i in (0, -1)]
     fine = apart <= FLAT
-    return Finding(
+    return Check(
         "deviation by reduction",
         (8,),
         f"Deviation of the optimised design: Craig-Bampton with 4 to {cms.coordinates[-1]} "
@@ -574,10 +543,10 @@ def _histories(measured: Measured) -> Finding:
     )
 
 
-def _made_with_modes(measured: Measured) -> Finding:
+def _made_with_modes(measured: Measured) -> Check:
     cms, modal = _of(measured, CRAIG_BAMPTON)[1], _of(measured, MODAL)[1]
     off = modal.deviation / cms.deviation - 1.0
-    return Finding(
+    return Check(
         "designs made with modes",
         (9,),
         "Designs optimised with modal truncation and with Craig-Bampton, both simulated with "
@@ -593,7 +562,7 @@ def _made_with_modes(measured: Measured) -> Finding:
     )
 
 
-def _payload(measured: Measured) -> list[Finding]:
+def _payload(measured: Measured) -> list[Check]:
     sweep = measured.payload
     bends = [max(bend(sweep.values, used.deviation) for used in sweep.designs)]
     bends += [bend(sweep.values, used.compliance) for used in (sweep.initial, sweep.optima[1])]
@@ -603,7 +572,7 @@ def _payload(measured: Measured) -> list[Finding]:
     light, heavy = sweep.optima[0], sweep.optima[-1]
     differ = max(abs(a / b - 1.0) for a, b in zip(light.compliance, heavy.compliance, strict=True))
     return [
-        Finding(
+        Check(
             "payload, linear",
             (10, 11),
             "Compliance and deviation are nearly linear in the payload from "
@@ -621,7 +590,7 @@ def _payload(measured: Measured) -> list[Finding]:
             f"a deviation at most {percent(LINEAR)} off the straight line",
             bends[0] <= LINEAR,
         ),
-        Finding(
+        Check(
             "payload, loss",
             (10, 11),
             f"Designs optimised for {light.made_for:g} and for {heavy.made_for:g} kg differ by at "
@@ -651,7 +620,7 @@ def power(x: Sequence[float], y: Sequence[float]) -> float:
     return math.log(y[-1] / y[0]) / math.log(x[-1] / x[0])
 
 
-def _path(measured: Measured) -> list[Finding]:
+def _path(measured: Measured) -> list[Check]:
     sweep = measured.path
     values, own = sweep.own("deviation")
     before = np.array([sweep.initial.deviation[sweep.values.index(s)] for s in values])
@@ -662,7 +631,7 @@ def _path(measured: Measured) -> list[Finding]:
     solid = _solid(sweep)
     solid_there = np.array([_solid_arms(sweep).deviation[sweep.values.index(s)] for s in values])
     return [
-        Finding(
+        Check(
             "path, sensitivity",
             (12, 13, 14, 15),
             "From the semicircle to a straight line the initial design's compliance changes by "
@@ -675,7 +644,7 @@ def _path(measured: Measured) -> list[Finding]:
             "depends on the time law and on the cart's share of the motion, which the paper does "
             "not state.",
         ),
-        Finding(
+        Check(
             "path, a tenth",
             (12, 13, 14, 15),
             "The optimised design's deviation stays below a tenth of the initial one's on every "
@@ -688,7 +657,7 @@ def _path(measured: Measured) -> list[Finding]:
             f"at most {NEAR_SOLID:g} times the deviation of solid arms on every path",
             bool(np.all(own <= NEAR_SOLID * solid_there)),
         ),
-        Finding(
+        Check(
             "path, loss",
             (12, 13, 14, 15),
             "A design made for one path loses at most 1.8 % compliance and 2.2 % deviation on "
@@ -704,11 +673,11 @@ def _path(measured: Measured) -> list[Finding]:
     ]
 
 
-def _solid_arms(sweep: Swept) -> Used:
+def _solid_arms(sweep: ValueSweep) -> SweptDesign:
     return next(used for used in sweep.designs if used.label == "solid arms")
 
 
-def _solid(sweep: Swept) -> list[float]:
+def _solid(sweep: ValueSweep) -> list[float]:
     """Return the deviation of solid arms on the nominal path, and over the initial design's."""
     deviation = np.array(_solid_arms(sweep).deviation)
     ratios = deviation / np.array(sweep.initial.deviation)

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from dolfinopt.data import page_folder
-from dolfinopt.paper.checks import Ends, Measured, Swept, mm, percent
+from dolfinopt.paper.checks import Ends, Measured, ValueSweep, mm, percent
 from dolfinopt.paper.reproduction import INITIAL, OPTIMUM, Numbered, Reproduction, cell_sizes
 from dolfinopt.study.tables import DesignFigure, LineFigure, Table, as_text
 
@@ -87,7 +87,7 @@ def page(done: Reproduction, folder: Path) -> str:
         measured=done.measured,
         cards=_cards(done),
         player=_player(done),
-        checks=done.findings,
+        checks=done.checks,
         sections=[_section(title, n, done, gallery, folder) for title, n in SECTIONS],
         scene=scene,
         cases=outcomes.by_case,
@@ -107,12 +107,12 @@ def _cards(done: Reproduction) -> list[tuple[str, str]]:
     """Return names and values of the figures one looks for first."""
     initial = done.measured.objectives[0]
     best = next(m for m in done.measured.objectives if m.kind == "esl")
-    holds = sum(finding.holds for finding in done.findings)
+    holds = sum(check.holds for check in done.checks)
     return [
         ("compliance", f"{initial.compliance:.4g} → {best.compliance:.4g} N m"),
         ("largest deviation", f"{1e3 * initial.deviation:.3g} → {1e3 * best.deviation:.3g} mm"),
         ("material", percent(done.plan.scene.design.volume_fraction).replace(".0 %", " %")),
-        ("of the paper’s statements hold", f"{holds} of {len(done.findings)}"),
+        ("of the paper’s statements hold", f"{holds} of {len(done.checks)}"),
     ]
 
 
@@ -136,7 +136,7 @@ def _section(
         designs = "Designs by path", plan.paths
     return {
         "title": title,
-        "checks": [f for f in done.findings if set(f.figures) <= set(numbers)],
+        "checks": [f for f in done.checks if set(f.figures) <= set(numbers)],
         "plots": [
             (n, _png((folder / f"{n.name}.png").read_bytes()), _about(n))
             for n in shown
@@ -190,7 +190,7 @@ def _ends_table(ends: Ends) -> Table:
     return Table("", f"{ends.words}; nothing else differs", frame)
 
 
-def _loss_table(sweep: Swept) -> Table:
+def _loss_table(sweep: ValueSweep) -> Table:
     labels = [f"{used.made_for:g}" for used in sweep.optima]
     frame = pd.DataFrame({f"made for {sweep.axis}": labels})
     for quantity in ("compliance", "deviation"):

@@ -22,16 +22,16 @@ from dolfinopt.output.summary import FILTER_CELLS
 from dolfinopt.paper.checks import (
     CRAIG_BAMPTON,
     MODAL,
+    Check,
+    CoordinateSweep,
+    DesignResult,
     Ends,
-    Finding,
-    Made,
     Measured,
-    Reduced,
-    Resolved,
+    ReducedResult,
     Setting,
-    Swept,
-    Used,
-    find,
+    SweptDesign,
+    ValueSweep,
+    check_paper,
 )
 from dolfinopt.scene.load import Scene, load_scene
 from dolfinopt.study.plans import design_figure, deviation_panels
@@ -274,14 +274,14 @@ class Reproduction:
 
     Attributes:
         plan, outcomes: what was done, and what came of it.
-        measured, findings: figures, and what they say of the paper's.
+        measured, checks: figures, and what they say of the paper's.
         figures: 3 to 15.
     """
 
     plan: Plan
     outcomes: Outcomes
     measured: Measured
-    findings: tuple[Finding, ...]
+    checks: tuple[Check, ...]
     figures: tuple[Numbered, ...]
 
 
@@ -316,7 +316,7 @@ def cell_sizes(scene: Scene) -> dict[int, float]:
 def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) -> Reproduction:
     """Do everything that is not done yet (collective); the same on all ranks.
 
-    Cases without a result stand in the outcomes; figures leave them out, and no finding that needs
+    Cases without a result stand in the outcomes; figures leave them out, and no check that needs
     them holds.
 
     Args:
@@ -337,14 +337,14 @@ def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) 
     measured = on_root(world, measure, plan, outcomes)
     with together(world):
         drawn = figures(plan, outcomes, measured)
-        return Reproduction(plan, outcomes, measured, find(measured), drawn)
+        return Reproduction(plan, outcomes, measured, check_paper(measured), drawn)
 
 
 # -- what is measured ------------------------------------------------------------------------
 
 
 def measure(plan: Plan, outcomes: Outcomes) -> Measured:
-    """Return the figures that the findings rest on."""
+    """Return the figures that the checks rest on."""
     return Measured(
         tuple(plan.scene.arms[0].cells or ()),
         plan.scene.optimizer.max_iterations,
@@ -394,13 +394,13 @@ def _path_words(scene: Scene) -> str:
     return "a given path"
 
 
-def _all_made(plan: Plan, outcomes: Outcomes) -> tuple[Made, ...]:
+def _all_made(plan: Plan, outcomes: Outcomes) -> tuple[DesignResult, ...]:
     return tuple(_made(outcomes[case]) for case in (plan.initial, *plan.objectives))
 
 
-def _made(outcome: Outcome) -> Made:
+def _made(outcome: Outcome) -> DesignResult:
     case = outcome.case
-    return Made(
+    return DesignResult(
         case.label,
         case.scene.objective.kind if case.action == "optimize" else "",
         outcome.compliance,
@@ -411,11 +411,11 @@ def _made(outcome: Outcome) -> Made:
     )
 
 
-def _reduced(plan: Plan, outcomes: Outcomes, case: Case) -> Reduced:
+def _reduced(plan: Plan, outcomes: Outcomes, case: Case) -> ReducedResult:
     own, again = outcomes[case], outcomes[plan.again(case)]
     finest = [c for c in plan.reductions if c.scene.reduction.method == CRAIG_BAMPTON][-1]
     best = finest if finest in outcomes.by_case else plan.reductions[0]
-    return Reduced(
+    return ReducedResult(
         case.scene.reduction.method,
         case.scene.reduction.count,
         own.compliance,
@@ -437,10 +437,10 @@ def _apart(one: Outcome, other: Outcome) -> float:
 
 def _resolved(
     plan: Plan, outcomes: Outcomes, label: str, design: Case | None, method: str
-) -> Resolved:
+) -> CoordinateSweep:
     found = [outcomes[case] for case in plan.resolved(label, design, method)]
     finest = outcomes[plan.resolved(label, design, CRAIG_BAMPTON)[-1]]
-    return Resolved(
+    return CoordinateSweep(
         label,
         method,
         tuple(o.case.scene.reduction.count for o in found),
@@ -458,13 +458,13 @@ def _distance(one: Outcome, other: Outcome) -> float:
     return float(np.abs(a - b).max() / b.max())
 
 
-def _swept(plan: Plan, outcomes: Outcomes, sweep: Sweep) -> Swept:
+def _swept(plan: Plan, outcomes: Outcomes, sweep: Sweep) -> ValueSweep:
     designs = []
     for label, made_for, cases in plan.used(sweep):
         found = [outcomes[case] for case in cases]
         values = tuple(o.compliance for o in found), tuple(o.max_deviation for o in found)
-        designs.append(Used(label, made_for, *values))
-    return Swept(sweep.axis, sweep.values, tuple(designs))
+        designs.append(SweptDesign(label, made_for, *values))
+    return ValueSweep(sweep.axis, sweep.values, tuple(designs))
 
 
 # -- figures ---------------------------------------------------------------------------------
@@ -568,7 +568,7 @@ def _good(found: Sequence[Outcome]) -> list[Outcome]:
     return [outcome for outcome in found if not outcome.failure]
 
 
-def _sweep_figures(sweep: Swept, number: int) -> list[Numbered]:
+def _sweep_figures(sweep: ValueSweep, number: int) -> list[Numbered]:
     """Return compliance and deviation; the initial design has a scale of its own."""
     numbered: list[Numbered] = []
     for quantity, factor, label in (
@@ -587,7 +587,7 @@ def _sweep_figures(sweep: Swept, number: int) -> list[Numbered]:
     return numbered
 
 
-def _loss_figures(sweep: Swept, number: int) -> list[Numbered]:
+def _loss_figures(sweep: ValueSweep, number: int) -> list[Numbered]:
     labels = tuple(f"{used.made_for:g}" for used in sweep.optima)
     numbered: list[Numbered] = []
     for quantity in ("compliance", "deviation"):

@@ -22,15 +22,15 @@ from dolfinopt.study.variants import COORDINATES, Vary, parse_vary
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-Topic = Literal["payload", "flattening", "coordinates", "objective", "reduction"]
+Preset = Literal["payload", "flattening", "coordinates", "objective", "reduction"]
 
-# What a topic varies unless told otherwise.
+# What a preset varies unless told otherwise.
 RANGES = {"payload": "payload.mass=4:8:9", "flattening": "motion.flattening=0:1:9"}
 
 
 def study(
     scene: Scene,
-    topic: Topic | None,
+    preset: Preset | None,
     vary: Sequence[str],
     designs: Sequence[Path],
     folder: Path,
@@ -43,8 +43,8 @@ def study(
 
     Args:
         scene: what is varied.
-        topic: which study; None: a sweep over `vary` alone.
-        vary: values to sweep over, see `parse_vary`; in place of the topic's own.
+        preset: which study; None: a sweep over `vary` alone.
+        vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
         folder: DIR, where the cases are kept.
         world: all ranks.
@@ -57,7 +57,7 @@ def study(
     from dolfinopt.output.folders import prepare_folder
     from dolfinopt.parallel import on_root, together
 
-    plan = on_root(world, _plan, scene, topic, tuple(vary), tuple(designs), reoptimize)
+    plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize)
     on_root(world, prepare_folder, folder)
     outcomes = run_cases(plan.cases, folder, world, shown=shown)
     with together(world):
@@ -68,7 +68,7 @@ def study(
 
 def _plan(
     scene: Scene,
-    topic: Topic | None,
+    preset: Preset | None,
     vary: tuple[str, ...],
     designs: tuple[Path, ...],
     reoptimize: bool,
@@ -79,51 +79,51 @@ def _plan(
     for key in keys:
         if keys.count(key) > 1:
             raise InputError(f"--vary {key} twice; give all its values in one")
-    if topic in ("objective", "reduction", "coordinates"):
-        return _fixed_plan(scene, topic, asked, designs, reoptimize)
-    if topic is None and not asked:
-        raise InputError("sweep: name a topic (payload, flattening, coordinates) or what to --vary")
-    if topic is not None:
-        own = parse_vary(RANGES[topic])
+    if preset in ("objective", "reduction", "coordinates"):
+        return _fixed_plan(scene, preset, asked, designs, reoptimize)
+    if preset is None and not asked:
+        raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
+    if preset is not None:
+        own = parse_vary(RANGES[preset])
         if own.key not in keys:
             asked.insert(0, own)
-    return sweep_plan(scene, sweep_name(topic, vary), asked, designs, reoptimize)
+    return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
 
 
-def sweep_name(topic: Topic | None, vary: Sequence[str]) -> str:
-    """Return the name of a sweep's files: the topic, and the keys that it varies besides."""
-    own = RANGES.get(topic or "", "=").partition("=")[0]
-    own = COORDINATES if topic == "coordinates" else own
+def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
+    """Return the name of a sweep's files: the preset, and the keys that it varies besides."""
+    own = RANGES.get(preset or "", "=").partition("=")[0]
+    own = COORDINATES if preset == "coordinates" else own
     keys = [text.partition("=")[0].strip() for text in vary]
-    return file_name(*([topic] if topic else []), *(key for key in keys if key != own))
+    return file_name(*([preset] if preset else []), *(key for key in keys if key != own))
 
 
 def _fixed_plan(
     scene: Scene,
-    topic: Topic,
+    preset: Preset,
     asked: Sequence[Vary],
     designs: tuple[Path, ...],
     reoptimize: bool,
 ) -> Plan:
-    """Plan a topic that has its own variants."""
+    """Plan a preset that has its own variants."""
     for one in asked:
-        if topic == "objective" or one.key != COORDINATES:
-            only = "none" if topic == "objective" else f"only {COORDINATES}"
-            raise InputError(f"--vary {one.text}: expected {only} with {_command(topic)}")
-    if topic in ("objective", "reduction") and designs:
-        raise InputError(f"--design: expected none with {_command(topic)}, which makes its own")
+        if preset == "objective" or one.key != COORDINATES:
+            only = "none" if preset == "objective" else f"only {COORDINATES}"
+            raise InputError(f"--vary {one.text}: expected {only} with {_command(preset)}")
+    if preset in ("objective", "reduction") and designs:
+        raise InputError(f"--design: expected none with {_command(preset)}, which makes its own")
     if reoptimize:
-        raise InputError(f"--reoptimize: not with {_command(topic)}; see compare reductions")
-    if topic == "objective":
+        raise InputError(f"--reoptimize: not with {_command(preset)}; see compare reductions")
+    if preset == "objective":
         return objective_plan(scene)
     counts = [_whole(value, asked[0]) for value in asked[0].values] if asked else None
-    if topic == "coordinates":
-        return coordinates_plan(scene, topic, designs, counts)
+    if preset == "coordinates":
+        return coordinates_plan(scene, preset, designs, counts)
     return reduction_plan(scene, counts)
 
 
-def _command(topic: Topic) -> str:
-    return f"sweep {topic}" if topic == "coordinates" else f"compare {topic}s"
+def _command(preset: Preset) -> str:
+    return f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
 
 
 def _whole(value: str, vary: Vary) -> int:

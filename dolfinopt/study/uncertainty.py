@@ -1,416 +1,421 @@
-"""Random inputs: distributions, seeded samples, statistics, and Sobol' indices.
-
-Inputs are independent. Points (n, d) of the unit cube become samples through the distributions'
-quantiles; what is said of a model rests on its values (n,) at the samples alone.
-"""
+"""Random uncertainties of a scene: what scatter of its values makes of the designs."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from itertools import product
-from typing import Any, Literal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.polynomial import legendre
-from scipy import stats
-from scipy.stats import qmc
+import pandas as pd
+from pydantic.fields import FieldInfo
 
 from dolfinopt.errors import InputError
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.messages import allowed_words, field_at
+from dolfinopt.scene.schema import without_none
+from dolfinopt.study.plans import given_designs
+from dolfinopt.study.sampling import Responses, Samples, posed, respond
+from dolfinopt.study.statistics import (
+    CONFIDENCE,
+    QUANTILES,
+    Distribution,
+    Estimate,
+    Indices,
+    Sampler,
+    Statistics,
+    draw,
+    parse_distribution,
+    polynomial_indices,
+    saltelli_indices,
+    saltelli_points,
+    statistics,
+    unit_points,
+)
+from dolfinopt.study.store import Case, run_cases
+from dolfinopt.study.tables import (
+    BarFigure,
+    Bars,
+    Cell,
+    Figure,
+    Histogram,
+    HistogramFigure,
+    ScatterFigure,
+    Study,
+    Table,
+    file_name,
+)
+from dolfinopt.study.variants import Vary, changed
 
-Sampler = Literal["sobol", "latin-hypercube"]
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-CONFIDENCE = 0.95  # of all intervals
-QUANTILES = (0.05, 0.5, 0.95)
-RESAMPLES = 400  # of a bootstrap: its ends are right to a tenth of the interval
-# Quantiles beyond it, at both ends, are out of reach of any number of samples.
-REMOTE = 1e-12
-NODES = 400  # of the quadrature over a distribution
-MAX_DEGREE = 10  # of the polynomial; total
-# Samples a term of the polynomial: with fewer it fits the noise, and neighbours of a point decide.
-SAMPLES_A_TERM = 3
-
-
-# -- distributions ---------------------------------------------------------------------------
+NAME = "uncertainty"
+# Tables and keys that do not change what a given design does, or that no given design outlives.
+TABLES = ("motion", "payload", "damping", "material", "arms", "interpolation")
+SIZES = ("length", "height", "mesh_size", "passive")
+LEAST = 10  # samples: fewer tell nothing of the scatter
+QUANTITIES: tuple[tuple[str, Callable[[Responses], np.ndarray]], ...] = (
+    ("compliance [N m]", lambda found: found.compliance),
+    ("maximal deviation [mm]", lambda found: 1e3 * found.max_deviation),
+)
+INTERVAL = f"{100.0 * CONFIDENCE:g} %"
 
 
 @dataclass(frozen=True)
-class Distribution:
-    """How one input is distributed, cut off where it has bounds.
+class Plan:
+    """How samples are drawn and what is made of them.
 
     Attributes:
-        text: as the user wrote it, e.g. "normal:6:0.3".
-        law: SciPy's frozen distribution.
-        bounded: whether it has bounds of its own.
-        low, high: where it is cut off.
-        kink: where the density has one.
+        samples: that the statistics rest on.
+        seed: of all that is random.
+        sampler: see `statistics.unit_points`.
+        indices: "polynomial": Sobol' indices of one fitted to the samples; "saltelli": of the
+            simulations themselves, d / 2 times as many more for d inputs.
     """
 
-    text: str
-    law: Any = field(compare=False)
-    bounded: bool
-    low: float = -math.inf
-    high: float = math.inf
-    kink: float | None = None
+    samples: int = 1000
+    seed: int = 1
+    sampler: Sampler = "sobol"
+    indices: Literal["polynomial", "saltelli"] = "polynomial"
+
+
+@dataclass(frozen=True)
+class Input:
+    """A scene value and its distribution within what the key allows."""
+
+    key: str
+    distribution: Distribution
 
     @property
-    def cut_off(self) -> float:
-        """Share of the whole that lies beyond `low` and `high`."""
-        return float(self.law.cdf(self.low) + self.law.sf(self.high))
-
-    def within(self, low: float, high: float) -> Distribution:
-        """Return the distribution cut off at bounds.
-
-        Raises:
-            InputError: it has bounds of its own that reach beyond, or nothing lies between them.
-        """
-        least, most = self.law.support()
-        if self.bounded and (least < low or most > high):
-            raise InputError(f"{self.text}: reaches from {least:g} to {most:g}")
-        cut = replace(self, low=low, high=high)
-        if cut.cut_off > 0.5:
-            raise InputError(f"{self.text}: {100.0 * cut.cut_off:.3g} % of it lie beyond")
-        return cut
-
-    def at(self, shares: np.ndarray) -> np.ndarray:
-        """Return the quantiles of shares in [0, 1]."""
-        shares = np.clip(shares, REMOTE, 1.0 - REMOTE)
-        first, last = self.law.cdf(self.low), self.law.cdf(self.high)
-        return np.clip(self.law.ppf(first + shares * (last - first)), self.low, self.high)
-
-    @property
-    def mean(self) -> float:
-        """Its expectation."""
-        x, weights = self._quadrature
-        return float(weights @ x)
-
-    @property
-    def deviation(self) -> float:
-        """Its standard deviation."""
-        x, weights = self._quadrature
-        return float(np.sqrt(weights @ (x - self.mean) ** 2))
-
-    @cached_property
-    def _quadrature(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes (2 n,) and weights, with sum 1, of integrals over the distribution.
-
-        Gauss's rule on both sides of a kink.
-        """
-        ends = self.at(np.array([0.0, 1.0]))
-        middle = float(np.clip(ends.mean() if self.kink is None else self.kink, *ends))
-        nodes, weights = legendre.leggauss(NODES)
-        parts = [(ends[0], middle), (middle, ends[1])]
-        x = np.concatenate([0.5 * (a + b) + 0.5 * (b - a) * nodes for a, b in parts])
-        w = np.concatenate([0.5 * (b - a) * weights for a, b in parts]) * self.law.pdf(x)
-        return x, w / w.sum()
-
-    def polynomials(self, x: np.ndarray, degree: int) -> np.ndarray:
-        """Return the orthonormal polynomials of the distribution, degrees 0 to `degree`.
-
-        Args:
-            x: (n,) where.
-            degree: of the last one.
-
-        Returns:
-            (n, degree + 1).
-        """
-        nodes, weights = self._quadrature
-        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
-        known = legendre.legvander((nodes - middle) / half, degree)
-        _, upper = np.linalg.qr(np.sqrt(weights)[:, None] * known)
-        rows = legendre.legvander((np.asarray(x) - middle) / half, degree)
-        return np.linalg.solve(upper.T, rows.T).T * np.sign(np.diag(upper))
+    def axis(self) -> str:
+        """Key with its unit."""
+        return Vary(self.key, (), "").axis
 
 
-def parse_distribution(text: str) -> Distribution:
-    """Return the distribution that a text like "normal:6:0.3" means.
+def study_random(
+    scene: Scene,
+    random: Sequence[str],
+    designs: Sequence[Path],
+    folder: Path,
+    world: MPI.Comm,
+    plan: Plan = Plan(),
+    *,
+    shown: bool = True,
+) -> Study:
+    """Simulate designs under random values of the scene (collective).
 
-    "normal:MEAN:DEVIATION", "uniform:LOW:HIGH", "triangular:LOW:MODE:HIGH",
-    "lognormal:MEDIAN:SIGMA" with the standard deviation SIGMA of the logarithm.
+    Args:
+        scene: with the nominal values; its scenarios are left out.
+        random: texts "key.path=distribution", see `statistics.parse_distribution`.
+        designs: design.npz files in place of the initial and the optimised design.
+        folder: DIR, where simulations are kept.
+        world: all ranks.
+        plan: how many samples, and how they are drawn.
+        shown: draw progress.
 
     Raises:
-        InputError: it means none.
+        InputError: something asked for is not possible.
     """
-    name, *words = (part.strip() for part in text.split(":"))
-    forms = {
-        "normal": "normal:MEAN:DEVIATION with DEVIATION > 0",
-        "uniform": "uniform:LOW:HIGH with LOW < HIGH",
-        "triangular": "triangular:LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
-        "lognormal": "lognormal:MEDIAN:SIGMA with both > 0",
-    }
-    if name not in forms:
-        raise InputError(f"{text}: expected one of {', '.join(forms)}, for example normal:6:0.3")
-    wrong = InputError(f"{text}: expected {forms[name]}")
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        raise wrong from None
-    if len(values) != forms[name].split()[0].count(":") or not all(map(math.isfinite, values)):
-        raise wrong
-    a, b, c = (*values, values[-1])[:3]
-    if name == "normal" and b > 0.0:
-        return Distribution(text, stats.norm(a, b), False)
-    if name == "lognormal" and a > 0.0 and b > 0.0:
-        return Distribution(text, stats.lognorm(b, scale=a), False)
-    if name == "uniform" and a < b:
-        return Distribution(text, stats.uniform(a, b - a), True)
-    if name == "triangular" and a <= b <= c and a < c:
-        return Distribution(text, stats.triang((b - a) / (c - a), a, c - a), True, kink=b)
-    raise wrong
+    from dolfinopt.output.folders import prepare_folder
+    from dolfinopt.parallel import on_root
 
-
-# -- samples ---------------------------------------------------------------------------------
-
-
-def unit_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
-    """Return points (count, dimensions) of the unit cube that fill it evenly.
-
-    "sobol": Owen's scrambling of Sobol's sequence; more of them begin with the same ones.
-    "latin-hypercube": every input has one point in each of `count` equal intervals.
-    """
-    if sampler == "latin-hypercube":
-        return qmc.LatinHypercube(dimensions, seed=seed).random(count)
-    with warnings.catch_warnings():
-        # Numbers that are no power of two are a little less even, and no error.
-        warnings.filterwarnings("ignore", "The balance properties", UserWarning)
-        return qmc.Sobol(dimensions, seed=seed).random(count)
-
-
-def draw(distributions: Sequence[Distribution], points: np.ndarray) -> np.ndarray:
-    """Return the samples (n, d) at points (n, d) of the unit cube."""
-    return np.stack([one.at(points[:, i]) for i, one in enumerate(distributions)], axis=1)
-
-
-def saltelli_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
-    """Return the points ((d + 2) n, d) of Saltelli's scheme: A, B, and A with each column of B.
-
-    A and B are two samples of n points each. Source: Saltelli et al. (2010),
-    doi:10.1016/j.cpc.2009.09.018.
-    """
-    both = unit_points(count, 2 * dimensions, sampler, seed)
-    A, B = both[:, :dimensions], both[:, dimensions:]
-    mixed = [np.where(np.arange(dimensions) == i, B, A) for i in range(dimensions)]
-    return np.concatenate([A, B, *mixed])
-
-
-# -- statistics ------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A value and its confidence interval; an end that the samples do not tell is nan."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """What the values of a sample say; intervals as for independent samples.
-
-    Attributes:
-        mean, deviation: the latter with n - 1.
-        quantiles: at `QUANTILES`.
-    """
-
-    mean: Estimate
-    deviation: Estimate
-    quantiles: tuple[Estimate, ...]
-
-
-def statistics(values: np.ndarray) -> Statistics:
-    """Return mean, standard deviation and quantiles of values (n,), n >= 2.
-
-    Standard errors s / sqrt(n) and sqrt(m4 - s^4 (n - 3) / (n - 1)) / (2 s sqrt(n)) with the fourth
-    central moment m4; quantiles lie between order statistics. Even samples (`unit_points`) do
-    better than these intervals say.
-    """
-    n = len(values)
-    wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
-    mean, s = float(values.mean()), float(values.std(ddof=1))
-    of_mean = s / math.sqrt(n)
-    m4 = float(np.mean((values - mean) ** 4))
-    of_s = math.sqrt(max(m4 - s**4 * (n - 3) / (n - 1), 0.0) / n) / (2.0 * s) if s > 0.0 else 0.0
-    return Statistics(
-        Estimate(mean, mean - wide * of_mean, mean + wide * of_mean),
-        Estimate(s, s - wide * of_s, s + wide * of_s),
-        tuple(quantile(values, share) for share in QUANTILES),
-    )
-
-
-def quantile(values: np.ndarray, share: float) -> Estimate:
-    """Return a quantile of values (n,), between two order statistics whatever the distribution.
-
-    P(x_(l) <= quantile < x_(u)) = P(l <= B < u) with B binomial. Source: David & Nagaraja, Order
-    Statistics (2003), 7.1, doi:10.1002/0471722162.
-    """
-    ordered = np.sort(values)
-    n = len(ordered)
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low = int(stats.binom.ppf(tail, n, share))
-    high = int(stats.binom.ppf(1.0 - tail, n, share)) + 1
-    return Estimate(
-        float(np.quantile(ordered, share)),
-        float(ordered[low - 1]) if low >= 1 else math.nan,
-        float(ordered[high - 1]) if high <= n else math.nan,
-    )
-
-
-# -- Sobol' indices --------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Indices:
-    """Shares of the variance, one an input.
-
-    Attributes:
-        first: of the input alone.
-        total: of the input alone and together with others.
-        degree: of the polynomial they were taken from; 0 without one.
-        unexplained: share of the variance that the polynomial misses, found by leaving one out.
-    """
-
-    first: tuple[Estimate, ...]
-    total: tuple[Estimate, ...]
-    degree: int = 0
-    unexplained: float = math.nan
-
-
-def saltelli_indices(values: np.ndarray, dimensions: int, seed: int) -> Indices:
-    """Return the indices from the values ((d + 2) n,) at `saltelli_points`.
-
-    With V the variance: S_i = mean(f(B) (f(A_B^i) - f(A))) / V and
-    T_i = mean((f(A) - f(A_B^i))^2) / (2 V), f without its mean; intervals by bootstrap.
-    Sources: Saltelli et al. (2010), doi:10.1016/j.cpc.2009.09.018; Jansen (1999),
-    doi:10.1016/S0010-4655(98)00154-4.
-    """
-    rows = values.reshape(dimensions + 2, -1)
-    n = rows.shape[1]
-
-    def estimate(weights: np.ndarray) -> np.ndarray:
-        mean = 0.5 * (rows[0] + rows[1]) @ weights
-        f = rows - mean
-        variance = 0.5 * (f[0] ** 2 + f[1] ** 2) @ weights
-        if variance == 0.0:
-            return np.zeros(2 * dimensions)
-        first = (f[1] * (f[2:] - f[0])) @ weights
-        total = 0.5 * (f[0] - f[2:]) ** 2 @ weights
-        return np.concatenate([first, total]) / variance
-
-    found = _bootstrap(estimate, n, seed)
-    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]))
-
-
-def polynomial_indices(
-    samples: np.ndarray, values: np.ndarray, distributions: Sequence[Distribution]
-) -> Indices:
-    """Return the indices of the polynomial that fits values (n,) at samples (n, d).
-
-    Least squares in products of the distributions' orthonormal polynomials, whose squared
-    coefficients are shares of the variance; the total degree is the one that leaves the least
-    error when each sample is left out in turn; intervals by jackknife.
-    Sources: Sudret (2008), doi:10.1016/j.ress.2007.04.002; Blatman & Sudret (2010),
-    doi:10.1016/j.probengmech.2009.10.003.
-    """
-    n, dimensions = samples.shape
-    spread = values - values.mean()
-    if not spread.any():
-        none = (Estimate(0.0, 0.0, 0.0),) * dimensions
-        return Indices(none, none, 0, 0.0)
-    degrees = [p for p in range(1, MAX_DEGREE + 1) if _terms(dimensions, p) <= n / SAMPLES_A_TERM]
-    single = [
-        one.polynomials(samples[:, i], max(degrees, default=1))
-        for i, one in enumerate(distributions)
+    asked: _Asked = on_root(world, _ask, scene, tuple(random), tuple(designs), plan)
+    on_root(world, prepare_folder, folder)
+    cases = [design for _, design in asked.designs if isinstance(design, Case)]
+    made = run_cases(cases, folder, world, shown=shown)
+    if made.failures:
+        failures = tuple(f"{o.case.label}: {o.failure}" for o in made.failures)
+        return Study(random_name(random), (), (), failures, made.computed)
+    paths = [
+        (label, made[design].design if isinstance(design, Case) else design)
+        for label, design in asked.designs
     ]
-    fits = []
-    for degree in degrees or [1]:
-        powers = _powers(dimensions, degree)
-        basis = np.prod([single[i][:, powers[:, i]] for i in range(dimensions)], axis=0)
-        fits.append(_fit(basis, spread, powers))
-    best = min(fits, key=lambda fit: fit.left_out)
-    shares = [_shares(best.powers, c) for c in (best.all_but_one, best.coefficients[None])]
-    found = [_jackknife(share[0], leaving) for share, leaving in zip(shares[1].T, shares[0].T)]
-    degree = int(best.powers.sum(axis=1).max())
-    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]), degree, best.left_out)
+    found, computed = respond(asked.samples, paths, folder, world, shown=shown)
+    return on_root(world, _report, random_name(random), asked, found, made.computed + computed)
+
+
+def random_name(random: Sequence[str]) -> str:
+    """Return the name of the files of a study: the keys that are random."""
+    return file_name(NAME, *(text.partition("=")[0].strip() for text in random))
+
+
+# -- what is asked ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
-    """A polynomial fitted by least squares.
+class _Asked:
+    """What is to be simulated."""
 
-    Attributes:
-        powers: (terms, d), see `_powers`.
-        coefficients: (terms,).
-        all_but_one: (n, terms) those without each of the samples.
-        left_out: relative squared error at each sample of the fit to all others.
+    plan: Plan
+    inputs: tuple[Input, ...]
+    samples: Samples
+    designs: tuple[tuple[str, Case | Path | None], ...]
+
+
+def _ask(scene: Scene, random: Sequence[str], designs: tuple[Path, ...], plan: Plan) -> _Asked:
+    """Check what is asked and draw the samples (root only)."""
+    if plan.samples < LEAST:
+        raise InputError(f"--samples {plan.samples}: expected at least {LEAST}")
+    if plan.seed < 0:
+        raise InputError(f"--seed {plan.seed}: expected an integer >= 0")
+    nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
+    inputs = tuple(parse_input(nominal, text) for text in random)
+    keys = [one.key for one in inputs]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise InputError(f"--random {key} twice; a value has one distribution")
+    values = draw([one.distribution for one in inputs], _points(plan, len(inputs)))
+    samples = Samples(nominal, tuple(keys), values)
+    for column in values.T:  # what is refused is so at the ends, mostly
+        for index in (int(np.argmin(column)), int(np.argmax(column))):
+            posed(samples, 1 + index)
+    return _Asked(plan, inputs, samples, given_designs(scene, designs))
+
+
+def _points(plan: Plan, dimensions: int) -> np.ndarray:
+    if plan.indices == "saltelli" and dimensions > 1:
+        half = -(-plan.samples // 2)
+        return saltelli_points(half, dimensions, plan.sampler, plan.seed)
+    return unit_points(plan.samples, dimensions, plan.sampler, plan.seed)
+
+
+def parse_input(scene: Scene, text: str) -> Input:
+    """Return what "key.path=distribution" asks for.
+
+    Distributions without bounds of their own are cut off where the key's range ends.
+
+    Raises:
+        InputError: there is no such key or distribution, the key is no number, has no influence
+            or changes the arms' size; or the distribution leaves its range.
     """
-
-    powers: np.ndarray
-    coefficients: np.ndarray
-    all_but_one: np.ndarray
-    left_out: float
-
-
-def _fit(basis: np.ndarray, values: np.ndarray, powers: np.ndarray) -> _Fit:
-    """Fit values (n,) in a basis (n, terms)."""
-    q, r = np.linalg.qr(basis)
-    diagonal = np.abs(np.diag(r))
-    if len(basis) <= basis.shape[1] or diagonal.min() < 1e-10 * diagonal.max():
-        none = np.full(len(powers), math.nan)
-        return _Fit(powers, none, np.full(basis.shape, math.nan), math.inf)
-    own = 1.0 - np.sum(q**2, axis=1)  # what a sample does not decide alone
-    errors = (values - q @ (q.T @ values)) / np.maximum(own, REMOTE)
-    coefficients = np.linalg.solve(r, q.T @ values)
-    without = coefficients - np.linalg.solve(r, (q * errors[:, None]).T).T
-    return _Fit(powers, coefficients, without, float(errors @ errors / (values @ values)))
-
-
-def _shares(powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return first (d) and total (d) indices (m, 2 d) from coefficients (m, terms)."""
-    involved = powers > 0
-    alone = involved & (involved.sum(axis=1) == 1)[:, None]
-    squares = coefficients**2
-    variance = squares[:, 1:].sum(axis=1, keepdims=True)
-    return np.concatenate([squares @ alone, squares @ involved], axis=1) / variance
+    where = f"--random {text}"
+    key, equals, law = (part.strip() for part in text.partition("="))
+    if not key or not equals:
+        raise InputError(f"{where}: expected KEY=DISTRIBUTION, for example "
+                         "payload.mass=normal:6:0.3")  # fmt: skip
+    try:
+        distribution = parse_distribution(law)
+        middle = float(distribution.at(np.array(0.5)))
+        known = changed(scene, f"{key}={middle!r}")
+        if not isinstance(nominal_value(known, key), float):
+            raise InputError("expected a key with a real number as its value")
+        parts = key.split(".")
+        if parts[0] not in TABLES:
+            raise InputError(
+                f"does not change what a given design does; expected a key of {', '.join(TABLES)}"
+            )
+        if parts[0] == "arms" and parts[-1] in SIZES:
+            raise InputError(f"no given design fits arms of another {parts[-1]}")
+        low, high = _range(key)
+        try:
+            return Input(key, distribution.within(low, high))
+        except InputError as error:
+            raise InputError(f"{error}; {key} is {allowed_words(_field(key))}") from None
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
-def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
-    """Return an index within [0, 1] with an interval from those (n,) that leave a sample out.
-
-    Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
-    """
-    n = len(leaving)
-    wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
-    half = wide * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
-    return Estimate(float(value), max(float(value) - half, 0.0), min(float(value) + half, 1.0))
-
-
-def _terms(dimensions: int, degree: int) -> int:
-    return math.comb(dimensions + degree, degree)
-
-
-def _powers(dimensions: int, degree: int) -> np.ndarray:
-    """Return the degrees (terms, d) of all products up to a total degree, the constant first."""
-    rows: list[tuple[int, ...]] = [()]
-    for _ in range(dimensions):
-        rows = [(*row, p) for row, p in product(rows, range(degree + 1)) if sum(row) + p <= degree]
-    return np.array(sorted(rows, key=lambda row: (sum(row), row)))
+def nominal_value(scene: Scene, key: str) -> object:
+    """Return the scene's value of a key, None where arms differ in it."""
+    parts = key.split(".")
+    if parts[0] != "arms":
+        return getattr(getattr(scene, parts[0]), parts[1], None)
+    count = len(scene.arms)
+    names = [*map(str, range(count)), *(arm.name for arm in scene.arms)]
+    places = [names.index(parts[1]) % count] if len(parts) == 3 else range(count)
+    values = set()
+    for i in places:
+        own = getattr(scene.arms[i], parts[-1])
+        values.add(getattr(scene.material_of(i), parts[-1], None) if own is None else own)
+    return values.pop() if len(values) == 1 else None
 
 
-def _bootstrap(
-    estimate: Callable[[np.ndarray], np.ndarray], count: int, seed: int
-) -> list[Estimate]:
-    """Return what `estimate(weights)` gives, with intervals from samples drawn with repetition.
+def _field(key: str) -> FieldInfo:
+    parts = key.split(".")
+    return field_at(("arms", 0, parts[-1]) if parts[0] == "arms" else tuple(parts))
 
-    Source: Efron & Tibshirani (1993), 13.3, doi:10.1201/9780429246593.
-    """
-    even = np.full(count, 1.0 / count)
-    draws = np.random.default_rng(seed).multinomial(count, even, size=RESAMPLES) / count
-    found = np.array([estimate(weights) for weights in draws])
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low, high = np.quantile(found, [tail, 1.0 - tail], axis=0)
-    return [Estimate(*map(float, row)) for row in zip(estimate(even), low, high)]
+
+def _rules(field: FieldInfo) -> list[Any]:
+    """Return the bounds of a field, also where it may be left out (`T | None`)."""
+    inner = get_args(without_none(field.annotation))[1:]
+    return [*field.metadata, *(rule for one in inner for rule in getattr(one, "metadata", ()))]
+
+
+def _range(key: str) -> tuple[float, float]:
+    """Return the least and the largest value of a key."""
+    low, high = -math.inf, math.inf
+    for rule in _rules(_field(key)):
+        low = max([low, *(getattr(rule, name) for name in ("gt", "ge") if hasattr(rule, name))])
+        high = min([high, *(getattr(rule, name) for name in ("lt", "le") if hasattr(rule, name))])
+    return low, high
+
+
+# -- what comes out --------------------------------------------------------------------------
+
+
+def _report(name: str, asked: _Asked, found: Sequence[Responses], computed: int) -> Study:
+    """Return tables and figures (root only)."""
+    labels = [label for label, _ in asked.designs]
+    columns = list(zip(labels, found, strict=True))
+    failures = [
+        f"{label}, sample {index} ({', '.join(asked.samples.changes(index))}): {message}"
+        for label, responses in columns
+        for index, message in responses.failures.items()
+    ]
+    tables = [_input_table(asked)]
+    figures: list[Figure] = []
+    if not failures:
+        used = _statistics_count(asked)
+        tables.append(_statistics_table(columns, used))
+        figures.append(_histograms(columns, used))
+        if len(asked.inputs) > 1:
+            indices = [
+                [_indices(asked, take(responses)[1:]) for _, take in QUANTITIES]
+                for responses in found
+            ]
+            tables.append(_indices_table(asked, labels, indices))
+            figures.append(_index_bars(asked, labels, indices))
+        figures.append(_scatter(asked, columns, used))
+    data = (_sample_table(asked, columns),)
+    return Study(name, tuple(tables), tuple(figures), tuple(failures), computed, data)
+
+
+def _statistics_count(asked: _Asked) -> int:
+    """Return how many samples are independent draws: Saltelli's mixed ones are none."""
+    count = len(asked.samples.values)
+    if asked.plan.indices == "saltelli" and len(asked.inputs) > 1:
+        return 2 * count // (len(asked.inputs) + 2)
+    return count
+
+
+def _indices(asked: _Asked, values: np.ndarray) -> Indices:
+    if asked.plan.indices == "saltelli":
+        return saltelli_indices(values, len(asked.inputs), asked.plan.seed)
+    distributions = [one.distribution for one in asked.inputs]
+    return polynomial_indices(asked.samples.values, values, distributions)
+
+
+def _input_table(asked: _Asked) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for one in asked.inputs:
+        nominal = nominal_value(asked.samples.scene, one.key)
+        law = one.distribution
+        rows.append(
+            (
+                one.axis,
+                law.text,
+                nominal if isinstance(nominal, float) else math.nan,
+                law.mean,
+                law.deviation,
+                round(100.0 * law.cut_off, 6),
+            )
+        )
+    columns = ["input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"]
+    title = "Random values, independent of one another, cut off where the key's range ends."
+    return Table("inputs", title, pd.DataFrame(rows, columns=columns))
+
+
+def _statistics_table(columns: Sequence[tuple[str, Responses]], used: int) -> Table:
+    """Return all statistics, designs beside one another."""
+    names = ["mean", "standard deviation"]
+    names += [f"{100.0 * share:g} % quantile" for share in QUANTILES]
+    header = ["quantity", "statistic"]
+    for label, _ in columns:
+        header += [label, f"{label}: from", f"{label}: to"]
+    rows: list[tuple[Cell, ...]] = []
+    for what, take in QUANTITIES:
+        nominal: list[Cell] = [what, "nominal"]
+        several: list[Statistics] = []
+        for _, found in columns:
+            values = take(found)
+            nominal += [float(values[0]), math.nan, math.nan]
+            several.append(statistics(values[1 : 1 + used]))
+        rows.append(tuple(nominal))
+        for i, name in enumerate(names):
+            row: list[Cell] = [what, name]
+            for one in several:
+                row += _cells([one.mean, one.deviation, *one.quantiles][i])
+            rows.append(tuple(row))
+    title = (
+        f"Designs under {used} samples, with {INTERVAL} confidence intervals as for independent "
+        "samples."
+    )
+    return Table("statistics", title, pd.DataFrame(rows, columns=header))
+
+
+def _cells(one: Estimate) -> list[Cell]:
+    return [one.value, one.low, one.high]
+
+
+def _indices_table(
+    asked: _Asked, labels: Sequence[str], indices: Sequence[Sequence[Indices]]
+) -> Table:
+    fitted = asked.plan.indices == "polynomial"
+    header = ["design", "quantity", "input", "first order [-]", "from", "to", "total [-]"]
+    header += ["total from", "total to"]
+    header += ["degree [-]", "unexplained [-]"] if fitted else []
+    rows: list[tuple[Cell, ...]] = []
+    for label, by_quantity in zip(labels, indices, strict=True):
+        for (what, _), one in zip(QUANTITIES, by_quantity, strict=True):
+            for k, known in enumerate(asked.inputs):
+                row: list[Cell] = [label, what.partition(" [")[0], known.key]
+                row += [*_cells(one.first[k]), *_cells(one.total[k])]
+                row += [one.degree, one.unexplained] if fitted else []
+                rows.append(tuple(row))
+    how = "of a polynomial fitted to the samples" if fitted else "by Saltelli's scheme"
+    title = f"Sobol' indices, shares of the variance, {how}, with {INTERVAL} confidence intervals."
+    return Table("indices", title, pd.DataFrame(rows, columns=header))
+
+
+def _sample_table(asked: _Asked, columns: Sequence[tuple[str, Responses]]) -> Table:
+    """Return a row a sample."""
+    frame = pd.DataFrame(asked.samples.values, columns=[one.axis for one in asked.inputs])
+    frame.insert(0, "sample", np.arange(1, 1 + len(frame)))
+    for label, found in columns:
+        for what, take in QUANTITIES:
+            frame[f"{label}: {what}"] = take(found)[1:]
+        frame[f"{label}: at [s]"] = found.max_deviation_time[1:]
+    return Table("", "All samples.", frame)
+
+
+def _histograms(columns: Sequence[tuple[str, Responses]], used: int) -> HistogramFigure:
+    rows = tuple(
+        tuple(
+            Histogram(label, what, take(found)[1 : 1 + used], float(take(found)[0]))
+            for what, take in QUANTITIES
+        )
+        for label, found in columns
+    )
+    return HistogramFigure("", f"Designs under {used} samples of the random values", rows)
+
+
+def _index_bars(
+    asked: _Asked, labels: Sequence[str], indices: Sequence[Sequence[Indices]]
+) -> BarFigure:
+    rows = []
+    for label, by_quantity in zip(labels, indices, strict=True):
+        panels = []
+        for (what, _), one in zip(QUANTITIES, by_quantity, strict=True):
+            groups = tuple(
+                (name, np.array([_cells(estimate) for estimate in estimates], dtype=float))
+                for name, estimates in (("first order", one.first), ("total", one.total))
+            )
+            title = f"{label}: {what.partition(' [')[0]}"
+            panels.append(Bars(title, "share of the variance [-]", tuple(groups)))
+        rows.append(tuple(panels))
+    keys = tuple(one.key for one in asked.inputs)
+    title = f"Sobol' indices with {INTERVAL} confidence intervals"
+    return BarFigure("indices", title, keys, tuple(rows))
+
+
+def _scatter(asked: _Asked, columns: Sequence[tuple[str, Responses]], used: int) -> ScatterFigure:
+    axes = tuple((one.axis, asked.samples.values[:used, k]) for k, one in enumerate(asked.inputs))
+    rows = tuple(
+        (f"{label}: {what}", take(found)[1 : 1 + used])
+        for label, found in columns
+        for what, take in QUANTITIES
+    )
+    return ScatterFigure("scatter", "Samples by each random value", axes, rows)

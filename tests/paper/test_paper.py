@@ -22,20 +22,19 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.paper import reproduction as paper
 from dolfinopt.paper.checks import (
+    CoordinateSweep,
+    DesignResult,
     Ends,
-    Made,
     Measured,
-    Reduced,
-    Resolved,
+    ReducedResult,
     Setting,
-    Swept,
-    Used,
+    SweptDesign,
+    ValueSweep,
     bend,
-    broken,
-    find,
+    check_paper,
+    failed_checks,
     percent,
     power,
-    read_measured,
     span,
 )
 from dolfinopt.study import store as cases
@@ -50,26 +49,31 @@ ENVIRONMENT = dict(os.environ)
 def figures():
     """Round figures that meet every demand of `--check`.
 
-    They are made up so that each demand can be broken alone: what the program computes is for
-    the demands themselves to judge, in `dolfinopt reproduce --check`.
+    They are made up so that each demand can be broken alone: what the program computes is for the
+    demands themselves to judge, in `dolfinopt reproduce --check`.
     """
-    initial = Made("initial design", "", 28.0, 0.055, 1.0, 0, "simulated")
-    dynamic = Made("dynamic loads (esl)", "esl", 2.5, 0.008, 0.2, 60, "")
-    static = Made("static compliance", "static", 2.7, 0.009, 0.2, 60, "")
-    frequency = Made("eigenfrequency", "eigenfrequency", 2.6, 0.0085, 0.2, 60, "")
+    initial = DesignResult("initial design", "", 28.0, 0.055, 1.0, 0, "simulated")
+    dynamic = DesignResult("dynamic loads (esl)", "esl", 2.5, 0.008, 0.2, 60, "")
+    static = DesignResult("static compliance", "static", 2.7, 0.009, 0.2, 60, "")
+    frequency = DesignResult("eigenfrequency", "eigenfrequency", 2.6, 0.0085, 0.2, 60, "")
     reductions = (
-        Reduced("craig-bampton", 4, 2.5, 2.5, 0.008, 0.01, 60),
-        Reduced("craig-bampton", 48, 2.5, 2.5, 0.008, 0.0, 60),
-        Reduced("modal", 4, 2.0, 900.0, 1.5, 0.3, 60),
-        Reduced("modal", 48, 2.2, 800.0, 1.4, 0.3, 60),
+        ReducedResult("craig-bampton", 4, 2.5, 2.5, 0.008, 0.01, 60),
+        ReducedResult("craig-bampton", 48, 2.5, 2.5, 0.008, 0.0, 60),
+        ReducedResult("modal", 4, 2.0, 900.0, 1.5, 0.3, 60),
+        ReducedResult("modal", 48, 2.2, 800.0, 1.4, 0.3, 60),
     )
     counts = (4, 48, 100)
     still = (0.0, 0.0, 0.0)
+    before, after = "initial design", "optimised design"
     coordinates = (
-        Resolved("initial design", "craig-bampton", counts, (28.0,) * 3, (0.055,) * 3, still),
-        Resolved("initial design", "modal", counts, (25.0, 27.0, 27.5), (0.05,) * 3, still),
-        Resolved("optimised design", "craig-bampton", counts, (2.5,) * 3, (0.008,) * 3, still),
-        Resolved("optimised design", "modal", counts, (1.9, 2.1, 2.2), (0.007,) * 3, still),
+        CoordinateSweep(
+            "initial design", "craig-bampton", counts, (28.0,) * 3, (0.055,) * 3, still
+        ),
+        CoordinateSweep(before, "modal", counts, (25.0, 27.0, 27.5), (0.05,) * 3, still),
+        CoordinateSweep(
+            "optimised design", "craig-bampton", counts, (2.5,) * 3, (0.008,) * 3, still
+        ),
+        CoordinateSweep(after, "modal", counts, (1.9, 2.1, 2.2), (0.007,) * 3, still),
     )
 
     def swept(axis, values, made_for, solid):
@@ -77,13 +81,13 @@ def figures():
         x = np.array(values) + 4.0
 
         def used(label, value, c, d):
-            return Used(label, value, tuple(c * x**2), tuple(d * x))
+            return SweptDesign(label, value, tuple(c * x**2), tuple(d * x))
 
         designs = [used("initial design", math.nan, 1.0, 0.01)]
         if solid:
             designs.append(used("solid arms", math.nan, 0.08, 0.0011))
         designs += [used(f"made for {value:g}", value, 0.1, 0.0014) for value in made_for]
-        return Swept(axis, values, tuple(designs))
+        return ValueSweep(axis, values, tuple(designs))
 
     return Measured(
         (100, 6),
@@ -125,23 +129,23 @@ def test_texts_take_their_values_from_the_scene():
         "A cart carries two flexible arms that move 4 kg along a semicircle flattened to 0.5."
     )
     measured = dataclasses.replace(FIGURES, setting=setting)
-    assert read_measured(measured.json()).setting == setting
-    words = {finding.name: finding.reason for finding in find(measured)}
+    assert json.loads(measured.json())["setting"] == dataclasses.asdict(setting)
+    words = {check.name: check.reason for check in check_paper(measured)}
     assert "has 6.25 % of the solid arm's stiffness (0.25 to the power 2)" in words["path, a tenth"]
     assert "25.0 % of the material in two flanges has 57.8 % of it" in words["path, a tenth"]
     assert "4 times the material" in words["path, a tenth"]
-    paper_words = {finding.name: finding.reason for finding in find(FIGURES)}
+    paper_words = {check.name: check.reason for check in check_paper(FIGURES)}
     assert "12.5 %" in paper_words["path, a tenth"] and "14.3 %" in paper_words["path, a tenth"]
 
 
-# -- findings on made-up figures -------------------------------------------------------------
+# -- checks on made-up figures -------------------------------------------------------------
 
 
 def test_main_findings_stand():
     """All that `reproduce --check` demands."""
-    findings = find(FIGURES)
-    assert broken(findings) == []
-    asserted = {finding.name for finding in findings if finding.asserted}
+    checks = check_paper(FIGURES)
+    assert failed_checks(checks) == []
+    asserted = {check.name for check in checks if check.asserted}
     assert asserted >= {
         "dynamic loads",  # ranking of the objectives
         "coordinates, initial design",  # Craig-Bampton flat, modal truncation below
@@ -191,21 +195,23 @@ FLAWS = {
 @pytest.mark.parametrize("name", FLAWS)
 def test_check_finds(name):
     """Every demand fails where it should, under its name."""
-    assert any(line.startswith(f"{name}: expected") for line in broken(find(FLAWS[name])))
+    assert any(
+        line.startswith(f"{name}: expected") for line in failed_checks(check_paper(FLAWS[name]))
+    )
 
 
 def test_every_demand_can_fail():
-    assert {finding.name for finding in find(FIGURES) if finding.asserted} == set(FLAWS)
+    assert {check.name for check in check_paper(FIGURES) if check.asserted} == set(FLAWS)
 
 
 def test_sentences_follow_from_the_figures():
-    """A finding that holds says so, with the figure; one that does not gives the reason."""
-    for finding in find(FIGURES):
-        start = "Holds: " if finding.holds else "Does not hold: "
-        assert finding.sentence.startswith(start + finding.ours)
-        assert finding.holds or finding.reason
+    """A check that holds says so, with the figure; one that does not gives the reason."""
+    for check in check_paper(FIGURES):
+        start = "Holds: " if check.holds else "Does not hold: "
+        assert check.sentence.startswith(start + check.ours)
+        assert check.holds or check.reason
     stiffer = altered("objectives", 1, deviation=0.0031)
-    before, after = (find(one)[2] for one in (FIGURES, stiffer))
+    before, after = (check_paper(one)[2] for one in (FIGURES, stiffer))
     assert not before.holds and "8.00 mm" in before.sentence
     assert after.holds and "3.10 mm" in after.sentence
 
@@ -253,11 +259,6 @@ def test_losses():
         ),
     )
     np.testing.assert_allclose(sweep.loss("compliance"), [[0.0, 0.25], [0.5, 0.0]])
-
-
-def test_figures_survive_their_file():
-    again = read_measured(FIGURES.json())
-    assert again.json() == FIGURES.json() and again.objectives == FIGURES.objectives
 
 
 # -- what is planned -------------------------------------------------------------------------
@@ -341,12 +342,13 @@ def test_pipeline(small, shared_tmp_path, capsys):
         assert "payload, linear (paper: nearly linear)." in texts[0]
         names = {path.name for path in out.iterdir()}
         assert names == {f"fig{k:02d}.csv" for k in range(3, 16)} | {"measured.json", "cases"}
-        measured = read_measured((out / "measured.json").read_text())
-        assert [f.name for f in find(measured)] == [f.name for f in find(FIGURES)]
+        measured = json.loads((out / "measured.json").read_text())
+        told = re.findall(r"^(.*?) \(paper: ", texts[0], re.M)
+        assert told == [check.name for check in check_paper(FIGURES)]
         rows = list(csv.DictReader((out / "fig10.csv").open(newline="")))
         initial = [r for r in rows if r["line"] == "initial design"]
         assert [float(r["payload [kg]"]) for r in initial] == [4.0, 6.0, 8.0]
-        own = measured.payload.initial.compliance
+        own = measured["payload"]["designs"][0]["compliance"]
         np.testing.assert_allclose([float(r["compliance [N m]"]) for r in initial], own)
 
 

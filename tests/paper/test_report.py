@@ -13,7 +13,7 @@ from test_paper import tiny_plan
 from dolfinopt.output.files import ArmView
 from dolfinopt.paper import page as report
 from dolfinopt.paper import reproduction as paper
-from dolfinopt.paper.checks import broken, find, read_measured
+from dolfinopt.paper.checks import check_paper, failed_checks
 
 WORLD = MPI.COMM_WORLD
 VOID = {"meta", "link", "img", "input", "br", "path", "rect", "circle"}
@@ -116,15 +116,15 @@ def test_page_is_sound(page):
     assert len(page.all("img")) == 12 + 2 * (4 + 4 + 2)
 
 
-def test_every_finding_is_told(folder):
+def test_every_finding_is_told(made, folder):
     """With the paper's figure, ours, and the verdict."""
     from html import unescape
 
     text = unescape((folder / "report.html").read_text(encoding="utf-8"))
-    for finding in find(read_measured((folder / "measured.json").read_text())):
-        for words in (finding.statement, finding.paper, finding.ours, finding.criterion):
+    for check in made[0].checks:
+        for words in (check.statement, check.paper, check.ours, check.criterion):
             assert words in text
-        assert finding.holds or finding.reason in text
+        assert check.holds or check.reason in text
 
 
 def test_page_without_some_results(made, tmp_path):
@@ -142,13 +142,13 @@ def test_page_without_some_results(made, tmp_path):
         },
     )
     measured = paper.measure(plan, outcomes)
-    findings = find(measured)
+    checks = check_paper(measured)
     drawn = paper.figures(plan, outcomes, measured)
-    poorer = paper.Reproduction(plan, outcomes, measured, findings, drawn)
+    poorer = paper.Reproduction(plan, outcomes, measured, checks, drawn)
     report.write_reproduction(poorer, tmp_path)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "it &lt;diverged&gt;" in text and len(Reader(text).all("article")) == 15
-    wrong = {line.partition(":")[0] for line in broken(findings)}
+    wrong = {line.partition(":")[0] for line in failed_checks(checks)}
     assert wrong >= {"dynamic loads", "coordinates, optimised design", "payload, loss"}
     assert "coordinates, initial design" not in wrong
 
@@ -231,7 +231,7 @@ def test_page_in_a_browser(folder, window, size):
 @in_browser
 @pytest.mark.serial
 def test_tables_scroll_in_their_boxes(folder, window):
-    """On a phone figures are wider than their boxes, which scroll; the findings are read down."""
+    """On a phone figures are wider than their boxes, which scroll; the checks are read down."""
     window.open(folder / "report.html", *PHONE)
     wider, moved, first = window.value(
         "(() => { const boxes = [...document.querySelectorAll('.scroll')];"

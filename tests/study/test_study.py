@@ -18,10 +18,9 @@ from mpi4py import MPI
 import dolfinopt as do
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.study import presets as topics
+from dolfinopt.study import presets, variants
 from dolfinopt.study import store as cases
 from dolfinopt.study import studies as study
-from dolfinopt.study import variants
 from dolfinopt.study.tables import TornadoFigure
 from dolfinopt.study.variants import parse_vary
 
@@ -116,7 +115,7 @@ def test_axes_bear_units():
 
 BAD = {
     "nothing asked": ([], "--vary"),
-    "unknown topic": (["tides"], "tides"),
+    "unknown preset": (["tides"], "tides"),
     "unknown key": (["--vary", "payload.mas=1,2"], "payload.mass"),
     "no numbers": (["--vary", "payload.mass=a,b"], "expected"),
     "out of range": (["--vary", "payload.mass=-1:1:3"], "payload.mass = -1"),
@@ -130,7 +129,7 @@ BAD = {
     "coordinates of another key": (["coordinates", "--vary", "payload.mass=1,2"], "only"),
     "broken coordinates": (["coordinates", "--vary", "reduction.coordinates=4,4.5"], "whole"),
     "too many coordinates": (["coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
-    "a file that looks like a topic": (["--design", "a.npz", "b.npz"], "b.npz"),
+    "a file that looks like a preset": (["--design", "a.npz", "b.npz"], "b.npz"),
     "several times reoptimised": (["coordinates", "--reoptimize"], "compare reductions"),
 }
 
@@ -285,7 +284,7 @@ def test_arms_of_several_sizes(folder):
 
 
 @pytest.mark.parametrize(
-    ("topic", "vary", "name"),
+    ("preset", "vary", "name"),
     [
         ("payload", [], "payload"),
         ("payload", ["payload.mass=4,8"], "payload"),
@@ -299,8 +298,8 @@ def test_arms_of_several_sizes(folder):
         ),
     ],
 )
-def test_files_are_named_after_what_varies(topic, vary, name):
-    assert study.sweep_name(topic, vary) == name
+def test_files_are_named_after_what_varies(preset, vary, name):
+    assert study.sweep_name(preset, vary) == name
 
 
 def test_long_names_stay_apart():
@@ -392,21 +391,21 @@ def test_objective(folder):
 
 
 def test_solid_ends_allow_nothing_attached():
-    plan = topics.objective_plan(scene("arms.passive=0.05"))
+    plan = presets.objective_plan(scene("arms.passive=0.05"))
     labels = [case.label for case in plan.cases]
     assert "eigenfrequency, nothing attached" in labels and len(labels) == 12
 
 
 def test_exact_gradient_only_where_there_is_one():
-    plan = topics.objective_plan(scene("simulation.integrator=generalized-alpha"))
+    plan = presets.objective_plan(scene("simulation.integrator=generalized-alpha"))
     assert not any("exact" in case.label for case in plan.cases)
 
 
 @pytest.mark.slow
 def test_reduction(folder, monkeypatch):
     """Craig-Bampton and Krylov do not depend on q, modal truncation is below and climbs."""
-    monkeypatch.setattr(topics, "SWEPT", (4, 8))
-    monkeypatch.setattr(topics, "COMPARED", (4,))
+    monkeypatch.setattr(presets, "SWEPT", (4, 8))
+    monkeypatch.setattr(presets, "COMPARED", (4,))
     monkeypatch.setattr(variants, "REFERENCE", 8)
     monkeypatch.setattr(cases, "REFERENCE", 8)
     run(

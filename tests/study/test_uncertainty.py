@@ -1,346 +1,298 @@
-"""Distributions, samples, statistics and Sobol' indices against closed forms."""
+"""Random uncertainties from the command line: what is asked, tables and pictures."""
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
+import csv
+from pathlib import Path
 
+import click
 import numpy as np
 import pytest
-from scipy import stats
+from mpi4py import MPI
 
-from dolfinopt.errors import InputError
-from dolfinopt.study.uncertainty import (
-    Distribution,
-    draw,
-    parse_distribution,
-    polynomial_indices,
-    quantile,
-    saltelli_indices,
-    saltelli_points,
-    statistics,
-    unit_points,
-)
+import dolfinopt as do
+from dolfinopt.cli import commands
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.study.figures import draw
+from dolfinopt.study.tables import BarFigure, HistogramFigure, ScatterFigure
+from dolfinopt.study.uncertainty import Plan, nominal_value, parse_input, study_random
 
-TEXTS = (
-    "normal:6:0.3",
-    "normal:70e9:2e9",
-    "uniform:-2:3",
-    "triangular:0:1:4",
-    "triangular:1:1:2",
-    "lognormal:2:0.25",
-)
+WORLD = MPI.COMM_WORLD
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+SMALL = ["arms.cells=[12,3]", "optimizer.max_iterations=2", "simulation.sample=0.01",
+         "simulation.tolerance=1e-2"]  # fmt: skip
+SETTINGS = [word for value in SMALL for word in ("--set", value)]
+MASS, YOUNG = "payload.mass=normal:6:0.3", "material.young_modulus=normal:70e9:2e9"
+TWO = "uncertainty_payload.mass_material.young_modulus"
 
 
-# -- distributions ---------------------------------------------------------------------------
+def scene(*overrides):
+    return do.load_scene(SCENE, [*SMALL, *overrides])
 
 
-@pytest.mark.parametrize(
-    ("text", "mean", "variance"),
-    [
-        ("normal:6:0.3", 6.0, 0.09),
-        ("uniform:-2:3", 0.5, 25.0 / 12.0),
-        ("triangular:0:1:4", 5.0 / 3.0, (16.0 + 1.0 - 4.0) / 18.0),
-        ("triangular:1:1:2", 4.0 / 3.0, 1.0 / 18.0),
-        (
-            "lognormal:2:0.25",
-            2.0 * math.exp(0.25**2 / 2.0),
-            4.0 * math.exp(0.25**2) * math.expm1(0.25**2),
-        ),
-    ],
-)
-def test_moments(text, mean, variance):
-    """Text-book moments; the tails that are left out hold 1e-12 and reach seven deviations."""
-    law = parse_distribution(text)
-    assert law.mean == pytest.approx(mean, rel=1e-9)
-    assert law.deviation**2 == pytest.approx(variance, rel=1e-8)
+def run(*arguments):
+    """Run the command on all ranks."""
+    commands.main(["uncertainty", *map(str, arguments)], standalone_mode=False, obj=WORLD)
+    WORLD.barrier()
 
 
-@pytest.mark.parametrize("text", TEXTS)
-def test_quantiles_are_those_of_the_distribution(text):
-    law = parse_distribution(text)
-    shares = np.linspace(0.001, 0.999, 50)
-    np.testing.assert_allclose(law.law.cdf(law.at(shares)), shares, rtol=1e-9)
+def rows_of(path):
+    with open(path, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
 
 
-@pytest.mark.parametrize(
-    ("text", "low", "high"),
-    [("normal:1:0.1", -math.inf, 1.05), ("normal:1:2", 0.0, math.inf), ("normal:0:1", -1.0, 2.0)],
-)
-def test_cut_off(text, low, high):
-    """As SciPy's truncated normal distribution; all samples lie within."""
-    law = parse_distribution(text).within(low, high)
-    mean, deviation = map(float, text.split(":")[1:])
-    ends = (low - mean) / deviation, (high - mean) / deviation
-    exact = stats.truncnorm(*ends, mean, deviation)
-    assert law.mean == pytest.approx(exact.mean(), rel=1e-8, abs=1e-10)
-    assert law.deviation == pytest.approx(exact.std(), rel=1e-8)
-    shares = np.linspace(0.0, 1.0, 1001)
-    samples = law.at(shares)
-    assert low <= samples.min() and samples.max() <= high
-    np.testing.assert_allclose(samples[1:-1], exact.ppf(shares[1:-1]), rtol=1e-8, atol=1e-10)
-    beyond = stats.norm.cdf(ends[0]) + stats.norm.sf(ends[1])
-    assert law.cut_off == pytest.approx(beyond, rel=1e-12)
+def cells_of(table):
+    return list(table.frame.itertuples(index=False, name=None))
 
 
-def test_own_bounds_are_kept():
-    law = parse_distribution("uniform:0.9:1")
-    assert law.within(0.0, 1.0).cut_off == 0.0
-    with pytest.raises(InputError, match=r"uniform:0\.9:1: reaches from 0\.9 to 1"):
-        law.within(0.0, 0.95)
-    with pytest.raises(InputError, match=r"99\.9 % of it lie beyond"):
-        parse_distribution("normal:3:1").within(-math.inf, 0.0)
+def column(rows, name):
+    return np.array([float(row[name]) for row in rows])
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["", "gauss:1:2", "normal", "normal:1", "normal:1:0", "normal:1:-1", "normal:1:2:3",
-     "normal:a:1", "normal:inf:1", "normal:1:nan", "uniform:2:1", "uniform:1:1", "triangular:0:2:1",
-     "triangular:1:1:1", "triangular:0:1", "lognormal:0:1", "lognormal:-1:1", "lognormal:1:0"],
-)  # fmt: skip
-def test_no_distribution(text):
-    with pytest.raises(InputError, match="expected") as caught:
-        parse_distribution(text)
-    assert "\n" not in str(caught.value)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where the studies of this file keep what they compute."""
+    path = tmp_path_factory.mktemp("random") if WORLD.rank == 0 else None
+    return WORLD.bcast(path, root=0)
 
 
-@pytest.mark.parametrize("text", TEXTS)
-def test_polynomials_are_orthonormal(text):
-    """Moments of products by SciPy's adaptive quadrature of the density."""
-    law = parse_distribution(text)
-    x, weights = quadrature(law)
-    rows = law.polynomials(x, 4)
-    # Tails of 1e-12, times polynomials of degree 8 in them, are left out.
-    np.testing.assert_allclose((rows.T * weights) @ rows, np.eye(5), atol=1e-6)
+def tables_of(done):
+    return {table.name: table for table in done.tables}
 
 
-def quadrature(law: Distribution) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of the double exponential rule between a law's quartiles."""
-    t, h = np.linspace(-3.5, 3.5, 401, retstep=True)
-    inner = 0.5 * np.pi * np.sinh(t)
-    slope = 0.5 * np.pi * np.cosh(t) / np.cosh(inner) ** 2
-    ends = {*law.at(np.array([0.0, 0.25, 0.5, 0.75, 1.0])), law.law.ppf(0.0), law.law.ppf(1.0)}
-    parts = list(pairwise(sorted(end for end in ends if np.isfinite(end))))
-    x = np.concatenate([0.5 * (a + b) + 0.5 * (b - a) * np.tanh(inner) for a, b in parts])
-    w = np.concatenate([0.5 * (b - a) * slope * h for a, b in parts])
-    return x, w * law.law.pdf(x)
+# -- what is asked ---------------------------------------------------------------------------
 
 
-def test_polynomials_of_uniform_inputs_are_legendre():
-    x = np.linspace(-1.0, 1.0, 9)
-    found = parse_distribution("uniform:-1:1").polynomials(x, 2)
-    expected = np.stack(
-        [np.ones_like(x), np.sqrt(3.0) * x, np.sqrt(5.0) * 0.5 * (3.0 * x**2 - 1.0)], axis=1
-    )
-    np.testing.assert_allclose(found, expected, atol=1e-9)  # tails of 1e-12 are left out
+BAD = {
+    "no distribution": (["--random", "payload.mass"], "KEY=DISTRIBUTION"),
+    "unknown distribution": (["--random", "payload.mass=cauchy:6:1"], "expected one of normal"),
+    "wrong numbers": (["--random", "payload.mass=normal:6"], "normal:MEAN:DEVIATION"),
+    "unknown key": (["--random", "payload.mas=normal:6:1"], "payload.mass"),
+    "unknown arm": (["--random", "arms.leg.thickness=normal:6:1"], "arm1"),
+    "a table": (["--random", "payload=normal:6:1"], "a table"),
+    "an integer": (["--random", "reduction.coordinates=normal:4.2:1"], "an integer"),
+    "a choice": (["--random", "motion.elbow=uniform:0:1"], "motion.elbow"),
+    "an array": (["--random", "motion.gravity=normal:0:1"], "motion.gravity"),
+    "median out of range": (["--random", "motion.flattening=normal:2:0.1"], "<= 1"),
+    "beyond the range": (["--random", "motion.flattening=uniform:0.9:1.1"], ">= 0 and <= 1"),
+    "half beyond": (["--random", "payload.mass=normal:-1:2"], "payload.mass = -1"),
+    "of the optimisation": (["--random", "design.initial=uniform:0.4:0.6"], "given design does"),
+    "of the integration": (["--random", "simulation.sample=uniform:1e-3:2e-3"], "given design"),
+    "another size": (["--random", "arms.arm2.length=normal:1:0.01"], "another length"),
+    "twice": (["--random", MASS, "--random", "payload.mass=uniform:1:2"], "twice"),
+    "out of reach": (["--random", "motion.radius=normal:1:1"], "from the shoulder"),
+    "few samples": (["--random", MASS, "--samples", "5"], "at least 10"),
+    "negative seed": (["--random", MASS, "--seed", "-1"], "--seed -1"),
+    "unknown sampler": (["--random", MASS, "--sampler", "dice"], "latin-hypercube"),
+    "nothing random": ([], "--random"),
+    "no design": (["--random", MASS, "--design", "nowhere.npz"], "nowhere.npz"),
+}
 
 
-# -- samples ---------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line(name, shared_tmp_path):
+    arguments, word = BAD[name]
+    with pytest.raises((InputError, click.UsageError)) as caught:
+        run(SCENE, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
+    error = caught.value
+    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
+    assert "\n" not in message and word in message
+    assert not (shared_tmp_path / "o").exists()
 
 
-@pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
-def test_seeds_repeat(sampler):
-    one = unit_points(50, 3, sampler, 7)
-    assert one.shape == (50, 3) and one.min() >= 0.0 and one.max() < 1.0
-    np.testing.assert_array_equal(one, unit_points(50, 3, sampler, 7))
-    assert not np.array_equal(one, unit_points(50, 3, sampler, 8))
+def test_inputs_are_cut_off_at_the_range():
+    """Half a normal distribution about the key's largest value is left: mean 1 - s sqrt(2/pi)."""
+    one = parse_input(scene(), "motion.flattening=normal:0.999999:0.01")
+    assert (one.distribution.low, one.distribution.high) == (0.0, 1.0)
+    assert one.distribution.mean == pytest.approx(1.0 - 0.01 * (2.0 / np.pi) ** 0.5, abs=1e-6)
+    assert one.axis == "motion.flattening [-]"
+    young = parse_input(scene(), "arms.arm2.young_modulus=lognormal:70e9:0.05")
+    assert young.axis == "arms.arm2.young_modulus [Pa]" and young.distribution.low == 1.0
 
 
-def test_latin_hypercube_has_a_point_in_every_interval():
-    points = unit_points(40, 3, "latin-hypercube", 3)
-    for column in points.T:
-        np.testing.assert_array_equal(np.sort((40 * column).astype(int)), np.arange(40))
-
-
-def test_sobol_fills_every_box():
-    """64 points of a (0, 6, 2)-net: one in each box of 8 x 8, 16 x 4, 4 x 16."""
-    points = unit_points(64, 2, "sobol", 5)
-    for a, b in ((8, 8), (16, 4), (4, 16), (64, 1)):
-        boxes = {(int(a * x), int(b * y)) for x, y in points}
-        assert len(boxes) == 64
-
-
-def test_more_sobol_points_begin_alike():
-    few, many = (unit_points(count, 3, "sobol", 1) for count in (100, 257))
-    np.testing.assert_array_equal(few, many[:100])
-
-
-def test_samples_follow_the_distributions():
-    laws = [parse_distribution(text) for text in TEXTS]
-    samples = draw(laws, unit_points(4096, len(laws), "sobol", 2))
-    for law, column in zip(laws, samples.T, strict=True):
-        # 4096 net points: the distribution function is right to some 1/4096.
-        assert stats.kstest(column, law.law.cdf).statistic < 2e-3
-
-
-def test_saltelli_points():
-    points = saltelli_points(16, 3, "sobol", 1).reshape(5, 16, 3)
-    A, B, mixed = points[0], points[1], points[2:]
-    assert not np.isin(A, B).any()
-    for i in range(3):
-        np.testing.assert_array_equal(mixed[i][:, i], B[:, i])
-        np.testing.assert_array_equal(np.delete(mixed[i], i, axis=1), np.delete(A, i, axis=1))
-
-
-# -- statistics ------------------------------------------------------------------------------
-
-
-def test_statistics_of_a_normal_sample():
-    """Net points give the law's figures; intervals have the width of independent samples."""
-    n = 2048
-    values = parse_distribution("normal:6:0.3").at(unit_points(n, 1, "sobol", 4)[:, 0])
-    found = statistics(values)
-    assert found.mean.value == pytest.approx(6.0, abs=1e-4)
-    assert found.deviation.value == pytest.approx(0.3, rel=2e-3)
-    assert found.mean.high - found.mean.value == pytest.approx(1.96 * 0.3 / n**0.5, rel=5e-3)
-    # Of a normal sample the standard error is s / sqrt(2 n); its fourth moment is less certain.
-    width = found.deviation.high - found.deviation.value
-    assert width == pytest.approx(1.96 * 0.3 / (2 * n) ** 0.5, rel=0.03)
-    for one, share in zip(found.quantiles, (0.05, 0.5, 0.95), strict=True):
-        assert one.value == pytest.approx(stats.norm.ppf(share, 6.0, 0.3), abs=2e-3)
-        error = (share * (1.0 - share) / n) ** 0.5 / stats.norm.pdf(one.value, 6.0, 0.3)
-        assert one.high - one.low == pytest.approx(2.0 * 1.96 * error, rel=0.1)
-
-
-def test_intervals_cover():
-    """Of 1000 samples of a skewed law, intervals miss the truth 5 % of the time, or less."""
-    rng = np.random.default_rng(3)
-    law = stats.gamma(4.0)
-    missed = np.zeros(5)
-    for _ in range(1000):
-        found = statistics(law.rvs(100, random_state=rng))
-        truth = [law.mean(), law.std(), *law.ppf([0.05, 0.5, 0.95])]
-        estimates = [found.mean, found.deviation, *found.quantiles]
-        for k, (one, true) in enumerate(zip(estimates, truth, strict=True)):
-            missed[k] += not (one.low <= true <= one.high or math.isnan(one.low + one.high))
-    # Three standard errors of 1000 trials are 2 %; those of s rest on the law's fourth moment,
-    # which 100 samples underestimate.
-    assert missed[0] / 1000 < 0.08 and missed[1] / 1000 < 0.14
-    assert (missed[2:] / 1000 < 0.07).all() and (missed > 0).all()
-
-
-def test_few_samples_bound_no_quantile():
-    """The least of n samples lies above the 5 % quantile with probability 0.95^n."""
-    values = np.arange(20.0)
-    one = quantile(values, 0.05)
-    assert math.isnan(one.low) and one.high == values[3]  # B(20, 0.05) <= 3 but for 1.6 %
-    many = quantile(np.arange(200.0), 0.05)
-    assert many.low < many.value < many.high
-
-
-def test_statistics_of_a_constant():
-    found = statistics(np.full(20, 3.0))
-    assert (found.mean.low, found.mean.high) == (3.0, 3.0)
-    assert found.deviation.value == found.deviation.high == 0.0
-
-
-# -- Sobol' indices --------------------------------------------------------------------------
-
-A, B = 7.0, 0.1
-
-
-def ishigami(x):
-    """Return sin x1 + a sin^2 x2 + b x3^4 sin x1 (Ishigami & Homma 1990)."""
-    return np.sin(x[:, 0]) + A * np.sin(x[:, 1]) ** 2 + B * x[:, 2] ** 4 * np.sin(x[:, 0])
-
-
-def ishigami_indices():
-    """Return its first and total indices in closed form."""
-    v1 = 0.5 * (1.0 + B * np.pi**4 / 5.0) ** 2
-    v2 = A**2 / 8.0
-    v13 = B**2 * np.pi**8 * (1.0 / 18.0 - 1.0 / 50.0)
-    total = v1 + v2 + v13
-    return np.array([v1, v2, 0.0]) / total, np.array([v1 + v13, v2, v13]) / total
-
-
-ANGLE = parse_distribution(f"uniform:{-math.pi}:{math.pi}")
-
-
-@pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
-def test_saltelli_on_ishigami(sampler):
-    points = draw([ANGLE] * 3, saltelli_points(4096, 3, sampler, 1))
-    found = saltelli_indices(ishigami(points), 3, 1)
-    first, total = ishigami_indices()
-    for one, exact in zip((*found.first, *found.total), (*first, *total), strict=True):
-        assert one.low <= exact <= one.high
-        # Independent samples are right to 0.02; 4096 of a hypercube in six dimensions not better.
-        assert one.value == pytest.approx(exact, abs=0.03)
-        assert 0.005 < one.high - one.low < 0.12
-
-
-def test_saltelli_intervals_are_repeatable():
-    points = draw([ANGLE] * 3, saltelli_points(256, 3, "sobol", 1))
-    values = ishigami(points)
-    again = saltelli_indices(values, 3, 5)
-    assert repr(saltelli_indices(values, 3, 5)) == repr(again)  # one of its numbers is nan
-    # A mean far from zero does not spoil the estimates.
-    for one, other in zip(
-        saltelli_indices(values, 3, 5).first, saltelli_indices(values + 1e6, 3, 5).first
+def test_nominal_values():
+    given = scene("arms.arm2.density=2600.0", "arms.arm2.thickness=0.02")
+    for key, value in (
+        ("payload.mass", 6.0),
+        ("arms.arm2.density", 2600.0),
+        ("arms.arm1.density", 2700.0),
+        ("arms.1.thickness", 0.02),
+        ("arms.density", None),
+        ("arms.height", 0.06),
     ):
-        assert one.value == pytest.approx(other.value, abs=1e-7)
+        assert nominal_value(given, key) == value
 
 
-def test_polynomial_on_ishigami():
-    """Degree 10 leaves 1e-5 of the variance."""
-    samples = draw([ANGLE] * 3, unit_points(1000, 3, "sobol", 1))
-    found = polynomial_indices(samples, ishigami(samples), [ANGLE] * 3)
-    first, total = ishigami_indices()
-    np.testing.assert_allclose([one.value for one in found.first], first, atol=1e-3)
-    np.testing.assert_allclose([one.value for one in found.total], total, atol=1e-3)
-    assert found.degree >= 9 and found.unexplained < 1e-4
+# -- what comes out --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "texts",
-    [
-        ("normal:6:0.3", "normal:70e9:2e9", "uniform:0.9:1"),
-        ("lognormal:2:0.25", "triangular:0:1:4", "triangular:1:1:2"),
-    ],
-)
-def test_linear_model(texts):
-    """Shares (a_i s_i)^2 of the variance, whatever the distributions; nothing is left over."""
-    laws = [parse_distribution(text) for text in texts]
-    slopes = np.array([3.0 / laws[0].deviation, -2.0 / laws[1].deviation, 1.0 / laws[2].deviation])
-    exact = np.array([9.0, 4.0, 1.0]) / 14.0
-    samples = draw(laws, unit_points(100, 3, "sobol", 1))
-    found = polynomial_indices(samples, 5.0 + samples @ slopes, laws)
-    for one in (found.first, found.total):
-        np.testing.assert_allclose([share.value for share in one], exact, rtol=1e-8)
-    assert found.unexplained < 1e-20
-    points = draw(laws, saltelli_points(2048, 3, "sobol", 1))
-    direct = saltelli_indices(5.0 + points @ slopes, 3, 1)
-    for one in (direct.first, direct.total):
-        np.testing.assert_allclose([share.value for share in one], exact, atol=0.03)
+def test_command(folder, capsys):
+    """Statistics are those of the samples in the file; the second time nothing is computed."""
+    arguments = (SCENE, "--random", MASS, "--random", YOUNG, "--samples", 32, *SETTINGS,
+                 "--out", folder / "two")  # fmt: skip
+    run(*arguments)
+    first = capsys.readouterr().out
+    rows = rows_of(folder / "two" / f"{TWO}.csv")
+    assert len(rows) == 32
+    mass = column(rows, "payload.mass [kg]")
+    assert mass.mean() == pytest.approx(6.0, abs=0.02)
+    assert mass.std() == pytest.approx(0.3, rel=0.1)
+    statistics = rows_of(folder / "two" / f"{TWO}_statistics.csv")
+    for label in ("initial design", "optimised design"):
+        for quantity in ("compliance [N m]", "maximal deviation [mm]"):
+            values = column(rows, f"{label}: {quantity}")
+            mine = {r["statistic"]: r for r in statistics if r["quantity"] == quantity}
+            expected = {
+                "mean": values.mean(),
+                "standard deviation": values.std(ddof=1),
+                "5 % quantile": np.quantile(values, 0.05),
+                "50 % quantile": np.quantile(values, 0.5),
+                "95 % quantile": np.quantile(values, 0.95),
+            }
+            for name, value in expected.items():
+                assert float(mine[name][label]) == pytest.approx(value, rel=1e-8)
+            low, high = (float(mine["mean"][f"{label}: {end}"]) for end in ("from", "to"))
+            assert low < values.mean() < high
+            assert 0.0 < float(mine["nominal"][label]) < values.max()
+    indices = rows_of(folder / "two" / f"{TWO}_indices.csv")
+    assert len(indices) == 8
+    for one in indices:
+        first_order, total = float(one["first order [-]"]), float(one["total [-]"])
+        assert 0.0 <= first_order <= total + 1e-9 <= 1.0 + 2e-9
+        # A heavier payload matters more than as many per cent less of stiffness.
+        assert (total > 0.5) == (one["input"] == "payload.mass")
+    names = ("", "_indices", "_scatter")
+    assert all((folder / "two" / f"{TWO}{name}.png").is_file() for name in names)
+    if WORLD.rank == 0:
+        assert "67 cases computed" in first  # two designs at 33 points, and one made
+        assert (folder / "two" / f"{TWO}.md").read_text() in first
+    WORLD.barrier()
+    before = (folder / "two" / f"{TWO}.csv").read_bytes()
+    run(*arguments, "--no-plots")
+    if WORLD.rank == 0:
+        assert "0 cases computed" in capsys.readouterr().out
+    assert (folder / "two" / f"{TWO}.csv").read_bytes() == before
 
 
-def test_product_has_an_interaction():
-    """(1 + z1) (1 + z2 / 2): variances 1, 1/4, 1/4 of the parts."""
-    laws = [parse_distribution("normal:0:1")] * 2
-    z = draw(laws, unit_points(200, 2, "sobol", 1))
-    found = polynomial_indices(z, (1.0 + z[:, 0]) * (1.0 + 0.5 * z[:, 1]), laws)
-    first, total = ([one.value for one in rows] for rows in (found.first, found.total))
-    np.testing.assert_allclose(first, [1.0 / 1.5, 0.25 / 1.5], rtol=1e-8)
-    np.testing.assert_allclose(total, [1.25 / 1.5, 0.5 / 1.5], rtol=1e-8)
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    """A design of solid arms in a file, which needs no optimisation."""
+    path = None
+    if WORLD.rank == 0:
+        path = tmp_path_factory.mktemp("design") / "solid.npz"
+        x, y = np.meshgrid((np.arange(12) + 0.5) / 12.0, (np.arange(3) - 1) * 0.02)
+        centroid = np.stack([x.ravel(), y.ravel()], axis=1)
+        arms = {f"arm{k}/centroid": centroid for k in (1, 2)}
+        np.savez(path, **arms, **{f"arm{k}/density": np.ones(36) for k in (1, 2)})
+    return WORLD.bcast(path, root=0)
 
 
-def test_noise_is_left_unexplained():
-    """A tenth of the variance is noise; leaving one out finds it, and intervals cover."""
-    rng = np.random.default_rng(0)
-    laws = [parse_distribution("normal:0:1")] * 2
-    exact = np.array([0.8, 0.2])
-    covered = 0
-    for seed in range(20):
-        z = draw(laws, unit_points(400, 2, "sobol", seed))
-        y = z @ np.sqrt(exact) + rng.normal(0.0, 1.0 / 3.0, 400)
-        found = polynomial_indices(z, y, laws)
-        assert found.unexplained == pytest.approx(0.1, abs=0.03)
-        covered += found.first[0].low <= 0.8 <= found.first[0].high
-    # 95 % intervals that hold less than 16 times of 20 have a chance of 0.3 %.
-    assert covered >= 16
+def study(given, folder, *random, base=None, **plan):
+    base = scene() if base is None else base
+    return study_random(base, random, [given], folder, WORLD, Plan(**plan), shown=False)
 
 
-def test_a_constant_has_no_shares():
-    laws = [parse_distribution("normal:0:1")] * 2
-    z = draw(laws, unit_points(50, 2, "sobol", 1))
-    assert polynomial_indices(z, np.full(50, 2.0), laws).total[0].value == 0.0
-    assert saltelli_indices(np.full(64, 2.0), 2, 1).first[1].value == 0.0
+def test_small_scatter_is_linear(folder, given):
+    """The standard deviation is that of the linearised model, by central differences."""
+    fine = scene("simulation.tolerance=1e-4", "motion.horizon=2.2")
+    spread = {"payload.mass": 0.01, "material.young_modulus": 1e8, "arms.thickness": 1e-5}
+    centre = {"payload.mass": 6.0, "material.young_modulus": 70e9, "arms.thickness": 0.01}
+    texts = [f"{key}=normal:{centre[key]!r}:{s!r}" for key, s in spread.items()]
+    done = study(given, folder, *texts, base=fine, samples=64)
+    found = {row[:2]: row[2] for row in cells_of(tables_of(done)["statistics"])}
+
+    def simulate(key, value):
+        other = scene("simulation.tolerance=1e-4", "motion.horizon=2.2", f"{key}={value!r}")
+        share = do.share_arms(MPI.COMM_SELF, other.cell_counts)
+        arms = do.build_arms(other, share, do.Ledger())
+        x = {k: arm.uniform(1.0) for k, arm in arms.items()}
+        evaluation, _ = do.evaluate(other, share, arms, x, do.Ledger())
+        return np.array([evaluation.compliance, 1e3 * evaluation.max_deviation])
+
+    parts = [
+        0.5 * (simulate(key, centre[key] + s) - simulate(key, centre[key] - s))
+        for key, s in spread.items()
+    ]
+    expected = np.sqrt(np.sum(np.square(parts), axis=0))
+    shares = np.square(parts) / np.sum(np.square(parts), axis=0)
+    quantities = ("compliance [N m]", "maximal deviation [mm]")
+    for j, quantity in enumerate(quantities):
+        # 64 net points give a normal law's standard deviation to some 2 %.
+        assert found[quantity, "standard deviation"] == pytest.approx(expected[j], rel=0.04)
+        name = quantity.partition(" [")[0]
+        rows = [row for row in cells_of(tables_of(done)["indices"]) if row[1] == name]
+        # The polynomial knows the distributions themselves.
+        np.testing.assert_allclose([row[3] for row in rows], shares[:, j], atol=0.01)
+
+
+def test_both_ways_to_the_indices(folder, given):
+    """Saltelli's scheme takes more simulations and comes to the polynomial's indices."""
+    fitted = study(given, folder / "i", MASS, YOUNG, samples=32)
+    direct = study(given, folder / "i", MASS, YOUNG, samples=32, indices="saltelli", seed=3)
+    assert direct.computed == 1 + 16 * (2 + 2)
+    assert len(cells_of(direct.data[0])) == 64
+    ours, theirs = (cells_of(tables_of(done)["indices"]) for done in (fitted, direct))
+    assert len(ours) == len(theirs) == 4
+    for one, other in zip(ours, theirs, strict=True):
+        assert one[:3] == other[:3]
+        for value, (low, high) in ((one[3], other[4:6]), (one[6], other[7:9])):
+            # Twice as far as the 95 % interval of eight estimates leaves no chance.
+            middle, half = 0.5 * (low + high), 0.5 * (high - low)
+            assert abs(value - middle) < 2.0 * half and half < 0.8
+    # Mixed samples are no draws of their own: statistics rest on 32.
+    figure = direct.figures[0]
+    assert isinstance(figure, HistogramFigure) and len(figure.rows[0][0].values) == 32
+
+
+def test_one_input_has_no_indices(folder, given):
+    done = study(given, folder, MASS, samples=20, sampler="latin-hypercube", indices="saltelli")
+    assert done.computed == 21
+    assert list(tables_of(done)) == ["inputs", "statistics"]
+    assert [figure.name for figure in done.figures] == ["", "scatter"]
+
+
+def test_scenarios_are_left_out(folder, given):
+    several = scene('scenarios=[{changes=["payload.mass=4"]}]')
+    plain = study(given, folder / "p", MASS, samples=10)
+    assert study(given, folder / "p", MASS, base=several, samples=10).computed == 0
+    assert plain.computed == 11
+
+
+@pytest.mark.serial
+def test_failures_end_with_status_1(folder, given, monkeypatch):
+    from dolfinopt.study import sampling
+
+    def failing(scenes, *_):
+        return [ConvergenceError("no luck")] * len(scenes)
+
+    monkeypatch.setattr(sampling, "simulate_batch", failing)
+    with pytest.raises(ConvergenceError, match=r"solid, sample 0 \(\): no luck \(and 10 more\)"):
+        run(SCENE, "--random", MASS, "--samples", 10, "--design", given, *SETTINGS,
+            "--out", folder / "f")  # fmt: skip
+    rows = rows_of(folder / "f" / "uncertainty_payload.mass.csv")
+    assert len(rows) == 10 and rows[0]["solid: compliance [N m]"] == ""
+
+
+# -- pictures --------------------------------------------------------------------------------
+
+
+@pytest.mark.serial
+def test_pictures_show_the_samples(folder, given):
+    done = study(given, folder / "i", MASS, YOUNG, samples=32)
+    values = np.array([row[3:5] for row in cells_of(done.data[0])], dtype=float)
+    histogram, bars, scatter = done.figures
+    assert isinstance(histogram, HistogramFigure)
+    assert isinstance(bars, BarFigure) and isinstance(scatter, ScatterFigure)
+    drawn = draw(histogram)
+    for j, axes in enumerate(drawn.axes[:2]):
+        assert sum(patch.get_height() for patch in axes.patches) == 32
+        [curve] = drawn.axes[2 + j].lines
+        np.testing.assert_array_equal(curve.get_xdata(), np.sort(values[:, j]))
+        assert curve.get_ydata()[-1] == 1.0
+    heights = [patch.get_height() for patch in draw(bars).axes[0].patches]
+    rows = [row for row in cells_of(tables_of(done)["indices"]) if row[1] == "compliance"]
+    np.testing.assert_allclose(heights, [row[3] for row in rows] + [row[6] for row in rows])
+    axes = draw(scatter).axes
+    assert len(axes) == 4
+    np.testing.assert_array_equal(axes[3].lines[0].get_ydata(), values[:, 1])
+    assert axes[2].get_xlabel() == "payload.mass [kg]"

@@ -1,0 +1,416 @@
+"""Random inputs: distributions, seeded samples, statistics, and Sobol' indices.
+
+Inputs are independent. Points (n, d) of the unit cube become samples through the distributions'
+quantiles; what is said of a model rests on its values (n,) at the samples alone.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy import stats
+from scipy.stats import qmc
+
+from dolfinopt.errors import InputError
+
+Sampler = Literal["sobol", "latin-hypercube"]
+
+CONFIDENCE = 0.95  # of all intervals
+QUANTILES = (0.05, 0.5, 0.95)
+RESAMPLES = 400  # of a bootstrap: its ends are right to a tenth of the interval
+# Quantiles beyond it, at both ends, are out of reach of any number of samples.
+REMOTE = 1e-12
+NODES = 400  # of the quadrature over a distribution
+MAX_DEGREE = 10  # of the polynomial; total
+# Samples a term of the polynomial: with fewer it fits the noise, and neighbours of a point decide.
+SAMPLES_A_TERM = 3
+
+
+# -- distributions ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """How one input is distributed, cut off where it has bounds.
+
+    Attributes:
+        text: as the user wrote it, e.g. "normal:6:0.3".
+        law: SciPy's frozen distribution.
+        bounded: whether it has bounds of its own.
+        low, high: where it is cut off.
+        kink: where the density has one.
+    """
+
+    text: str
+    law: Any = field(compare=False)
+    bounded: bool
+    low: float = -math.inf
+    high: float = math.inf
+    kink: float | None = None
+
+    @property
+    def cut_off(self) -> float:
+        """Share of the whole that lies beyond `low` and `high`."""
+        return float(self.law.cdf(self.low) + self.law.sf(self.high))
+
+    def within(self, low: float, high: float) -> Distribution:
+        """Return the distribution cut off at bounds.
+
+        Raises:
+            InputError: it has bounds of its own that reach beyond, or nothing lies between them.
+        """
+        least, most = self.law.support()
+        if self.bounded and (least < low or most > high):
+            raise InputError(f"{self.text}: reaches from {least:g} to {most:g}")
+        cut = replace(self, low=low, high=high)
+        if cut.cut_off > 0.5:
+            raise InputError(f"{self.text}: {100.0 * cut.cut_off:.3g} % of it lie beyond")
+        return cut
+
+    def at(self, shares: np.ndarray) -> np.ndarray:
+        """Return the quantiles of shares in [0, 1]."""
+        shares = np.clip(shares, REMOTE, 1.0 - REMOTE)
+        first, last = self.law.cdf(self.low), self.law.cdf(self.high)
+        return np.clip(self.law.ppf(first + shares * (last - first)), self.low, self.high)
+
+    @property
+    def mean(self) -> float:
+        """Its expectation."""
+        x, weights = self._quadrature
+        return float(weights @ x)
+
+    @property
+    def deviation(self) -> float:
+        """Its standard deviation."""
+        x, weights = self._quadrature
+        return float(np.sqrt(weights @ (x - self.mean) ** 2))
+
+    @cached_property
+    def _quadrature(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes (2 n,) and weights, with sum 1, of integrals over the distribution.
+
+        Gauss's rule on both sides of a kink.
+        """
+        ends = self.at(np.array([0.0, 1.0]))
+        middle = float(np.clip(ends.mean() if self.kink is None else self.kink, *ends))
+        nodes, weights = legendre.leggauss(NODES)
+        parts = [(ends[0], middle), (middle, ends[1])]
+        x = np.concatenate([0.5 * (a + b) + 0.5 * (b - a) * nodes for a, b in parts])
+        w = np.concatenate([0.5 * (b - a) * weights for a, b in parts]) * self.law.pdf(x)
+        return x, w / w.sum()
+
+    def polynomials(self, x: np.ndarray, degree: int) -> np.ndarray:
+        """Return the orthonormal polynomials of the distribution, degrees 0 to `degree`.
+
+        Args:
+            x: (n,) where.
+            degree: of the last one.
+
+        Returns:
+            (n, degree + 1).
+        """
+        nodes, weights = self._quadrature
+        middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
+        known = legendre.legvander((nodes - middle) / half, degree)
+        _, upper = np.linalg.qr(np.sqrt(weights)[:, None] * known)
+        rows = legendre.legvander((np.asarray(x) - middle) / half, degree)
+        return np.linalg.solve(upper.T, rows.T).T * np.sign(np.diag(upper))
+
+
+def parse_distribution(text: str) -> Distribution:
+    """Return the distribution that a text like "normal:6:0.3" means.
+
+    "normal:MEAN:DEVIATION", "uniform:LOW:HIGH", "triangular:LOW:MODE:HIGH",
+    "lognormal:MEDIAN:SIGMA" with the standard deviation SIGMA of the logarithm.
+
+    Raises:
+        InputError: it means none.
+    """
+    name, *words = (part.strip() for part in text.split(":"))
+    forms = {
+        "normal": "normal:MEAN:DEVIATION with DEVIATION > 0",
+        "uniform": "uniform:LOW:HIGH with LOW < HIGH",
+        "triangular": "triangular:LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
+        "lognormal": "lognormal:MEDIAN:SIGMA with both > 0",
+    }
+    if name not in forms:
+        raise InputError(f"{text}: expected one of {', '.join(forms)}, for example normal:6:0.3")
+    wrong = InputError(f"{text}: expected {forms[name]}")
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise wrong from None
+    if len(values) != forms[name].split()[0].count(":") or not all(map(math.isfinite, values)):
+        raise wrong
+    a, b, c = (*values, values[-1])[:3]
+    if name == "normal" and b > 0.0:
+        return Distribution(text, stats.norm(a, b), False)
+    if name == "lognormal" and a > 0.0 and b > 0.0:
+        return Distribution(text, stats.lognorm(b, scale=a), False)
+    if name == "uniform" and a < b:
+        return Distribution(text, stats.uniform(a, b - a), True)
+    if name == "triangular" and a <= b <= c and a < c:
+        return Distribution(text, stats.triang((b - a) / (c - a), a, c - a), True, kink=b)
+    raise wrong
+
+
+# -- samples ---------------------------------------------------------------------------------
+
+
+def unit_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
+    """Return points (count, dimensions) of the unit cube that fill it evenly.
+
+    "sobol": Owen's scrambling of Sobol's sequence; more of them begin with the same ones.
+    "latin-hypercube": every input has one point in each of `count` equal intervals.
+    """
+    if sampler == "latin-hypercube":
+        return qmc.LatinHypercube(dimensions, seed=seed).random(count)
+    with warnings.catch_warnings():
+        # Numbers that are no power of two are a little less even, and no error.
+        warnings.filterwarnings("ignore", "The balance properties", UserWarning)
+        return qmc.Sobol(dimensions, seed=seed).random(count)
+
+
+def draw(distributions: Sequence[Distribution], points: np.ndarray) -> np.ndarray:
+    """Return the samples (n, d) at points (n, d) of the unit cube."""
+    return np.stack([one.at(points[:, i]) for i, one in enumerate(distributions)], axis=1)
+
+
+def saltelli_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
+    """Return the points ((d + 2) n, d) of Saltelli's scheme: A, B, and A with each column of B.
+
+    A and B are two samples of n points each. Source: Saltelli et al. (2010),
+    doi:10.1016/j.cpc.2009.09.018.
+    """
+    both = unit_points(count, 2 * dimensions, sampler, seed)
+    A, B = both[:, :dimensions], both[:, dimensions:]
+    mixed = [np.where(np.arange(dimensions) == i, B, A) for i in range(dimensions)]
+    return np.concatenate([A, B, *mixed])
+
+
+# -- statistics ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its confidence interval; an end that the samples do not tell is nan."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What the values of a sample say; intervals as for independent samples.
+
+    Attributes:
+        mean, deviation: the latter with n - 1.
+        quantiles: at `QUANTILES`.
+    """
+
+    mean: Estimate
+    deviation: Estimate
+    quantiles: tuple[Estimate, ...]
+
+
+def statistics(values: np.ndarray) -> Statistics:
+    """Return mean, standard deviation and quantiles of values (n,), n >= 2.
+
+    Standard errors s / sqrt(n) and sqrt(m4 - s^4 (n - 3) / (n - 1)) / (2 s sqrt(n)) with the fourth
+    central moment m4; quantiles lie between order statistics. Even samples (`unit_points`) do
+    better than these intervals say.
+    """
+    n = len(values)
+    wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
+    mean, s = float(values.mean()), float(values.std(ddof=1))
+    of_mean = s / math.sqrt(n)
+    m4 = float(np.mean((values - mean) ** 4))
+    of_s = math.sqrt(max(m4 - s**4 * (n - 3) / (n - 1), 0.0) / n) / (2.0 * s) if s > 0.0 else 0.0
+    return Statistics(
+        Estimate(mean, mean - wide * of_mean, mean + wide * of_mean),
+        Estimate(s, s - wide * of_s, s + wide * of_s),
+        tuple(quantile(values, share) for share in QUANTILES),
+    )
+
+
+def quantile(values: np.ndarray, share: float) -> Estimate:
+    """Return a quantile of values (n,), between two order statistics whatever the distribution.
+
+    P(x_(l) <= quantile < x_(u)) = P(l <= B < u) with B binomial. Source: David & Nagaraja, Order
+    Statistics (2003), 7.1, doi:10.1002/0471722162.
+    """
+    ordered = np.sort(values)
+    n = len(ordered)
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low = int(stats.binom.ppf(tail, n, share))
+    high = int(stats.binom.ppf(1.0 - tail, n, share)) + 1
+    return Estimate(
+        float(np.quantile(ordered, share)),
+        float(ordered[low - 1]) if low >= 1 else math.nan,
+        float(ordered[high - 1]) if high <= n else math.nan,
+    )
+
+
+# -- Sobol' indices --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Indices:
+    """Shares of the variance, one an input.
+
+    Attributes:
+        first: of the input alone.
+        total: of the input alone and together with others.
+        degree: of the polynomial they were taken from; 0 without one.
+        unexplained: share of the variance that the polynomial misses, found by leaving one out.
+    """
+
+    first: tuple[Estimate, ...]
+    total: tuple[Estimate, ...]
+    degree: int = 0
+    unexplained: float = math.nan
+
+
+def saltelli_indices(values: np.ndarray, dimensions: int, seed: int) -> Indices:
+    """Return the indices from the values ((d + 2) n,) at `saltelli_points`.
+
+    With V the variance: S_i = mean(f(B) (f(A_B^i) - f(A))) / V and
+    T_i = mean((f(A) - f(A_B^i))^2) / (2 V), f without its mean; intervals by bootstrap.
+    Sources: Saltelli et al. (2010), doi:10.1016/j.cpc.2009.09.018; Jansen (1999),
+    doi:10.1016/S0010-4655(98)00154-4.
+    """
+    rows = values.reshape(dimensions + 2, -1)
+    n = rows.shape[1]
+
+    def estimate(weights: np.ndarray) -> np.ndarray:
+        mean = 0.5 * (rows[0] + rows[1]) @ weights
+        f = rows - mean
+        variance = 0.5 * (f[0] ** 2 + f[1] ** 2) @ weights
+        if variance == 0.0:
+            return np.zeros(2 * dimensions)
+        first = (f[1] * (f[2:] - f[0])) @ weights
+        total = 0.5 * (f[0] - f[2:]) ** 2 @ weights
+        return np.concatenate([first, total]) / variance
+
+    found = _bootstrap(estimate, n, seed)
+    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]))
+
+
+def polynomial_indices(
+    samples: np.ndarray, values: np.ndarray, distributions: Sequence[Distribution]
+) -> Indices:
+    """Return the indices of the polynomial that fits values (n,) at samples (n, d).
+
+    Least squares in products of the distributions' orthonormal polynomials, whose squared
+    coefficients are shares of the variance; the total degree is the one that leaves the least
+    error when each sample is left out in turn; intervals by jackknife.
+    Sources: Sudret (2008), doi:10.1016/j.ress.2007.04.002; Blatman & Sudret (2010),
+    doi:10.1016/j.probengmech.2009.10.003.
+    """
+    n, dimensions = samples.shape
+    spread = values - values.mean()
+    if not spread.any():
+        none = (Estimate(0.0, 0.0, 0.0),) * dimensions
+        return Indices(none, none, 0, 0.0)
+    degrees = [p for p in range(1, MAX_DEGREE + 1) if _terms(dimensions, p) <= n / SAMPLES_A_TERM]
+    single = [
+        one.polynomials(samples[:, i], max(degrees, default=1))
+        for i, one in enumerate(distributions)
+    ]
+    fits = []
+    for degree in degrees or [1]:
+        powers = _powers(dimensions, degree)
+        basis = np.prod([single[i][:, powers[:, i]] for i in range(dimensions)], axis=0)
+        fits.append(_fit(basis, spread, powers))
+    best = min(fits, key=lambda fit: fit.left_out)
+    shares = [_shares(best.powers, c) for c in (best.all_but_one, best.coefficients[None])]
+    found = [_jackknife(share[0], leaving) for share, leaving in zip(shares[1].T, shares[0].T)]
+    degree = int(best.powers.sum(axis=1).max())
+    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]), degree, best.left_out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A polynomial fitted by least squares.
+
+    Attributes:
+        powers: (terms, d), see `_powers`.
+        coefficients: (terms,).
+        all_but_one: (n, terms) those without each of the samples.
+        left_out: relative squared error at each sample of the fit to all others.
+    """
+
+    powers: np.ndarray
+    coefficients: np.ndarray
+    all_but_one: np.ndarray
+    left_out: float
+
+
+def _fit(basis: np.ndarray, values: np.ndarray, powers: np.ndarray) -> _Fit:
+    """Fit values (n,) in a basis (n, terms)."""
+    q, r = np.linalg.qr(basis)
+    diagonal = np.abs(np.diag(r))
+    if len(basis) <= basis.shape[1] or diagonal.min() < 1e-10 * diagonal.max():
+        none = np.full(len(powers), math.nan)
+        return _Fit(powers, none, np.full(basis.shape, math.nan), math.inf)
+    own = 1.0 - np.sum(q**2, axis=1)  # what a sample does not decide alone
+    errors = (values - q @ (q.T @ values)) / np.maximum(own, REMOTE)
+    coefficients = np.linalg.solve(r, q.T @ values)
+    without = coefficients - np.linalg.solve(r, (q * errors[:, None]).T).T
+    return _Fit(powers, coefficients, without, float(errors @ errors / (values @ values)))
+
+
+def _shares(powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return first (d) and total (d) indices (m, 2 d) from coefficients (m, terms)."""
+    involved = powers > 0
+    alone = involved & (involved.sum(axis=1) == 1)[:, None]
+    squares = coefficients**2
+    variance = squares[:, 1:].sum(axis=1, keepdims=True)
+    return np.concatenate([squares @ alone, squares @ involved], axis=1) / variance
+
+
+def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
+    """Return an index within [0, 1] with an interval from those (n,) that leave a sample out.
+
+    Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
+    """
+    n = len(leaving)
+    wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
+    half = wide * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
+    return Estimate(float(value), max(float(value) - half, 0.0), min(float(value) + half, 1.0))
+
+
+def _terms(dimensions: int, degree: int) -> int:
+    return math.comb(dimensions + degree, degree)
+
+
+def _powers(dimensions: int, degree: int) -> np.ndarray:
+    """Return the degrees (terms, d) of all products up to a total degree, the constant first."""
+    rows: list[tuple[int, ...]] = [()]
+    for _ in range(dimensions):
+        rows = [(*row, p) for row, p in product(rows, range(degree + 1)) if sum(row) + p <= degree]
+    return np.array(sorted(rows, key=lambda row: (sum(row), row)))
+
+
+def _bootstrap(
+    estimate: Callable[[np.ndarray], np.ndarray], count: int, seed: int
+) -> list[Estimate]:
+    """Return what `estimate(weights)` gives, with intervals from samples drawn with repetition.
+
+    Source: Efron & Tibshirani (1993), 13.3, doi:10.1201/9780429246593.
+    """
+    even = np.full(count, 1.0 / count)
+    draws = np.random.default_rng(seed).multinomial(count, even, size=RESAMPLES) / count
+    found = np.array([estimate(weights) for weights in draws])
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low, high = np.quantile(found, [tail, 1.0 - tail], axis=0)
+    return [Estimate(*map(float, row)) for row in zip(estimate(even), low, high)]

@@ -1,0 +1,346 @@
+"""Distributions, samples, statistics and Sobol' indices against closed forms."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from dolfinopt.errors import InputError
+from dolfinopt.study.statistics import (
+    Distribution,
+    draw,
+    parse_distribution,
+    polynomial_indices,
+    quantile,
+    saltelli_indices,
+    saltelli_points,
+    statistics,
+    unit_points,
+)
+
+TEXTS = (
+    "normal:6:0.3",
+    "normal:70e9:2e9",
+    "uniform:-2:3",
+    "triangular:0:1:4",
+    "triangular:1:1:2",
+    "lognormal:2:0.25",
+)
+
+
+# -- distributions ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "mean", "variance"),
+    [
+        ("normal:6:0.3", 6.0, 0.09),
+        ("uniform:-2:3", 0.5, 25.0 / 12.0),
+        ("triangular:0:1:4", 5.0 / 3.0, (16.0 + 1.0 - 4.0) / 18.0),
+        ("triangular:1:1:2", 4.0 / 3.0, 1.0 / 18.0),
+        (
+            "lognormal:2:0.25",
+            2.0 * math.exp(0.25**2 / 2.0),
+            4.0 * math.exp(0.25**2) * math.expm1(0.25**2),
+        ),
+    ],
+)
+def test_moments(text, mean, variance):
+    """Text-book moments; the tails that are left out hold 1e-12 and reach seven deviations."""
+    law = parse_distribution(text)
+    assert law.mean == pytest.approx(mean, rel=1e-9)
+    assert law.deviation**2 == pytest.approx(variance, rel=1e-8)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_quantiles_are_those_of_the_distribution(text):
+    law = parse_distribution(text)
+    shares = np.linspace(0.001, 0.999, 50)
+    np.testing.assert_allclose(law.law.cdf(law.at(shares)), shares, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "low", "high"),
+    [("normal:1:0.1", -math.inf, 1.05), ("normal:1:2", 0.0, math.inf), ("normal:0:1", -1.0, 2.0)],
+)
+def test_cut_off(text, low, high):
+    """As SciPy's truncated normal distribution; all samples lie within."""
+    law = parse_distribution(text).within(low, high)
+    mean, deviation = map(float, text.split(":")[1:])
+    ends = (low - mean) / deviation, (high - mean) / deviation
+    exact = stats.truncnorm(*ends, mean, deviation)
+    assert law.mean == pytest.approx(exact.mean(), rel=1e-8, abs=1e-10)
+    assert law.deviation == pytest.approx(exact.std(), rel=1e-8)
+    shares = np.linspace(0.0, 1.0, 1001)
+    samples = law.at(shares)
+    assert low <= samples.min() and samples.max() <= high
+    np.testing.assert_allclose(samples[1:-1], exact.ppf(shares[1:-1]), rtol=1e-8, atol=1e-10)
+    beyond = stats.norm.cdf(ends[0]) + stats.norm.sf(ends[1])
+    assert law.cut_off == pytest.approx(beyond, rel=1e-12)
+
+
+def test_own_bounds_are_kept():
+    law = parse_distribution("uniform:0.9:1")
+    assert law.within(0.0, 1.0).cut_off == 0.0
+    with pytest.raises(InputError, match=r"uniform:0\.9:1: reaches from 0\.9 to 1"):
+        law.within(0.0, 0.95)
+    with pytest.raises(InputError, match=r"99\.9 % of it lie beyond"):
+        parse_distribution("normal:3:1").within(-math.inf, 0.0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "gauss:1:2", "normal", "normal:1", "normal:1:0", "normal:1:-1", "normal:1:2:3",
+     "normal:a:1", "normal:inf:1", "normal:1:nan", "uniform:2:1", "uniform:1:1", "triangular:0:2:1",
+     "triangular:1:1:1", "triangular:0:1", "lognormal:0:1", "lognormal:-1:1", "lognormal:1:0"],
+)  # fmt: skip
+def test_no_distribution(text):
+    with pytest.raises(InputError, match="expected") as caught:
+        parse_distribution(text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_polynomials_are_orthonormal(text):
+    """Moments of products by SciPy's adaptive quadrature of the density."""
+    law = parse_distribution(text)
+    x, weights = quadrature(law)
+    rows = law.polynomials(x, 4)
+    # Tails of 1e-12, times polynomials of degree 8 in them, are left out.
+    np.testing.assert_allclose((rows.T * weights) @ rows, np.eye(5), atol=1e-6)
+
+
+def quadrature(law: Distribution) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of the double exponential rule between a law's quartiles."""
+    t, h = np.linspace(-3.5, 3.5, 401, retstep=True)
+    inner = 0.5 * np.pi * np.sinh(t)
+    slope = 0.5 * np.pi * np.cosh(t) / np.cosh(inner) ** 2
+    ends = {*law.at(np.array([0.0, 0.25, 0.5, 0.75, 1.0])), law.law.ppf(0.0), law.law.ppf(1.0)}
+    parts = list(pairwise(sorted(end for end in ends if np.isfinite(end))))
+    x = np.concatenate([0.5 * (a + b) + 0.5 * (b - a) * np.tanh(inner) for a, b in parts])
+    w = np.concatenate([0.5 * (b - a) * slope * h for a, b in parts])
+    return x, w * law.law.pdf(x)
+
+
+def test_polynomials_of_uniform_inputs_are_legendre():
+    x = np.linspace(-1.0, 1.0, 9)
+    found = parse_distribution("uniform:-1:1").polynomials(x, 2)
+    expected = np.stack(
+        [np.ones_like(x), np.sqrt(3.0) * x, np.sqrt(5.0) * 0.5 * (3.0 * x**2 - 1.0)], axis=1
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-9)  # tails of 1e-12 are left out
+
+
+# -- samples ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
+def test_seeds_repeat(sampler):
+    one = unit_points(50, 3, sampler, 7)
+    assert one.shape == (50, 3) and one.min() >= 0.0 and one.max() < 1.0
+    np.testing.assert_array_equal(one, unit_points(50, 3, sampler, 7))
+    assert not np.array_equal(one, unit_points(50, 3, sampler, 8))
+
+
+def test_latin_hypercube_has_a_point_in_every_interval():
+    points = unit_points(40, 3, "latin-hypercube", 3)
+    for column in points.T:
+        np.testing.assert_array_equal(np.sort((40 * column).astype(int)), np.arange(40))
+
+
+def test_sobol_fills_every_box():
+    """64 points of a (0, 6, 2)-net: one in each box of 8 x 8, 16 x 4, 4 x 16."""
+    points = unit_points(64, 2, "sobol", 5)
+    for a, b in ((8, 8), (16, 4), (4, 16), (64, 1)):
+        boxes = {(int(a * x), int(b * y)) for x, y in points}
+        assert len(boxes) == 64
+
+
+def test_more_sobol_points_begin_alike():
+    few, many = (unit_points(count, 3, "sobol", 1) for count in (100, 257))
+    np.testing.assert_array_equal(few, many[:100])
+
+
+def test_samples_follow_the_distributions():
+    laws = [parse_distribution(text) for text in TEXTS]
+    samples = draw(laws, unit_points(4096, len(laws), "sobol", 2))
+    for law, column in zip(laws, samples.T, strict=True):
+        # 4096 net points: the distribution function is right to some 1/4096.
+        assert stats.kstest(column, law.law.cdf).statistic < 2e-3
+
+
+def test_saltelli_points():
+    points = saltelli_points(16, 3, "sobol", 1).reshape(5, 16, 3)
+    A, B, mixed = points[0], points[1], points[2:]
+    assert not np.isin(A, B).any()
+    for i in range(3):
+        np.testing.assert_array_equal(mixed[i][:, i], B[:, i])
+        np.testing.assert_array_equal(np.delete(mixed[i], i, axis=1), np.delete(A, i, axis=1))
+
+
+# -- statistics ------------------------------------------------------------------------------
+
+
+def test_statistics_of_a_normal_sample():
+    """Net points give the law's figures; intervals have the width of independent samples."""
+    n = 2048
+    values = parse_distribution("normal:6:0.3").at(unit_points(n, 1, "sobol", 4)[:, 0])
+    found = statistics(values)
+    assert found.mean.value == pytest.approx(6.0, abs=1e-4)
+    assert found.deviation.value == pytest.approx(0.3, rel=2e-3)
+    assert found.mean.high - found.mean.value == pytest.approx(1.96 * 0.3 / n**0.5, rel=5e-3)
+    # Of a normal sample the standard error is s / sqrt(2 n); its fourth moment is less certain.
+    width = found.deviation.high - found.deviation.value
+    assert width == pytest.approx(1.96 * 0.3 / (2 * n) ** 0.5, rel=0.03)
+    for one, share in zip(found.quantiles, (0.05, 0.5, 0.95), strict=True):
+        assert one.value == pytest.approx(stats.norm.ppf(share, 6.0, 0.3), abs=2e-3)
+        error = (share * (1.0 - share) / n) ** 0.5 / stats.norm.pdf(one.value, 6.0, 0.3)
+        assert one.high - one.low == pytest.approx(2.0 * 1.96 * error, rel=0.1)
+
+
+def test_intervals_cover():
+    """Of 1000 samples of a skewed law, intervals miss the truth 5 % of the time, or less."""
+    rng = np.random.default_rng(3)
+    law = stats.gamma(4.0)
+    missed = np.zeros(5)
+    for _ in range(1000):
+        found = statistics(law.rvs(100, random_state=rng))
+        truth = [law.mean(), law.std(), *law.ppf([0.05, 0.5, 0.95])]
+        estimates = [found.mean, found.deviation, *found.quantiles]
+        for k, (one, true) in enumerate(zip(estimates, truth, strict=True)):
+            missed[k] += not (one.low <= true <= one.high or math.isnan(one.low + one.high))
+    # Three standard errors of 1000 trials are 2 %; those of s rest on the law's fourth moment,
+    # which 100 samples underestimate.
+    assert missed[0] / 1000 < 0.08 and missed[1] / 1000 < 0.14
+    assert (missed[2:] / 1000 < 0.07).all() and (missed > 0).all()
+
+
+def test_few_samples_bound_no_quantile():
+    """The least of n samples lies above the 5 % quantile with probability 0.95^n."""
+    values = np.arange(20.0)
+    one = quantile(values, 0.05)
+    assert math.isnan(one.low) and one.high == values[3]  # B(20, 0.05) <= 3 but for 1.6 %
+    many = quantile(np.arange(200.0), 0.05)
+    assert many.low < many.value < many.high
+
+
+def test_statistics_of_a_constant():
+    found = statistics(np.full(20, 3.0))
+    assert (found.mean.low, found.mean.high) == (3.0, 3.0)
+    assert found.deviation.value == found.deviation.high == 0.0
+
+
+# -- Sobol' indices --------------------------------------------------------------------------
+
+A, B = 7.0, 0.1
+
+
+def ishigami(x):
+    """Return sin x1 + a sin^2 x2 + b x3^4 sin x1 (Ishigami & Homma 1990)."""
+    return np.sin(x[:, 0]) + A * np.sin(x[:, 1]) ** 2 + B * x[:, 2] ** 4 * np.sin(x[:, 0])
+
+
+def ishigami_indices():
+    """Return its first and total indices in closed form."""
+    v1 = 0.5 * (1.0 + B * np.pi**4 / 5.0) ** 2
+    v2 = A**2 / 8.0
+    v13 = B**2 * np.pi**8 * (1.0 / 18.0 - 1.0 / 50.0)
+    total = v1 + v2 + v13
+    return np.array([v1, v2, 0.0]) / total, np.array([v1 + v13, v2, v13]) / total
+
+
+ANGLE = parse_distribution(f"uniform:{-math.pi}:{math.pi}")
+
+
+@pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
+def test_saltelli_on_ishigami(sampler):
+    points = draw([ANGLE] * 3, saltelli_points(4096, 3, sampler, 1))
+    found = saltelli_indices(ishigami(points), 3, 1)
+    first, total = ishigami_indices()
+    for one, exact in zip((*found.first, *found.total), (*first, *total), strict=True):
+        assert one.low <= exact <= one.high
+        # Independent samples are right to 0.02; 4096 of a hypercube in six dimensions not better.
+        assert one.value == pytest.approx(exact, abs=0.03)
+        assert 0.005 < one.high - one.low < 0.12
+
+
+def test_saltelli_intervals_are_repeatable():
+    points = draw([ANGLE] * 3, saltelli_points(256, 3, "sobol", 1))
+    values = ishigami(points)
+    again = saltelli_indices(values, 3, 5)
+    assert repr(saltelli_indices(values, 3, 5)) == repr(again)  # one of its numbers is nan
+    # A mean far from zero does not spoil the estimates.
+    for one, other in zip(
+        saltelli_indices(values, 3, 5).first, saltelli_indices(values + 1e6, 3, 5).first
+    ):
+        assert one.value == pytest.approx(other.value, abs=1e-7)
+
+
+def test_polynomial_on_ishigami():
+    """Degree 10 leaves 1e-5 of the variance."""
+    samples = draw([ANGLE] * 3, unit_points(1000, 3, "sobol", 1))
+    found = polynomial_indices(samples, ishigami(samples), [ANGLE] * 3)
+    first, total = ishigami_indices()
+    np.testing.assert_allclose([one.value for one in found.first], first, atol=1e-3)
+    np.testing.assert_allclose([one.value for one in found.total], total, atol=1e-3)
+    assert found.degree >= 9 and found.unexplained < 1e-4
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("normal:6:0.3", "normal:70e9:2e9", "uniform:0.9:1"),
+        ("lognormal:2:0.25", "triangular:0:1:4", "triangular:1:1:2"),
+    ],
+)
+def test_linear_model(texts):
+    """Shares (a_i s_i)^2 of the variance, whatever the distributions; nothing is left over."""
+    laws = [parse_distribution(text) for text in texts]
+    slopes = np.array([3.0 / laws[0].deviation, -2.0 / laws[1].deviation, 1.0 / laws[2].deviation])
+    exact = np.array([9.0, 4.0, 1.0]) / 14.0
+    samples = draw(laws, unit_points(100, 3, "sobol", 1))
+    found = polynomial_indices(samples, 5.0 + samples @ slopes, laws)
+    for one in (found.first, found.total):
+        np.testing.assert_allclose([share.value for share in one], exact, rtol=1e-8)
+    assert found.unexplained < 1e-20
+    points = draw(laws, saltelli_points(2048, 3, "sobol", 1))
+    direct = saltelli_indices(5.0 + points @ slopes, 3, 1)
+    for one in (direct.first, direct.total):
+        np.testing.assert_allclose([share.value for share in one], exact, atol=0.03)
+
+
+def test_product_has_an_interaction():
+    """(1 + z1) (1 + z2 / 2): variances 1, 1/4, 1/4 of the parts."""
+    laws = [parse_distribution("normal:0:1")] * 2
+    z = draw(laws, unit_points(200, 2, "sobol", 1))
+    found = polynomial_indices(z, (1.0 + z[:, 0]) * (1.0 + 0.5 * z[:, 1]), laws)
+    first, total = ([one.value for one in rows] for rows in (found.first, found.total))
+    np.testing.assert_allclose(first, [1.0 / 1.5, 0.25 / 1.5], rtol=1e-8)
+    np.testing.assert_allclose(total, [1.25 / 1.5, 0.5 / 1.5], rtol=1e-8)
+
+
+def test_noise_is_left_unexplained():
+    """A tenth of the variance is noise; leaving one out finds it, and intervals cover."""
+    rng = np.random.default_rng(0)
+    laws = [parse_distribution("normal:0:1")] * 2
+    exact = np.array([0.8, 0.2])
+    covered = 0
+    for seed in range(20):
+        z = draw(laws, unit_points(400, 2, "sobol", seed))
+        y = z @ np.sqrt(exact) + rng.normal(0.0, 1.0 / 3.0, 400)
+        found = polynomial_indices(z, y, laws)
+        assert found.unexplained == pytest.approx(0.1, abs=0.03)
+        covered += found.first[0].low <= 0.8 <= found.first[0].high
+    # 95 % intervals that hold less than 16 times of 20 have a chance of 0.3 %.
+    assert covered >= 16
+
+
+def test_a_constant_has_no_shares():
+    laws = [parse_distribution("normal:0:1")] * 2
+    z = draw(laws, unit_points(50, 2, "sobol", 1))
+    assert polynomial_indices(z, np.full(50, 2.0), laws).total[0].value == 0.0
+    assert saltelli_indices(np.full(64, 2.0), 2, 1).first[1].value == 0.0
