@@ -114,6 +114,9 @@ def test_every_block_runs(page, folder):
         elif block.title:
             small = made_small(block.text) if block.title.endswith(".toml") else block.text
             (folder / block.title).write_text(small + "\n")
+        elif block.language == "python" and "gmsh.initialize" in block.text:
+            # OpenCASCADE keeps the unit of the file that this process has read last.
+            subprocess.run([sys.executable, "-c", block.text], cwd=folder, check=True)
         elif block.language == "python":
             exec(compile(block.text, page.name, "exec"), names)
         elif block.language == "sh":
