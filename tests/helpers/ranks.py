@@ -33,11 +33,11 @@ class Ranks:
         self.stderr = os.fdopen(os.dup(2), "w")
         self.unread: list[str] = []
 
-    @pytest.hookimpl(trylast=True)
-    def pytest_configure(self, config: pytest.Config) -> None:
-        """Silence all ranks but the first."""
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_sessionstart(self, session: pytest.Session) -> None:
+        """Silence all ranks but the first; the reporter does not exist before."""
         if self.comm.rank > 0:
-            reporter = config.pluginmanager.get_plugin("terminalreporter")
+            reporter = session.config.pluginmanager.get_plugin("terminalreporter")
             reporter._tw._file = open(os.devnull, "w")  # for the life of the process
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
