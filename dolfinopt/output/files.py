@@ -215,12 +215,16 @@ def gather_views(
         return gather_cells(share, mine)
 
     def modes(index: int, arm: Arm) -> np.ndarray:
-        cells = arm.elastic.operators.cells
+        cells = arm.substructure.operators.cells
         if arm.basis is None:
             return np.zeros((*cells.shape, 2, 0))
         return arm.basis.V[cells]
 
-    corners = collect(lambda _, arm: arm.elastic.points[arm.elastic.operators.cells])
+    def points(index: int, arm: Arm) -> np.ndarray:
+        operators = arm.substructure.operators  # also of arms that no design was set for
+        return operators.points[operators.cells]
+
+    corners = collect(points)
     centroids = collect(lambda _, arm: arm.mesh.centroid)
     densities = collect(lambda index, _: x_phys[index])
     shapes = collect(modes)

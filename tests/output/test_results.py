@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.output import run_folder as results
+from dolfinopt.output.files import gather_views
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
@@ -71,3 +72,16 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
         with pytest.raises(OSError, match="disk full"):
             results._write(shared_tmp_path, [], one.trajectory, None, {}, False)
         assert not (shared_tmp_path / "summary.json").exists()
+
+
+def test_views_of_arms_without_a_current_design():
+    """Studies and the paper's page draw designs that they have read but never assembled."""
+    scene = do.load_scene(SCENE, SMALL)
+    share = do.share_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, share, do.Ledger())
+    views = gather_views(scene, share, arms, {k: arm.uniform(0.5) for k, arm in arms.items()})
+    if WORLD.rank == 0:
+        assert [view.name for view in views] == ["arm1", "arm2"]
+        for view in views:
+            assert view.corners.shape == (60, 4, 2) and view.modes.shape[-1] == 0
+            assert view.corners[..., 0].max() - view.corners[..., 0].min() == pytest.approx(1.0)
