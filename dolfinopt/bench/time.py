@@ -22,14 +22,11 @@ from dolfinopt.bench.common import (
     timed,
 )
 from dolfinopt.dynamics import generalized_alpha, radau
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.problem import (
-    ElasticProblem,
-    even_steps,
-    relative_error,
-    static_start,
-)
 from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.dynamics.system import relative_error
+from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.mechanism import deviation, inverse_dynamics, tangent
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
@@ -87,7 +84,7 @@ class Judge:
         q: (n, N) of the reference.
     """
 
-    problem: ElasticProblem
+    problem: ElasticSystem
     t: np.ndarray
     q: np.ndarray
 
@@ -101,7 +98,7 @@ class Judge:
         return relative_error(mechanism, q - self.q, self.q), far
 
 
-def judge(problem: ElasticProblem, tolerance: float = REFERENCE_TOLERANCE) -> Judge:
+def judge(problem: ElasticSystem, tolerance: float = REFERENCE_TOLERANCE) -> Judge:
     """Solve by Radau of six stages to `tolerance`, or to what rounding leaves of it."""
     while True:
         try:
@@ -115,7 +112,7 @@ def judge(problem: ElasticProblem, tolerance: float = REFERENCE_TOLERANCE) -> Ju
     return Judge(problem, t, solution.sample(t))
 
 
-def accelerations(problem: ElasticProblem, t: float, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+def accelerations(problem: ElasticSystem, t: float, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return qdd (N,) from M(q, t) qdd = -rows(q, qd, 0): the rows are affine in qdd.
 
     Args:
@@ -131,7 +128,7 @@ def accelerations(problem: ElasticProblem, t: float, q: np.ndarray, qd: np.ndarr
     return np.linalg.solve(mass, -rows)
 
 
-def jacobian(problem: ElasticProblem, t: float, y: np.ndarray) -> np.ndarray:
+def jacobian(problem: ElasticSystem, t: float, y: np.ndarray) -> np.ndarray:
     """Return the derivative (2N, 2N) of [qd, qdd] by y = [q, qd], exact."""
     size = len(y) // 2
     q, qd = y[:size], y[size:]
@@ -143,7 +140,7 @@ def jacobian(problem: ElasticProblem, t: float, y: np.ndarray) -> np.ndarray:
     return np.vstack([upper, lower])
 
 
-def scipy_motion(problem: ElasticProblem, method: str, tolerance: float, t: np.ndarray,
+def scipy_motion(problem: ElasticSystem, method: str, tolerance: float, t: np.ndarray,
                  scales: tuple[float, float]) -> np.ndarray:  # fmt: skip
     """Return q (n, N) at t by SciPy's `solve_ivp`, piece by piece between the breakpoints.
 
@@ -157,7 +154,7 @@ def scipy_motion(problem: ElasticProblem, method: str, tolerance: float, t: np.n
     Raises:
         ConvergenceError: SciPy gave up.
     """
-    start = static_start(problem)
+    start = problem.initial_state()[0][0]
     size = len(start)
     y = np.concatenate([start, np.zeros(size)])
     q = np.empty((len(t), size))
@@ -225,7 +222,7 @@ def _scipys(judge: Judge, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Sol
     scales = float(np.abs(z).max()), float(np.abs(rates).max())
 
     def solved(method: str, tolerance: float) -> np.ndarray:
-        found = scipy_motion(modes.problem, method, tolerance, judge.t, scales)
+        found = scipy_motion(modes.system, method, tolerance, judge.t, scales)
         return modes.from_modes(found)
 
     for method in ("Radau", "BDF", "LSODA"):
@@ -245,7 +242,7 @@ def _measure(plan: Plan, tell: Tell) -> list[Row]:
             motion = partial(rigid_motion, scene=scene)
             tell(f"reference, {label}, q = {coordinates}")
             reference = judge(
-                ElasticProblem(mechanism, motion, breakpoints(scene)),
+                ElasticSystem(mechanism, motion, breakpoints(scene)),
                 QUICK_REFERENCE if plan.quick else REFERENCE_TOLERANCE,
             )
             for method, solvers in (*_ours(reference, plan), *_scipys(reference, plan)):

@@ -17,14 +17,12 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, arms_of, bodies_of, timed
 from dolfinopt.bench.time import scipy_motion
 from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.problem import (
-    ElasticProblem,
-    Solution,
-    even_steps,
-    relative_error,
-)
 from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.system import relative_error
+from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.profiling import Ledger
@@ -101,7 +99,7 @@ class Case:
     design: str
     scene: Scene
     x_phys: dict[int, np.ndarray]
-    problem: ElasticProblem
+    problem: ElasticSystem
 
     def cells(self) -> Row:
         """Return what tells the case from others, as the rows begin."""
@@ -140,7 +138,7 @@ def random_case(scene: Scene, arms: dict[int, Arm], number: int, folder: Path) -
             continue  # out of reach
         mechanism = build_mechanism(found, bodies_of(found, arms, x_phys))
         motion = partial(rigid_motion, scene=found)
-        problem = ElasticProblem(mechanism, motion, breakpoints(found))
+        problem = ElasticSystem(mechanism, motion, breakpoints(found))
         if modes_of(problem).frequencies.min() * found.motion.duration >= LEAST_SWING:
             return Case(number, design, found, x_phys, problem)
 
@@ -245,7 +243,7 @@ def _measure(plan: Plan, tell: Tell) -> list[Row]:
     return rows
 
 
-def _slowest(case: Case, arms: dict[int, Arm]) -> ElasticProblem:
+def _slowest(case: Case, arms: dict[int, Arm]) -> ElasticSystem:
     """Return the case with nothing but every arm's slowest vibration."""
     scene = reduced(case.scene, "modal", 1)
     mechanism = build_mechanism(scene, bodies_of(scene, arms, case.x_phys))
@@ -271,7 +269,7 @@ def judged(case: Case, check: float = math.nan) -> list[Row]:
     return [(*case.cells(), *_cells(one, case.problem, right, check, failure)) for one in runs]
 
 
-def run(problem: ElasticProblem, tolerance: float) -> Run:
+def run(problem: ElasticSystem, tolerance: float) -> Run:
     """Simulate from cold to a tolerance, as `simulate` does."""
 
     def solve() -> Solution | ConvergenceError:
@@ -283,7 +281,7 @@ def run(problem: ElasticProblem, tolerance: float) -> Run:
     return Run(tolerance, *timed(solve, 1))
 
 
-def reference(problem: ElasticProblem, judged: Run) -> Solution:
+def reference(problem: ElasticSystem, judged: Run) -> Solution:
     """Return the motion to a hundredth of the tolerance of a run, by its own steps and order.
 
     Steps are doubled until the estimate is below the goal, from one more than the run has: not by
@@ -304,7 +302,7 @@ def reference(problem: ElasticProblem, judged: Run) -> Solution:
     raise ConvergenceError(f"an error of {start.error:.2g} with {len(start.a)} steps")
 
 
-def checked(problem: ElasticProblem) -> float:
+def checked(problem: ElasticSystem) -> float:
     """Return the relative difference of a problem's reference from SciPy's explicit solution.
 
     In the arms' vibrations, where one absolute tolerance suits all coordinates. nan if either
@@ -317,19 +315,19 @@ def checked(problem: ElasticProblem) -> float:
         sizes = [np.abs(modes.to_modes(right.sample(t, k))).max() for k in (0, 1)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # it is given a Jacobian in vain
-            z = scipy_motion(modes.problem, CHECK_METHOD, CHECK_TOLERANCE, t, (sizes[0], sizes[1]))
+            z = scipy_motion(modes.system, CHECK_METHOD, CHECK_TOLERANCE, t, (sizes[0], sizes[1]))
     except ConvergenceError:
         return math.nan
     q = right.sample(t)
     return relative_error(problem.mechanism, modes.from_modes(z) - q, q)
 
 
-def _instants(problem: ElasticProblem) -> np.ndarray:
+def _instants(problem: ElasticSystem) -> np.ndarray:
     return np.linspace(0.0, problem.breakpoints[-1], INSTANTS)
 
 
 def _cells(
-    one: Run, problem: ElasticProblem, right: Solution | None, other: float, failure: str
+    one: Run, problem: ElasticSystem, right: Solution | None, other: float, failure: str
 ) -> Row:
     """Return the rest of a row, from the tolerance on."""
     found = one.found

@@ -6,7 +6,7 @@ step's beginning, the multipliers of a function J follow backwards from
     p_n = dJ/dy_n + Phi_n' p_{n+1} + S_n' lambda_n,  S_n = dR_n/dy_n,
 and dJ by any constant b of the bodies is sum_n lambda_n . dR_n/db beside the explicit part: exact
 for the discrete trajectory. Solved in modal coordinates with Newton's matrix of few slow
-coordinates and corrected until it is exact (`factors`). Source: Hairer, Lubich & Wanner,
+coordinates and corrected until it is exact (`newton_matrix`). Source: Hairer, Lubich & Wanner,
 Geometric Numerical Integration (2006), VI.1; Sanz-Serna, SIAM Rev. 58 (2016),
 doi:10.1137/151002769.
 """
@@ -17,22 +17,24 @@ import numpy as np
 
 from dolfinopt.dynamics.collocation import (
     Stages,
-    pulled_back,
     radau_iia,
     stage_values,
     stages_of,
     tangent_at,
+    vector_jacobian_product,
 )
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
 from dolfinopt.dynamics.newton_matrix import (
-    Factors,
+    NewtonMatrix,
     factorise,
     limits_for,
-    next_slow,
+    next_slow_coordinates,
     windows,
 )
-from dolfinopt.dynamics.problem import ElasticProblem, Solution, lagrange_integrals
-from dolfinopt.multibody.mechanism import Tangent, body_slopes, tangent
+from dolfinopt.dynamics.solution import Solution, lagrange_integrals
+from dolfinopt.dynamics.system import Linearisation
+from dolfinopt.multibody.mechanism import body_gradient
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 # Share of the multipliers that a correction may have left: their error is a tenth of it or less.
@@ -40,41 +42,45 @@ ENOUGH = 1e-8
 POOR = 0.3  # contraction above which more coordinates are treated densely
 
 
-def trajectory_slopes(
-    problem: ElasticProblem, solution: Solution, t: np.ndarray, by_q: np.ndarray
+def trajectory_gradient(
+    system: ElasticSystem, solution: Solution, t: np.ndarray, by_q: np.ndarray
 ) -> list[ShapeIntegrals]:
     """Return dJ/d(constants) of every body through the trajectory's coordinates.
 
     Args:
-        problem, solution: as solved by `radau.integrate`.
+        system, solution: as solved by `radau.integrate`.
         t: (m,) instants at which J looks at the coordinates, s.
         by_q: (m, N) dJ/dq there.
     """
-    method, modes = radau_iia(len(solution.nodes)), modes_of(problem)
-    stages = stages_of(modes, method, solution.edges)
+    method, modes = radau_iia(len(solution.nodes)), modes_of(system)
+    stages = stages_of(modes, method, solution.time_grid)
     z, zd, a = (modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
     z_s, zd_s = stage_values(stages, z, zd, a)
-    by_a, by_y = _sampled(solution, t, modes.slopes_to_modes(by_q))
+    by_a, by_y = _sampled(solution, t, modes.gradient_to_modes(by_q))
     multipliers, first = _backwards(stages, z_s, zd_s, a, by_a, by_y)
     q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
     size = q.shape[2]
+    times = solution.time_grid[:-1, None] + np.diff(solution.time_grid)[:, None] * method.c
+    motion = system.motion(times.ravel())
     # Rows in z are T' times those in q: their multipliers turn like coordinates.
     flat = (x.reshape(-1, size) for x in (q, qd, solution.a, modes.from_modes(multipliers)))
-    slopes = body_slopes(problem.mechanism, stages.motion, *flat)
-    by_start = modes.slopes_from_modes(first)
-    return add_slopes(slopes, _start_slopes(problem, solution.q[0], by_start))
+    gradient = body_gradient(system.mechanism, motion, *flat)
+    by_start = modes.gradient_from_modes(first)
+    return add_gradients(gradient, _equilibrium_gradient(system, solution.q[0], by_start))
 
 
-def add_slopes(first: list[ShapeIntegrals], second: list[ShapeIntegrals]) -> list[ShapeIntegrals]:
+def add_gradients(
+    first: list[ShapeIntegrals], second: list[ShapeIntegrals]
+) -> list[ShapeIntegrals]:
     """Return the sums, body by body."""
     return [a + b for a, b in zip(first, second, strict=True)]
 
 
 def _sampled(solution: Solution, t: np.ndarray, by_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return dJ by the steps' accelerations (n, s, N) and beginnings (n, 2, N); undoes `sample`."""
-    step = np.clip(np.searchsorted(solution.edges, t, side="left") - 1, 0, len(solution.a) - 1)
-    h = np.diff(solution.edges)[step]
-    tau = (t - solution.edges[step]) / h
+    """Return dJ by the steps' accelerations (n, s, N) and states (n, 2, N); undoes `sample`."""
+    step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(solution.a) - 1)
+    h = np.diff(solution.time_grid)[step]
+    tau = (t - solution.time_grid[step]) / h
     weights = lagrange_integrals(solution.nodes, tau)[2] * (h * h)[:, None]
     by_a = np.zeros_like(solution.a)
     by_y = np.zeros((len(solution.a), 2, by_q.shape[1]))
@@ -96,40 +102,46 @@ def _backwards(
     Newton's matrix is not the derivative where coordinates are treated as fast: what its answer
     leaves, by the exact derivative, is answered again until nothing is left.
     """
-    slow, limits = next_slow(stages, limits_for(stages), 0)
+    slow, limits = next_slow_coordinates(stages, limits_for(stages), 0)
     while True:
         multipliers, after = np.empty_like(a), np.zeros_like(by_y[0])
         for part in reversed(windows(stages, slow)):
             window = stages.window(part.start, part.stop)
             at = (q[part], qd[part], a[part])
-            factors = factorise(window, *at, slow)
-            exact = tangent_at(window, *at) if len(factors.fast) else factors.tangent
-            answer = _answered(factors, exact, by_a[part], by_y[part], after)
+            matrix = factorise(window, *at, slow)
+            exact = tangent_at(window, *at) if len(matrix.fast) else matrix.tangent
+            answer = _answered(matrix, exact, by_a[part], by_y[part], after)
             if answer is None:
                 break
             multipliers[part], after = answer
         else:
             return multipliers, after[0]
-        slow, limits = next_slow(stages, limits, len(slow))
+        slow, limits = next_slow_coordinates(stages, limits, len(slow))
 
 
 def _answered(
-    factors: Factors, exact: Tangent, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray
+    matrix: NewtonMatrix,
+    exact: Linearisation,
+    by_a: np.ndarray,
+    by_y: np.ndarray,
+    after: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return a window's multipliers and dJ by the state (2, N) at its beginning.
 
     None where corrections do not shrink by `POOR`.
     """
-    multipliers = factors.solve_transposed(by_a, by_y, after)
+    multipliers = matrix.solve_transposed(by_a, by_y, after)
     moved = np.abs(multipliers).max()
     enough = ENOUGH * moved
     while True:
-        slopes = exact.transposed(multipliers.reshape(-1, by_a.shape[2]))
-        more_a, more_y = pulled_back(factors.stages, *(x.reshape(by_a.shape) for x in slopes))
+        gradient = exact.transposed(multipliers.reshape(-1, by_a.shape[2]))
+        more_a, more_y = vector_jacobian_product(
+            matrix.stages, *(x.reshape(by_a.shape) for x in gradient)
+        )
         left_a, left_y = by_a + more_a, by_y + more_y
-        if len(factors.fast) == 0 or moved <= enough:
-            return multipliers, _before(factors.stages, left_y, after)
-        step = factors.solve_transposed(left_a, left_y, after)
+        if len(matrix.fast) == 0 or moved <= enough:
+            return multipliers, _before(matrix.stages, left_y, after)
+        step = matrix.solve_transposed(left_a, left_y, after)
         before, moved = moved, np.abs(step).max()
         if not moved <= POOR * before:
             return None
@@ -143,10 +155,12 @@ def _before(stages: Stages, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.stack([by_q.sum(axis=0), (by_v + since * by_q).sum(axis=0)])
 
 
-def _start_slopes(problem: ElasticProblem, q: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
+def _equilibrium_gradient(
+    system: ElasticSystem, q: np.ndarray, by_q: np.ndarray
+) -> list[ShapeIntegrals]:
     """Return the part through the static equilibrium (N,) at t = 0 that the motion starts from."""
-    motion = problem.motion(np.zeros(1))
+    instants = system.at(np.zeros(1))
     rest = np.zeros((1, len(q)))
-    stiffness = tangent(problem.mechanism, motion, q[None], rest, rest)[0, :, : len(q)]
+    stiffness = instants.linearise(q[None], rest, rest).dense()[0, :, : len(q)]
     multipliers = np.linalg.solve(stiffness.T, -by_q)
-    return body_slopes(problem.mechanism, motion, q[None], rest, rest, multipliers[None])
+    return body_gradient(system.mechanism, instants.motion, q[None], rest, rest, multipliers[None])

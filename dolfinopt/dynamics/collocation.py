@@ -1,17 +1,20 @@
-"""Radau IIA on the steps of a horizon: coefficients, stages, and the elastic rows there."""
+"""Radau IIA on the steps of a horizon: coefficients, stages, and a system's residual there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from dolfinopt.dynamics.modal_coordinates import Modes
-from dolfinopt.dynamics.problem import lagrange_integrals
-from dolfinopt.multibody.mechanism import Mechanism, Tangent, elastic_rows, linearise
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.dynamics.solution import lagrange_integrals
+from dolfinopt.dynamics.system import (
+    Instants,
+    Linearisation,
+    Preconditioner,
+    State,
+    relative_errors,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,24 +39,22 @@ def radau_iia(stages: int) -> Collocation:
 
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """The problem at all stages of a run of steps.
+    """A system at all stages of `runs` equally long runs of steps, one run after the other.
 
     Attributes:
-        mechanism: of the problem, in modal coordinates.
-        frequencies: (N,) of the coordinates, rad/s.
+        preconditioner: of the system; its rows of `frequencies` and `uncoupled` are the runs'.
         method: collocation.
-        h: (n,) steps, s.
-        motion: rigid coordinates at the n s stages.
+        h: (n,) steps of all runs, s.
+        instants: the system at the n s stages.
         middle: in the middle of every step.
-        runs: equal parts of the steps, each a problem of its own.
+        runs: each a problem of its own.
     """
 
-    mechanism: Mechanism
-    frequencies: np.ndarray
+    preconditioner: Preconditioner
     method: Collocation
     h: np.ndarray
-    motion: RigidMotion
-    middle: RigidMotion
+    instants: Instants
+    middle: Instants
     runs: int = 1
 
     @property
@@ -61,57 +62,75 @@ class Stages:
         """Number of steps in a run."""
         return len(self.h) // self.runs
 
+    @property
+    def uncoupled(self) -> tuple[np.ndarray, ...]:
+        """Stiffness, damping and mass of every coordinate, (1, N) or of every step (n, N)."""
+        every = self.preconditioner.uncoupled
+        return every if len(every[0]) == 1 else tuple(x.repeat(self.length, axis=0) for x in every)
+
+    @property
+    def angles(self) -> np.ndarray:
+        """The smallest angle w h (N,) in the runs' median steps, by coordinate."""
+        median = np.median(self.h.reshape(self.runs, -1), axis=1)[:, None]
+        return (self.preconditioner.frequencies * median).min(axis=0)
+
     def window(self, first: int, last: int) -> Stages:
-        """Return the steps first..last - 1."""
+        """Return the steps first..last - 1 of a single run."""
         s = len(self.method.c)
-        motion, middle = self.motion[first * s : last * s], self.middle[first:last]
-        return replace(self, h=self.h[first:last], motion=motion, middle=middle)
+        instants, middle = self.instants[first * s : last * s], self.middle[first:last]
+        return replace(self, h=self.h[first:last], instants=instants, middle=middle)
+
+    def chosen(self, runs: np.ndarray) -> Stages:
+        """Return some of the runs, by index."""
+        if len(runs) == self.runs:
+            return self
+        steps = (runs[:, None] * self.length + np.arange(self.length)).ravel()
+        s = len(self.method.c)
+        stages = (steps[:, None] * s + np.arange(s)).ravel()
+        return replace(
+            self,
+            preconditioner=self.preconditioner.chosen(runs),
+            h=self.h[steps],
+            instants=self.instants[stages],
+            middle=self.middle[steps],
+            runs=len(runs),
+        )
+
+    def relative(self, change: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Return the relative size of a change of q, both (n, s, N), by run; inf for no number."""
+        shape = (self.runs, -1, q.shape[-1])
+        with np.errstate(all="ignore"):  # of what diverges
+            size = relative_errors(
+                self.preconditioner.system, change.reshape(shape), q.reshape(shape)
+            )
+        return np.where(np.isfinite(size), size, np.inf)
 
 
-def stages_of(modes: Modes, method: Collocation, edges: np.ndarray) -> Stages:
-    """Return all stages of the steps between `edges` (n + 1,)."""
-    problem = modes.problem
-    motion, middle = motions(problem.motion, method, edges)
-    return Stages(problem.mechanism, modes.frequencies, method, np.diff(edges), motion, middle)
-
-
-def motions(
-    motion: Callable[[np.ndarray], RigidMotion], method: Collocation, edges: np.ndarray
-) -> tuple[RigidMotion, RigidMotion]:
-    """Return the motion at all stages of the steps between `edges`, and in the steps' middles."""
-    h = np.diff(edges)
+def stages_of(preconditioner: Preconditioner, method: Collocation, time_grid: np.ndarray) -> Stages:
+    """Return all stages of the steps of time grids (n + 1,), or (runs, n + 1), s."""
+    system = preconditioner.system
+    grids = time_grid.reshape(system.runs, -1)
+    h = np.diff(grids, axis=1)
     nodes = np.append(method.c, 0.5)
-    every = motion((edges[:-1, None] + h[:, None] * nodes).ravel())
-
-    def part(x: np.ndarray, chosen: slice | int) -> np.ndarray:
-        return x.reshape(len(h), len(nodes), -1)[:, chosen].reshape(-1, x.shape[1])
-
-    inner, middle = (
-        RigidMotion(part(every.q, chosen), part(every.qd, chosen), part(every.qdd, chosen))
-        for chosen in (slice(-1), -1)
-    )
-    return inner, middle
+    every = system.at((grids[:, :-1, None] + h[:, :, None] * nodes).ravel())
+    index = np.arange(h.size * len(nodes)).reshape(-1, len(nodes))
+    stages, middle = every[index[:, :-1].ravel()], every[index[:, -1]]
+    return Stages(preconditioner, method, h.ravel(), stages, middle, system.runs)
 
 
-def starts(
-    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def step_ends(stages: Stages, state: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return q, qd (n + 1, N) at the beginning of every step and at the end of the last."""
     q, qd = _ends(stages, state, a)
     return q[0], qd[0]
 
 
-def beginnings(
-    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def step_beginnings(stages: Stages, state: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return q, qd (n, N) at the beginning of every step; of one run, or of each (runs, N)."""
     q, qd = (x[:, :-1].reshape(-1, a.shape[2]) for x in _ends(stages, state, a))
     return q, qd
 
 
-def _ends(
-    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _ends(stages: Stages, state: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return q, qd (runs, 1 + steps, N) at both ends of all steps."""
     method, h = stages.method, stages.h[:, None]
     shape = (stages.runs, stages.length, a.shape[2])
@@ -123,27 +142,25 @@ def _ends(
     return np.cumsum(np.concatenate([q_0, gain_q], axis=1), axis=1), qd
 
 
-def at_stages(
-    stages: Stages, state: tuple[np.ndarray, np.ndarray], a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def at_stages(stages: Stages, state: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return q, qd (n, s, N) at all stages."""
-    return stage_values(stages, *beginnings(stages, state, a), a)
+    return stage_values(stages, *step_beginnings(stages, state, a), a)
 
 
 def stage_values(
     stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return q, qd (n, s, N) at all stages from those (n, N) at the steps' beginnings."""
+    """Return q, qd (n, s, N) at all stages from those (n, N) at the steps' step_beginnings."""
     method, h = stages.method, stages.h[:, None, None]
     q_s = q[:, None] + method.c[:, None] * h * qd[:, None] + h * h * (method.A2 @ a)
     return q_s, qd[:, None] + h * (method.A @ a)
 
 
-def rows_at(stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the elastic rows (n, s, N) at all stages."""
+def residual_at(stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the residual (n, s, N) at all stages."""
     size = q.shape[2]
     flat = (x.reshape(-1, size) for x in (q, qd, a))
-    return elastic_rows(stages.mechanism, stages.motion, *flat).reshape(q.shape)
+    return stages.instants.residual(*flat).reshape(q.shape)
 
 
 def tangent_at(
@@ -152,18 +169,18 @@ def tangent_at(
     qd: np.ndarray,
     a: np.ndarray,
     keep: np.ndarray | None = None,
-) -> Tangent:
-    """Return the rows' derivative at the n s stages by the coordinates `keep`, or all."""
+) -> Linearisation:
+    """Return the residual's derivative at the n s stages by the coordinates `keep`, or all."""
     q, qd, a = (x.reshape(-1, q.shape[2]) for x in (q, qd, a))
-    return linearise(stages.mechanism, stages.motion, q, qd, a, keep)
+    return stages.instants.linearise(q, qd, a, keep)
 
 
-def pulled_back(
+def vector_jacobian_product(
     stages: Stages, by_q: np.ndarray, by_v: np.ndarray, by_a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return slopes by the steps' accelerations (n, s, S), states at their beginnings (n, 2, S).
+    """Return the gradient by the steps' accelerations (n, s, S) and first states (n, 2, S).
 
-    Undoes `stage_values`: from slopes by the stages' q, qd, qdd, each (n, s, S).
+    The transpose of `stage_values`, from gradients by the stages' q, qd, qdd, each (n, s, S).
     """
     method, h = stages.method, stages.h[:, None, None]
     steps = by_a + h * (method.A.T @ by_v) + h * h * (method.A2.T @ by_q)

@@ -1,7 +1,7 @@
 """Generalised-alpha, step by step: the conventional method, kept for comparison.
 
 Source: Chung & Hulbert (1993), doi:10.1115/1.2900803. Of second order; `rho_inf` sets how fast
-unresolved vibrations die. The nonlinear rows r are taken at the generalised midpoint of their
+unresolved vibrations die. The residual r is taken at the generalised midpoint of their
 arguments (Erlicher, Bonaventura & Bursi 2002, doi:10.1007/s00466-001-0273-z),
     r(t_n + (1 - alpha_f) h, q_f, qd_f, a_m) = 0
     q_f = (1 - alpha_f) q_{n+1} + alpha_f q_n,  qd_f alike
@@ -18,17 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from dolfinopt.dynamics.problem import (
-    ElasticProblem,
-    Solution,
-    even_steps,
-    first_count,
-    relative_error,
-    static_start,
-)
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.system import Instants, System, relative_error
+from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import Mechanism, inverse_dynamics, tangent
-from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.profiling import Ledger
 
 MAX_STEPS = 400_000
@@ -66,16 +59,14 @@ def parameters(rho_inf: float) -> Parameters:
     return Parameters(alpha_m, alpha_f, 0.25 * (1.0 + surplus) ** 2, 0.5 + surplus)
 
 
-def integrate(
-    problem: ElasticProblem, tolerance: float, rho_inf: float, ledger: Ledger
-) -> Solution:
+def integrate(system: System, tolerance: float, rho_inf: float, ledger: Ledger) -> Solution:
     """Solve to `tolerance`, dividing the steps until Richardson's estimate is below it.
 
     Measured on the paper's example (4 coordinates per arm, rho_inf = 0.8, tolerance 1e-4) on one
     core: 8704 steps after four coarser grids, 0.24 ms a step, 3.2 s; `radau` takes 0.05 s.
 
     Args:
-        problem: what to solve.
+        system: what to solve; its stiffness at rest is definite.
         tolerance: relative error of the elastic coordinates, energy norm, largest in time.
         rho_inf: spectral radius at infinity, from 0 (unresolved vibrations die in a step) to 1
             (nothing is damped).
@@ -85,22 +76,22 @@ def integrate(
         ConvergenceError: more than `MAX_STEPS` steps are needed, or Newton's method fails in a
             step whatever its length.
     """
-    edges = even_steps(problem, first_count(problem))
+    time_grid = even_steps(system, first_num_steps(system))
     coarse: Solution | None = None
     scaled = np.nan  # the last difference, as the error of its finer grid at second order
     ratio, failures, iterations = 2, 0, 0
     while True:
         try:
-            fine = on_grid(problem, edges, tolerance, rho_inf)
+            fine = on_grid(system, time_grid, tolerance, rho_inf)
         except ConvergenceError:
             failures += 1
             if failures == MAX_FAILURES:
                 raise
-            coarse, scaled, edges = None, np.nan, _divided(edges, 4)
+            coarse, scaled, time_grid = None, np.nan, _divided(time_grid, 4)
             continue
         iterations += fine.iterations
         if coarse is not None:
-            difference = _difference(problem.mechanism, coarse, fine)
+            difference = _difference(system, coarse, fine)
             error = _error(difference, scaled * (1.0 - 1.0 / ratio**2), ratio)
             if error <= ACCEPT * tolerance:
                 ledger.counts.newton_iterations += iterations
@@ -115,18 +106,16 @@ def integrate(
                 )
             # Above 4 a grid far from the tolerance would vouch for one that should meet it.
             ratio = int(np.clip(np.ceil(growth), 2, 4))
-        coarse, edges = fine, _divided(edges, ratio)
+        coarse, time_grid = fine, _divided(time_grid, ratio)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a diverging step ends in a ConvergenceError
-def on_grid(
-    problem: ElasticProblem, edges: np.ndarray, tolerance: float, rho_inf: float
-) -> Solution:
+def on_grid(system: System, time_grid: np.ndarray, tolerance: float, rho_inf: float) -> Solution:
     """Solve on given steps, whatever the error; `tolerance` bounds what Newton leaves of it.
 
     Args:
-        problem: what to solve.
-        edges: (n + 1,) ends of the steps, the breakpoints among them, s.
+        system: what to solve; its stiffness at rest is definite.
+        time_grid: (n + 1,) ends of the steps, the breakpoints among them, s.
         tolerance: as of `integrate`.
         rho_inf: as of `integrate`.
 
@@ -137,39 +126,39 @@ def on_grid(
         ConvergenceError: Newton's method fails in a step.
     """
     weights = parameters(rho_inf)
-    mechanism, h = problem.mechanism, np.diff(edges)
-    motion = problem.motion(edges[:-1] + (1.0 - weights.alpha_f) * h)
-    enough = max(REST * tolerance, ROUNDING) * _static_size(mechanism, motion)
-    newton = _Newton(mechanism, weights, enough)
-    q = np.empty((len(edges), mechanism.coordinates))
-    q[0] = static_start(problem)
+    h = np.diff(time_grid)
+    instants = system.at(time_grid[:-1] + (1.0 - weights.alpha_f) * h)
+    flexibility = _flexibility(system)
+    enough = max(REST * tolerance, ROUNDING) * _static_size(instants[:: _every(h)], flexibility)
+    newton = _Newton(flexibility, weights, enough)
+    q = np.empty((len(time_grid), system.num_coordinates))
+    q[:1] = system.initial_state()[0]
     qd = a = before = older = np.zeros_like(q[:1])  # in equilibrium at rest
     for n in range(len(h)):
         state = (q[n : n + 1], qd, a)
-        here = RigidMotion(motion.q[n : n + 1], motion.qd[n : n + 1], motion.qdd[n : n + 1])
-        new = newton.step(here, h[n], state, 3.0 * (a - before) + older)
+        new = newton.step(instants[n : n + 1], h[n], state, 3.0 * (a - before) + older)
         if new is None:
             raise ConvergenceError(
-                f"Newton's method fails at t = {edges[n]:.4g} s in a time step of {h[n]:.3g} s: "
-                "the arms deform beyond small-deflection theory; stiffen them "
+                f"Newton's method fails at t = {time_grid[n]:.4g} s in a time step of "
+                f"{h[n]:.3g} s: the arms deform beyond small-deflection theory; stiffen them "
                 "(material.young_modulus, interpolation.floor, design.minimum) or slow the "
                 "motion (motion.duration)"
             )
         q[n + 1 : n + 2], qd = _newmark(weights, h[n], state, new)
         a, before, older = new, a, before
-    return _interpolated(edges, q, newton.iterations)
+    return _interpolated(time_grid, q, newton.iterations)
 
 
-def _divided(edges: np.ndarray, ratio: int) -> np.ndarray:
+def _divided(time_grid: np.ndarray, ratio: int) -> np.ndarray:
     """Return the ends of steps `ratio` times shorter."""
-    parts = edges[:-1, None] + np.diff(edges)[:, None] * (np.arange(ratio) / ratio)
-    return np.append(parts, edges[-1])
+    parts = time_grid[:-1, None] + np.diff(time_grid)[:, None] * (np.arange(ratio) / ratio)
+    return np.append(parts, time_grid[-1])
 
 
-def _difference(mechanism: Mechanism, coarse: Solution, fine: Solution) -> float:
+def _difference(system: System, coarse: Solution, fine: Solution) -> float:
     """Return the relative distance of two solutions at the ends of the finer steps."""
-    q = fine.sample(fine.edges)
-    return relative_error(mechanism, q - coarse.sample(fine.edges), q)
+    q = fine.sample(fine.time_grid)
+    return relative_error(system, q - coarse.sample(fine.time_grid), q)
 
 
 def _error(difference: float, before: float, ratio: int) -> float:
@@ -204,39 +193,36 @@ class _Newton:
     The tangent is renewed where an iteration leaves more than `SLOW` of the residual. A step
     ends on the residual that its last correction is expected to leave, by the contraction
     observed so far and trusted less with every step: rate^0.8, Hairer & Wanner (1996), IV.8,
-    doi:10.1007/978-3-642-05221-7. Most steps cost one evaluation of the rows.
+    doi:10.1007/978-3-642-05221-7. Most steps cost one evaluation of it.
 
     Attributes:
         iterations: corrections made.
     """
 
-    def __init__(self, mechanism: Mechanism, weights: Parameters, enough: float) -> None:
-        """Take `enough`, the norm of rows that may be left in a step, see `_norm`."""
+    def __init__(self, flexibility: np.ndarray, weights: Parameters, enough: float) -> None:
+        """Take K^-1 and `enough`, the residual that may be left in a step, see `_norm`."""
         self.iterations = 0
-        self._mechanism, self._weights = mechanism, weights
-        self._flexibility = np.linalg.inv(mechanism.stiffness())
+        self._weights, self._flexibility = weights, flexibility
         self._enough = enough
         self._inverse_t: np.ndarray = np.empty((0, 0))
         self._h, self._rate = np.inf, 1.0
 
-    def step(
-        self, motion: RigidMotion, h: float, state: State, guess: np.ndarray
-    ) -> np.ndarray | None:
+    def step(self, at: Instants, h: float, state: State, guess: np.ndarray) -> np.ndarray | None:
         """Return the acceleration (1, N) at the end of a step, or None where it diverges.
 
         Args:
-            motion: at the generalised midpoint, one instant.
+            at: the generalised midpoint, one instant.
             h: length of the step, s.
             state: at its beginning.
             guess: of the answer.
         """
         # Steps of one piece differ by rounding, those on either side of a breakpoint by more.
         if abs(h - self._h) > 1e-6 * h:
-            self._renew(motion, h, state, guess)
+            self._renew(at, h, state, guess)
         a, rate, before = guess, self._rate**0.8, None
         for _ in range(MAX_NEWTON):
-            rows = inverse_dynamics(self._mechanism, motion, *self._midpoint(h, state, a))[0]
-            norm = self._norm(rows)
+            residual = at.residual(*self._midpoint(h, state, a))
+            norm = self._norm(residual)
             if before is None:
                 if not np.isfinite(norm):
                     return None
@@ -245,13 +231,13 @@ class _Newton:
                 if norm <= self._enough:
                     break
                 if not rate < 1.0:  # not a number included
-                    self._renew(motion, h, state, guess)
+                    self._renew(at, h, state, guess)
                     a, rate, before = guess, 1.0, None
                     continue
                 if rate > SLOW:
-                    self._renew(motion, h, state, a)
+                    self._renew(at, h, state, a)
                     rate = 1.0
-            a = a - rows @ self._inverse_t
+            a = a - residual @ self._inverse_t
             self.iterations += 1
             if rate * norm <= self._enough:
                 break
@@ -273,18 +259,18 @@ class _Newton:
             a + alpha_m * (state[2] - a),
         )
 
-    def _norm(self, rows: np.ndarray) -> float:
+    def _norm(self, residual: np.ndarray) -> float:
         """Return sqrt(r' K^-1 r): the energy norm of the deflection that r makes at rest."""
-        return float(np.sqrt(max((rows @ self._flexibility * rows).sum(), 0.0)))
+        return float(np.sqrt(max((residual @ self._flexibility * residual).sum(), 0.0)))
 
-    def _renew(self, motion: RigidMotion, h: float, state: State, a: np.ndarray) -> None:
-        """Invert the derivative of the rows with respect to the acceleration at the end.
+    def _renew(self, at: Instants, h: float, state: State, a: np.ndarray) -> None:
+        """Invert the derivative of the residual with respect to the acceleration at the end.
 
-        An inverse and not factors: with N in the tens, two triangular solves cost the calls.
+        An inverse and no factorisation: with N in the tens, two triangular solves cost the calls.
         """
         w = self._weights
-        slopes = tangent(self._mechanism, motion, *self._midpoint(h, state, a))[0]
-        by_q, by_v, by_a = np.split(slopes, 3, axis=1)
+        derivative = at.linearise(*self._midpoint(h, state, a)).dense()[0]
+        by_q, by_v, by_a = np.split(derivative, 3, axis=1)
         matrix = (1.0 - w.alpha_m) * by_a + (1.0 - w.alpha_f) * (
             (w.gamma * h) * by_v + (w.beta * h * h) * by_q
         )
@@ -298,17 +284,28 @@ class _Newton:
 # -- first and last --------------------------------------------------------------------------
 
 
-def _static_size(mechanism: Mechanism, motion: RigidMotion) -> float:
-    """Return the largest sqrt(q' K q) of a quasi-static motion, from up to 2000 instants."""
-    part = slice(None, None, max(1, len(motion.q) // 2000))
-    motion = RigidMotion(motion.q[part], motion.qd[part], motion.qdd[part])
-    rest = np.zeros((len(motion.q), mechanism.coordinates))
-    loads = inverse_dynamics(mechanism, motion, rest, rest, rest)[0]
-    deflections = np.linalg.solve(mechanism.stiffness(), loads.T).T
-    return float(np.sqrt(np.maximum((loads * deflections).sum(axis=1), 0.0).max()))
+def _flexibility(system: System) -> np.ndarray:
+    """Return the inverse (N, N) of the stiffness of the system at rest at t = 0."""
+    size = system.num_coordinates
+    rest = np.zeros((1, size))
+    derivative = system.at(np.zeros(1)).linearise(rest, rest, rest).dense()
+    return np.linalg.inv(derivative[0, :, :size])
 
 
-def _interpolated(edges: np.ndarray, q: np.ndarray, iterations: int) -> Solution:
+def _every(h: np.ndarray) -> int:
+    """Return which instants stand for all: up to 2000 of them."""
+    return max(1, len(h) // 2000)
+
+
+def _static_size(instants: Instants, flexibility: np.ndarray) -> float:
+    """Return the largest sqrt(q' K q) of a quasi-static motion."""
+    rest = np.zeros((len(instants), len(flexibility)))
+    loads = instants.residual(rest, rest, rest)
+    squares = (loads @ flexibility * loads).sum(axis=1)
+    return float(np.sqrt(np.maximum(squares, 0.0).max()))
+
+
+def _interpolated(time_grid: np.ndarray, q: np.ndarray, iterations: int) -> Solution:
     """Return the cubic spline through q (n + 1, N), at rest at first.
 
     Twice differentiable as the motion is. A cubic through both q and qd of a step would have
@@ -316,8 +313,8 @@ def _interpolated(edges: np.ndarray, q: np.ndarray, iterations: int) -> Solution
     difference that a further derivative turns into h.
     """
     at_rest = (1, np.zeros(q.shape[1]))
-    spline = CubicSpline(edges, q, bc_type=(at_rest, "not-a-knot"))
-    a = spline(edges, 2)
+    spline = CubicSpline(time_grid, q, bc_type=(at_rest, "not-a-knot"))
+    a = spline(time_grid, 2)
     ends = np.stack([a[:-1], a[1:]], axis=1)
     nodes = np.array([0.0, 1.0])
-    return Solution(edges, nodes, q[:-1], spline(edges[:-1], 1), ends, np.nan, iterations)
+    return Solution(time_grid, nodes, q[:-1], spline(time_grid[:-1], 1), ends, np.nan, iterations)

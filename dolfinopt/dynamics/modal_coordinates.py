@@ -1,16 +1,23 @@
-"""Coordinates in which the elastic rows are nearly uncoupled: each arm's own vibrations."""
+"""Coordinates in which the elastic residual is nearly uncoupled: each arm's own vibrations.
+
+The preconditioner of elastic systems, see `system.Preconditioner`: it takes stiffness and mass for
+definite.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 
-from dolfinopt.dynamics.problem import ElasticProblem
-from dolfinopt.multibody.mechanism import linearise
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
+
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.elastic_system import ElasticSystem
 
 # What T'KT may be away from the identity, and is still taken for it.
 ROUNDING = 1e-9
@@ -21,19 +28,28 @@ REFERENCES = 3  # instants of the horizon whose mass is averaged: 1 to 9 cost th
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """A problem in the coordinates z of its arms' vibrations, q = T z arm by arm.
+    """A system in the coordinates z of its arms' vibrations, q = T z arm by arm.
 
     Attributes:
-        problem: in z; every arm's stiffness is the identity there.
-        shapes: T (q, q) of every arm.
+        system: in z; every arm's stiffness is the identity there.
+        transforms: T (q, q) of every arm.
         inverses: T^-1.
-        frequencies: (N,) of every coordinate, rad/s, those of an arm descending.
+        frequencies: (1, N) of every coordinate, rad/s, those of an arm descending.
     """
 
-    problem: ElasticProblem
-    shapes: tuple[np.ndarray, ...]
+    system: ElasticSystem
+    transforms: tuple[np.ndarray, ...]
     inverses: tuple[np.ndarray, ...]
     frequencies: np.ndarray
+    definite = True
+
+    @cached_property
+    def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Stiffness, damping, mass (1, N) of every coordinate; the mass with all it carries."""
+        bodies = self.system.mechanism.bodies
+        k = np.concatenate([np.diag(body.K) for body in bodies])[None]
+        d = np.concatenate([np.diag(body.D) for body in bodies])[None]
+        return k, d, k / self.frequencies**2
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., N) of coordinates q (..., N)."""
@@ -41,44 +57,48 @@ class Modes:
 
     def from_modes(self, z: np.ndarray) -> np.ndarray:
         """Return q = T z (..., N)."""
-        return self._each(z, self.shapes)
+        return self._each(z, self.transforms)
 
-    def slopes_to_modes(self, by_q: np.ndarray) -> np.ndarray:
+    def gradient_to_modes(self, by_q: np.ndarray) -> np.ndarray:
         """Return dJ/dz = T' dJ/dq (..., N)."""
-        return self._each(by_q, [T.T for T in self.shapes])
+        return self._each(by_q, [T.T for T in self.transforms])
 
-    def slopes_from_modes(self, by_z: np.ndarray) -> np.ndarray:
+    def gradient_from_modes(self, by_z: np.ndarray) -> np.ndarray:
         """Return dJ/dq = T^-T dJ/dz (..., N)."""
         return self._each(by_z, [inverse.T for inverse in self.inverses])
 
+    def chosen(self, runs: np.ndarray) -> Modes:
+        """Return itself: there is one run."""
+        return self
+
     def _each(self, x: np.ndarray, maps: tuple[np.ndarray, ...] | list[np.ndarray]) -> np.ndarray:
-        parts = self.problem.mechanism.slices
+        parts = self.system.mechanism.slices
         pieces = [x[..., part] @ T.T for part, T in zip(parts, maps, strict=True)]
         return np.concatenate(pieces, axis=-1)
 
 
-def modes_of(problem: ElasticProblem) -> Modes:
-    """Return the problem in every arm's vibrations with all that it carries, T'KT = I.
+def modes_of(system: ElasticSystem) -> Modes:
+    """Return the system in every arm's vibrations with all that it carries, T'KT = I.
 
     K v = w^2 M v with the arm's block of the chain's mass matrix at rest, the mean over some
     instants of the prescribed motion: the arms outboard weigh on this one in changing directions.
     Solved as M v = w^-2 K v, whose largest, slowest solutions are right to rounding however stiff
     the rest. The change of coordinates is exact; only how well they uncouple rests on the mean.
     """
-    mechanism = problem.mechanism
-    size = mechanism.coordinates
-    motion = problem.motion(np.linspace(0.0, problem.breakpoints[-1], REFERENCES))
+    mechanism, size = system.mechanism, system.num_coordinates
+    instants = system.at(np.linspace(0.0, system.breakpoints[-1], REFERENCES))
     rest = np.zeros((REFERENCES, size))
-    mass = linearise(mechanism, motion, rest, rest, rest).dense()[:, :, 2 * size :].mean(axis=0)
-    bodies, shapes, inverses, frequencies = [], [], [], []
+    mass = instants.linearise(rest, rest, rest).dense()[:, :, 2 * size :].mean(axis=0)
+    bodies, transforms, inverses, frequencies = [], [], [], []
     for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
         T, inverse, squares = _vibrations(body.K, mass[part, part])
         bodies.append(_changed(body, T))
-        shapes.append(T)
+        transforms.append(T)
         inverses.append(inverse)
         frequencies.append(1.0 / np.sqrt(np.maximum(squares, np.finfo(float).tiny)))
-    changed = replace(problem, mechanism=replace(mechanism, bodies=tuple(bodies)))
-    return Modes(changed, tuple(shapes), tuple(inverses), np.concatenate(frequencies))
+    changed = replace(system, mechanism=replace(mechanism, bodies=tuple(bodies)))
+    every = np.concatenate(frequencies)[None]
+    return Modes(changed, tuple(transforms), tuple(inverses), every)
 
 
 def _vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

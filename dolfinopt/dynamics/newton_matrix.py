@@ -21,12 +21,12 @@ from scipy.linalg.blas import dtbsv
 from dolfinopt.dynamics.collocation import (
     Stages,
     end_gain,
-    pulled_back,
     stage_values,
-    starts,
+    step_ends,
     tangent_at,
+    vector_jacobian_product,
 )
-from dolfinopt.multibody.mechanism import Tangent
+from dolfinopt.dynamics.system import Linearisation
 
 BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
 # Angles w h up to which coordinates are slow, tried in turn. Simulations of a running optimisation
@@ -42,10 +42,10 @@ MEMORY_BYTES = 256e6  # of the factors of steps that are solved together
 
 def limits_for(stages: Stages) -> tuple[float, ...]:
     """Return the limits to try where an exact matrix saves repetitions: of few coordinates, it."""
-    return LIMITS if len(stages.frequencies) > SMALL else LIMITS[-1:]
+    return LIMITS if stages.preconditioner.system.num_coordinates > SMALL else LIMITS[-1:]
 
 
-def next_slow(
+def next_slow_coordinates(
     stages: Stages, limits: tuple[float, ...], more_than: int
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return the first larger set of slow coordinates, ascending, and the limits beyond.
@@ -53,14 +53,16 @@ def next_slow(
     A coordinate is slow up to an angle w h in a median step; the slowest one always is. No limits
     are left when all are.
     """
-    angles = stages.frequencies * np.median(stages.h)
+    angles = stages.angles
+    if not stages.preconditioner.definite:
+        return np.arange(len(angles)), ()
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))
     most = max(1, min(MOST, int(np.sqrt(MEMORY_BYTES / _bytes(stages)))))
     if limit < np.inf and len(slow) > most:
         slow = np.sort(np.argsort(angles, kind="stable")[:most])
     if len(slow) <= more_than and beyond:
-        return next_slow(stages, tuple(beyond), more_than)
+        return next_slow_coordinates(stages, tuple(beyond), more_than)
     return slow, tuple(beyond) if len(slow) < len(angles) else ()
 
 
@@ -78,7 +80,7 @@ def windows(stages: Stages, slow: np.ndarray) -> list[slice]:
 
 
 @dataclass(frozen=True, eq=False)
-class Factors:
+class NewtonMatrix:
     """Newton's matrix at some iterate, ready to be solved with.
 
     Attributes:
@@ -88,15 +90,15 @@ class Factors:
         inverse: (n, s S, s S) of the slow blocks.
         answer: (n, s, S, 2 S) change of their a by their state at the step's beginning.
         transfer: (n, 2 S, 2 S) change of that state over a step by that before it.
-        band: the same for `carried`.
+        band: the same for `bidiagonal_solve`.
         fast_inverse: (s, s, n, F).
         fast_loads: (2, n, s, F) change of the fast rows by their state (q, qd) at the beginning.
         fast_transfer: (n, 2, 2, F).
-        fast_band: the same for `carried`, coordinate after coordinate.
+        fast_band: the same for `bidiagonal_solve`, coordinate after coordinate.
     """
 
     stages: Stages
-    tangent: Tangent
+    tangent: Linearisation
     slow: np.ndarray
     fast: np.ndarray
     inverse: np.ndarray
@@ -136,7 +138,7 @@ class Factors:
         y = np.empty((count, 2 * size))
         y[1:] = end_gain(self.stages, forced[..., None])[:-1, :, 0]
         y[:: self.stages.length] = before.ravel()
-        y = carried(self.band, y)
+        y = bidiagonal_solve(self.band, y)
         answer = self.answer.reshape(count, s * size, -1)
         step = forced + (answer @ y[:, :, None]).reshape(rows.shape)
         return step, *stage_values(self.stages, y[:, :size], y[:, size:], step)
@@ -149,7 +151,7 @@ class Factors:
         y[1:] = end_gain(self.stages, forced[..., None])[:-1].reshape(-1, 2, size)
         y[:: self.stages.length] = before
         # Coordinate by coordinate, one after the other.
-        y = carried(self.fast_band, _in_turn(y))
+        y = bidiagonal_solve(self.fast_band, _in_turn(y))
         y = y.reshape(size, count, 2).transpose(1, 2, 0)
         loads = y[:, None, 0] * self.fast_loads[0] + y[:, None, 1] * self.fast_loads[1]
         step = forced - _diagonal(self.fast_inverse, loads)
@@ -160,7 +162,7 @@ class Factors:
 
         Args:
             by_a: (n, s, N) slopes of J by the accelerations.
-            by_y: (n, 2, N) by the states (q, qd) at the steps' beginnings.
+            by_y: (n, 2, N) by the states (q, qd) at the steps' step_beginnings.
             after: (2, N) by the state at the end of the last.
         """
         multipliers = np.zeros_like(by_a)
@@ -171,7 +173,7 @@ class Factors:
             )
             shape = (*by_a.shape[:2], len(self.slow))
             felt = self.tangent.transposed(multipliers.reshape(-1, by_a.shape[2]))
-            more_a, more_y = pulled_back(self.stages, *(x.reshape(shape) for x in felt))
+            more_a, more_y = vector_jacobian_product(self.stages, *(x.reshape(shape) for x in felt))
             by_a_s, by_y_s = by_a_s + more_a, by_y_s + more_y
         multipliers[:, :, self.slow] = self._slow_transposed(by_a_s, by_y_s, after[:, self.slow])
         return multipliers
@@ -183,8 +185,8 @@ class Factors:
         flat = by_a.reshape(count, -1, 1)
         direct = (by_y.reshape(count, -1, 1) + answer.swapaxes(1, 2) @ flat)[:, :, 0]
         direct[-1] += after.ravel() @ self.transfer[-1]
-        p = np.concatenate([carried(self.band, direct, 1)[1:], after.reshape(1, -1)])
-        flat = flat + _end_slopes(self.stages, p).reshape(flat.shape)
+        p = np.concatenate([bidiagonal_solve(self.band, direct, 1)[1:], after.reshape(1, -1)])
+        flat = flat + _end_gradient(self.stages, p).reshape(flat.shape)
         return -(self.inverse.swapaxes(1, 2) @ flat).reshape(by_a.shape)
 
     def _fast_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -193,9 +195,9 @@ class Factors:
         direct = by_y - np.einsum("injk,njk->nik", self.fast_loads, eased)
         direct[-1] += np.einsum("ik,ijk->jk", after, self.fast_transfer[-1])
         count, _, size = direct.shape
-        p = carried(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
+        p = bidiagonal_solve(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
         p = np.concatenate([p.transpose(1, 2, 0)[1:], after[None]])
-        return -_diagonal(turned, by_a + _end_slopes(self.stages, p.reshape(len(p), -1)))
+        return -_diagonal(turned, by_a + _end_gradient(self.stages, p.reshape(len(p), -1)))
 
 
 def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
@@ -211,7 +213,7 @@ def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
     return bands.reshape(count * m, 2 * m).T
 
 
-def carried(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
+def bidiagonal_solve(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
     """Return y_n+1 = T_n y_n + gain_n (n, m) from y_0 and the gains (n, m), or the transposed.
 
     One call instead of a loop over the steps: for 176 steps of 5 fast coordinates 0.01 instead of
@@ -231,7 +233,7 @@ def _diagonal(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.einsum("ijnk,njk->nik", matrices, x)
 
 
-def _end_slopes(stages: Stages, p: np.ndarray) -> np.ndarray:
+def _end_gradient(stages: Stages, p: np.ndarray) -> np.ndarray:
     """Return slopes by a (n, s, S) of states after each step whose slopes are p (n, 2 S)."""
     h = stages.h[:, None, None]
     by_q, by_v = np.split(p[:, None], 2, axis=2)
@@ -241,7 +243,7 @@ def _end_slopes(stages: Stages, p: np.ndarray) -> np.ndarray:
 
 def factorise(
     stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray, slow: np.ndarray
-) -> Factors:
+) -> NewtonMatrix:
     """Return Newton's matrix at an iterate, inverted; nan where a block is singular.
 
     Args:
@@ -269,16 +271,8 @@ def factorise(
     diagonal = np.arange(slow_size)
     transfer[:, diagonal, slow_size + diagonal] += stages.h[:, None]
     dense = (inverse, answer, transfer, band_of(transfer, stages.length))
-    single = diagonal_factors(stages, *(x[:, fast] for x in alone(stages)))
-    return Factors(stages, tangent, slow, fast, *dense, *single)
-
-
-def alone(stages: Stages) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return stiffness, damping and mass (1, N) of every coordinate by itself."""
-    bodies = stages.mechanism.bodies
-    k = np.concatenate([np.diag(body.K) for body in bodies])
-    d = np.concatenate([np.diag(body.D) for body in bodies])
-    return k[None], d[None], (k / stages.frequencies**2)[None]  # mass with what the arm carries
+    single = diagonal_matrix(stages, *(x[:, fast] for x in stages.uncoupled))
+    return NewtonMatrix(stages, tangent, slow, fast, *dense, *single)
 
 
 def _blocks(stages: Stages, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -301,7 +295,7 @@ def _blocks(stages: Stages, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return block.reshape(count, s * size, -1), beginning.reshape(count, s * size, -1)
 
 
-def diagonal_factors(
+def diagonal_matrix(
     stages: Stages, k: np.ndarray, d: np.ndarray, m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return inverse, loads, transfer and its band of the fast coordinates, one by one.
@@ -341,12 +335,12 @@ def solve_once(
     slow: np.ndarray,
     rows: np.ndarray,
 ) -> np.ndarray:
-    """Return the change of q (n, s, N) as `Factors.solve`, factors made window by window."""
+    """Return the change of q (n, s, N) as `NewtonMatrix.solve`, factors made window by window."""
     shift = np.empty_like(a)
     before = np.zeros((2, a.shape[2]))
     for part in windows(stages, slow):
         window = stages.window(part.start, part.stop)
-        factors = factorise(window, q[part], qd[part], a[part], slow)
-        step, shift[part] = factors.solve(rows[part], before)
-        before = np.stack([x[-1] for x in starts(window, (before[0], before[1]), step)])
+        matrix = factorise(window, q[part], qd[part], a[part], slow)
+        step, shift[part] = matrix.solve(rows[part], before)
+        before = np.stack([x[-1] for x in step_ends(window, (before[0], before[1]), step)])
     return shift

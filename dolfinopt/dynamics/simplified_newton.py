@@ -15,17 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Collocation, Stages, end_gain, stage_values
-from dolfinopt.dynamics.newton_matrix import Factors, band_of, carried, diagonal_factors
-from dolfinopt.dynamics.problem import lagrange_integrals
-from dolfinopt.multibody.mechanism import Tangent, linearise
-
-State = tuple[np.ndarray, np.ndarray]  # q, qd
+from dolfinopt.dynamics.newton_matrix import (
+    NewtonMatrix,
+    band_of,
+    bidiagonal_solve,
+    diagonal_matrix,
+)
+from dolfinopt.dynamics.solution import lagrange_integrals
+from dolfinopt.dynamics.system import Linearisation, State
 
 CHUNK = 512  # matrices that are inverted together: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
-class HeldFactors(Factors):
+class SimplifiedNewtonMatrix(NewtonMatrix):
     """Newton's matrix with held tangents; its slow blocks are kept in A's eigenvectors.
 
     Attributes:
@@ -49,7 +52,7 @@ class HeldFactors(Factors):
         y = np.empty((count, 2 * size))
         y[1:] = end_gain(stages, -self._applied(rows)[..., None])[:-1, :, 0]
         y[:: stages.length] = before.ravel()
-        y = carried(self.band, y)
+        y = bidiagonal_solve(self.band, y)
         q, qd = y[:, :size], y[:, size:]
         # What the state at the beginning does to the rows: K q + (D + c h K) qd.
         at_once = (self.slopes[:, :, : 2 * size] @ y[:, :, None])[:, None, :, 0]
@@ -68,21 +71,19 @@ class HeldFactors(Factors):
         return (self.out @ both).reshape(s, count, size).swapaxes(0, 1)
 
 
-def held_factors(
+def simplified_newton_matrix(
     stages: Stages,
     begin: State,
     a: np.ndarray,
     slow: np.ndarray,
-    single: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> Factors:
+) -> NewtonMatrix:
     """Return Newton's matrix, inverted; nan where a block is singular.
 
     Args:
         stages: n steps.
-        begin: q, qd (n, N) at the steps' beginnings.
+        begin: q, qd (n, N) at the steps' step_beginnings.
         a: (n, s, N).
         slow: ascending coordinates (S,) that are treated densely.
-        single: stiffness, damping and mass (1, N), or (n, N) of every step.
     """
     fast = np.setdiff1d(np.arange(a.shape[2]), slow)
     tangent = _tangent(stages, begin, a, slow)
@@ -93,12 +94,14 @@ def held_factors(
     transfer = _transfer(stages, slopes, parts, into, out)
     none = np.empty(0)  # the blocks of all stages are never formed
     dense = (none, none, transfer, band_of(transfer, stages.length))
-    alone = diagonal_factors(stages, *(x[:, fast] for x in single))
-    return HeldFactors(stages, tangent, slow, fast, *dense, *alone, slopes, into, out, parts)
+    single = diagonal_matrix(stages, *(x[:, fast] for x in stages.uncoupled))
+    return SimplifiedNewtonMatrix(
+        stages, tangent, slow, fast, *dense, *single, slopes, into, out, parts
+    )
 
 
 def _eigenvectors(method: Collocation) -> tuple[np.ndarray, np.ndarray]:
-    """Return what takes stages' rows into A's eigenvectors, and back; see `HeldFactors`."""
+    """Return what takes stages into A's eigenvectors and back, see `SimplifiedNewtonMatrix`."""
     values, X = np.linalg.eig(method.A)
     upper = values.imag >= -1e-12
     # A conjugate pair is twice the real part of one of them.
@@ -154,15 +157,14 @@ def _transfer(
     return transfer
 
 
-def _tangent(stages: Stages, begin: State, a: np.ndarray, slow: np.ndarray) -> Tangent:
+def _tangent(stages: Stages, begin: State, a: np.ndarray, slow: np.ndarray) -> Linearisation:
     """Return the rows' derivative by the slow coordinates in the middle of every step."""
-    s = len(stages.method.c)
     value, first, second = lagrange_integrals(stages.method.c, np.array([0.5]))
     h = stages.h[:, None]
     q = begin[0] + 0.5 * h * begin[1] + h * h * np.einsum("j,njk->nk", second[0], a)
     qd = begin[1] + h * np.einsum("j,njk->nk", first[0], a)
     qdd = np.einsum("j,njk->nk", value[0], a)
-    return linearise(stages.mechanism[::s], stages.middle, q, qd, qdd, slow)
+    return stages.middle.linearise(q, qd, qdd, slow)
 
 
 def _inverted(A: np.ndarray) -> np.ndarray:

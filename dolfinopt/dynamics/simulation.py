@@ -9,7 +9,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
-from dolfinopt.dynamics.problem import ElasticProblem, Solution
+from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.mechanism import Mechanism, compliance, deviation, inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
@@ -30,7 +31,7 @@ class Trajectory:
         scenarios: the same design under the scene's scenarios.
     """
 
-    problem: ElasticProblem
+    problem: ElasticSystem
     scene: Scene
     solution: Solution
     t: np.ndarray
@@ -150,7 +151,7 @@ def simulate(
         ConvergenceError: the integrator gave up; the message says what to try.
     """
     options = scene.simulation
-    problem = ElasticProblem(
+    problem = ElasticSystem(
         build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), breakpoints(scene)
     )
     with ledger.phase("simulation"):
@@ -219,18 +220,18 @@ def simulate_batch(
 
 def _problems(
     scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]
-) -> list[ElasticProblem]:
+) -> list[ElasticSystem]:
     """Return what moves in every scene; scenes of one motion share it."""
     motions: dict[object, Callable[[np.ndarray], RigidMotion]] = {}
     problems = []
     for scene, own in zip(scenes, bodies, strict=True):
         key = (scene.motion, tuple((arm.name, arm.length) for arm in scene.arms))
         motion = motions.setdefault(key, partial(rigid_motion, scene=scene))
-        problems.append(ElasticProblem(build_mechanism(scene, own), motion, breakpoints(scene)))
+        problems.append(ElasticSystem(build_mechanism(scene, own), motion, breakpoints(scene)))
     return problems
 
 
-def _trajectory(problem: ElasticProblem, scene: Scene, solution: Solution) -> Trajectory:
+def _trajectory(problem: ElasticSystem, scene: Scene, solution: Solution) -> Trajectory:
     """Return a solution with its sample instants."""
     horizon, sample = scene.motion.horizon, scene.simulation.sample
     t = np.arange(round(horizon / sample) + 1) * sample

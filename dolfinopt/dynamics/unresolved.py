@@ -1,6 +1,6 @@
 """The error of vibrations that steps do not resolve, which one stage more does not see.
 
-Where the prescribed motion sets in, changes its law or ends, loads have kinks, and every vibration
+Where the prescribed motion sets in, changes its law or ends, loads have breakpoint_steps, and every vibration
 sets in with an amplitude of its own. Steps much longer than its period damp it out by the method
 with s stages and with s + 1 alike: the difference of both says nothing about it. Without damping
 it is there to the end, though. So estimated by the amplitude at each kink, asymptotically for
@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Collocation, Stages, radau_iia
-from dolfinopt.dynamics.problem import lagrange_slopes
+from dolfinopt.dynamics.solution import lagrange_derivatives
 
 # Numbers of steps, about sixteen of them, after which a free vibration is compared.
 LOOKS = 16
@@ -28,7 +28,7 @@ def unresolved(
     single: tuple[np.ndarray, np.ndarray, np.ndarray],
     states: tuple[np.ndarray, np.ndarray, np.ndarray],
     rest: np.ndarray,
-    kinks: np.ndarray,
+    breakpoint_steps: np.ndarray,
 ) -> np.ndarray:
     """Return the error of every coordinate's free vibrations (runs, N), in its units.
 
@@ -40,17 +40,17 @@ def unresolved(
         single: stiffness, damping and mass (runs or 1, N) of every coordinate by itself.
         states: q, qd, a (n, s, N) at the stages.
         rest: (runs, N) coordinates before they move.
-        kinks: (P,) steps of a run behind which the motion's law changes; the first is 0.
+        breakpoint_steps: (P,) steps of a run behind which the motion's law changes; the first is 0.
     """
     k, d, m = (x[:, None] for x in single)
-    jumps = _jumps(stages, single, states, kinks)
+    jumps = _jumps(stages, single, states, breakpoint_steps)
     jumps[0, :, 0] -= k[:, 0] * rest
     square = np.minimum(k / m, FASTEST**2)
     amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
     decay = np.minimum(0.5 * (d / m), FASTEST)
     rate = -decay + np.sqrt((decay * decay - square).astype(complex))
-    h = stages.h.reshape(stages.runs, -1, 1)[:, kinks]
-    lost = _lost(radau_iia(len(stages.method.c) + 1), rate * h, stages.length - kinks)
+    h = stages.h.reshape(stages.runs, -1, 1)[:, breakpoint_steps]
+    lost = _lost(radau_iia(len(stages.method.c) + 1), rate * h, stages.length - breakpoint_steps)
     return np.sqrt(np.square(amplitude * lost).sum(axis=1))
 
 
@@ -58,15 +58,17 @@ def _jumps(
     stages: Stages,
     single: tuple[np.ndarray, np.ndarray, np.ndarray],
     states: tuple[np.ndarray, np.ndarray, np.ndarray],
-    kinks: np.ndarray,
+    breakpoint_steps: np.ndarray,
 ) -> np.ndarray:
-    """Return the jumps of F, F', F'' (3, runs, P, N) at the kinks, from zero at the first."""
+    """Return the jumps of F, F', F'' (3, runs, P, N) at breakpoints, from zero at first."""
     k, d, m = (x[:, None, None] for x in single)
-    ends = lagrange_slopes(stages.method.c, np.array([0.0, 1.0]))  # (3, 2, s)
+    ends = lagrange_derivatives(stages.method.c, np.array([0.0, 1.0]))  # (3, 2, s)
     shape = (stages.runs, stages.length, *states[0].shape[1:])
     h = stages.h.reshape(shape[:2])
     sides = []
-    for end, steps in zip(ends.swapaxes(0, 1), (kinks, kinks[1:] - 1), strict=True):
+    for end, steps in zip(
+        ends.swapaxes(0, 1), (breakpoint_steps, breakpoint_steps[1:] - 1), strict=True
+    ):
         q, qd, a = (x.reshape(shape)[:, steps] for x in states)
         load = m * a + d * qd + k * q
         power = h[:, steps, None] ** -np.arange(3.0)[:, None, None, None]

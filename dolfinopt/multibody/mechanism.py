@@ -39,17 +39,17 @@ UNSCALED = Scale()
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class ModalConstants:
     """One body's constants in complex form, and tables that serve all instants in one product.
 
     Attributes:
         body: real constants.
         c: first mass moment, complex.
         C, B: (q,) complex; B is the outboard deflection.
-        turn: (q,) outboard rotation.
-        reach: outboard reference point, complex.
-        moved: (q, 6) real: x and y of C, of B; turn, 0.
-        pushed: (7, q) real: x and y of C; r; j; x and y of B; turn.
+        rotation: (q,) outboard rotation.
+        outboard_position: outboard reference point, complex.
+        kinematics: (q, 6) real: x and y of C, of B; rotation, 0.
+        loads: (7, q) real: x and y of C; r; j; x and y of B; rotation.
         K, D: (q, q), or their diagonals (q,) where there is nothing else; no D, None.
     """
 
@@ -57,31 +57,31 @@ class Shapes:
     c: complex
     C: np.ndarray
     B: np.ndarray
-    turn: np.ndarray
-    reach: complex
-    moved: np.ndarray
-    pushed: np.ndarray
+    rotation: np.ndarray
+    outboard_position: complex
+    kinematics: np.ndarray
+    loads: np.ndarray
     K: np.ndarray
     D: np.ndarray | None
 
 
-def _shapes(body: ShapeIntegrals) -> Shapes:
-    C, (B_x, B_y, turn) = body.C, body.outboard
-    return Shapes(
+def _modal_constants(body: ShapeIntegrals) -> ModalConstants:
+    C, (B_x, B_y, rotation) = body.C, body.outboard
+    return ModalConstants(
         body=body,
         c=complex(*body.moment),
         C=C[0] + 1j * C[1],
         B=B_x + 1j * B_y,
-        turn=turn,
-        reach=complex(*body.outboard_point),
-        moved=np.stack([C[0], C[1], B_x, B_y, turn, np.zeros_like(turn)], axis=1),
-        pushed=np.stack([C[0], C[1], body.r, body.j, B_x, B_y, turn]),
-        K=_alone(body.K),
-        D=_alone(body.D) if body.D.any() else None,
+        rotation=rotation,
+        outboard_position=complex(*body.outboard_point),
+        kinematics=np.stack([C[0], C[1], B_x, B_y, rotation, np.zeros_like(rotation)], axis=1),
+        loads=np.stack([C[0], C[1], body.r, body.j, B_x, B_y, rotation]),
+        K=_diagonal_or_matrix(body.K),
+        D=_diagonal_or_matrix(body.D) if body.D.any() else None,
     )
 
 
-def _alone(A: np.ndarray) -> np.ndarray:
+def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
     """Return the diagonal of a matrix that has nothing else, or the matrix."""
     diagonal = np.diagonal(A)
     return diagonal if np.count_nonzero(A) == np.count_nonzero(diagonal) else A
@@ -126,9 +126,9 @@ class Mechanism:
         return sum(body.num_modes for body in self.bodies)
 
     @cached_property
-    def shapes(self) -> tuple[Shapes, ...]:
+    def modal_constants(self) -> tuple[ModalConstants, ...]:
         """Every body's constants as the equations of motion use them."""
-        return tuple(_shapes(body) for body in self.bodies)
+        return tuple(_modal_constants(body) for body in self.bodies)
 
     def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
         """Return it at some of the instants."""
@@ -146,6 +146,17 @@ class Mechanism:
     def scale(self, k: int) -> Scale:
         """Return that of a body."""
         return self.scales[k] if self.scales else UNSCALED
+
+    def norm(self, q: np.ndarray) -> np.ndarray:
+        """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
+        norms = []
+        for part, constants in zip(self.slices, self.modal_constants, strict=True):
+            e = q[..., part]
+            unit = constants.K.ndim == 1 and (constants.K == 1.0).all()
+            loads = e if unit else _product(e, constants.K)
+            squares = np.einsum("...nk,...nk->...n", loads, e)
+            norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
+        return np.stack(norms, axis=-1)
 
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
@@ -179,8 +190,8 @@ class _Frame:
         w, wd: angular velocity and acceleration.
         d, dd, ddd: outboard point from the origin and its relative velocity and acceleration.
         s, sd, sdd: first mass moment c + C q and its relative rates.
-        swing: (n,) complex exp(i (theta + joint angle)) from the next frame to this one.
-        shape: of the body.
+        joint_rotation: (n,) complex exp(i (theta + joint angle)) from the next frame to this one.
+        constants: of the body.
         e: (n, q) its coordinates.
     """
 
@@ -193,19 +204,19 @@ class _Frame:
     s: np.ndarray
     sd: np.ndarray
     sdd: np.ndarray
-    swing: np.ndarray
-    shape: Shapes
+    joint_rotation: np.ndarray
+    constants: ModalConstants
     e: np.ndarray
 
     @cached_property
     def jM(self) -> np.ndarray:
         """Return j + M q (n, q)."""
-        return self.shape.body.j + self.e @ self.shape.body.M
+        return self.constants.body.j + self.e @ self.constants.body.M
 
     @cached_property
     def rG(self) -> np.ndarray:
         """Return r + G q (n, q); G is skew: (G q)' = -q' G."""
-        return self.shape.body.r - self.e @ self.shape.body.G
+        return self.constants.body.r - self.e @ self.constants.body.G
 
 
 def _outward(
@@ -218,19 +229,23 @@ def _outward(
     w, wd = joints_d[:, 0], joints_dd[:, 0]
     frames: list[_Frame] = []
     last = len(mechanism.bodies) - 1
-    for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
+    for k, (part, constants) in enumerate(
+        zip(mechanism.slices, mechanism.modal_constants, strict=True)
+    ):
         e = q[:, part]
-        # One real product for C q, B q and the turn: of complex matrices all q would be copied.
-        s, d, turn = (e @ shape.moved).view(complex).T
-        sd, dd, turn_d = (qd[:, part] @ shape.moved).view(complex).T
-        sdd, ddd, turn_dd = (qdd[:, part] @ shape.moved).view(complex).T
-        swing = np.exp(1j * turn.real)
+        # One real product for C q, B q and the rotation: of complex matrices all q would be copied.
+        s, d, rotation = (e @ constants.kinematics).view(complex).T
+        sd, dd, rotation_d = (qd[:, part] @ constants.kinematics).view(complex).T
+        sdd, ddd, rotation_dd = (qdd[:, part] @ constants.kinematics).view(complex).T
+        joint_rotation = np.exp(1j * rotation.real)
         if k < last:  # behind the last arm the payload's frame has no joint of its own
-            swing *= motion.swings[k + 1]
-        d = shape.reach + d
-        frames.append(_Frame(a, w, wd, d, dd, ddd, shape.c + s, sd, sdd, swing, shape, e))
-        a = np.conj(swing) * (a + (1j * wd - w * w) * d + 2j * w * dd + ddd)
-        w, wd = w + turn_d.real, wd + turn_dd.real
+            joint_rotation *= motion.swings[k + 1]
+        d = constants.outboard_position + d
+        frames.append(
+            _Frame(a, w, wd, d, dd, ddd, constants.c + s, sd, sdd, joint_rotation, constants, e)
+        )
+        a = np.conj(joint_rotation) * (a + (1j * wd - w * w) * d + 2j * w * dd + ddd)
+        w, wd = w + rotation_d.real, wd + rotation_dd.real
         if k < last:
             w, wd = w + joints_d[:, k + 1], wd + joints_dd[:, k + 1]
     return frames, (a, w, wd)
@@ -266,12 +281,12 @@ def inverse_dynamics(
     return rows, np.stack([cart, *drives], axis=1)
 
 
-def elastic_rows(
+def elastic_residual(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
     """Return the elastic rows (n, N) of `inverse_dynamics`, without what only drives need."""
     if 0 < len(q) < FEW:
-        return elastic_rows(*_several(mechanism, motion, q, qd, qdd))[: len(q)]
+        return elastic_residual(*_several(mechanism, motion, q, qd, qdd))[: len(q)]
     return _inward(mechanism, motion, (q, qd, qdd), driven=False)[0]
 
 
@@ -289,8 +304,8 @@ def _inward(
     for k in reversed(range(len(frames))):
         part, frame, scale = mechanism.slices[k], frames[k], mechanism.scale(k)
         own = (rates[0][:, part], rates[1][:, part], rates[2][:, part])
-        force = frame.swing * force  # of everything outboard, in this frame
-        rows[:, part] = _body_rows(frame, own, (force, moment), scale)
+        force = frame.joint_rotation * force  # of everything outboard, in this frame
+        rows[:, part] = _body_residual(frame, own, (force, moment), scale)
         if k > 0 or driven:
             moment = (
                 moment + (np.conj(frame.d) * force).imag + scale.mass * _body_moment(frame, own)
@@ -300,26 +315,27 @@ def _inward(
     return rows, (force, drives)
 
 
-def _body_rows(
+def _body_residual(
     frame: _Frame, rates: _Rates, load: tuple[np.ndarray, np.ndarray], scale: Scale
 ) -> np.ndarray:
     """Return one body's elastic rows (n, q) under the load (force, moment) on its outboard end."""
     e, ed, edd = rates
-    body, shape = frame.shape.body, frame.shape
+    body, constants = frame.constants.body, frame.constants
     w, wd = frame.w, frame.wd
-    pushes = np.empty((len(e), 7))
-    pushes[:, 0], pushes[:, 1], pushes[:, 2], pushes[:, 3] = frame.a.real, frame.a.imag, wd, -w * w
-    pushes[:, :4] *= _column(scale.mass)
-    pushes[:, 4], pushes[:, 5], pushes[:, 6] = load[0].real, load[0].imag, load[1]
+    load_coefficients = np.empty((len(e), 7))
+    columns = (frame.a.real, frame.a.imag, wd, -w * w, load[0].real, load[0].imag, load[1])
+    for i, column in enumerate(columns):
+        load_coefficients[:, i] = column
+    load_coefficients[:, :4] *= _column(scale.mass)
     w, wd = w[:, None], wd[:, None]
     inertial = (edd - (w * w) * e) @ body.M
     inertial -= (wd * e + (2.0 * w) * ed) @ body.G
     if isinstance(scale.mass, np.ndarray) or scale.mass != 1.0:
         inertial *= _column(scale.mass)
-    inertial += pushes @ shape.pushed
-    inertial += _column(scale.stiffness) * _product(e, shape.K)
-    if shape.D is not None:
-        inertial += _column(scale.damping) * _product(ed, shape.D)
+    inertial += load_coefficients @ constants.loads
+    inertial += _column(scale.stiffness) * _product(e, constants.K)
+    if constants.D is not None:
+        inertial += _column(scale.damping) * _product(ed, constants.D)
     return inertial
 
 
@@ -336,13 +352,13 @@ def _body_moment(frame: _Frame, rates: _Rates) -> np.ndarray:
 
 def _inertia(frame: _Frame) -> np.ndarray:
     """Return the deformed body's inertia about its frame's origin (n,), kg m2."""
-    body = frame.shape.body
+    body = frame.constants.body
     return body.inertia + np.einsum("nk,nk->n", body.j + frame.jM, frame.e)
 
 
 def _body_force(frame: _Frame) -> np.ndarray:
     """Return the inertia force F (n,) complex, body components, N."""
-    w, body = frame.w, frame.shape.body
+    w, body = frame.w, frame.constants.body
     return body.mass * frame.a + (1j * frame.wd - w * w) * frame.s + 2j * w * frame.sd + frame.sdd
 
 
@@ -354,7 +370,7 @@ class _BodyTangent:
     y = [q, qd, qdd] of all bodies.
 
     Attributes:
-        shape: its constants.
+        constants: its constants.
         rows, columns: its place among all rows and among the kept columns.
         kept: its coordinates that have a column.
         w, wd: of its frame.
@@ -363,7 +379,7 @@ class _BodyTangent:
         right: (n, r, 3 S).
     """
 
-    shape: Shapes
+    constants: ModalConstants
     rows: slice
     columns: slice
     kept: np.ndarray
@@ -376,7 +392,7 @@ class _BodyTangent:
     @property
     def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return K, D, M, G (q, q)."""
-        body = self.shape.body
+        body = self.constants.body
         return body.K, body.D, body.M, body.G
 
     def at(self, part: slice) -> _BodyTangent:
@@ -434,7 +450,7 @@ class Tangent:
             columns = _columns(part.columns, size)
             rows[:, :, columns[0]] += k * K + m_q * M + g_q * G
             rows[:, :, columns[1]] += g_v * G
-            if part.shape.D is not None:
+            if part.constants.D is not None:
                 rows[:, :, columns[1]] += d * D
             rows[:, :, columns[2]] += m * M
         return jacobian
@@ -459,31 +475,31 @@ class Tangent:
             K, D, M, G = (x[np.ix_(own, part.kept)].T for x in part.matrices)
             k, m_q, g_q, d, g_v, m = part.factors(times)
             e, ed, edd = q[:, part.columns], qd[:, part.columns], qdd[:, part.columns]
-            felt = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
-            felt += (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
+            coupled = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
+            coupled += (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
             if K.any():  # not of the rows of other coordinates that vibrate by themselves
-                felt += (k * e) @ K
+                coupled += (k * e) @ K
             if D.any():
-                felt += (d * ed) @ D
-            out.append(felt)
+                coupled += (d * ed) @ D
+            out.append(coupled)
         return np.concatenate(out, axis=1)
 
     def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the slopes of sum_n rows_n . (all rows)_n by kept q, qd, qdd, each (n, S)."""
+        """Return the gradient of sum_n rows_n . (all rows)_n by kept q, qd, qdd, each (n, S)."""
         size = len(self.kept)
-        slopes = np.zeros((len(rows), 3 * size))
+        gradient = np.zeros((len(rows), 3 * size))
         for part in self.bodies:
             y = rows[:, part.rows]
-            slopes += ((y[:, None] @ part.left) @ part.right)[:, 0]
-        by_q, by_v, by_a = slopes[:, :size], slopes[:, size : 2 * size], slopes[:, 2 * size :]
+            gradient += ((y[:, None] @ part.left) @ part.right)[:, 0]
+        by_q, by_v, by_a = gradient[:, :size], gradient[:, size : 2 * size], gradient[:, 2 * size :]
         for part in self.bodies:
             y = rows[:, part.rows]
-            body = part.shape.body
+            body = part.constants.body
             K, M, G = (y @ x[:, part.kept] for x in (body.K, body.M, body.G))
             k, m_q, g_q, d, g_v, m = part.factors()
             by_q[:, part.columns] += k * K + m_q * M + g_q * G
             by_v[:, part.columns] += g_v * G
-            if part.shape.D is not None:
+            if part.constants.D is not None:
                 by_v[:, part.columns] += d * (y @ body.D[:, part.kept])
             by_a[:, part.columns] += m * M
         return by_q, by_v, by_a
@@ -528,27 +544,27 @@ def linearise(
     for frame, place, chosen in zip(frames, places, kept, strict=True):
         columns = _columns(place, len(keep))
         motions.append(_next_motion(frame, columns, chosen, motions[-1]))
-    tip_v, _, turn_v = motions[-1]
+    tip_v, _, rotation_v = motions[-1]
     force, force_v = mechanism.payload_mass * tip[0], _column(mechanism.payload_mass) * tip_v
-    moment_v = _column(mechanism.payload_inertia) * turn_v
+    moment_v = _column(mechanism.payload_inertia) * rotation_v
     bodies: list[_BodyTangent] = []
     for k in reversed(range(len(frames))):
         part, frame, chosen = mechanism.slices[k], frames[k], kept[k]
-        shape = frame.shape
+        constants = frame.constants
         rates = (q[:, part], qd[:, part], qdd[:, part])
         columns = _columns(places[k], len(keep))
-        force = frame.swing * force
-        force_v = frame.swing[:, None] * force_v
-        force_v[:, columns[0]] += 1j * force[:, None] * shape.turn[chosen]
+        force = frame.joint_rotation * force
+        force_v = frame.joint_rotation[:, None] * force_v
+        force_v[:, columns[0]] += 1j * force[:, None] * constants.rotation[chosen]
         scale = mechanism.scale(k)
         load = (force_v, moment_v)
-        left, right = _felt(frame, motions[k], rates[1], load, scale.mass, k > 0)
-        own = (shape, part, places[k], chosen, frame.w, frame.wd, scale)
+        left, right = _coupling(frame, motions[k], rates[1], load, scale.mass, k > 0)
+        own = (constants, part, places[k], chosen, frame.w, frame.wd, scale)
         bodies.insert(0, _BodyTangent(*own, left, right))
         if k == 0:
             break
         moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
-        moment_v[:, columns[0]] += (np.conj(shape.B[chosen]) * force[:, None]).imag
+        moment_v[:, columns[0]] += (np.conj(constants.B[chosen]) * force[:, None]).imag
         force_b, moment_b = _body_load(frame, motions[k], columns, chosen, rates)
         mass = _column(scale.mass)
         force_v, moment_v = force_v + mass * force_b, moment_v + mass * moment_b
@@ -556,19 +572,19 @@ def linearise(
     return Tangent(tuple(bodies), keep)
 
 
-_FrameSlopes = tuple[np.ndarray, np.ndarray, np.ndarray]  # of (a, w, wd), each (n, 3 S)
+_FrameDerivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # of (a, w, wd), each (n, 3 S)
 _Columns = tuple[slice, slice, slice]
 
 
-def _prescribed(count: int, width: int) -> _FrameSlopes:
+def _prescribed(count: int, width: int) -> _FrameDerivatives:
     """Return the derivatives of a frame's motion that is prescribed."""
     zero = np.zeros((count, width))
     return zero.astype(complex), zero, zero
 
 
-def _felt(
+def _coupling(
     frame: _Frame,
-    motion: _FrameSlopes,
+    motion: _FrameDerivatives,
     ed: np.ndarray,
     load: tuple[np.ndarray, np.ndarray],
     mass: PerInstant,
@@ -576,18 +592,18 @@ def _felt(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
     force_v, moment_v = load
-    shape = frame.shape
-    by = [shape.B.real, shape.B.imag, shape.turn]
-    felt = [force_v.real, force_v.imag, moment_v]
+    constants = frame.constants
+    by = [constants.B.real, constants.B.imag, constants.rotation]
+    coupled = [force_v.real, force_v.imag, moment_v]
     if moves:
         a_v, w_v, wd_v = motion
-        by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ shape.body.G)
-        by += [shape.C.real, shape.C.imag, by_w, frame.rG]
-        felt += [_column(mass) * x for x in (a_v.real, a_v.imag, w_v, wd_v)]
+        by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ constants.body.G)
+        by += [constants.C.real, constants.C.imag, by_w, frame.rG]
+        coupled += [_column(mass) * x for x in (a_v.real, a_v.imag, w_v, wd_v)]
     left = np.empty((*ed.shape, len(by)))
     for i, column in enumerate(by):
         left[:, :, i] = column
-    return left, np.stack(felt, axis=1)
+    return left, np.stack(coupled, axis=1)
 
 
 def _columns(part: slice, size: int) -> _Columns:
@@ -597,12 +613,12 @@ def _columns(part: slice, size: int) -> _Columns:
 
 
 def _next_motion(
-    frame: _Frame, columns: _Columns, chosen: np.ndarray, motion: _FrameSlopes
-) -> _FrameSlopes:
+    frame: _Frame, columns: _Columns, chosen: np.ndarray, motion: _FrameDerivatives
+) -> _FrameDerivatives:
     """Return the derivatives of the next frame's (a, w, wd)."""
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
-    B, turn = frame.shape.B[chosen], frame.shape.turn[chosen]
+    B, rotation = frame.constants.B[chosen], frame.constants.rotation[chosen]
     w, wd = frame.w[:, None], frame.wd[:, None]
     d, dd = frame.d[:, None], frame.dd[:, None]
     inner = a_v + 1j * d * wd_v + (2j * dd - 2.0 * w * d) * w_v
@@ -610,23 +626,23 @@ def _next_motion(
     inner[:, cv] += 2j * w * B
     inner[:, ca] += B
     next_a = frame.a + (1j * frame.wd - frame.w**2) * frame.d + 2j * frame.w * frame.dd + frame.ddd
-    inner[:, cq] -= 1j * next_a[:, None] * turn
-    out = np.conj(frame.swing)[:, None] * inner
+    inner[:, cq] -= 1j * next_a[:, None] * rotation
+    out = np.conj(frame.joint_rotation)[:, None] * inner
     w_v, wd_v = w_v.copy(), wd_v.copy()
-    w_v[:, cv] += turn
-    wd_v[:, ca] += turn
+    w_v[:, cv] += rotation
+    wd_v[:, ca] += rotation
     return out, w_v, wd_v
 
 
 def _body_load(
     frame: _Frame,
-    motion: _FrameSlopes,
+    motion: _FrameDerivatives,
     columns: _Columns,
     chosen: np.ndarray,
     rates: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (n, 3 S) of one body's own force F and moment T."""
-    body, C = frame.shape.body, frame.shape.C[chosen]
+    body, C = frame.constants.body, frame.constants.C[chosen]
     _, ed, edd = rates
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
@@ -654,11 +670,13 @@ def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np
     if 0 < len(q) < FEW:
         return end_effector(*_several(mechanism, motion, q))[: len(q)]
     place = motion.q[:, 0] + 1j * mechanism.joint_height
-    swing = np.ones(len(q), dtype=complex)
-    for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
-        swing = swing * np.exp(1j * motion.q[:, k + 1])
-        place = place + swing * (shape.reach + q[:, part] @ shape.B)
-        swing = swing * np.exp(1j * (q[:, part] @ shape.turn))
+    joint_rotation = np.ones(len(q), dtype=complex)
+    for k, (part, constants) in enumerate(
+        zip(mechanism.slices, mechanism.modal_constants, strict=True)
+    ):
+        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
+        place = place + joint_rotation * (constants.outboard_position + q[:, part] @ constants.B)
+        joint_rotation = joint_rotation * np.exp(1j * (q[:, part] @ constants.rotation))
     return np.stack([place.real, place.imag], axis=1)
 
 
@@ -671,10 +689,10 @@ def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.nd
     return end_effector(mechanism, motion, q) - rigid
 
 
-def end_effector_slopes(
+def end_effector_gradient(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the slopes of sum_n weights_n . end_effector_n.
+    """Return the gradient of sum_n weights_n . end_effector_n.
 
     Args:
         mechanism, motion, q: as for `end_effector`, n instants.
@@ -686,29 +704,31 @@ def end_effector_slopes(
     if 0 < len(q) < FEW:
         several = _several(mechanism, motion, q, weights)
         several[-1][len(q) :] = 0.0
-        by_several, by_bodies = end_effector_slopes(*several)
+        by_several, by_bodies = end_effector_gradient(*several)
         return by_several[: len(q)], by_bodies
     w = weights[:, 0] + 1j * weights[:, 1]
-    swings, levers = [], []
-    swing = np.ones(len(q), dtype=complex)
-    for k, (part, shape) in enumerate(zip(mechanism.slices, mechanism.shapes, strict=True)):
-        swing = swing * np.exp(1j * motion.q[:, k + 1])
-        swings.append(swing)
-        levers.append(swing * (shape.reach + q[:, part] @ shape.B))
-        swing = swing * np.exp(1j * (q[:, part] @ shape.turn))
+    rotations, levers = [], []
+    joint_rotation = np.ones(len(q), dtype=complex)
+    for k, (part, constants) in enumerate(
+        zip(mechanism.slices, mechanism.modal_constants, strict=True)
+    ):
+        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
+        rotations.append(joint_rotation)
+        levers.append(joint_rotation * (constants.outboard_position + q[:, part] @ constants.B))
+        joint_rotation = joint_rotation * np.exp(1j * (q[:, part] @ constants.rotation))
     by_q = np.empty_like(q)
     by_outboard: list[np.ndarray] = []
     beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
-    for k in reversed(range(len(swings))):
-        part, shape = mechanism.slices[k], mechanism.shapes[k]
-        place = np.conj(swings[k]) * w
-        turn = (np.conj(w) * 1j * beyond).real
+    for k in reversed(range(len(rotations))):
+        part, constants = mechanism.slices[k], mechanism.modal_constants[k]
+        place = np.conj(rotations[k]) * w
+        rotation = (np.conj(w) * 1j * beyond).real
         by_q[:, part] = (
-            np.outer(place.real, shape.B.real)
-            + np.outer(place.imag, shape.B.imag)
-            + np.outer(turn, shape.turn)
+            np.outer(place.real, constants.B.real)
+            + np.outer(place.imag, constants.B.imag)
+            + np.outer(rotation, constants.rotation)
         )
-        rows = [weight @ q[:, part] for weight in (place.real, place.imag, turn)]
+        rows = [weight @ q[:, part] for weight in (place.real, place.imag, rotation)]
         by_outboard.insert(0, np.stack(rows))
         beyond = beyond + levers[k]
     return by_q, by_outboard
@@ -730,7 +750,7 @@ def compliance(
 # -- adjoint ---------------------------------------------------------------------------------
 
 
-def body_slopes(
+def body_gradient(
     mechanism: Mechanism,
     motion: RigidMotion,
     q: np.ndarray,
@@ -742,8 +762,8 @@ def body_slopes(
 
     The multipliers are a virtual displacement of the elastic coordinates: the sum is the virtual
     work of all inertia and elastic forces, linear in every shape integral. Only the outboard
-    interface enters through the kinematics, too; its slopes come from a pass back along the chain
-    that carries the derivatives with respect to the frames' motion beside the forces.
+    interface enters through the kinematics, too; its gradient comes from a pass back along the
+    chain that carries the derivatives with respect to the frames' motion beside the forces.
 
     Args:
         mechanism, motion, q, qd, qdd: as for `inverse_dynamics`; n instants.
@@ -752,36 +772,36 @@ def body_slopes(
     if 0 < len(q) < FEW:
         several = _several(mechanism, motion, q, qd, qdd, multipliers)
         several[-1][len(q) :] = 0.0
-        return body_slopes(*several)
+        return body_gradient(*several)
     frames, tip = _outward(mechanism, motion, q, qd, qdd)
-    moves, (tip_p, tip_turn) = _virtual_motion(mechanism, frames, multipliers)
+    moves, (tip_p, tip_rotation) = _virtual_motion(mechanism, frames, multipliers)
     outer = _Outer(
         force=mechanism.payload_mass * tip[0],
         moment=mechanism.payload_inertia * tip[2],
         a=mechanism.payload_mass * tip_p,
-        w=np.zeros_like(tip_turn),
-        wd=mechanism.payload_inertia * tip_turn,
+        w=np.zeros_like(tip_rotation),
+        wd=mechanism.payload_inertia * tip_rotation,
         next_a=tip[0],
         next_p=tip_p,
     )
-    slopes: list[ShapeIntegrals] = []
+    gradient: list[ShapeIntegrals] = []
     for k in reversed(range(len(frames))):
         part = mechanism.slices[k]
         rates = (q[:, part], qd[:, part], qdd[:, part])
         virtual = (*moves[k], multipliers[:, part])
-        outboard, outer = _outboard_slopes(frames[k], rates, virtual, outer)
-        slopes.insert(0, _integral_slopes(frames[k], rates, virtual, outboard))
+        outboard, outer = _outboard_gradient(frames[k], rates, virtual, outer)
+        gradient.insert(0, _integral_gradient(frames[k], rates, virtual, outboard))
         outer = _with_body(frames[k], rates, virtual, outer)
-    return slopes
+    return gradient
 
 
 @dataclass(frozen=True, eq=False)
 class _Outer:
-    """Everything from one frame outwards, as seen in it: forces and slopes of the virtual work.
+    """Everything from one frame outwards, as seen in it: forces and gradient of the virtual work.
 
     Attributes:
-        force, moment: of the bodies outboard; also the slopes by the frame's virtual motion.
-        a, w, wd: slopes by the frame's acceleration (complex), angular velocity, acceleration.
+        force, moment: of the bodies outboard; also the gradient by the frame's virtual motion.
+        a, w, wd: gradient by the frame's acceleration (complex), angular velocity, acceleration.
         next_a, next_p: the frame's own acceleration and virtual displacement.
     """
 
@@ -797,28 +817,30 @@ class _Outer:
 def _virtual_motion(
     mechanism: Mechanism, frames: list[_Frame], multipliers: np.ndarray
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], tuple[np.ndarray, np.ndarray]]:
-    """Return every frame's virtual displacement (complex, its components) and turn."""
+    """Return every frame's virtual displacement (complex, its components) and rotation."""
     p = np.zeros(len(multipliers), dtype=complex)
-    turn = np.zeros(len(multipliers))
+    rotation = np.zeros(len(multipliers))
     moves = []
     for part, frame in zip(mechanism.slices, frames, strict=True):
-        shape = frame.shape
-        moves.append((p, turn))
-        p = np.conj(frame.swing) * (p + 1j * turn * frame.d + multipliers[:, part] @ shape.B)
-        turn = turn + multipliers[:, part] @ shape.turn
-    return moves, (p, turn)
+        constants = frame.constants
+        moves.append((p, rotation))
+        p = np.conj(frame.joint_rotation) * (
+            p + 1j * rotation * frame.d + multipliers[:, part] @ constants.B
+        )
+        rotation = rotation + multipliers[:, part] @ constants.rotation
+    return moves, (p, rotation)
 
 
-def _outboard_slopes(
+def _outboard_gradient(
     frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer
 ) -> tuple[np.ndarray, _Outer]:
-    """Return the slopes (3, q) of the outboard modes and `outer` brought into this frame."""
+    """Return the gradient (3, q) of the outboard modes and `outer` brought into this frame."""
     q, qd, qdd = rates
-    _, turn, multipliers = virtual
+    _, rotation, multipliers = virtual
     w = frame.w
     kappa = 1j * frame.wd - w * w
-    force, a = frame.swing * outer.force, frame.swing * outer.a
-    d = a * np.conj(kappa) - 1j * turn * force
+    force, a = frame.joint_rotation * outer.force, frame.joint_rotation * outer.a
+    d = a * np.conj(kappa) - 1j * rotation * force
     phi = (np.conj(outer.a) * -1j * outer.next_a).real
     phi += (np.conj(outer.force) * -1j * outer.next_p).real
     place = d @ q + (-2j * w * a) @ qd + a @ qdd + force @ multipliers
@@ -836,12 +858,12 @@ def _outboard_slopes(
     return np.stack([place.real, place.imag, rotation]), inner
 
 
-def _integral_slopes(
+def _integral_gradient(
     frame: _Frame, rates: _Rates, virtual: _Rates, outboard: np.ndarray
 ) -> ShapeIntegrals:
-    """Return the slopes of one body's virtual work by its shape integrals."""
+    """Return the gradient of one body's virtual work by its shape integrals."""
     q, qd, _ = rates
-    p, turn, multipliers = virtual
+    p, rotation, multipliers = virtual
     eta, eta_d, eta_dd, virtual_eta = (
         np.insert(x, 0, first, axis=1)
         for x, first in zip((*rates, multipliers), (1.0, 0.0, 0.0, 0.0))
@@ -849,17 +871,17 @@ def _integral_slopes(
     w, wd = frame.w[:, None], frame.wd[:, None]
     radial = eta_dd - w * w * eta  # of a point's acceleration, in N
     around = wd * eta + 2.0 * w * eta_d  # in S N
-    turned = turn[:, None] * eta
+    rotated_eta = rotation[:, None] * eta
     kappa = 1j * frame.wd - frame.w * frame.w
-    moment = p * np.conj(kappa) - 1j * turn * frame.a
+    moment = p * np.conj(kappa) - 1j * rotation * frame.a
     by_w = moment @ eta + (p * -2j * frame.w) @ eta_d + p @ eta_dd + frame.a @ virtual_eta
     return ShapeIntegrals(
         mass=float((np.conj(p) * frame.a).real.sum()),
         w=np.stack([by_w.real, by_w.imag]),
         W=np.stack(
             [
-                virtual_eta.T @ radial + turned.T @ around,
-                virtual_eta.T @ around + (turn[:, None] * radial).T @ eta,
+                virtual_eta.T @ radial + rotated_eta.T @ around,
+                virtual_eta.T @ around + (rotation[:, None] * radial).T @ eta,
             ]
         ),
         K=multipliers.T @ q,
@@ -870,10 +892,10 @@ def _integral_slopes(
 
 
 def _with_body(frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer) -> _Outer:
-    """Add one body's own force and slopes to what lies outboard of it."""
-    body, shape = frame.shape.body, frame.shape
+    """Add one body's own force and gradient to what lies outboard of it."""
+    body, constants = frame.constants.body, frame.constants
     _, qd, qdd = rates
-    p, turn, multipliers = virtual
+    p, rotation, multipliers = virtual
     w = frame.w
     spin = np.einsum("nk,nk->n", frame.jM, qd)
     gyro = -2.0 * w[:, None] * frame.jM - 2.0 * (qd @ body.G)
@@ -884,14 +906,14 @@ def _with_body(frame: _Frame, rates: _Rates, virtual: _Rates, outer: _Outer) -> 
         + _inertia(frame) * frame.wd
         + 2.0 * w * spin
         + np.einsum("nk,nk->n", frame.rG, qdd),
-        a=outer.a + body.mass * p + 1j * frame.s * turn + multipliers @ shape.C,
+        a=outer.a + body.mass * p + 1j * frame.s * rotation + multipliers @ constants.C,
         w=outer.w
         + (np.conj(p) * (2j * frame.sd - 2.0 * w * frame.s)).real
-        + 2.0 * spin * turn
+        + 2.0 * spin * rotation
         + np.einsum("nk,nk->n", gyro, multipliers),
         wd=outer.wd
         + (np.conj(p) * 1j * frame.s).real
-        + _inertia(frame) * turn
+        + _inertia(frame) * rotation
         + np.einsum("nk,nk->n", frame.rG, multipliers),
         next_a=outer.next_a,
         next_p=outer.next_p,

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.problem import Solution
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.continuation import Continuation
 from dolfinopt.optimization.convergence import ending, stop_reason

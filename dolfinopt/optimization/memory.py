@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.dynamics.problem import Solution
+from dolfinopt.dynamics.solution import Solution
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.responses.order_selection import Choice
 

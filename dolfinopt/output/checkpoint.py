@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.dynamics.problem import Solution
+from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 NAME = CHECKPOINT
-SOLUTION = ("edges", "nodes", "q", "qd", "a")
+# A solution's arrays: name in the file, field.
+SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
 # Keys a resumed run may change: they say when to stop, not what is computed.
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance")
 
@@ -92,8 +93,8 @@ def _write(
         arrays["coordinates"] = memory.choice.coordinates
         arrays["tried"] = np.array(memory.choice.tried)
     for k, solution in enumerate(memory.solutions):
-        for field in (*SOLUTION, "error"):
-            arrays[f"solution{k}/{field}"] = getattr(solution, field)
+        for name, field in (*SOLUTION.items(), ("error", "error")):
+            arrays[f"solution{k}/{name}"] = getattr(solution, field)
     for key, by_arm in columns.items():
         for k, value in by_arm.items():
             arrays[f"arm{k}/{key}"] = value
@@ -137,7 +138,7 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
     solutions: list[Solution] = []
     while f"solution{len(solutions)}/error" in arrays:
         of = f"solution{len(solutions)}"
-        parts = {field: arrays[f"{of}/{field}"] for field in SOLUTION}
+        parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
     columns = arrays["history_columns"].tolist()
     history = [HistoryRow.from_values(columns, row.tolist()) for row in arrays["history"]]

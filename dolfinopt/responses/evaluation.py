@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import chain_of
-from dolfinopt.dynamics.problem import Solution
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency
 from dolfinopt.parallel import ArmShare, gather_arms, on_root, together

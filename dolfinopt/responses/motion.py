@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dolfinopt.dynamics.adjoint import trajectory_slopes
+from dolfinopt.dynamics.adjoint import trajectory_gradient
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import on_root, together
@@ -99,7 +99,7 @@ class MotionResponse(Response):
         """
         cases = self.load_cases(trajectory)
         by_q, own = self.derivatives(trajectory, cases)
-        followed = trajectory_slopes(
+        followed = trajectory_gradient(
             trajectory.problem, trajectory.solution, trajectory.t[cases.indices], by_q
         )
         return [

@@ -15,9 +15,10 @@ from dolfinopt.bench.beams import exudyn_available, exudyn_tip
 from dolfinopt.bench.common import Diagram, Goal, curves, fitted_exponent
 from dolfinopt.bench.statics import StaticArm, dolfinx_iteration, pymoto_iteration
 from dolfinopt.dynamics import generalized_alpha, radau
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.problem import ElasticProblem, even_steps
 from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.multibody.mechanism import inverse_dynamics
@@ -37,7 +38,7 @@ def problem():
     arms = common.arms_of(scene)
     x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
     mechanism = build_mechanism(scene, common.bodies_of(scene, arms, x_phys))
-    return ElasticProblem(mechanism, partial(rigid_motion, scene=scene), breakpoints(scene))
+    return ElasticSystem(mechanism, partial(rigid_motion, scene=scene), breakpoints(scene))
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_jacobian_is_the_slope_of_accelerations(problem):
 def test_scipy_and_radau_agree(problem, judge):
     """Two independent paths through the same rows; the errors fall with the tolerance."""
     modes = modes_of(problem)
-    found = times.scipy_motion(modes.problem, "Radau", 1e-4, judge.t, (0.1, 10.0))
+    found = times.scipy_motion(modes.system, "Radau", 1e-4, judge.t, (0.1, 10.0))
     assert max(judge.errors(modes.from_modes(found))) < 3e-2
     ours = [
         radau.integrate(problem, tolerance, 3, Ledger()).sample(judge.t)

@@ -9,7 +9,7 @@ import pytest
 
 from dolfinopt.bench import common, tolerance
 from dolfinopt.bench.tolerance import Run
-from dolfinopt.dynamics.problem import relative_error
+from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.motion import DENSE, rigid_motion
 from dolfinopt.paper.reproduction import load_paper

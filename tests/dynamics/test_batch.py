@@ -9,13 +9,21 @@ import pytest
 from bodies import beam, random_cloud
 
 from dolfinopt.dynamics import batch, radau
-from dolfinopt.dynamics.adjoint import trajectory_slopes
-from dolfinopt.dynamics.collocation import beginnings, radau_iia, rows_at, stages_of, starts
+from dolfinopt.dynamics.adjoint import trajectory_gradient
+from dolfinopt.dynamics.collocation import (
+    radau_iia,
+    residual_at,
+    stages_of,
+    step_beginnings,
+    step_ends,
+)
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.newton_matrix import alone as alone_of
 from dolfinopt.dynamics.newton_matrix import factorise
-from dolfinopt.dynamics.problem import ElasticProblem, Solution, even_steps, relative_error
-from dolfinopt.dynamics.simplified_newton import held_factors
+from dolfinopt.dynamics.simplified_newton import simplified_newton_matrix
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.system import relative_error
+from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.mechanism import (
     Mechanism,
@@ -57,15 +65,15 @@ def two_arms(
     gravity: tuple[float, float] = (0.0, 0.0),
     factors: tuple[float, float, float] = (1.0, 1.0, DAMPING),
     bending: float = 10.0,
-) -> ElasticProblem:
+) -> ElasticSystem:
     """Return two slender arms of 1 to 50 Hz; factors of mass, stiffness, and the damping, s."""
     body = beam(bending=bending, axial=300.0, damping=DAMPING).body()
     bodies = tuple(of_material(body, *factors) for _ in range(2))
     mechanism = Mechanism(bodies, payload, inertia, gravity, 0.0)
-    return ElasticProblem(mechanism, reach(duration, size), (0.0, duration, horizon))
+    return ElasticSystem(mechanism, reach(duration, size), (0.0, duration, horizon))
 
 
-def various() -> list[ElasticProblem]:
+def various() -> list[ElasticSystem]:
     """Return problems that differ in all that a batch knows."""
     return [
         two_arms(),
@@ -77,7 +85,7 @@ def various() -> list[ElasticProblem]:
     ]
 
 
-def solve(problems: list[ElasticProblem], starts_: list[Solution | None] | None = None):
+def solve(problems: list[ElasticSystem], starts_: list[Solution | None] | None = None):
     """Return the solutions and the ledger; nothing may have been left to the single method."""
     ledger = Ledger()
     found = batch.integrate(problems, TOLERANCE, 3, ledger, starts_ or [None] * len(problems))
@@ -85,12 +93,12 @@ def solve(problems: list[ElasticProblem], starts_: list[Solution | None] | None 
 
 
 @pytest.fixture
-def alone(monkeypatch) -> list[ElasticProblem]:
+def alone(monkeypatch) -> list[ElasticSystem]:
     """Return what the batch leaves to the single method."""
-    left: list[ElasticProblem] = []
+    left: list[ElasticSystem] = []
     single = batch._alone
 
-    def counted(problem: ElasticProblem, *rest):
+    def counted(problem: ElasticSystem, *rest):
         left.append(problem)
         return single(problem, *rest)
 
@@ -98,7 +106,7 @@ def alone(monkeypatch) -> list[ElasticProblem]:
     return left
 
 
-def distance(problem: ElasticProblem, one: Solution, other: Solution) -> float:
+def distance(problem: ElasticSystem, one: Solution, other: Solution) -> float:
     """Return the relative difference in energy over the horizon."""
     t = np.linspace(0.0, problem.breakpoints[-1], 500)
     here, there = one.sample(t), other.sample(t)
@@ -198,16 +206,12 @@ def test_held_matrix_is_exact_where_the_tangent_rests(stages):
     zero = np.zeros((count, stages, 6))
     exact = factorise(own, zero, zero, zero, slow)
     flat = np.zeros((count, 6))
-    found = held_factors(own, (flat, flat), zero, slow, alone_of(own))
+    found = simplified_newton_matrix(own, (flat, flat), zero, slow)
     rows = np.random.default_rng(1).normal(size=zero.shape)
     for mine, theirs in zip(
         found.solve(rows, np.zeros((2, 6))), exact.solve(rows, np.zeros((2, 6))), strict=True
     ):
         np.testing.assert_allclose(mine, theirs, atol=1e-8 * np.abs(theirs).max())
-
-
-def doubled(motion):
-    return RigidMotion(*(np.tile(x, (2, 1)) for x in (motion.q, motion.qd, motion.qdd)))
 
 
 def test_runs_begin_anew():
@@ -218,21 +222,21 @@ def test_runs_begin_anew():
     twice = replace(
         own,
         h=np.tile(own.h, 2),
-        motion=doubled(own.motion),
-        middle=doubled(own.middle),
+        instants=own.instants[np.tile(np.arange(len(own.instants)), 2)],
+        middle=own.middle[np.tile(np.arange(len(own.middle)), 2)],
         runs=2,
     )
     rng = np.random.default_rng(2)
     a = rng.normal(size=(len(twice.h), 3, 6))
     state = rng.normal(size=(2, 2, 6))
     half = len(own.h)
-    q, qd = beginnings(twice, (state[0], state[1]), a)
+    q, qd = step_beginnings(twice, (state[0], state[1]), a)
     zero = np.zeros_like(a)
     slow = np.array([2, 5])
-    rows = rows_at(twice, zero, zero, a)
+    rows = residual_at(twice, zero, zero, a)
     both = factorise(twice, zero, zero, zero, slow).solve(rows, np.zeros((2, 6)))
     for k, part in enumerate((slice(0, half), slice(half, None))):
-        alone = starts(own, (state[0][k], state[1][k]), a[part])
+        alone = step_ends(own, (state[0][k], state[1][k]), a[part])
         np.testing.assert_allclose(q[part], alone[0][:-1], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(qd[part], alone[1][:-1], rtol=1e-12, atol=1e-12)
         one = factorise(own, zero[part], zero[part], zero[part], slow)
@@ -255,7 +259,7 @@ def test_batch_is_each_of_them_alone(alone):
         single = radau.integrate(problem, TOLERANCE, 3, Ledger())
         assert one.error <= TOLERANCE
         assert distance(problem, one, single) <= 2.0 * TOLERANCE
-        same = radau.on_grid(problem, one.edges, TOLERANCE, 3)
+        same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
         assert distance(problem, one, same) <= LEFT
         # Of a single answer: more by what its contraction may leave, up to a quarter.
         assert 0.9 <= one.error / same.error <= 1.3
@@ -266,7 +270,7 @@ def test_order_does_not_matter():
     here, _ = solve(problems)
     there, _ = solve(problems[::-1])
     for one, other in zip(here, there[::-1], strict=True):
-        assert np.array_equal(one.edges, other.edges) and np.array_equal(one.a, other.a)
+        assert np.array_equal(one.time_grid, other.time_grid) and np.array_equal(one.a, other.a)
 
 
 def test_a_start_keeps_its_steps(alone):
@@ -277,7 +281,7 @@ def test_a_start_keeps_its_steps(alone):
     assert not alone
     assert second.counts.newton_iterations < first.counts.newton_iterations
     for problem, one, other in zip(problems, cold, warm, strict=True):
-        assert np.array_equal(one.edges, other.edges)
+        assert np.array_equal(one.time_grid, other.time_grid)
         assert distance(problem, one, other) <= LEFT
 
 
@@ -309,21 +313,21 @@ def test_failure_stays_alone():
     assert isinstance(found[1], ConvergenceError) and str(found[1]) == str(error.value)
     without, _ = solve(good)
     for problem, one, other in zip(good, (found[0], found[2]), without, strict=True):
-        assert np.array_equal(one.edges, other.edges)
+        assert np.array_equal(one.time_grid, other.time_grid)
         assert distance(problem, one, other) <= LEFT  # the matrix is renewed at other times
 
 
 def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
     """Whom Newton's method in the batch gives up is solved by itself."""
     problems = [two_arms(), two_arms(payload=1.3), two_arms(payload=1.6)]
-    newton = batch._newton
+    newton = batch.newton
 
-    def refuses(grid, a, goal):
-        found = newton(grid, a, goal)
-        heavy = grid.family.payload[grid.members, 0] == 1.6
+    def refuses(stages, *rest):
+        found = newton(stages, *rest)
+        heavy = stages.preconditioner.system.payload[:, 0] == 1.6
         return replace(found, converged=found.converged & ~heavy)
 
-    monkeypatch.setattr(batch, "_newton", refuses)
+    monkeypatch.setattr(batch, "newton", refuses)
     found, _ = solve(problems)
     assert alone == [problems[2]]
     assert all(one.error <= TOLERANCE for one in found)
@@ -332,12 +336,12 @@ def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
 def test_adjoint_of_a_solution_from_the_batch():
     """Slopes through a solution of the batch are those through the same one found alone."""
     problems = [two_arms(), two_arms(payload=1.5)]
-    found, _ = solve(problems)
+    found = batch.integrate(problems, TOLERANCE, 3, Ledger(), [None] * 2, radau.GOAL)
     problem, one = problems[1], found[1]
-    same = radau.on_grid(problem, one.edges, TOLERANCE, 3)
+    same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
     t = np.linspace(0.1, 1.0, 7)
     by_q = np.random.default_rng(4).normal(size=(7, 6))
-    here, there = (trajectory_slopes(problem, x, t, by_q) for x in (one, same))
+    here, there = (trajectory_gradient(problem, x, t, by_q) for x in (one, same))
     for mine, theirs in zip(here, there, strict=True):
         for name in ("K", "M", "C", "outboard"):
             expected = getattr(theirs, name)
@@ -349,7 +353,7 @@ def test_bodies_without_coordinates(alone):
     """A rigid arm among them."""
     bar = rigid_bar(0.5, 0.05, 0.01, 2700.0)
 
-    def problem(payload: float) -> ElasticProblem:
+    def problem(payload: float) -> ElasticSystem:
         whole = two_arms(payload=payload)
         bodies: tuple[ShapeIntegrals, ...] = (bar, whole.mechanism.bodies[1])
         return replace(whole, mechanism=replace(whole.mechanism, bodies=bodies))
@@ -358,5 +362,5 @@ def test_bodies_without_coordinates(alone):
     found, _ = solve(problems)
     assert not alone
     for one, each in zip(found, problems, strict=True):
-        same = radau.on_grid(each, one.edges, TOLERANCE, 3)
+        same = radau.on_grid(each, one.time_grid, TOLERANCE, 3)
         assert distance(each, one, same) <= LEFT

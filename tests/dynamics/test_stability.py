@@ -20,9 +20,11 @@ from remainders import SCENE, Built, rates, uneven, wave
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.cli import commands
-from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.problem import ElasticProblem, Solution, relative_error
+from dolfinopt.dynamics import newton, radau
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.constraint_modes import MOST_ROUNDING, floats, rounding_error
 from dolfinopt.fem.elasticity import ElasticArm
@@ -412,7 +414,7 @@ def test_motions(overrides: list[str]) -> None:
     assert distance(trajectory, fine) < 1.1e-4
 
 
-def quasi_static(problem: ElasticProblem, t: np.ndarray) -> np.ndarray:
+def quasi_static(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
     """Return K^-1 (- rows of the undeformed mechanism) at instants t."""
     rest = np.zeros((len(t), problem.mechanism.coordinates))
     rows = inverse_dynamics(problem.mechanism, problem.motion(t), rest, rest, rest)[0]
@@ -545,15 +547,15 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
 def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Arms that fold over: with Newton's method refused for more than 20 steps, the same motion."""
     trajectory = moved("motion.duration=0.4", "motion.horizon=0.6", field=checkerboard)
-    newton, refused = radau._newton, []
+    method, refused = newton.newton, []
 
-    def stubborn(stages, state, a, *options):
+    def stubborn(stages, state, a, *others, **options):
         if len(stages.h) > 20:
             refused.append(len(stages.h))
-            return a, 1, False
-        return newton(stages, state, a, *options)
+            return newton.Iterate(a, np.zeros(1, dtype=bool), np.zeros(1), np.ones(1, dtype=int))
+        return method(stages, state, a, *others, **options)
 
-    monkeypatch.setattr(radau, "_newton", stubborn)
+    monkeypatch.setattr(newton, "newton", stubborn)
     again = radau.integrate(trajectory.problem, 1e-4, 3, do.Ledger())
     assert refused
     assert distance(trajectory, again) < 2e-4

@@ -6,17 +6,24 @@ import numpy as np
 import pytest
 
 from dolfinopt.dynamics.collocation import Stages, radau_iia
-from dolfinopt.dynamics.problem import lagrange_slopes
+from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.solution import lagrange_derivatives
+from dolfinopt.dynamics.system import Unchanged
 from dolfinopt.dynamics.unresolved import _lost, unresolved
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 
 
-def test_slopes_of_polynomials() -> None:
+def still(t: np.ndarray) -> RigidMotion:
+    """Return a cart at rest."""
+    return RigidMotion(*np.zeros((3, len(t), 1)))
+
+
+def test_derivatives_of_polynomials() -> None:
     """A cubic by four nodes: its own value and derivatives, at the ends and beyond."""
     nodes, tau = np.array([0.1, 0.4, 0.7, 1.0]), np.array([-0.2, 0.0, 0.55, 1.0])
     cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0])
-    found = lagrange_slopes(nodes, tau) @ cubic(nodes)
+    found = lagrange_derivatives(nodes, tau) @ cubic(nodes)
     for k, row in enumerate(found):
         # Rounding of the inverted powers' matrix, some thousand large.
         np.testing.assert_allclose(row, cubic.deriv(k)(tau) if k else cubic(tau), atol=1e-11)
@@ -27,9 +34,9 @@ def test_slopes_of_polynomials() -> None:
 def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
     """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
     method, h = radau_iia(3), np.full(10, 0.1)
-    still = RigidMotion(*np.zeros((3, 30, 1)))
-    mechanism = Mechanism((), 0.0, 0.0, (0.0, 0.0), 0.0)
-    stages = Stages(mechanism, np.array([1e154]), method, h, still, still)
+    nothing = ElasticSystem(Mechanism((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
+    instants = nothing.at(np.zeros(30))
+    stages = Stages(Unchanged(nothing), method, h, instants, instants[::3])
     t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]
     states = (t**2, np.zeros_like(t), np.zeros_like(t))
     single = tuple(np.full((1, 1), x) for x in (1.0, damping, 1e-290))

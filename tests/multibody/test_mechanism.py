@@ -10,12 +10,12 @@ from bodies import Chain, assert_close, derivative, random_cloud
 
 from dolfinopt.multibody.mechanism import (
     Mechanism,
-    body_slopes,
+    body_gradient,
     compliance,
     deviation,
-    elastic_rows,
+    elastic_residual,
     end_effector,
-    end_effector_slopes,
+    end_effector_gradient,
     inverse_dynamics,
     tangent,
 )
@@ -258,11 +258,11 @@ def test_few_instants_do_not_depend_on_memory(rng: np.random.Generator, count: i
             kept[place] = kept[0]
         motion = RigidMotion(y[:, :r].copy(), yd[:, :r].copy(), ydd[:, :r].copy())
         q, qd, qdd = y[:, r:], yd[:, r:], ydd[:, r:]
-        slopes = body_slopes(mechanism, motion, q, qd, qdd, qd)
-        by_q, by_outboard = end_effector_slopes(mechanism, motion, q, weights)
+        slopes = body_gradient(mechanism, motion, q, qd, qdd, qd)
+        by_q, by_outboard = end_effector_gradient(mechanism, motion, q, weights)
         arrays = [
             *inverse_dynamics(mechanism, motion, q, qd, qdd),
-            elastic_rows(mechanism, motion, q, qd, qdd),
+            elastic_residual(mechanism, motion, q, qd, qdd),
             tangent(mechanism, motion, q, qd, qdd),
             end_effector(mechanism, motion, q),
             *(value for one in slopes for value in (one.w, one.W, one.K, one.outboard)),
@@ -283,7 +283,7 @@ def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) ->
     rates, weights = (y[:, r:], yd[:, r:], ydd[:, r:]), rng.normal(size=(8, 2))
     first = slice(count)
     few = tuple(x[first] for x in rates)
-    for function in (inverse_dynamics, elastic_rows, tangent):
+    for function in (inverse_dynamics, elastic_residual, tangent):
         whole, part = function(mechanism, many, *rates), function(mechanism, many[first], *few)
         if not isinstance(whole, tuple):
             whole, part = (whole,), (part,)
@@ -293,12 +293,12 @@ def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) ->
     # What is summed over the instants: weights of none at the others.
     weights[count:] = 0.0
     multipliers = np.where(np.arange(8)[:, None] < count, rates[1], 0.0)
-    by_q, by_outboard = end_effector_slopes(mechanism, many[first], few[0], weights[first])
-    whole_q, whole_outboard = end_effector_slopes(mechanism, many, rates[0], weights)
+    by_q, by_outboard = end_effector_gradient(mechanism, many[first], few[0], weights[first])
+    whole_q, whole_outboard = end_effector_gradient(mechanism, many, rates[0], weights)
     np.testing.assert_allclose(by_q, whole_q[first], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(by_outboard[0], whole_outboard[0], rtol=1e-12, atol=1e-12)
-    part = body_slopes(mechanism, many[first], *few, multipliers[first])
-    whole = body_slopes(mechanism, many, *rates, multipliers)
+    part = body_gradient(mechanism, many[first], *few, multipliers[first])
+    whole = body_gradient(mechanism, many, *rates, multipliers)
     for a, b in zip(whole, part, strict=True):
         np.testing.assert_allclose(b.W, a.W, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(b.K, a.K, rtol=1e-12, atol=1e-12)

@@ -11,8 +11,8 @@ from mpi4py import MPI
 from remainders import SCENE, Built, build, wave
 
 import dolfinopt as do
-from dolfinopt.dynamics.problem import relative_error
 from dolfinopt.dynamics.simulation import simulate
+from dolfinopt.dynamics.system import relative_error
 from dolfinopt.optimization import loop as optimization
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import gather_arms

@@ -73,7 +73,7 @@ class MeanSquare(MotionResponse):
         from dolfinopt.responses import deviation
 
         by_deviation = 2.0 * cases.weights[:, None] * trajectory.deviation[cases.indices]
-        by_q, by_outboard = deviation.end_effector_slopes(
+        by_q, by_outboard = deviation.end_effector_gradient(
             trajectory.mechanism, trajectory.motion, trajectory.q_e[cases.indices], by_deviation
         )
         return by_q, [{"outboard": part} for part in by_outboard]

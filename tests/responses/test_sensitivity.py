@@ -21,14 +21,16 @@ from scipy.optimize import brentq
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.adjoint import trajectory_slopes
-from dolfinopt.dynamics.problem import ElasticProblem, Solution, even_steps
+from dolfinopt.dynamics.adjoint import trajectory_gradient
+from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.mechanism import (
     Mechanism,
-    body_slopes,
+    body_gradient,
     end_effector,
-    end_effector_slopes,
+    end_effector_gradient,
     inverse_dynamics,
 )
 from dolfinopt.multibody.motion import RigidMotion, check_motion
@@ -99,7 +101,7 @@ def test_body_slopes_are_those_of_the_rows(rng: np.random.Generator, arms: int, 
     """Every entry of every constant of every body, payload and gravity included."""
     model = random_chain(rng, arms)
     motion, (q, qd, qdd, multipliers) = random_instants(rng, model, 4)
-    slopes = body_slopes(model, motion, q, qd, qdd, multipliers)
+    slopes = body_gradient(model, motion, q, qd, qdd, multipliers)
     for arm, body in enumerate(model.bodies):
         changes = list(unit_changes(body, name))
 
@@ -119,7 +121,7 @@ def test_end_effector_slopes(rng: np.random.Generator, arms: int) -> None:
     model = random_chain(rng, arms)
     motion, (q, _, _, _) = random_instants(rng, model, 3)
     weights = rng.normal(size=(3, 2))
-    by_q, by_outboard = end_effector_slopes(model, motion, q, weights)
+    by_q, by_outboard = end_effector_gradient(model, motion, q, weights)
 
     def place(one: Mechanism, coordinates: np.ndarray) -> float:
         return float(np.sum(weights * end_effector(one, motion, coordinates)))
@@ -172,7 +174,7 @@ def test_trajectory_slopes(
     """A quadratic function of the coordinates at instants on and between the steps' ends."""
     arm = orthonormal(beam(axial=300.0, damping=1e-3))
     chain = Chain((arm,) * arms, 0.5, 0.01, gravity, 0.0)
-    problem = ElasticProblem(chain.mechanism(), swing(arms), (0.0, 0.1, 0.25))
+    problem = ElasticSystem(chain.mechanism(), swing(arms), (0.0, 0.1, 0.25))
     edges = even_steps(problem, 15)
     t = np.linspace(0.0, 0.25, 18)
     weights = rng.uniform(0.5, 1.5, size=(len(t), problem.mechanism.coordinates))
@@ -182,7 +184,7 @@ def test_trajectory_slopes(
     def solve(model: Mechanism) -> Solution:
         return radau.on_grid(replace(problem, mechanism=model), edges, 1e-12, stages, base)
 
-    slopes = trajectory_slopes(problem, base, t, weights * base.sample(t))
+    slopes = trajectory_gradient(problem, base, t, weights * base.sample(t))
     value = 0.5 * np.sum(weights * base.sample(t) ** 2)
     for arm, body in enumerate(problem.mechanism.bodies):
         for name in CONSTANTS:
@@ -401,19 +403,19 @@ def no_modes(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hold the coordinates."""
 
-    def none(problem: ElasticProblem, *_: object) -> list[ShapeIntegrals]:
+    def none(problem: ElasticSystem, *_: object) -> list[ShapeIntegrals]:
         bodies = problem.mechanism.bodies
         return [
             replace(scaled(body, 0.0, 0.0, 0.0), outboard=np.zeros_like(body.outboard))
             for body in bodies
         ]
 
-    monkeypatch.setattr("dolfinopt.responses.motion.trajectory_slopes", none)
+    monkeypatch.setattr("dolfinopt.responses.motion.trajectory_gradient", none)
 
 
 def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hold the equilibrium that the motion starts from."""
-    monkeypatch.setattr("dolfinopt.dynamics.adjoint.add_slopes", lambda first, _: first)
+    monkeypatch.setattr("dolfinopt.dynamics.adjoint.add_gradients", lambda first, _: first)
 
 
 def no_filter(monkeypatch: pytest.MonkeyPatch) -> None:

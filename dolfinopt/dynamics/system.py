@@ -1,0 +1,174 @@
+"""Interface between mechanics and integrators: what is solved, and by what it is measured.
+
+An integrator sees a system of N coordinates through its residual r(t, q, q', q'') = 0 alone. What
+a mechanism of elastic bodies makes of it stands in `elastic_system`; another system is another
+file with another implementation. A constraint g(q, t) = 0 is a row of the residual, its multiplier
+the second derivative of a coordinate that nothing else depends on: collocation then fulfils it at
+every stage (Hairer, Lubich & Roche 1989, doi:10.1007/BFb0093947). Such rows ask for the exact
+Newton matrix, that of a system without a preconditioner.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+State = tuple[np.ndarray, np.ndarray]  # q, qd
+
+# An arm that nearly rests beside the others is measured against this share of theirs.
+LEAST_SHARE = 1e-3
+
+
+class Linearisation(Protocol):
+    """Derivative of the residual by S of the coordinates and their rates at n instants."""
+
+    def window(self, first: int, last: int) -> Linearisation:
+        """Return it at the instants first..last - 1."""
+
+    def dense(self) -> np.ndarray:
+        """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
+
+    def times(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of the W rows `wanted` (m, W) by one of the S coordinates, (m, S)."""
+
+    def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the gradient of sum_n rows_n . residual_n by q, qd, qdd, each (n, S)."""
+
+
+class Instants(Protocol):
+    """A system at n instants, all that depends on time alone evaluated."""
+
+    def __len__(self) -> int:
+        """Return n."""
+
+    def __getitem__(self, part: slice | np.ndarray) -> Instants:
+        """Return it at some of the instants."""
+
+    def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+        """Return r (n, N) of q, qd, qdd (n, N); zero when the equations of motion hold."""
+
+    def linearise(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, keep: np.ndarray | None = None
+    ) -> Linearisation:
+        """Return the derivative by the ascending coordinates `keep` (S,), or all."""
+
+
+class Preconditioner(Protocol):
+    """Coordinates z of a system in which its residual is nearly uncoupled.
+
+    Attributes:
+        system: in z.
+        frequencies: (runs, N) of every coordinate by itself, rad/s; 0 of what must be treated
+            densely.
+        uncoupled: stiffness, damping and mass (runs, N) of every coordinate by itself.
+        definite: whether mass and stiffness are: then the simplified Newton matrix may be used.
+    """
+
+    @property
+    def system(self) -> System: ...
+    @property
+    def frequencies(self) -> np.ndarray: ...
+    @property
+    def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+    @property
+    def definite(self) -> bool: ...
+
+    def to_modes(self, q: np.ndarray) -> np.ndarray:
+        """Return z (..., N) of coordinates q (..., N)."""
+
+    def from_modes(self, z: np.ndarray) -> np.ndarray:
+        """Return q (..., N)."""
+
+    def chosen(self, runs: np.ndarray) -> Preconditioner:
+        """Return that of some of the runs, by index."""
+
+
+class System(Protocol):
+    """N coordinates over a horizon; several runs of as many coordinates may be one system.
+
+    Attributes:
+        num_coordinates: N.
+        runs: equal problems side by side, mostly 1; instants are ordered run after run.
+        breakpoints: ascending instants, first 0 and last the horizon, between which the residual
+            is a smooth function of time; steps end there. Of the first run. s.
+    """
+
+    @property
+    def num_coordinates(self) -> int: ...
+    @property
+    def runs(self) -> int: ...
+    @property
+    def breakpoints(self) -> tuple[float, ...]: ...
+
+    def at(self, t: np.ndarray) -> Instants:
+        """Return the system at instants t (runs n,), s."""
+
+    def initial_state(self) -> State:
+        """Return q, qd (runs, N) at t = 0.
+
+        Raises:
+            ConvergenceError: there is none.
+        """
+
+    def norm(self, q: np.ndarray) -> np.ndarray:
+        """Return the largest norm of q (..., n, N) over n instants, (..., groups).
+
+        A group is what is measured by itself: errors are relative to its own size.
+        """
+
+    def slowest_frequency(self) -> float:
+        """Return that of the slowest vibration, rad/s: eight steps a period are tried first."""
+
+    def describe(self, q: np.ndarray) -> str:
+        """Say how far a motion q (n, N) goes, for a message: "the arms' ends turn by 2 rad"."""
+
+    def preconditioner(self) -> Preconditioner:
+        """Return coordinates for Newton's method; `Unchanged` where there are no better ones."""
+
+
+class Unchanged:
+    """A system in its own coordinates: all of them are treated densely, with pivots."""
+
+    definite = False
+
+    def __init__(self, system: System) -> None:
+        """Take the system."""
+        self.system = system
+        size = (1, system.num_coordinates)
+        self.frequencies = np.zeros(size)
+        self.uncoupled = (np.ones(size), np.zeros(size), np.ones(size))
+
+    def to_modes(self, q: np.ndarray) -> np.ndarray:
+        """Return q."""
+        return q
+
+    def from_modes(self, z: np.ndarray) -> np.ndarray:
+        """Return z."""
+        return z
+
+    def chosen(self, runs: np.ndarray) -> Unchanged:
+        """Return itself: there is one run."""
+        return self
+
+
+class Measured(Protocol):
+    """Anything with a system's norm."""
+
+    def norm(self, q: np.ndarray) -> np.ndarray:
+        """Return the largest norm over the instants, by group."""
+
+
+def relative_error(system: Measured, error: np.ndarray, q: np.ndarray) -> float:
+    """Return the largest error in time over the largest value, worst group; both (n, N)."""
+    return float(relative_errors(system, error, q))
+
+
+def relative_errors(system: Measured, error: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return `relative_error` of several runs (...); error and q (..., n, N)."""
+    size = system.norm(q)
+    largest = size.max(axis=-1, keepdims=True)
+    size = np.where(largest == 0.0, 1.0, np.maximum(size, LEAST_SHARE * largest))
+    return (system.norm(error) / size).max(axis=-1)
