@@ -1,6 +1,6 @@
 """The error of vibrations that steps do not resolve, which one stage more does not see.
 
-Where the prescribed motion sets in, changes its law or ends, loads have breakpoint_steps, and every vibration
+Where the prescribed motion sets in, changes its law or ends, loads have kinks, and every vibration
 sets in with an amplitude of its own. Steps much longer than its period damp it out by the method
 with s stages and with s + 1 alike: the difference of both says nothing about it. Without damping
 it is there to the end, though. So estimated by the amplitude at each kink, asymptotically for
