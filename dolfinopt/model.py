@@ -120,7 +120,7 @@ class SimulationResult:
 
     def plot_deviation(self) -> Figure | None:
         """Return the figure of the end-effector's distance from its rigid path over time."""
-        from dolfinopt.plots.figures import deviation_figure
+        from dolfinopt.plots.curves import deviation_figure
 
         if self.trajectory is None:
             return None
@@ -128,13 +128,13 @@ class SimulationResult:
 
     def plot_design(self) -> Figure | None:
         """Return the figure of the arms' densities."""
-        from dolfinopt.plots.figures import design_page
+        from dolfinopt.plots.design import design_figure
 
-        return design_page(designed(self.views), self.scene.name) if self.views else None
+        return design_figure(designed(self.views), self.scene.name) if self.views else None
 
     def plot_machine(self) -> Figure | None:
         """Return the figure of the machine in a few poses along its path."""
-        from dolfinopt.plots.figures import machine_figure
+        from dolfinopt.plots.machine import machine_figure
 
         if self.trajectory is None:
             return None
@@ -196,7 +196,7 @@ class OptimizationResult(SimulationResult):
 
     def plot_history(self) -> Figure | None:
         """Return the figure of the objective and other figures over the iterations."""
-        from dolfinopt.plots.figures import history_figure
+        from dolfinopt.plots.curves import history_figure
 
         minimised = objective_of(self.scene)
         label = f"{minimised.label} [{minimised.unit}]"

@@ -340,7 +340,8 @@ def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     """Nor anything of other commands: statistics, studies, exports."""
     others = {
         "scipy.stats",
-        "dolfinopt.plots.figures",
+        "dolfinopt.plots.design",
+        "dolfinopt.plots.curves",
         "dolfinopt.study.studies",
         "dolfinopt.multibody.mbdyn",
     }

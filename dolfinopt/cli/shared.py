@@ -143,19 +143,23 @@ def draw(
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.files import designed
-    from dolfinopt.plots import figures as plots
+    from dolfinopt.plots.curves import draw_deviation, draw_history
+    from dolfinopt.plots.design import draw_design
+    from dolfinopt.plots.machine import draw_machine
     from dolfinopt.responses.response import objective_of
 
     minimised = objective_of(scene)
     label = f"{minimised.label} [{minimised.unit}]"
-    plots.draw_design(folder / "design.png", designed(views), scene.name)
+    draw_design(folder / "design.png", designed(views), scene.name)
     if history:
-        plots.draw_history(folder / "history.png", history, label)
-    plots.draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
+        draw_history(folder / "history.png", history, label)
+    draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
     mechanism, t, q_r = trajectory.mechanism, trajectory.t, trajectory.q_r
-    plots.draw_machine(folder / "machine.png", views, mechanism, t, q_r, scene.name)
+    draw_machine(folder / "machine.png", views, mechanism, t, q_r, scene.name)
     if animation:
-        plots.draw_motion(folder / "motion.gif", views, mechanism, t, q_r, trajectory.q_e)
+        from dolfinopt.plots.animation import draw_motion
+
+        draw_motion(folder / "motion.gif", views, mechanism, t, q_r, trajectory.q_e)
 
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:

@@ -324,7 +324,7 @@ def strip(trajectory: Trajectory, at: np.ndarray, magnification: float) -> Strip
         at: (n,) samples to show.
         magnification: of the deformation.
     """
-    from dolfinopt.plots.figures import chain
+    from dolfinopt.plots.shapes import chain
 
     mechanism = trajectory.mechanism
     q = magnification * trajectory.q_e[at]
@@ -350,7 +350,7 @@ def _point(place: complex) -> str:
 
 def _player(done: Reproduction) -> dict[str, Any] | None:
     """Return the moving mechanism, initial and optimised design together; None without results."""
-    from dolfinopt.plots.figures import round_magnification
+    from dolfinopt.plots.animation import round_magnification
     from dolfinopt.study.store import simulate_scenarios
 
     optimum = done.outcomes[done.plan.optimum]

@@ -196,6 +196,20 @@ def log2_scale(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
+def round_number(value: float) -> float:
+    """Return the number 1, 2 or 5 times a power of ten that is nearest in ratio to `value` > 0."""
+    decade = 10.0 ** np.floor(np.log10(value))
+    choices = decade * np.array([1.0, 2.0, 5.0, 10.0])
+    return float(choices[np.argmin(np.abs(np.log(choices / value)))])
+
+
+def ticks(low: float, high: float, count: int = 10) -> np.ndarray:
+    """Return round numbers in [low, high], about `count` of them, evenly spaced."""
+    step = round_number((high - low) / count)
+    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
+    return step * np.arange(int(first), int(last) + 1)  # of integers: there is no -0
+
+
 # -- figures and files -----------------------------------------------------------------------
 
 

@@ -16,8 +16,7 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.files import ArmView
-from dolfinopt.plots import figures as plots
-from dolfinopt.plots import style
+from dolfinopt.plots import animation, curves, design, machine, shapes, style
 
 TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LENGTHS = (1.0, 0.7, 0.4)  # m
@@ -87,7 +86,7 @@ def still(q: np.ndarray) -> RigidMotion:
 )
 @pytest.mark.parametrize("decade", [1e-3, 1.0, 1e4])
 def test_round_number(value, expected, decade):
-    assert plots.round_number(value * decade) == pytest.approx(expected * decade)
+    assert style.round_number(value * decade) == pytest.approx(expected * decade)
 
 
 @pytest.mark.parametrize(
@@ -101,38 +100,38 @@ def test_round_number(value, expected, decade):
     ],
 )
 def test_magnification_is_round_and_at_least_one(largest, size, expected):
-    assert plots.round_magnification(largest, size) == pytest.approx(expected)
+    assert animation.round_magnification(largest, size) == pytest.approx(expected)
 
 
 def test_magnified_ends_turn_no_further_than_arms_do():
-    assert plots.round_magnification(0.00775, 2.0, 0.01) == 20.0
-    assert plots.round_magnification(0.00775, 2.0, 0.04) == 10.0
-    assert plots.round_magnification(0.00775, 2.0, 1.0) == 1.0
+    assert animation.round_magnification(0.00775, 2.0, 0.01) == 20.0
+    assert animation.round_magnification(0.00775, 2.0, 0.04) == 10.0
+    assert animation.round_magnification(0.00775, 2.0, 1.0) == 1.0
 
 
 @given(st.floats(1.2e-3, 0.05), st.floats(0.1, 10.0))
 def test_magnified_deviation_is_about_a_tenth_of_the_size(share, size):
-    magnification = plots.round_magnification(share * size, size)
+    magnification = animation.round_magnification(share * size, size)
     assert 0.1 / np.sqrt(2.6) < magnification * share < 0.1 * np.sqrt(2.6)
 
 
 def test_ticks_are_round_and_inside():
-    np.testing.assert_allclose(plots.ticks(0.0, 1.0), np.linspace(0.0, 1.0, 11))
-    np.testing.assert_allclose(plots.ticks(-0.05, 1.07, 5), np.linspace(0.0, 1.0, 6))
-    assert "-0" not in [f"{tick:g}" for tick in plots.ticks(-1e-17, 1.0)]
+    np.testing.assert_allclose(style.ticks(0.0, 1.0), np.linspace(0.0, 1.0, 11))
+    np.testing.assert_allclose(style.ticks(-0.05, 1.07, 5), np.linspace(0.0, 1.0, 6))
+    assert "-0" not in [f"{tick:g}" for tick in style.ticks(-1e-17, 1.0)]
 
 
 def test_areas_of_triangle_and_quadrilateral():
     triangle = np.array([[[0, 0], [2, 0], [0, 3]]], dtype=float)
     square = np.array([[[0, 0], [0, 2], [2, 2], [2, 0]]], dtype=float)  # clockwise
-    assert plots.cell_areas(triangle) == pytest.approx([3.0])
-    assert plots.cell_areas(square) == pytest.approx([4.0])
+    assert shapes.cell_areas(triangle) == pytest.approx([3.0])
+    assert shapes.cell_areas(square) == pytest.approx([4.0])
 
 
 def test_volume_fraction_weighs_with_area():
     corners = np.array([[[0, 0], [3, 0], [3, 1], [0, 1]], [[3, 0], [4, 0], [4, 1], [3, 1]]], float)
     view = ArmView("a", corners, corners.mean(axis=1), np.array([1.0, 0.2]), np.zeros((2, 4, 2, 0)))
-    assert plots.volume_fraction(view) == pytest.approx(0.8)
+    assert shapes.volume_fraction(view) == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(
@@ -151,19 +150,19 @@ SLENDER, FAT = (1.0, 0.06), (1.0, 1.2)
 @pytest.mark.parametrize("size", [SLENDER, FAT])
 def test_arms_stand_below_each_other_on_the_page(arms, size):
     views = [beam("a", size[0] / (k + 1), size[1] / (k + 1), 4, 2) for k in range(arms)]
-    layout = plots.stack_arms([view.corners for view in views])
+    layout = design.stack_arms([view.corners for view in views])
     placed = [layout.place(k, view.corners) for k, view in enumerate(views)]
     lows, highs = (np.array([f(p, axis=(0, 1)) for p in placed]) for f in (np.min, np.max))
-    assert np.allclose(lows[:, 0], plots.MARGIN)
-    assert (highs[:, 0] <= layout.width - plots.MARGIN + 1.0).all()
-    assert (lows[:-1, 1] - highs[1:, 1] >= plots.LABEL - 1.0).all()  # room for each name
-    assert lows[-1, 1] >= plots.FOOT - 1.0
-    assert highs[0, 1] <= layout.height - plots.HEAD - plots.LABEL + 1.0
+    assert np.allclose(lows[:, 0], design.MARGIN)
+    assert (highs[:, 0] <= layout.width - design.MARGIN + 1.0).all()
+    assert (lows[:-1, 1] - highs[1:, 1] >= design.LABEL - 1.0).all()  # room for each name
+    assert lows[-1, 1] >= design.FOOT - 1.0
+    assert highs[0, 1] <= layout.height - design.HEAD - design.LABEL + 1.0
     assert np.allclose(
         highs - lows, layout.scale * np.array(size) / np.arange(1, arms + 1)[:, None]
     )
     if size == SLENDER:
-        assert highs[0, 0] == pytest.approx(layout.width - plots.MARGIN, abs=1.0)
+        assert highs[0, 0] == pytest.approx(layout.width - design.MARGIN, abs=1.0)
 
 
 @pytest.mark.serial
@@ -172,20 +171,20 @@ def test_design_shows_each_density_in_its_place(tmp_path):
     from matplotlib.image import imread
 
     views = [beam("upper", 1.0, 0.2, 20, 4), beam("lower", 0.6, 0.1, 10, 2)]
-    path = plots.draw_design(tmp_path / "design.png", views, "half and half")
+    path = design.draw_design(tmp_path / "design.png", views, "half and half")
     assert [p.name for p in tmp_path.iterdir()] == ["design.png"]
     image = imread(path)[..., :3]
-    layout = plots.stack_arms([view.corners for view in views])
+    layout = design.stack_arms([view.corners for view in views])
     assert image.shape == (layout.height, layout.width, 3)
     for index, view in enumerate(views):
         for density in (0.0, 1.0):
             points = layout.place(index, view.centroid[view.density == density])
             shown = image[(layout.height - points[:, 1]).astype(int), points[:, 0].astype(int)]
-            expected = colormaps[plots.COLOURS](density)[:3]
+            expected = colormaps[style.COLOURS](density)[:3]
             np.testing.assert_allclose(shown, np.tile(expected, (len(shown), 1)), atol=0.02)
     dark = image.max(axis=2) < 0.3
     ruler, scale = layout.height - int(layout.bottom), layout.height - 90
-    assert dark[: int(plots.HEAD)].sum() > 500  # title
+    assert dark[: int(design.HEAD)].sum() > 500  # title
     assert dark[ruler + 30 : ruler + 60].sum() > 500  # lengths in m
     assert dark[scale:, : layout.width // 2 + 200].sum() > 300  # what the colours mean
     frame = np.concatenate([image[:8].ravel(), image[:, :8].ravel(), image[:, -8:].ravel()])
@@ -193,24 +192,45 @@ def test_design_shows_each_density_in_its_place(tmp_path):
 
 
 @pytest.mark.serial
+def test_joint_axes_are_marked_where_they_are():
+    """By black rings with white inside: the axis of the outboard joint is not the mesh's end."""
+    view = replace(beam("with bores", 1.1, 0.2, 20, 4), length=1.0)
+    image = design.design_image([view], "title")
+    layout = design.stack_arms([view.corners])
+    for x, y in layout.place(0, np.array([[0.0, 0.0], [1.0, 0.0]])):
+        row, column = int(layout.height - y), int(x)
+        assert (image[row, column] > 240).all()
+        ring = image[row - 8 : row + 9, column - 8 : column + 9]
+        assert (ring.max(axis=2) < 30).sum() >= 20
+
+
+@pytest.mark.serial
+def test_figure_of_the_designs_is_the_picture():
+    views = [beam("upper", 1.0, 0.2, 20, 4)]
+    figure, image = design.design_figure(views, "title"), design.design_image(views, "title")
+    figure.canvas.draw()
+    shown = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    assert shown.shape == image.shape
+    np.testing.assert_allclose(shown.astype(int), image, atol=1)
+
+
+@pytest.mark.serial
 def test_captions_give_the_axis_distance():
     """Which is not the extent of an arm with bosses beyond its bores."""
     view = replace(beam("with bores", 1.1, 0.2, 20, 4), length=1.0)
-    page = plots.design_page([view], "title")
-    (caption,) = [t.get_text() for t in page.axes[0].texts if t.get_text().startswith("with")]
+    page = design.design_page([view], "title")
+    page.close()
+    (caption,) = [words for words in page.texts if words.startswith("with")]
     assert "axis distance 1 m, 0.2 m high" in caption
-    layout = plots.stack_arms([view.corners])
-    joints = page.axes[0].lines[0].get_xydata()
-    np.testing.assert_allclose(joints, layout.place(0, np.array([[0.0, 0.0], [1.0, 0.0]])))
 
 
 def test_outline_is_what_one_cell_has_alone():
     view = beam("a", 2.0, 1.0, 5, 3)
-    ends = plots.outline(view.corners)
+    ends = shapes.outline(view.corners)
     assert len(ends) == 2 * (5 + 3)
     assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() == pytest.approx(6.0)
     hole = np.delete(view.corners, 7, axis=0)
-    assert len(plots.outline(hole)) == 2 * (5 + 3) + 4
+    assert len(shapes.outline(hole)) == 2 * (5 + 3) + 4
 
 
 # -- curves ----------------------------------------------------------------------------------
@@ -237,7 +257,7 @@ def assert_inside(figure) -> None:
 @pytest.mark.parametrize("count", [1, 2, 400])
 def test_history_shows_the_rows(count):
     rows = history(count)
-    figure = plots.history_figure(rows, "compliance of the load cases [N m]")
+    figure = curves.history_figure(rows, "compliance of the load cases [N m]")
     shown = {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_visible()}
     drawn = {title: axes.lines[0].get_ydata() for title, axes in shown.items()}
     columns = {
@@ -269,7 +289,7 @@ def test_history_has_a_panel_for_every_column_there_is():
         Row(k, 2.0, 0.01, 0.5, 0.5, 0.1, 1.0, 10.0**-k, {"first frequency of arm1 [Hz]": 60.0 + k})
         for k in range(3)
     ]
-    panels = plots.history_panels(rows, "objective [N m]")
+    panels = curves.history_panels(rows, "objective [N m]")
     np.testing.assert_allclose(panels["Karush-Kuhn-Tucker residual [-]"], [1.0, 0.1, 0.01])
     np.testing.assert_allclose(panels["first frequency of arm1 [Hz]"], [60.0, 61.0, 62.0])
 
@@ -278,7 +298,7 @@ def test_history_has_a_panel_for_every_column_there_is():
 def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
     t = np.linspace(0.0, 3.0, 301)
     optimised = 0.007 * np.sin(t)[:, None] * [0.6, 0.8]
-    figure = plots.deviation_figure(t, optimised, 8.0 * optimised)
+    figure = curves.deviation_figure(t, optimised, 8.0 * optimised)
     (axes,) = figure.axes
     for line, note, largest in zip(axes.lines, axes.texts, (56.0, 7.0), strict=True):
         np.testing.assert_allclose(line.get_ydata(), largest * np.sin(t))
@@ -301,8 +321,8 @@ def test_curves_are_written(tmp_path):
 
     t, nothing = np.linspace(0.0, 1.0, 11), np.zeros((11, 2))
     for path in (
-        plots.draw_history(tmp_path / "history.png", history(3), "objective [N m]"),
-        plots.draw_deviation(tmp_path / "deviation.png", t, nothing),
+        curves.draw_history(tmp_path / "history.png", history(3), "objective [N m]"),
+        curves.draw_deviation(tmp_path / "deviation.png", t, nothing),
     ):
         image = imread(path)
         assert min(image.shape[:2]) >= 600
@@ -318,7 +338,7 @@ def test_chain_ends_at_the_end_effector(arms):
     mechanism = manipulator(arms)[1]
     random = np.random.default_rng(arms)
     q_r, q_e = random.normal(size=(9, 1 + arms)), 0.2 * random.normal(size=(9, 2 * arms))
-    place = plots.chain(mechanism, q_r, q_e)[0]
+    place = shapes.chain(mechanism, q_r, q_e)[0]
     tip = np.stack([place[:, -1].real, place[:, -1].imag], axis=1)
     np.testing.assert_allclose(tip, end_effector(mechanism, still(q_r), q_e), atol=1e-14)
 
@@ -326,7 +346,7 @@ def test_chain_ends_at_the_end_effector(arms):
 def test_undeformed_arms_lie_where_the_angles_say():
     views, mechanism = manipulator(2)
     q_r, q_e = np.array([[0.3, 0.5 * np.pi, -0.5 * np.pi]]), np.zeros((1, 4))
-    film = plots.make_film(views, mechanism, np.zeros(1), q_r, q_e, None, 1)
+    film = animation.make_film(views, mechanism, np.zeros(1), q_r, q_e, None, 1)
     x, y = views[0].corners[..., 0], views[0].corners[..., 1]
     upright = np.stack([0.3 - y, -0.5 + x], axis=-1)
     np.testing.assert_allclose(film.cells(0, 0), upright, atol=1e-14)
@@ -337,7 +357,7 @@ def test_undeformed_arms_lie_where_the_angles_say():
 @pytest.mark.parametrize("magnification", [1.0, 20.0])
 def test_magnified_arms_join(magnification):
     views, mechanism = manipulator(3)
-    film = plots.make_film(views, mechanism, *swinging(3), magnification, 5)
+    film = animation.make_film(views, mechanism, *swinging(3), magnification, 5)
     for frame in range(5):
         for k, view in enumerate(views):
             cells = film.cells(k, frame)
@@ -353,26 +373,26 @@ def test_magnified_arms_join(magnification):
 def test_film_runs_from_the_first_to_the_last_instant():
     views, mechanism = manipulator(2)
     t, q_r, q_e = swinging(2)
-    film = plots.make_film(views, mechanism, t, q_r, q_e, 1.0, 7)
+    film = animation.make_film(views, mechanism, t, q_r, q_e, 1.0, 7)
     assert (film.t[0], film.t[-1], len(film.t)) == (t[0], t[-1], 7)
     flexible, rigid = (end_effector(mechanism, still(q_r), q) for q in (q_e, 0.0 * q_e))
     np.testing.assert_allclose(film.trace, flexible, atol=1e-14)
     np.testing.assert_allclose(film.desired, rigid, atol=1e-14)
     np.testing.assert_allclose(film.t, t[film.at])
     np.testing.assert_allclose(film.place[:, -1].real, flexible[film.at, 0], atol=1e-14)
-    magnified = plots.make_film(views, mechanism, t, q_r, q_e, 3.0, 7).trace
+    magnified = animation.make_film(views, mechanism, t, q_r, q_e, 3.0, 7).trace
     np.testing.assert_allclose(magnified, end_effector(mechanism, still(q_r), 3 * q_e), atol=1e-14)
     largest = np.linalg.norm(flexible - rigid, axis=1).max()
-    chosen = plots.make_film(views, mechanism, t, q_r, q_e, None, 7).magnification
-    assert chosen == plots.round_magnification(largest, sum(LENGTHS[:2]))
-    assert len(plots.make_film(views, mechanism, t, q_r, q_e, 1.0, 1000).t) == len(t)
+    chosen = animation.make_film(views, mechanism, t, q_r, q_e, None, 7).magnification
+    assert chosen == animation.round_magnification(largest, sum(LENGTHS[:2]))
+    assert len(animation.make_film(views, mechanism, t, q_r, q_e, 1.0, 1000).t) == len(t)
 
 
 def test_bounds_hold_all_cells():
     views, mechanism = manipulator(2)
     views[0] = beam("plate", 1.0, 1.5, 20, 4)  # reaches far beyond joints and paths
-    film = plots.make_film(views, mechanism, *swinging(2), 10.0, 9)
-    low, high = plots.film_bounds(film)
+    film = animation.make_film(views, mechanism, *swinging(2), 10.0, 9)
+    low, high = animation.film_bounds(film)
     cells = [film.cells(k, frame).reshape(-1, 2) for k in range(2) for frame in range(9)]
     points = np.concatenate([*cells, film.trace, film.desired])
     assert (points > low).all()
@@ -384,12 +404,12 @@ def test_fine_mesh_is_thinned_to_the_means_of_its_cells():
     fine, coarse = beam("a", 1.0, 0.3, 80, 24), beam("a", 1.0, 0.3, 20, 6)
     density = np.random.default_rng(1).random((80, 24))
     fine = replace(fine, density=density.ravel())
-    thinned = plots.thin(fine, 20 * 6)
+    thinned = shapes.thin(fine, 20 * 6)
     np.testing.assert_allclose(thinned.corners, coarse.corners, atol=1e-12)
     np.testing.assert_allclose(thinned.modes, coarse.modes, atol=1e-12)
     means = density.reshape(20, 4, 6, 4).mean(axis=(1, 3))
     np.testing.assert_allclose(thinned.density, means.ravel())
-    assert plots.thin(coarse, 120) is coarse
+    assert shapes.thin(coarse, 120) is coarse
 
 
 def test_thinned_mesh_keeps_holes_and_large_cells():
@@ -403,12 +423,12 @@ def test_thinned_mesh_keeps_holes_and_large_cells():
         np.linspace(0.0, 1.0, len(corners)),
         np.zeros((len(corners), 4, 2, 0)),
     )
-    thinned = plots.thin(view, 600)
+    thinned = shapes.thin(view, 600)
     assert len(thinned.density) < 600
     assert np.linalg.norm(thinned.centroid - [0.5, 0.0], axis=1).min() > 0.05
-    area = plots.cell_areas(view.corners).sum()
-    assert plots.cell_areas(thinned.corners).sum() == pytest.approx(area, rel=0.02)
-    assert plots.volume_fraction(thinned) == pytest.approx(plots.volume_fraction(view), rel=0.02)
+    area = shapes.cell_areas(view.corners).sum()
+    assert shapes.cell_areas(thinned.corners).sum() == pytest.approx(area, rel=0.02)
+    assert shapes.volume_fraction(thinned) == pytest.approx(shapes.volume_fraction(view), rel=0.02)
 
 
 @pytest.mark.parametrize("sides", [3, 4])
@@ -416,10 +436,10 @@ def test_cells_around_points(sides):
     mesh = beam("a", 1.0, 0.4, 5, 2)
     corners = mesh.corners[:, :sides]  # of four, or the lower right half of each
     view = replace(mesh, corners=corners, centroid=corners.mean(axis=1))
-    np.testing.assert_array_equal(plots.cells_around(view.centroid, view), np.arange(10))
+    np.testing.assert_array_equal(shapes.cells_around(view.centroid, view), np.arange(10))
     points = np.array([[0.19, -0.19], [0.01, -0.01], [1.1, 0.0]])
     np.testing.assert_array_equal(
-        plots.cells_around(points, view), [0, 0 if sides == 4 else -1, -1]
+        shapes.cells_around(points, view), [0, 0 if sides == 4 else -1, -1]
     )
 
 
@@ -427,8 +447,8 @@ def test_common_colours_begin_with_the_most_frequent():
     picture = np.full((20, 20, 3), 253, dtype=np.uint8)  # nearly white is white
     picture[:3] = [0, 0, 0]
     picture[5, :5] = [217, 95, 2]
-    np.testing.assert_array_equal(plots.common_colours(picture, 2), [[255] * 3, [0] * 3])
-    colours = plots.common_colours(picture, 128)
+    np.testing.assert_array_equal(animation.common_colours(picture, 2), [[255] * 3, [0] * 3])
+    colours = animation.common_colours(picture, 128)
     assert len(colours) == 3
     assert np.abs(colours[2].astype(int) - [217, 95, 2]).max() <= 8
 
@@ -438,8 +458,8 @@ def test_common_colours_begin_with_the_most_frequent():
 def test_stage_has_all_labels_inside(arms, magnification):
     views, mechanism = manipulator(arms)
     t, q_r, q_e = swinging(arms)
-    film = plots.make_film(views, mechanism, t, q_r, q_e / magnification, magnification, 3)
-    stage = plots.Stage(film, mechanism, 0.333)
+    film = animation.make_film(views, mechanism, t, q_r, q_e / magnification, magnification, 3)
+    stage = animation.Stage(film, mechanism, 0.333)
     stage.draw(1)
     assert_inside(stage.figure)
     assert f"deformation x {magnification:g}" in stage.axes.get_title(loc="right")
@@ -454,12 +474,12 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
 
     views, mechanism = manipulator(2)
     t, q_r, q_e = swinging(2)
-    path = plots.draw_motion(
+    path = animation.draw_motion(
         tmp_path / "motion.gif", views, mechanism, t, q_r, q_e, frames=4, duration=0.2
     )
     assert [p.name for p in tmp_path.iterdir()] == ["motion.gif"]
-    film = plots.make_film(views, mechanism, t, q_r, q_e, None, 4)
-    axes = plots.Stage(film, mechanism, 1.0).axes
+    film = animation.make_film(views, mechanism, t, q_r, q_e, None, 4)
+    axes = animation.Stage(film, mechanism, 1.0).axes
     with Image.open(path) as gif:
         assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (4, 50, 0)
         pictures = []
@@ -493,7 +513,7 @@ def test_real_arms_join():
     views = gather_views(scene, share, arms, x)
     mechanism = build_mechanism(scene, bodies)
     q_e = 0.01 * np.sin(np.arange(30.0)).reshape(3, 10)
-    film = plots.make_film(views, mechanism, np.arange(3.0), np.zeros((3, 3)), q_e, 2.0, 3)
+    film = animation.make_film(views, mechanism, np.arange(3.0), np.zeros((3, 3)), q_e, 2.0, 3)
     for frame in range(3):
         for k, view in enumerate(views):
             tip = np.all(np.abs(view.corners - [1.0, 0.0]) < 1e-9, axis=-1)
@@ -508,9 +528,9 @@ def test_real_arms_join():
 
 def test_poses_are_evenly_spaced_along_the_path():
     slow_then_fast = np.linspace(0.0, 1.0, 401) ** 3 * (1.0 + 1.0j)
-    at = plots.poses_along(slow_then_fast, 5)
+    at = machine.poses_along(slow_then_fast, 5)
     np.testing.assert_allclose(np.abs(slow_then_fast[at]) / np.sqrt(2), np.arange(5) / 4, atol=0.01)
-    np.testing.assert_array_equal(plots.poses_along(np.ones(9, dtype=complex), 5), [0])
+    np.testing.assert_array_equal(machine.poses_along(np.ones(9, dtype=complex), 5), [0])
 
 
 @pytest.mark.serial
@@ -518,10 +538,10 @@ def test_poses_are_evenly_spaced_along_the_path():
 def test_machine_shows_every_arm_where_it_is(arms):
     views, mechanism = manipulator(arms)
     t, q_r, _ = swinging(arms)
-    figure = plots.machine_figure(views, mechanism, t, q_r, "title")
+    figure = machine.machine_figure(views, mechanism, t, q_r, "title")
     axes = figure.axes[0]
-    place = plots.chain(mechanism, q_r, np.zeros((len(t), 2 * arms)))[0]
-    at = plots.poses_along(place[:, -1], plots.POSES)
+    place = shapes.chain(mechanism, q_r, np.zeros((len(t), 2 * arms)))[0]
+    at = machine.poses_along(place[:, -1], machine.POSES)
     assert [text.get_text() for text in axes.texts] == [f"{t[n]:.2f} s" for n in at]
     # Cells without material are left open: half of each arm's 80.
     cells = [one for one in axes.collections if one.get_array() is not None]
@@ -538,7 +558,9 @@ def test_machine_is_drawn(tmp_path):
 
     views, mechanism = manipulator(2)
     t, q_r, _ = swinging(2)
-    image = imread(plots.draw_machine(tmp_path / "machine.png", views, mechanism, t, q_r, "title"))
+    image = imread(
+        machine.draw_machine(tmp_path / "machine.png", views, mechanism, t, q_r, "title")
+    )
     assert [p.name for p in tmp_path.iterdir()] == ["machine.png"]
     solid = np.abs(image[..., :3] - np.array([8, 29, 88]) / 255.0).max(axis=2) < 0.05
     assert solid.sum() > 5000
