@@ -395,7 +395,7 @@ class Model:
         """
         share, arms = self._arms()
         for arm in arms.values():
-            arm.start, arm.loaded_starts = None, {}
+            arm.forget_modes()
         if x is None:
             return share, arms, self._uniform(self.scene.design.initial)
         if isinstance(x, SimulationResult):

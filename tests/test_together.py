@@ -14,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt.arms import arm
+from dolfinopt.arms import arm, design_state
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity
@@ -183,11 +183,11 @@ class Model:
 
 EVALUATIONS = {
     "interpolation": (arm, "interpolate", ()),
-    "reduction": (arm, "shape_integrals", ()),
+    "reduction": (design_state, "shape_integrals", ()),
     "statics": (static, "static_response", ('objective.kind="static"',)),
     "deflections": (tip_deflection, "static_response", ("constraints.tip_deflection=1.0",)),
     "rigid integrals": (eigenfrequency, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
-    "loaded modes": (arm, "loaded_modes", ("constraints.first_frequency=1.0",)),
+    "loaded modes": (design_state, "loaded_modes", ("constraints.first_frequency=1.0",)),
     "squared period": (eigenfrequency, "squared_period", ('objective.kind="eigenfrequency"',)),
 }
 
@@ -220,7 +220,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
             raise ConvergenceError("stuck")
         return body(*arguments)
 
-    monkeypatch.setattr(arm, "shape_integrals", stuck)
+    monkeypatch.setattr(design_state, "shape_integrals", stuck)
     found = evaluation.evaluate_batch(
         [model.scene] * 2, model.share, model.arms, model.x, do.Ledger()
     )

@@ -1,4 +1,4 @@
-"""One flexible arm of the scene: design variables in, floating body out."""
+"""One flexible arm of the scene: from design variables to physical densities to a `DesignState`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, loaded_modes
+from dolfinopt.arms.design_state import DesignState, InitialVectors, options, same_basis
+from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
@@ -22,11 +23,11 @@ from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar, shape_integrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.parallel import ArmShare, sum_over_arms, together
 from dolfinopt.profiling import Ledger
-from dolfinopt.reduction import METHODS, Basis, Options
+from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
 
 THRESHOLDS = 0.25, 0.75
@@ -58,19 +59,15 @@ class Arm:
     Attributes:
         mesh: see `ArmMesh`.
         solid: the arm's solid material.
-        coordinates: number q that `reduce` keeps; None until `take`, where the scene says "auto".
-        basis: of the current design; None before `reduce`.
-        start: (owned rows, k) eigenvectors from which the next `reduce` sets out, or None.
-        loaded_starts: the same for every `loaded_modes`, by the place in the chain.
+        substructure: finite elements whatever the design.
+        coordinates: number q of the basis; None until `set_order`, where the scene says "auto".
+        initial: eigenvectors from which the next design's searches set out.
         places: of the arms in the chain that have this design.
     """
 
     def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, ledger: Ledger):
         """Mesh arm number `index` on the ranks of `comm` (collective there)."""
         arm = scene.arms[index]
-        self._x_phys = np.empty(0)
-        self._material: Interpolated | None = None
-        self._elastic: ElasticArm | None = None
         self.scene = scene
         self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
         self.solid = scene.material_of(index)
@@ -94,17 +91,10 @@ class Arm:
                 f"{arm.name!r}"
             )
         self.ledger = ledger
-        self.basis: Basis | None = None
-        self.start: np.ndarray | None = None
-        self.loaded_starts: dict[int, np.ndarray] = {}
-        self._body: ShapeIntegrals | None = None
-        self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
+        self.initial = InitialVectors()
+        self._state: DesignState | None = None
 
-    @property
-    def elastic(self) -> ElasticArm:
-        """Stiffness and mass of the current design."""
-        assert self._elastic is not None
-        return self._elastic
+    # -- from design variables to physical densities, and back -------------------------------
 
     def physical(self, x: np.ndarray) -> np.ndarray:
         """Return the physical densities of design variables x: filtered, passive cells solid."""
@@ -185,27 +175,71 @@ class Arm:
     def _active(self, values: np.ndarray) -> np.ndarray:
         return np.where(self.mesh.passive, 0.0, values)
 
-    def set_design(self, x_phys: np.ndarray) -> None:
-        """Take physical densities in [0, 1] (collective on the arm).
+    # -- designs -----------------------------------------------------------------------------
+
+    def state(self, x_phys: np.ndarray) -> DesignState:
+        """Return the state of physical densities in [0, 1]; the same object for the last ones.
+
+        Collective on the arm.
 
         Raises:
             InputError: on the arm's ranks, see `refusal`.
         """
-        known = np.array_equal(x_phys, self._x_phys)
+        last = self._state
+        known = last is not None and np.array_equal(x_phys, last.x_phys)
         if self.mesh.comm.allreduce(known, op=MPI.LAND):
-            return
-        options = self.scene.interpolation
+            return self.current
+        law = self.scene.interpolation
         with together(self.mesh.comm):
             if reason := self.refusal(x_phys):
                 raise InputError(reason)
-            self._material = interpolate(x_phys, options.law, options.penalty, options.floor)
-        self._elastic = self.substructure.at(
-            self.solid.young_modulus * self._material.stiffness,
-            self.solid.density * self._material.mass,
+            material = interpolate(x_phys, law.law, law.penalty, law.floor)
+        elastic = self.substructure.at(
+            self.solid.young_modulus * material.stiffness, self.solid.density * material.mass
         )
-        self._x_phys = x_phys.copy()
-        self.basis = self._body = None
-        self._loaded = {}
+        self._state = DesignState(
+            x_phys, material, elastic, self.scene, self.coordinates, self.initial
+        )
+        return self._state
+
+    @property
+    def current(self) -> DesignState:
+        """The state that was asked for last.
+
+        Raises:
+            RuntimeError: none has been.
+        """
+        if self._state is None:
+            raise RuntimeError(f"arm {self.mesh.name!r} has no design yet: call state(x_phys)")
+        return self._state
+
+    def set_design(self, x_phys: np.ndarray) -> None:
+        """Make `state(x_phys)` the current state."""
+        self.state(x_phys)
+
+    def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
+        """Return the floating body of physical densities in [0, 1] (collective on the arm)."""
+        return self.state(x_phys).body
+
+    @property
+    def material(self) -> Interpolated:
+        """Interpolated stiffness and mass of the current design."""
+        return self.current.material
+
+    @property
+    def elastic(self) -> ElasticArm:
+        """Stiffness and mass of the current design."""
+        return self.current.elastic
+
+    @property
+    def basis(self) -> Basis | None:
+        """The basis of the current design, or None where nobody has asked for one."""
+        state = self._state
+        return state.basis if state is not None and state.is_reduced else None
+
+    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
+        """Return those of the current design, see `DesignState.loaded_modes`."""
+        return self.current.loaded_modes(place, carried)
 
     def refusal(self, x_phys: np.ndarray) -> str:
         """Return why these cannot be physical densities of this rank's cells, "" if they can."""
@@ -223,111 +257,61 @@ class Arm:
             )
         return ""
 
-    def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
-        """Return the floating body of physical densities in [0, 1] (collective on the arm).
-
-        The modes found before are where the search for the new ones starts. Nothing is done
-        twice for the same densities.
-        """
-        self.set_design(x_phys)
-        if self._body is not None:
-            return self._body
-        with self.ledger.phase("reduction"):
-            reduce = METHODS[self.scene.reduction.method].reduce
-            self.basis = reduce(self.elastic, self.reduction_options, self.start)
-        self.start = self.basis.start
-        with self.ledger.phase("inertia integrals"):
-            damping = self.scene.damping.stiffness_proportional
-            self._body = shape_integrals(self.elastic, self.basis, damping)
-        return self._body
-
-    def take(self, coordinates: int) -> None:
-        """Reduce to so many coordinates from now on."""
-        if coordinates != self.coordinates:
-            self.basis = self._body = self.start = None
-        self.coordinates = coordinates
+    def set_order(self, num_modes: int) -> None:
+        """Reduce to so many modes from now on."""
+        if num_modes == self.coordinates:
+            return
+        self.coordinates = num_modes
+        self.initial.basis = None
+        if self._state is not None:
+            self._state = self._state.under(self.scene, num_modes, self.initial)
 
     def under(self, scene: scenes.Scene) -> Arm:
         """Return this arm in a scene that differs in what it does, not in what it is.
 
-        Mesh, element matrices, filter and the current design's factorisation are shared; so is
-        the basis unless the reduction differs. Each has a design of its own from then on: while
-        the two differ, using both in turn factorises anew each time.
+        Everything that lasts is shared, and of the current state what both scenes have in common.
 
         Args:
             scene: with the same arms, material, interpolation and design options.
         """
         other = copy(self)
-        other.scene = scene
-        other._loaded, other.loaded_starts = {}, {}
-        old, new = self.scene, scene
-        # The Gramian knows the damping, other bases do not.
-        same_basis = old.reduction == new.reduction and (
-            old.damping == new.damping or new.reduction.method != "balanced"
-        )
-        if old.reduction != new.reduction:
+        other.scene, other.initial = scene, InitialVectors()
+        if self.scene.reduction != scene.reduction:
             other.coordinates = scene.reduction.count or None
-        if not same_basis or self.basis is None:
-            other.basis = other._body = other.start = None
-        elif old.damping != new.damping:
-            damping = scene.damping.stiffness_proportional
-            other._body = shape_integrals(other.elastic, self.basis, damping)
+        if same_basis(self.scene, scene) and self.basis is not None:
+            other.initial.basis = self.initial.basis
+        if self._state is not None:
+            other._state = self._state.under(scene, other.coordinates, other.initial)
         return other
 
-    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
-        """Return the current design's modes with what is carried (collective on the arm).
-
-        Args:
-            place: of the arm in the chain; several arms may share this design.
-            carried: about the outboard point.
-        """
-        known = self._loaded.get(place)
-        if known is None or known[0] != carried:
-            count, start = self.scene.objective.modes, self.loaded_starts.get(place)
-            with self.ledger.phase("vibration"):
-                known = carried, loaded_modes(self.elastic, carried, count, start)
-            self._loaded[place] = known
-            self.loaded_starts[place] = known[1].start
-        return known[1]
+    # -- initial vectors of searches for modes -----------------------------------------------
 
     @property
-    def starts(self) -> list[np.ndarray]:
-        """`start` and every place's `loaded_starts`; without columns where there is none yet."""
+    def initial_vectors(self) -> list[np.ndarray]:
+        """Those of the basis and of every place; without columns where there are none yet."""
         empty = np.empty((self.substructure.T.num_interior, 0))
-        loaded = [self.loaded_starts.get(place, empty) for place in self.places]
-        return [empty if self.start is None else self.start, *loaded]
+        basis, loaded = self.initial.basis, self.initial.loaded
+        first = empty if basis is None else basis
+        return [first, *(loaded.get(place, empty) for place in self.places)]
 
-    @starts.setter
-    def starts(self, starts: Sequence[np.ndarray]) -> None:
-        self.start = starts[0] if starts[0].shape[1] else None
-        loaded = zip(self.places, starts[1:], strict=True)
-        self.loaded_starts = {place: one for place, one in loaded if one.shape[1]}
+    @initial_vectors.setter
+    def initial_vectors(self, vectors: Sequence[np.ndarray]) -> None:
+        self.initial.basis = vectors[0] if vectors[0].shape[1] else None
+        self.initial.loaded.clear()
+        for place, one in zip(self.places, vectors[1:], strict=True):
+            if one.shape[1]:
+                self.initial.loaded[place] = one
 
-    @property
-    def reduction_options(self) -> Options:
-        """What the reduction method is told.
+    def forget_modes(self) -> None:
+        """Let the next searches for modes set out from nothing."""
+        self.initial.basis = None
+        self.initial.loaded.clear()
 
-        Raises:
-            InputError: the number of coordinates is "auto", and nobody has chosen one.
-        """
-        if self.coordinates is None:
-            raise InputError(
-                f'{self.scene.source}: reduction.coordinates = "auto": expected a number here, or '
-                "choose_coordinates() before the first evaluation"
-            )
-        return self.options(self.coordinates)
+    # -- measures ----------------------------------------------------------------------------
 
-    def options(self, coordinates: int) -> Options:
-        """Return what the scene tells the reduction method, with so many coordinates."""
-        options = self.scene.reduction
-        damping = self.scene.damping.stiffness_proportional
-        return Options(coordinates, options.shifts, options.band, damping)
-
-    @property
-    def material(self) -> Interpolated:
-        """Interpolated stiffness and mass of the current design."""
-        assert self._material is not None
-        return self._material
+    def options(self, num_modes: int) -> Options:
+        """Return what the scene tells the reduction method, with so many modes."""
+        return options(self.scene, num_modes)
 
     def volume_fraction(self, x_phys: np.ndarray) -> float:
         """Return sum x V / sum V over the whole arm (collective on the arm)."""

@@ -217,7 +217,7 @@ class _Run:
     def _evaluate(self) -> list[_Evaluated]:
         """Evaluate the design that x stands for, or all of them; the nominal one last."""
         self.start = self.solutions
-        self.modes = {k: arm.starts for k, arm in self.arms.items()}
+        self.modes = {k: arm.initial_vectors for k, arm in self.arms.items()}
         realised = self.continuation.realise(self.variables.split(self.x))
         several = self.scene.design.projection == "robust"
         designs = []
@@ -324,7 +324,7 @@ class _Run:
         x_phys, evaluation, crisp = designs[-1].x_phys, designs[-1].evaluation, None
         self._assess_choice(x_phys)
         # A followed mode is known by those before it: the initial and the crisp design's are not.
-        starts = {k: arm.starts for k, arm in self.arms.items()}
+        starts = {k: arm.initial_vectors for k, arm in self.arms.items()}
         if not self.moves:
             with together(self.share.world):
                 initial = {k: a.uniform(self.scene.design.initial) for k, a in self.arms.items()}
@@ -336,7 +336,7 @@ class _Run:
             crisp, _ = self._evaluate_one(cut, simulated=True)
         if crisp is not None or not self.moves:
             for k, arm in self.arms.items():
-                arm.starts = starts[k]
+                arm.initial_vectors = starts[k]
             evaluation, self.trajectory = self._evaluate_one(x_phys, simulated=True)
         return evaluation, crisp
 
@@ -432,8 +432,8 @@ class _Run:
         self.choice = memory.choice
         for k, arm in self.arms.items():
             if memory.choice is not None:
-                arm.take(memory.choice.coordinates)
-            arm.starts = memory.modes[k]
+                arm.set_order(memory.choice.coordinates)
+            arm.initial_vectors = memory.modes[k]
         self.history = memory.history if self.share.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
         self.iteration = memory.iteration

@@ -132,7 +132,7 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         rows = (2 * rows[:, None] + [0, 1]).ravel()
         last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
         modes[k] = []
-        for j in range(len(arm.starts)):
+        for j in range(len(arm.initial_vectors)):
             interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
             modes[k].append(np.vstack([interior[rows], outboard if last else outboard[:0]]))
     solutions: list[Solution] = []

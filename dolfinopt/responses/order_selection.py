@@ -94,7 +94,7 @@ def choose_coordinates(
         tried[middle] = comparison.error(middle)
         low, high = (low, middle) if tried[middle] <= goal else (middle, high)
     for arm in arms.values():
-        arm.take(high)
+        arm.set_order(high)
     return Choice(high, tried[high], tuple(sorted(tried.items())))
 
 

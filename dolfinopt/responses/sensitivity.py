@@ -34,14 +34,15 @@ def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
     Returns:
         (n_cells,) over this rank's cells.
     """
-    assert arm.basis is not None
+    state = arm.current
     with arm.ledger.phase("gradient"):
         left, values, right = np.linalg.svd(A)
         keep = values > RANK_TOLERANCE * values[0]
-        energies = arm.elastic.cell_stiffness_products(
-            arm.basis.V @ (left[:, keep] * values[keep]), arm.basis.V @ right[keep].T
+        V = state.basis.V
+        energies = state.elastic.cell_stiffness_products(
+            V @ (left[:, keep] * values[keep]), V @ right[keep].T
         )
-        return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
+        return -arm.solid.young_modulus * state.material.stiffness_slope * energies
 
 
 def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
@@ -58,9 +59,10 @@ def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
     Returns:
         (n_cells,) over this rank's cells.
     """
-    assert arm.basis is not None
+    state = arm.current
     with arm.ledger.phase("gradient"):
-        elastic, V = arm.elastic, arm.basis.V
+        elastic, basis = state.elastic, state.basis
+        V = basis.V
         damping = arm.scene.damping.stiffness_proportional
         by_K = slopes.K + damping * slopes.D
         partners = mass_partners(elastic.points, V, slopes)
@@ -70,15 +72,15 @@ def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
         method = METHODS[arm.scene.reduction.method]
         assert method.adjoint is not None  # the scene refuses the others
         fields = method.adjoint(
-            elastic, arm.basis, arm.reduction_options, interior, outboard + slopes.outboard
+            elastic, basis, state.reduction_options, interior, outboard + slopes.outboard
         )
         energies = elastic.cell_stiffness_products(V @ by_K.T - fields.stiffness, V)
         partners.left[:, :, 1:-1] += fields.mass
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        slope = arm.solid.young_modulus * arm.material.stiffness_slope * energies
-        return slope + arm.solid.density * arm.material.mass_slope * masses
+        slope = arm.solid.young_modulus * state.material.stiffness_slope * energies
+        return slope + arm.solid.density * state.material.mass_slope * masses
 
 
 def static_gradient(arm: Arm, response: StaticResponse) -> np.ndarray:

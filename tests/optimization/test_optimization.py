@@ -233,7 +233,7 @@ def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
     settings = small("reduction.method=modal", "objective.kind=eigenfrequency", iterations=2)
     result = do.optimize(settings, shared_tmp_path)
     for arm in result.arms.values():  # what a third iteration would set out from
-        assert [len(start) for start in arm.starts] == [arm.elastic.num_dofs] * 2
+        assert [len(start) for start in arm.initial_vectors] == [arm.elastic.num_dofs] * 2
     memory = checkpoint.load(shared_tmp_path, settings, result.share, result.arms)
     for k, arm in result.arms.items():
         empty, loaded = memory.modes[k]  # the objective needs no reduced model

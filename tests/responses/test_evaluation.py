@@ -361,7 +361,7 @@ def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None
     x = built.fields(wave)
     first, _ = built.evaluate(x)
     for arm in built.arms.values():  # the second mode of both arms was the lowest once
-        arm.starts = [start[:, ::-1] for start in arm.starts]
+        arm.initial_vectors = [start[:, ::-1] for start in arm.initial_vectors]
         arm.set_design(np.ones(arm.mesh.num_cells))
     second, _ = built.evaluate(x)
     assert second.objective < 0.5 * first.objective

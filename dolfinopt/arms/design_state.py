@@ -1,0 +1,144 @@
+"""One design of one arm: everything that follows from its physical densities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, loaded_modes
+from dolfinopt.density.interpolation import Interpolated
+from dolfinopt.errors import InputError
+from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
+from dolfinopt.reduction import METHODS, Basis, Options
+from dolfinopt.scene import load as scenes
+
+
+@dataclass(eq=False)
+class InitialVectors:
+    """Eigenvectors of the design before, from which searches for the next one's set out.
+
+    They decide how long a search takes, and the last digits of what it finds.
+
+    Attributes:
+        basis: (owned rows, k) of the reduced basis, or None.
+        loaded: the same of every `DesignState.loaded_modes`, by the place in the chain.
+    """
+
+    basis: np.ndarray | None = None
+    loaded: dict[int, np.ndarray] = field(default_factory=dict)
+
+
+class DesignState:
+    """What belongs to one x_phys of one arm in one scene; immutable.
+
+    Parts are computed when they are first asked for, once, and collectively on the arm's ranks.
+    An older state stays right; what it needs of the one factorisation of the arm is made anew.
+
+    Attributes:
+        x_phys: (n_cells,) physical densities of the owned cells, read only.
+        material: their interpolated stiffness and mass.
+        elastic: stiffness, mass and constraint modes.
+        scene: says how to reduce, and the damping.
+        num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
+    """
+
+    def __init__(
+        self,
+        x_phys: np.ndarray,
+        material: Interpolated,
+        elastic: ElasticArm,
+        scene: scenes.Scene,
+        num_modes: int | None,
+        initial: InitialVectors,
+    ):
+        self.x_phys = x_phys.copy()
+        self.x_phys.setflags(write=False)
+        self.material, self.elastic = material, elastic
+        self.scene, self.num_modes = scene, num_modes
+        self._initial = initial
+        self._basis: Basis | None = None
+        self._body: ShapeIntegrals | None = None
+        self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
+
+    @property
+    def reduction_options(self) -> Options:
+        """What the reduction method is told.
+
+        Raises:
+            InputError: the number of coordinates is "auto", and nobody has chosen one.
+        """
+        if self.num_modes is None:
+            raise InputError(
+                f'{self.scene.source}: reduction.coordinates = "auto": expected a number here, or '
+                "choose_coordinates() before the first evaluation"
+            )
+        return options(self.scene, self.num_modes)
+
+    @property
+    def is_reduced(self) -> bool:
+        """True once the basis has been asked for."""
+        return self._basis is not None
+
+    @property
+    def basis(self) -> Basis:
+        """The reduced basis by the scene's method."""
+        if self._basis is None:
+            with self.elastic.ledger.phase("reduction"):
+                reduce = METHODS[self.scene.reduction.method].reduce
+                self._basis = reduce(self.elastic, self.reduction_options, self._initial.basis)
+            self._initial.basis = self._basis.start
+        return self._basis
+
+    @property
+    def body(self) -> ShapeIntegrals:
+        """The floating body."""
+        if self._body is None:
+            basis = self.basis
+            with self.elastic.ledger.phase("inertia integrals"):
+                damping = self.scene.damping.stiffness_proportional
+                self._body = shape_integrals(self.elastic, basis, damping)
+        return self._body
+
+    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
+        """Return the natural modes with what is carried; once for the same load.
+
+        Args:
+            place: of the arm in the chain; several arms may share this design.
+            carried: about the outboard point.
+        """
+        known = self._loaded.get(place)
+        if known is None or known[0] != carried:
+            count, guess = self.scene.objective.modes, self._initial.loaded.get(place)
+            with self.elastic.ledger.phase("vibration"):
+                known = carried, loaded_modes(self.elastic, carried, count, guess)
+            self._loaded[place] = known
+            self._initial.loaded[place] = known[1].start
+        return known[1]
+
+    def under(
+        self, scene: scenes.Scene, num_modes: int | None, initial: InitialVectors
+    ) -> DesignState:
+        """Return the same design in another scene of the same arm, with what stays the same."""
+        other = DesignState(self.x_phys, self.material, self.elastic, scene, num_modes, initial)
+        if self.num_modes == num_modes and same_basis(self.scene, scene):
+            other._basis = self._basis
+            if self.scene.damping == scene.damping:
+                other._body = self._body
+        return other
+
+
+def options(scene: scenes.Scene, num_modes: int) -> Options:
+    """Return what the scene tells the reduction method, with so many modes."""
+    reduction = scene.reduction
+    damping = scene.damping.stiffness_proportional
+    return Options(num_modes, reduction.shifts, reduction.band, damping)
+
+
+def same_basis(one: scenes.Scene, other: scenes.Scene) -> bool:
+    """Return whether both scenes reduce an arm to the same basis, the number of modes aside."""
+    # The Gramian knows the damping, other bases do not.
+    return one.reduction == other.reduction and (
+        one.damping == other.damping or one.reduction.method != "balanced"
+    )
