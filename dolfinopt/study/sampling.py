@@ -43,8 +43,8 @@ FOLDER = "samples"
 # are linear in the thickness.
 SCALING = r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
 SCALING += r"|arms\.(.+\.)?thickness"
-CHUNK = 25  # samples that an interruption may cost, 0.7 s
-REDUCED = 5  # of those that are meshed and reduced anew, half a second each
+CHUNK = 25  # samples that an interruption may cost
+REDUCED = 5  # of those that are meshed and reduced anew, which take longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ class _Nominal:
             assert found.trajectory is not None  # on a single rank
             owned = {k: found.trajectory.mechanism.bodies[k] for k in found.arms}
             bodies = [bodies_in(self.scene, scene, owned) for scene in scenes]
-            # At once: 22 ms a sample in place of 58 (optimised design, q = 4).
+            # At once: less than half the time of one after the other.
             starts = [found.trajectory.solution] * len(scenes)
             yield from simulate_batch(scenes, bodies, Ledger(), starts)
         else:
