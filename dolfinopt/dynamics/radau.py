@@ -19,7 +19,8 @@ import numpy as np
 
 from dolfinopt.dynamics.collocation import Collocation, radau_iia, stages_of, step_ends
 from dolfinopt.dynamics.error_estimate import estimated_errors
-from dolfinopt.dynamics.newton import ONE_RUN, REMEDY, ROUNDING, March
+from dolfinopt.dynamics.march import REMEDY, March
+from dolfinopt.dynamics.newton import ONE_RUN, ROUNDING
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import Preconditioner, System
 from dolfinopt.dynamics.time_grid import even_steps, first_num_steps

@@ -13,8 +13,7 @@ from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
 import dolfinopt as do
-from dolfinopt.dynamics import generalized_alpha, radau
-from dolfinopt.dynamics import newton as newton_method
+from dolfinopt.dynamics import generalized_alpha, march, radau
 from dolfinopt.dynamics import newton_matrix as factors
 from dolfinopt.dynamics.adjoint import trajectory_gradient
 from dolfinopt.dynamics.collocation import Stages, at_stages, residual_at, stages_of, step_ends
@@ -490,14 +489,14 @@ def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     edges = even_steps(problem, 100)
     plain = radau.on_grid(problem, edges, 1e-8, 3)
     windows = []
-    newton = newton_method.newton
+    newton = march.newton
 
     def spy(stages, *arguments, **options):  # type: ignore[no-untyped-def]
         answer = newton(stages, *arguments, **options)
         windows.append((len(stages.h), answer.converged[0]))
         return answer
 
-    monkeypatch.setattr(newton_method, "newton", spy)
+    monkeypatch.setattr(march, "newton", spy)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, matrices=2))
     marched = radau.on_grid(problem, edges, 1e-8, 3)
     assert windows[0] == (100, False)
@@ -569,7 +568,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     arms = do.build_arms(scene, share, ledger)
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
     grids, work, told = [], [], []
-    on_grid, newton = radau._on_grid, newton_method.newton
+    on_grid, newton = radau._on_grid, march.newton
 
     def seen_grid(modes, edges, *others):  # type: ignore[no-untyped-def]
         grids.append(len(edges) - 1)
@@ -581,14 +580,14 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
         return found
 
     monkeypatch.setattr(radau, "_on_grid", seen_grid)
-    monkeypatch.setattr(newton_method, "newton", seen_newton)
+    monkeypatch.setattr(march, "newton", seen_newton)
     monkeypatch.setattr("dolfinopt.progress.SILENT", 0.0)
     monkeypatch.setattr("dolfinopt.progress.log.info", lambda *words: told.append(words))
     remedy = r"beyond small-deflection theory.*material\.young_modulus.*motion\.duration"
     with pytest.raises(ConvergenceError, match=remedy):
         do.evaluate(scene, share, arms, x, ledger)
     assert len(grids) == 2
-    assert sum(work) <= newton_method.MAX_SWEEPS * sum(grids)
+    assert sum(work) <= march.MAX_SWEEPS * sum(grids)
     assert len(told) >= 2
 
 

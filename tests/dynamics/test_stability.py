@@ -20,7 +20,7 @@ from remainders import SCENE, Built, rates, uneven, wave
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.cli import commands
-from dolfinopt.dynamics import newton, radau
+from dolfinopt.dynamics import march, newton, radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.solution import Solution
@@ -555,7 +555,7 @@ def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPa
             return newton.Iterate(a, np.zeros(1, dtype=bool), np.zeros(1), np.ones(1, dtype=int))
         return method(stages, state, a, *others, **options)
 
-    monkeypatch.setattr(newton, "newton", stubborn)
+    monkeypatch.setattr(march, "newton", stubborn)
     again = radau.integrate(trajectory.problem, 1e-4, 3, do.Ledger())
     assert refused
     assert distance(trajectory, again) < 2e-4
