@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.files import ArmView
     from dolfinopt.parallel import ArmShare
-    from dolfinopt.responses.order_selection import Choice
+    from dolfinopt.responses.order_selection import OrderSelection
     from dolfinopt.scene.load import Scene
 
 
@@ -199,7 +199,7 @@ def _minimised(summary: Mapping[str, Any]) -> str:
     return text
 
 
-def tell(world: MPI.Comm, choice: Choice | None) -> None:
+def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
     if choice is not None and world.rank == 0:
         click.echo(_chosen(choice.coordinates, choice.error))
 

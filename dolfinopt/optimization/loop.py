@@ -26,7 +26,7 @@ from dolfinopt.parallel import ArmShare, sum_over_arms, together
 from dolfinopt.profiling import Ledger
 from dolfinopt.responses.constraints import Limit, limits_of, violated, worst_limits
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
-from dolfinopt.responses.order_selection import Choice, choose_coordinates, estimated_error
+from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
@@ -149,7 +149,7 @@ class _Run:
         self.limits: tuple[Limit, ...] = ()
         self.grayness = 0.0  # of the nominal design; known on the root
         self.finished = ""
-        self.choice: Choice | None = None
+        self.choice: OrderSelection | None = None
         self.earlier = 0.0  # seconds spent before a resume
         self.begun = self.saved = time.perf_counter()
 
@@ -233,7 +233,7 @@ class _Run:
             self.initial_deviation = self.trajectory.deviation
         return designs
 
-    def _choose(self, x_phys: Mapping[int, np.ndarray], reserve: float) -> Choice | None:
+    def _choose(self, x_phys: Mapping[int, np.ndarray], reserve: float) -> OrderSelection | None:
         return choose_coordinates(
             self.scene, self.share, self.arms, x_phys, self.ledger, reserve=reserve
         )
@@ -412,7 +412,7 @@ class _Run:
             history=self.history,
             initial_deviation=self.initial_deviation,
             finished=self.finished,
-            sharpness=self.continuation.beta,
+            beta=self.continuation.beta,
             thresholds=self.continuation.thresholds,
             choice=self.choice,
         )
@@ -437,7 +437,7 @@ class _Run:
         self.history = memory.history if self.share.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
         self.iteration = memory.iteration
-        self.continuation.beta = memory.sharpness
+        self.continuation.beta = memory.beta
         self.continuation.thresholds = dict(memory.thresholds)
         self.change = memory.history[-1].change
         self.kkt = memory.history[-1].kkt

@@ -9,7 +9,7 @@ import numpy as np
 
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.responses.order_selection import Choice
+from dolfinopt.responses.order_selection import OrderSelection
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Memory:
         history: rows so far.
         initial_deviation: (n, 2) m of the initial design.
         finished: reason, or "" while running.
-        sharpness: the projection's beta.
+        beta: steepness of the projection.
         thresholds: per arm its eta.
         choice: of the coordinates, where the scene leaves it to "auto".
     """
@@ -39,6 +39,6 @@ class Memory:
     history: list[HistoryRow]
     initial_deviation: np.ndarray
     finished: str
-    sharpness: float
+    beta: float
     thresholds: Mapping[int, float]
-    choice: Choice | None = None
+    choice: OrderSelection | None = None

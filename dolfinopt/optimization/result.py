@@ -14,7 +14,7 @@ from dolfinopt.parallel import ArmShare
 from dolfinopt.profiling import Counts, Ledger
 from dolfinopt.responses.constraints import Limit, violated
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.order_selection import Choice
+from dolfinopt.responses.order_selection import OrderSelection
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -59,7 +59,7 @@ class Result:
     limits: tuple[Limit, ...]
     ledger: Ledger
     counts: Counts
-    choice: Choice | None = None
+    choice: OrderSelection | None = None
 
     @property
     def violated(self) -> str:

@@ -16,7 +16,7 @@ from dolfinopt.optimization.memory import Memory
 from dolfinopt.output.files import write_arrays
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root, together
-from dolfinopt.responses.order_selection import Choice
+from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.contents import DIGEST, program, with_digests
 from dolfinopt.scene.load import Scene
 
@@ -87,7 +87,7 @@ def _write(
         "history_columns": np.array(memory.history[0].columns),
         "initial_deviation": memory.initial_deviation,
         "finished": np.array(memory.finished),
-        "sharpness": memory.sharpness,
+        "sharpness": memory.beta,
     }
     if memory.choice is not None:
         arrays["coordinates"] = memory.choice.coordinates
@@ -146,7 +146,7 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
     if "coordinates" in arrays:
         tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
         count = int(arrays["coordinates"])
-        choice = Choice(count, dict(tried)[count], tried)
+        choice = OrderSelection(count, dict(tried)[count], tried)
     return Memory(
         iteration=int(arrays["iteration"]),
         cells=cells,
@@ -156,7 +156,7 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         history=history,
         initial_deviation=arrays["initial_deviation"],
         finished=str(arrays["finished"]),
-        sharpness=float(arrays["sharpness"]),
+        beta=float(arrays["sharpness"]),
         thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in arms},
         choice=choice,
     )

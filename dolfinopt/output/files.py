@@ -315,7 +315,7 @@ def write_gradient(
     scene: Scene,
     share: ArmShare,
     arms: Mapping[int, Arm],
-    slopes: Mapping[int, np.ndarray],
+    by_cell: Mapping[int, np.ndarray],
     objective: float,
 ) -> None:
     """Write the gradient with respect to the physical densities (collective).
@@ -323,7 +323,7 @@ def write_gradient(
     Of a shared design once, under the name of the arm it belongs to.
     """
     centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
-    gathered = gather_cells(share, slopes)
+    gathered = gather_cells(share, by_cell)
     with together(share.world):
         if share.world.rank != 0:
             return

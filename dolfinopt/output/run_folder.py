@@ -27,7 +27,7 @@ from dolfinopt.output.summary import summarise
 from dolfinopt.parallel import ArmShare, together
 from dolfinopt.profiling import Ledger
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.order_selection import Choice
+from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.contents import named_files, with_relative_paths
 from dolfinopt.scene.load import Scene
 
@@ -51,7 +51,7 @@ class Simulated:
     evaluation: Evaluation
     trajectory: Trajectory | None
     ledger: Ledger
-    choice: Choice | None = None
+    choice: OrderSelection | None = None
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts, Ledger
 from dolfinopt.responses.constraints import Limit, limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
-from dolfinopt.responses.order_selection import Choice
+from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.plausibility import implausible
@@ -46,7 +46,7 @@ def summarise(
     wall: float,
     counts: Counts | None = None,
     crisp: Evaluation | None = None,
-    choice: Choice | None = None,
+    choice: OrderSelection | None = None,
     iterations: int = 0,
     converged: bool = True,
     stop_reason: str = "simulated",
@@ -263,7 +263,7 @@ def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
     return found
 
 
-def _reduction(scene: Scene, choice: Choice | None) -> dict[str, Any]:
+def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
     """Return the number of coordinates and, where it was chosen, by which errors.
 
     For a given number there is no estimate: it would cost a simulation with more coordinates.
@@ -284,7 +284,7 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _too_few(scene: Scene, choice: Choice | None) -> list[str]:
+def _too_few(scene: Scene, choice: OrderSelection | None) -> list[str]:
     """Return a sentence where the final design would need more coordinates than were chosen."""
     if choice is None or choice.error <= scene.reduction.tolerance:
         return []

@@ -22,7 +22,7 @@ from dolfinopt.responses.response import (
     by_owner,
     find,
 )
-from dolfinopt.responses.scenarios import combined, factors, slopes_back
+from dolfinopt.responses.scenarios import combined, cotangents_of_scene, factors
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
 from dolfinopt.scene.load import WorstBy
 
@@ -223,7 +223,7 @@ def _cotangents(response: MotionResponse, trajectory: Trajectory) -> list[ShapeI
     total: list[ShapeIntegrals] = []
     for weight, one in zip(weights, others, strict=True):
         parts = [
-            slopes_back(by_body, factors(scene, one.scene, index), weight)
+            cotangents_of_scene(by_body, factors(scene, one.scene, index), weight)
             for index, by_body in enumerate(response.cotangents(one))
         ]
         total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts

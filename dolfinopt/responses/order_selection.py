@@ -36,7 +36,7 @@ RESTING = 1e-3
 
 
 @dataclass(frozen=True)
-class Choice:
+class OrderSelection:
     """What "auto" has chosen.
 
     Attributes:
@@ -59,7 +59,7 @@ def choose_coordinates(
     ledger: Ledger,
     *,
     reserve: float = 1.0,
-) -> Choice | None:
+) -> OrderSelection | None:
     """Let the arms reduce to the fewest coordinates that meet `reduction.tolerance` (collective).
 
     Numbers are tried upwards in growing steps, then bisected: the one below the chosen one does
@@ -95,7 +95,7 @@ def choose_coordinates(
         low, high = (low, middle) if tried[middle] <= goal else (middle, high)
     for arm in arms.values():
         arm.set_order(high)
-    return Choice(high, tried[high], tuple(sorted(tried.items())))
+    return OrderSelection(high, tried[high], tuple(sorted(tried.items())))
 
 
 def estimated_error(
@@ -106,7 +106,7 @@ def estimated_error(
     coordinates: int,
     ledger: Ledger,
 ) -> float:
-    """Return the error that so many coordinates make, see `Choice`; inf where they are none.
+    """Return the error that so many coordinates make, see `OrderSelection`; inf if impossible.
 
     Collective; the arms keep what they have.
 

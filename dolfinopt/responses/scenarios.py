@@ -61,18 +61,23 @@ def bodies_in(
     return bodies
 
 
-def slopes_back(slopes: ShapeIntegrals, f: Factors, weight: float) -> ShapeIntegrals:
-    """Return weighted slopes by the scene's body from those by the scenario's, see `scaled`.
+def cotangents_of_scene(cotangents: ShapeIntegrals, f: Factors, weight: float) -> ShapeIntegrals:
+    """Return weighted derivatives by the scene's body from those by the scenario's, see `scaled`.
 
     Those of D join K's.
     """
-    by_K = slopes.K + f.damping * slopes.D
-    back = replace(slopes, K=by_K, D=np.zeros_like(slopes.D), outboard=weight * slopes.outboard)
+    by_K = cotangents.K + f.damping * cotangents.D
+    back = replace(
+        cotangents,
+        K=by_K,
+        D=np.zeros_like(cotangents.D),
+        outboard=weight * cotangents.outboard,
+    )
     return scaled(back, weight * f.mass, weight * f.stiffness, 1.0)
 
 
 def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[float]]:
-    """Return (sum f^p)^(1/p) of positive values and its slopes; a single value is itself.
+    """Return (sum f^p)^(1/p) of positive values and its derivatives; a single value is itself.
 
     The largest, made smooth; with p = 20 it is 6 % above the largest of three equal ones:
     Kreisselmeier and Steinhauser's function of the logarithms.
@@ -85,7 +90,7 @@ def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[floa
 
 
 def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
-    """Return the objective of all scenarios from their own, and its slopes.
+    """Return the objective of all scenarios from their own, and its derivatives.
 
     "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`.
     """
@@ -93,5 +98,5 @@ def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]
     if scene.objective.scenarios == "sum":
         return sum(w * f for w, f in zip(weights, values, strict=True)), weights
     scaled_values = [w * f for w, f in zip(weights, values, strict=True)]
-    worst, slopes = worst_of(scaled_values, scene.objective.exponent)
-    return worst, [s * w for s, w in zip(slopes, weights, strict=True)]
+    worst, by_values = worst_of(scaled_values, scene.objective.exponent)
+    return worst, [s * w for s, w in zip(by_values, weights, strict=True)]

@@ -17,7 +17,7 @@ from dolfinopt.optimization import loop as optimization
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import gather_arms
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.responses.order_selection import Choice, estimated_error
+from dolfinopt.responses.order_selection import OrderSelection, estimated_error
 from dolfinopt.study.store import compare, simulate_scenarios
 
 WORLD = MPI.COMM_WORLD
@@ -34,7 +34,7 @@ def error(built: Built, x: dict[int, np.ndarray], count: int) -> float:
     return estimated_error(*place, x, count, built.ledger)
 
 
-def choose(built: Built, x: dict[int, np.ndarray]) -> Choice:
+def choose(built: Built, x: dict[int, np.ndarray]) -> OrderSelection:
     choice = do.choose_coordinates(built.scene, built.share, built.arms, x, built.ledger)
     assert choice is not None
     return choice
