@@ -40,7 +40,7 @@ class Roughness(Response):
     def measure(self, analysis: Analysis) -> Measured:
         with together(analysis.share.world):
             mine = {
-                k: float(arm.mesh.area @ (arm._x_phys - self.level) ** 2)
+                k: float(arm.mesh.area @ (arm.current.x_phys - self.level) ** 2)
                 for k, arm in analysis.arms.items()
             }
         found = on_all_ranks(analysis.share, mine)
@@ -52,7 +52,7 @@ class Roughness(Response):
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         return [
             {
-                k: 2.0 * arm.mesh.area * (arm._x_phys - self.level) * float(k == owner)
+                k: 2.0 * arm.mesh.area * (arm.current.x_phys - self.level) * float(k == owner)
                 for k, arm in analysis.arms.items()
             }
             for owner in analysis.scene.cell_counts
