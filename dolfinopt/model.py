@@ -166,7 +166,7 @@ class OptimizationResult(SimulationResult):
 
     Attributes:
         iterations: design updates made.
-        converged: whether the design rests, see `stop_reason`.
+        converged: whether a stopping criterion was met, see `stop_reason`.
         stop_reason: in words.
         violated: the constraints that are not met, "" if all are.
         rows: one a design, the initial one first; rank 0.
