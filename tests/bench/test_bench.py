@@ -121,7 +121,7 @@ def test_accelerations_solve_the_rows(problem):
 
 
 def test_jacobian_is_the_slope_of_accelerations(problem):
-    problem = modes_of(problem).problem
+    problem = modes_of(problem).system
     size = problem.mechanism.coordinates
     rng = np.random.default_rng(2)
     y, d = 1e-3 * rng.normal(size=2 * size), rng.normal(size=2 * size)
