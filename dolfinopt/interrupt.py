@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -25,6 +26,24 @@ def launched_rank(environment: Mapping[str, str] = os.environ) -> int | None:
         if text.isdigit():
             return int(text)
     return None
+
+
+def end_with_launcher(every: float = 1.0) -> None:
+    """End this rank when its launcher is gone, looked for `every` so many seconds.
+
+    A launcher that is killed cannot end its ranks. With Open MPI 5 they may then wait in MPI for
+    ever, and hold the locks of the folder that they work in.
+    """
+    if launched_rank() is None:
+        return
+    launcher = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == launcher:
+            time.sleep(every)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, name="launcher", daemon=True).start()
 
 
 def end_at_once() -> None:

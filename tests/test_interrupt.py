@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from mpi4py import MPI
@@ -91,3 +92,40 @@ def test_gmsh_leaves_interrupts_alone():
     with gmsh_on_root(MPI.COMM_WORLD):
         assert signal.getsignal(signal.SIGINT) is before
     assert signal.getsignal(signal.SIGINT) is before
+
+
+LAUNCHER = """
+import os, subprocess, sys, time
+rank = (
+    "import time; from dolfinopt.interrupt import end_with_launcher; end_with_launcher(0.05); "
+    "print('ready', flush=True); time.sleep(60)"
+)
+environment = {**os.environ, "OMPI_COMM_WORLD_RANK": "0"}
+child = subprocess.Popen([sys.executable, "-c", rank], env=environment, stdout=subprocess.PIPE)
+child.stdout.readline()
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.serial
+def test_ranks_end_with_a_launcher_that_is_killed():
+    with subprocess.Popen(
+        [sys.executable, "-c", LAUNCHER], stdout=subprocess.PIPE, text=True
+    ) as launcher:
+        rank = int(launcher.stdout.readline())
+        os.kill(rank, 0)  # it is there
+        launcher.kill()
+    limit = time.monotonic() + 30.0
+    while alive(rank):
+        assert time.monotonic() < limit
+        time.sleep(0.05)
+
+
+def alive(process):
+    """Whether a process runs; one that has ended and waits for its parent does not."""
+    try:
+        with open(f"/proc/{process}/stat") as state:
+            return state.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

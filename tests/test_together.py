@@ -213,7 +213,7 @@ def test_the_root_simulates(name, monkeypatch):
 
 def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeypatch):
     model = Model()
-    body = arm.shape_integrals
+    body = design_state.shape_integrals
 
     def stuck(*arguments):
         if COMM.rank == LONE:
@@ -473,7 +473,7 @@ def test_tables(monkeypatch, shared_tmp_path):
 # -- as a command ----------------------------------------------------------------------------
 
 COMMANDS = {
-    "reduction": ("dolfinopt.arms.arm", "shape_integrals", 1, "simulate"),
+    "reduction": ("dolfinopt.arms.design_state", "shape_integrals", 1, "simulate"),
     "mesh": ("dolfinopt.mesh.arm_mesh", "mesh_geo", 1, "simulate"),
     "simulation": ("dolfinopt.responses.evaluation", "simulate_batch", 0, "simulate"),
     "writing": ("dolfinopt.output.run_folder", "write_summary", 0, "simulate"),

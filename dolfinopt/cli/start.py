@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING
 import click
 
 from dolfinopt.errors import ConvergenceError, InputError, OutputError
-from dolfinopt.interrupt import INTERRUPTED, end_at_once, launched_rank, raise_again
+from dolfinopt.interrupt import (
+    INTERRUPTED,
+    end_at_once,
+    end_with_launcher,
+    launched_rank,
+    raise_again,
+)
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -53,6 +59,7 @@ class Start:
                     f"{', '.join(missing)} not installed; on Debian 12 or 13 run ./dolfinopt.sh, "
                     "elsewhere: conda install -c conda-forge fenics-dolfinx slepc4py python-gmsh"
                 )
+            end_with_launcher()
             import petsc4py
 
             # PETSc would turn a closed pipe or Ctrl-C into an abort with a page of advice.

@@ -366,6 +366,7 @@ main()
 
 @pytest.mark.serial
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_killed_run_continues(tmp_path):
     """On two ranks: the next call does the rest, and every file is that of one that ran through."""
     program = tmp_path / "program.py"
@@ -387,7 +388,7 @@ def test_killed_run_continues(tmp_path):
     computed = []
     for name in "ab":
         ended = subprocess.run([*line, str(tmp_path / name)], capture_output=True, text=True,
-                               timeout=150, **options)  # fmt: skip
+                               timeout=300, **options)  # fmt: skip
         assert ended.returncode == 0, ended.stderr
         computed.append(int(re.search(r"(\d+) cases computed", ended.stdout)[1]))
     # A rank may outlive its killed mpirun for a moment, and finish a case.
