@@ -11,9 +11,12 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 
 import dolfinopt as do
 from dolfinopt.multibody.motion import RigidMotion
+
+pytestmark = pytest.mark.serial  # one rank shows all there is
 
 OPTIONAL = {"bench"}  # imports programs that a plain installation does not have
 

@@ -7,6 +7,8 @@ import pytest
 from dolfinopt import profiling as ledger
 from dolfinopt.profiling import Ledger
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 
 def test_nested_phases_share_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """An inner phase stops the clock of the outer one, also where it ends by an error."""

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import time
 
+import pytest
+
 from dolfinopt.cli.live_line import plain_lines
 from dolfinopt.cli.shared import elapsed
 from dolfinopt.optimization.history import HistoryRow
+
+pytestmark = pytest.mark.serial  # one rank shows all there is
 
 
 def test_lines_without_a_terminal(capsys):

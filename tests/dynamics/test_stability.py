@@ -33,6 +33,8 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.reduction.basis import lowest_eigenpairs
 from dolfinopt.responses.objective import load_cases, objective
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 NAMED = (InputError, ConvergenceError)
 EXTENDED = pytest.mark.skipif(

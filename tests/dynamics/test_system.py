@@ -13,6 +13,8 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.profiling import Ledger
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 GRAVITY = 9.81  # m/s2
 
 

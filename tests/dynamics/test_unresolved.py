@@ -13,6 +13,8 @@ from dolfinopt.dynamics.unresolved import _lost, unresolved
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 
 def still(t: np.ndarray) -> RigidMotion:
     """Return a cart at rest."""

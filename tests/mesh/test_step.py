@@ -7,6 +7,8 @@ import pytest
 
 from dolfinopt.mesh.step import read_shapes
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 # As programs write it: spaces and line ends anywhere, comments of a kind in strings.
 SQUARE = """ISO-10303-21;
 DATA;

@@ -23,6 +23,8 @@ from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.scene.load import load_scene
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
 ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one

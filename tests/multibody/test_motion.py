@@ -36,6 +36,8 @@ from dolfinopt.parallel import on_root
 from dolfinopt.paths.time_laws import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 WORLD = MPI.COMM_WORLD
 
 DURATION = 1.9  # s

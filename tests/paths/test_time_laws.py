@@ -20,6 +20,8 @@ from dolfinopt.profiling import Ledger
 from dolfinopt.responses.evaluation import evaluate_batch
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)

@@ -18,6 +18,8 @@ from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.files import ArmView
 from dolfinopt.plots import animation, curves, design, machine, shapes, style
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LENGTHS = (1.0, 0.7, 0.4)  # m
 

@@ -12,6 +12,8 @@ import pytest
 from dolfinopt.scene.load import load_scene
 from dolfinopt.scene.plausibility import implausible
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 DEMOS = sorted((Path(__file__).parents[2] / "demos").glob("*.toml"))
 TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 

@@ -16,6 +16,8 @@ from dolfinopt.study.figures import (
 )
 from dolfinopt.study.tables import Line, LineFigure, MatrixFigure, Panel, TornadoFigure
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 
 def test_line_figure():
     """Axes with units, a legend; equal names look alike; steep curves on a log scale."""

@@ -22,6 +22,8 @@ from dolfinopt.study.statistics import (
     unit_points,
 )
 
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
 TEXTS = (
     "normal:6:0.3",
     "normal:70e9:2e9",
