@@ -91,7 +91,7 @@ def spectrum(law: str, void: float, cells: tuple[int, int]) -> Spectrum:
         f"arms.cells=[{cells[0]}, {cells[1]}]",
     ]
     scene = do.load_scene(HERE / "two_arm.toml", overrides)
-    arm = do.Arm(scene, 0, MPI.COMM_SELF, do.Ledger())
+    arm = do.Arm(scene, 0, MPI.COMM_SELF, do.Profile())
     x_phys = frame(arm.mesh.centroid, void)
     body = arm.reduce(x_phys)  # of modes with unit modal mass
     assert arm.basis is not None

@@ -53,7 +53,7 @@ def main(
             ]
             result = do.optimize(do.load_scene(HERE / "two_arm.toml", overrides), world=world)
             mine = {k: arm.volume_fraction(result.x_phys[k]) for k, arm in result.arms.items()}
-            fractions = list(do.gather_arms(result.share, mine).values())
+            fractions = list(do.gather_arms(result.partition, mine).values())
             if world.rank == 0:
                 end = result.evaluation
                 values = (payload, kind, end.compliance, 1e3 * end.max_deviation)

@@ -22,17 +22,17 @@ def main(folder: Path = Path("results/demo_two_arm")) -> do.Result:
     )
 
     # Mesh, elements and filter of every arm, on the ranks that own it.
-    ledger = do.Ledger()
-    share = do.share_arms(world, scene.cell_counts)
-    arms = do.build_arms(scene, share, ledger)
+    profile = do.Profile()
+    partition = do.partition_arms(world, scene.cell_counts)
+    arms = do.build_arms(scene, partition, profile)
 
     # Reduce and simulate the initial design.
     x_phys = {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
-    initial, _ = do.evaluate(scene, share, arms, x_phys, ledger)
+    initial, _ = do.evaluate(scene, partition, arms, x_phys, profile)
 
     # Optimise: filter, reduce, simulate, load cases, gradient, MMA; again and again.
     result = do.optimize(scene, world=world)
-    final, views = result.evaluation, do.gather_views(scene, share, result.arms, result.x_phys)
+    final, views = result.evaluation, do.gather_views(scene, partition, result.arms, result.x_phys)
 
     # Plot on the root, which alone has the whole arms and the motion.
     if world.rank == 0:

@@ -11,13 +11,14 @@ The same step by step, with ranks and profile in hand:
     import dolfinopt as do
     from mpi4py import MPI
 
-    scene = do.load_scene("demos/two_arm.toml")                     # what the user asks for
-    share = do.share_arms(MPI.COMM_WORLD, scene.cell_counts)        # which rank does which arm
-    arms = do.build_arms(scene, share, ledger := do.Ledger())       # mesh, elements, filter
-    x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}       # physical densities
-    evaluation, trajectory = do.evaluate(scene, share, arms, x_phys, ledger)  # reduce, simulate
-    gradient = do.gradient(scene, share, arms, trajectory, ledger)  # d objective / d x_phys
-    result = do.optimize(scene)                                     # again, until it converges
+    scene = do.load_scene("demos/two_arm.toml")  # what the user asks for
+    partition = do.partition_arms(MPI.COMM_WORLD, scene.cell_counts)  # which rank does which arm
+    arms = do.build_arms(scene, partition, profile := do.Profile())  # mesh, elements, filter
+    x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}  # physical densities
+    # Reduce and simulate; d objective / d x_phys.
+    evaluation, trajectory = do.evaluate(scene, partition, arms, x_phys, profile)
+    gradient = do.gradient(scene, partition, arms, trajectory, profile)
+    result = do.optimize(scene)  # again, until it converges
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
     from dolfinopt.optimization.result import Result
     from dolfinopt.output.files import gather_views
     from dolfinopt.output.run import optimize
-    from dolfinopt.parallel import abort_together, gather_arms, share_arms
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.parallel import abort_together, gather_arms, partition_arms
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
     from dolfinopt.responses.order_selection import choose_coordinates
     from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
@@ -53,14 +54,14 @@ _HOME = {
     "gradient": "responses.evaluation",
     "gather_views": "output.files",
     "gather_arms": "parallel",
-    "Ledger": "profiling",
+    "Profile": "profiling",
     "Model": "model",
     "OptimizationResult": "model",
     "SimulationResult": "model",
     "Result": "optimization.result",
     "optimize": "output.run",
     "abort_together": "parallel",
-    "share_arms": "parallel",
+    "partition_arms": "parallel",
     "Scene": "scene.load",
     "load_scene": "scene.load",
     "scene_from_dict": "scene.load",

@@ -43,8 +43,8 @@ from dolfinopt.output.files import (
     write_arrays,
 )
 from dolfinopt.output.run import optimize
-from dolfinopt.parallel import ArmShare, gather_cells, on_root, share_arms, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
@@ -234,8 +234,8 @@ class Model:
         self._world = MPI.COMM_WORLD if comm is None else comm
         self.scene: Scene = on_root(self._world, _load, scene, overrides)
         check_budget(self._world, self.scene)
-        self._profile = Ledger()
-        self._built: tuple[ArmShare, dict[int, Arm]] | None = None
+        self._profile = Profile()
+        self._built: tuple[Partition, dict[int, Arm]] | None = None
         self._order: dict[int, np.ndarray] = {}
         self._centroids: dict[str, np.ndarray] = {}
 
@@ -272,10 +272,10 @@ class Model:
             InputError: it does not fit the scene's arms.
             ConvergenceError: the motion could not be simulated; the message says what to try.
         """
-        share, arms, x_phys = self._prepared(x)
-        choose_coordinates(self.scene, share, arms, x_phys, self._profile)
-        evaluation, trajectory = evaluate(self.scene, share, arms, x_phys, self._profile)
-        views = gather_views(self.scene, share, arms, x_phys)
+        partition, arms, x_phys = self._prepared(x)
+        choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
+        evaluation, trajectory = evaluate(self.scene, partition, arms, x_phys, self._profile)
+        views = gather_views(self.scene, partition, arms, x_phys)
         return SimulationResult(self.scene, evaluation, self._gathered(x_phys), trajectory, views)
 
     def gradient(self, x: Design = None, kind: str | None = None) -> dict[str, np.ndarray]:
@@ -295,11 +295,11 @@ class Model:
         if kind is not None:
             objective = scene.objective.model_copy(update={"gradient": kind})
             scene = scene.model_copy(update={"objective": objective})
-        share, arms, x_phys = self._prepared(x)
+        partition, arms, x_phys = self._prepared(x)
         if needs(scene, "motion"):
-            choose_coordinates(scene, share, arms, x_phys, self._profile)
-        _, trajectory = evaluate(scene, share, arms, x_phys, self._profile, simulated=False)
-        return self._gathered(gradient(scene, share, arms, trajectory, self._profile))
+            choose_coordinates(scene, partition, arms, x_phys, self._profile)
+        _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
+        return self._gathered(gradient(scene, partition, arms, trajectory, self._profile))
 
     def optimize(
         self,
@@ -325,9 +325,9 @@ class Model:
         return OptimizationResult(
             self.scene,
             found.evaluation,
-            self._gathered(found.x_phys, found.share),
+            self._gathered(found.x_phys, found.partition),
             found.trajectory,
-            gather_views(self.scene, found.share, found.arms, found.x_phys),
+            gather_views(self.scene, found.partition, found.arms, found.x_phys),
             found.iterations,
             found.converged,
             found.stop_reason,
@@ -371,41 +371,41 @@ class Model:
 
     # -- designs over the ranks ----------------------------------------------------------------
 
-    def _arms(self) -> tuple[ArmShare, dict[int, Arm]]:
+    def _arms(self) -> tuple[Partition, dict[int, Arm]]:
         """Return which ranks do which arm, and this rank's, meshed at first use (collective)."""
         if self._built is None:
-            share = share_arms(self._world, self.scene.cell_counts)
-            arms = build_arms(self.scene, share, self._profile)
-            whole = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
+            partition = partition_arms(self._world, self.scene.cell_counts)
+            arms = build_arms(self.scene, partition, self._profile)
+            whole = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
             self._order = {k: canonical_order(points) for k, points in whole.items()}
             names = self.scene.arms
             self._centroids = {names[k].name: whole[k][o] for k, o in self._order.items()}
-            self._built = share, arms
+            self._built = partition, arms
         return self._built
 
     def _uniform(self, density: float) -> dict[int, np.ndarray]:
-        share, arms = self._arms()
-        with together(share.world):
+        partition, arms = self._arms()
+        with together(partition.world):
             return {k: arm.uniform(density) for k, arm in arms.items()}
 
-    def _prepared(self, x: Design) -> tuple[ArmShare, dict[int, Arm], dict[int, np.ndarray]]:
+    def _prepared(self, x: Design) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
         """Return the arms, which forget earlier designs, and the densities of this rank's cells.
 
         A search for modes that set out from another design's would end in other last digits.
         """
-        share, arms = self._arms()
+        partition, arms = self._arms()
         for arm in arms.values():
             arm.forget_modes()
         if x is None:
-            return share, arms, self._uniform(self.scene.design.initial)
+            return partition, arms, self._uniform(self.scene.design.initial)
         if isinstance(x, SimulationResult):
             x = x.design
         if isinstance(x, (str, os.PathLike)):
-            return share, arms, read_design(Path(x), share, arms)
+            return partition, arms, read_design(Path(x), partition, arms)
         whole = on_root(self._world, self._checked, x)
-        sizes = {k: share.comm.allgather(arm.mesh.num_cells) for k, arm in arms.items()}
-        parts = {k: np.cumsum([0, *size])[share.comm.rank :] for k, size in sizes.items()}
-        return share, arms, {k: whole[k][part[0] : part[1]] for k, part in parts.items()}
+        sizes = {k: partition.comm.allgather(arm.mesh.num_cells) for k, arm in arms.items()}
+        parts = {k: np.cumsum([0, *size])[partition.comm.rank :] for k, size in sizes.items()}
+        return partition, arms, {k: whole[k][part[0] : part[1]] for k, part in parts.items()}
 
     def _checked(self, x: Densities) -> dict[int, np.ndarray]:
         """Return a user's densities in the order of the ranks' cells (root only)."""
@@ -426,10 +426,10 @@ class Model:
         return whole
 
     def _gathered(
-        self, cells: Mapping[int, np.ndarray], share: ArmShare | None = None
+        self, cells: Mapping[int, np.ndarray], partition: Partition | None = None
     ) -> dict[str, np.ndarray]:
         """Return whole arrays by the arms' names on the root, empty elsewhere (collective)."""
-        whole = gather_cells(share or self._arms()[0], cells)
+        whole = gather_cells(partition or self._arms()[0], cells)
         return {self.scene.arms[k].name: one[self._order[k]] for k, one in whole.items()}
 
     @contextmanager

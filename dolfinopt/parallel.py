@@ -33,13 +33,12 @@ GRACE = 2.0  # s
 CLOSED = (errno.EPIPE, errno.ENOSPC)
 
 
-# Arms of fewer cells are faster on one rank than on two (see `share_arms`). One factorisation and
-# 18 solves, as an iteration needs, at 800 x 48 cells: 470 ms on one rank, 340 ms on two.
+# Arms of fewer cells are faster on one rank than on two (see `partition_arms`).
 SPLIT_CELLS = 40_000
 
 
 @dataclass(frozen=True)
-class ArmShare:
+class Partition:
     """Which ranks work on which arm.
 
     Attributes:
@@ -53,12 +52,12 @@ class ArmShare:
     arms: tuple[int, ...]
 
     @property
-    def leads(self) -> bool:
+    def is_root(self) -> bool:
         """True on the one rank that speaks for its arms."""
         return bool(self.arms) and self.comm.rank == 0
 
 
-def share_arms(world: MPI.Comm, cells: Mapping[int, int]) -> ArmShare:
+def partition_arms(world: MPI.Comm, cells: Mapping[int, int]) -> Partition:
     """Deal arms with a design of their own out over the ranks of `world` (collective).
 
     Up to as many ranks as arms, whole arms are dealt out and need no communication. Further
@@ -80,27 +79,27 @@ def share_arms(world: MPI.Comm, cells: Mapping[int, int]) -> ArmShare:
     else:
         color = world.rank
         mine = (arms[world.rank],) if world.rank < len(arms) else ()
-    return ArmShare(world=world, comm=world.Split(color, world.rank), arms=mine)
+    return Partition(world=world, comm=world.Split(color, world.rank), arms=mine)
 
 
-def sum_over_arms(share: ArmShare, mine: Mapping[int, np.ndarray]) -> np.ndarray:
+def sum_over_arms(partition: Partition, mine: Mapping[int, np.ndarray]) -> np.ndarray:
     """Return the sum of one array an arm, added in the arms' order: the same bits on all ranks.
 
     Args:
-        share: which ranks do which arm.
+        partition: which ranks do which arm.
         mine: arrays of this rank's arms, over its own cells; equal shapes.
     """
-    if share.comm.size > 1:
-        mine = {arm: share.comm.allreduce(value) for arm, value in mine.items()}
+    if partition.comm.size > 1:
+        mine = {arm: partition.comm.allreduce(value) for arm, value in mine.items()}
     pieces: dict[int, np.ndarray] = {}
-    for piece in share.world.allgather(dict(mine) if share.leads else {}):
+    for piece in partition.world.allgather(dict(mine) if partition.is_root else {}):
         pieces.update(piece)
     return np.sum([pieces[arm] for arm in sorted(pieces)], axis=0)
 
 
-def gather_arms(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:
+def gather_arms(partition: Partition, mine: Mapping[int, T]) -> dict[int, T]:
     """Collect one object an arm on the root, in the arms' order; empty elsewhere."""
-    pieces = share.world.gather(dict(mine) if share.leads else {}, root=0)
+    pieces = partition.world.gather(dict(mine) if partition.is_root else {}, root=0)
     if pieces is None:
         return {}
     merged: dict[int, T] = {}
@@ -109,7 +108,7 @@ def gather_arms(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:
     return {arm: merged[arm] for arm in sorted(merged)}
 
 
-def gather_cells(share: ArmShare, mine: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+def gather_cells(partition: Partition, mine: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Collect cell arrays (n_local, ...) of every arm on the root, ranks in order.
 
     Returns:
@@ -117,10 +116,10 @@ def gather_cells(share: ArmShare, mine: Mapping[int, np.ndarray]) -> dict[int, n
     """
     whole = {}
     for arm, values in mine.items():
-        pieces = share.comm.gather(values, root=0)
+        pieces = partition.comm.gather(values, root=0)
         if pieces is not None:
             whole[arm] = np.concatenate(pieces)
-    return gather_arms(share, whole)
+    return gather_arms(partition, whole)
 
 
 # -- one ending for all ranks ------------------------------------------------------------------

@@ -38,7 +38,7 @@ class Counts:
 
 
 @dataclass
-class Ledger:
+class Profile:
     """Seconds by phase and counts of one run on one rank.
 
     Attributes:

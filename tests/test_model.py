@@ -30,10 +30,10 @@ def result(model: Model) -> OptimizationResult:
 def test_simulate_is_evaluate(model: Model) -> None:
     """The initial design by name, by default, and by the functions give the same bits."""
     scene = do.load_scene(SCENE, SMALL)
-    share = do.share_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, share, ledger := do.Ledger())
+    partition = do.partition_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, partition, profile := do.Profile())
     x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
-    evaluation, _ = do.evaluate(scene, share, arms, x_phys, ledger)
+    evaluation, _ = do.evaluate(scene, partition, arms, x_phys, profile)
     assert model.simulate().evaluation == evaluation
     found = model.simulate(model.uniform(0.5))
     assert found.evaluation == evaluation

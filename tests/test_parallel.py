@@ -22,7 +22,7 @@ from dolfinopt.parallel import (
     gather_arms,
     gather_cells,
     on_root,
-    share_arms,
+    partition_arms,
     sum_over_arms,
 )
 
@@ -40,41 +40,43 @@ class FakeWorld:
 
 
 def teams(size, cells):
-    """Deal arms out over `size` ranks; return the shares and, a communicator, its ranks."""
+    """Deal arms out over `size` ranks; return the partitions and, a communicator, its ranks."""
     cells = dict(enumerate(cells))
-    shares = [share_arms(FakeWorld(size, rank), cells) for rank in range(size)]
-    assert [share.comm.key for share in shares] == list(range(size))  # ranks keep their order
+    partitions = [partition_arms(FakeWorld(size, rank), cells) for rank in range(size)]
+    assert [partition.comm.key for partition in partitions] == list(
+        range(size)
+    )  # ranks keep their order
     groups = {}
-    for rank, share in enumerate(shares):
-        groups.setdefault(share.comm.color, []).append(rank)
-    return shares, list(groups.values())
+    for rank, partition in enumerate(partitions):
+        groups.setdefault(partition.comm.color, []).append(rank)
+    return partitions, list(groups.values())
 
 
 @pytest.mark.parametrize("num_arms", [1, 2, 3, 5])
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
 def test_small_arms_stay_whole(size, num_arms):
-    shares, groups = teams(size, [2400] * num_arms)
-    dealt = [arm for share in shares for arm in share.arms]
+    partitions, groups = teams(size, [2400] * num_arms)
+    dealt = [arm for partition in partitions for arm in partition.arms]
     assert sorted(dealt) == list(range(num_arms))
     assert all(len(group) == 1 for group in groups)
-    loads = [len(share.arms) for share in shares]
+    loads = [len(partition.arms) for partition in partitions]
     assert max(loads) - min(loads) <= 1
-    assert all(share.arms == tuple(sorted(share.arms)) for share in shares)
+    assert all(partition.arms == tuple(sorted(partition.arms)) for partition in partitions)
 
 
 @pytest.mark.parametrize("num_arms", [1, 2, 3, 5])
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
 def test_large_arms_get_all_ranks(size, num_arms):
     # One large arm is enough: it sets the time that all wait for.
-    shares, groups = teams(size, [2400] * (num_arms - 1) + [SPLIT_CELLS])
+    partitions, groups = teams(size, [2400] * (num_arms - 1) + [SPLIT_CELLS])
     dealt = []
     for ranks in groups:
-        arms = {shares[rank].arms for rank in ranks}
+        arms = {partitions[rank].arms for rank in ranks}
         assert len(arms) == 1  # those who share a communicator share its arms
         dealt += arms.pop()
         assert ranks == list(range(ranks[0], ranks[-1] + 1))  # neighbours
     assert sorted(dealt) == list(range(num_arms))
-    assert all(share.arms for share in shares)
+    assert all(partition.arms for partition in partitions)
     sizes = [len(ranks) for ranks in groups]
     assert max(sizes) - min(sizes) <= 1
 
@@ -82,18 +84,24 @@ def test_large_arms_get_all_ranks(size, num_arms):
 @pytest.mark.parametrize("cells", [2400, SPLIT_CELLS])
 @pytest.mark.parametrize("num_arms", [1, 2, 3, 4])
 def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
-    share = share_arms(COMM, dict.fromkeys(range(num_arms), cells))
+    partition = partition_arms(COMM, dict.fromkeys(range(num_arms), cells))
     expected = {k: f"arm {k}" for k in range(num_arms)}
     # Given in any order, and by every rank of a team: the leader's counts.
-    mine = {k: expected[k] if share.leads else "not the leader's" for k in reversed(share.arms)}
-    bodies = gather_arms(share, mine)
+    mine = {
+        k: expected[k] if partition.is_root else "not the leader's"
+        for k in reversed(partition.arms)
+    }
+    bodies = gather_arms(partition, mine)
     assert bodies == (expected if COMM.rank == 0 else {})
     assert list(bodies) == sorted(bodies)
-    assert COMM.allreduce(int(share.leads)) == min(num_arms, COMM.size)
-    team = {k: n for arms, n in COMM.allgather((share.arms, share.comm.size)) for k in arms}
+    assert COMM.allreduce(int(partition.is_root)) == min(num_arms, COMM.size)
+    team = {k: n for arms, n in COMM.allgather((partition.arms, partition.comm.size)) for k in arms}
     whole = gather_cells(
-        share,
-        {k: np.full((2 + share.comm.rank, 3), 10.0 * k + share.comm.rank) for k in share.arms},
+        partition,
+        {
+            k: np.full((2 + partition.comm.rank, 3), 10.0 * k + partition.comm.rank)
+            for k in partition.arms
+        },
     )
     if COMM.rank > 0:
         assert whole == {}
@@ -107,11 +115,11 @@ def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
 @pytest.mark.parametrize("cells", [2400, SPLIT_CELLS])
 @pytest.mark.parametrize("num_arms", [1, 2, 3])
 def test_sums_over_arms_have_the_same_bits_on_any_number_of_ranks(num_arms, cells):
-    share = share_arms(COMM, dict.fromkeys(range(num_arms), cells))
+    partition = partition_arms(COMM, dict.fromkeys(range(num_arms), cells))
     # Cancelling numbers: any other order of the arms gives other bits.
     values = np.array([[1.0, 0.1], [1e17, 0.2], [-1e17, 0.3]])[:num_arms]
-    first = share.comm.rank == 0  # a team's parts are added before
-    total = sum_over_arms(share, {k: values[k] * first for k in share.arms})
+    first = partition.comm.rank == 0  # a team's parts are added before
+    total = sum_over_arms(partition, {k: values[k] * first for k in partition.arms})
     expected = values[0].copy()
     for value in values[1:]:
         expected += value
@@ -283,8 +291,8 @@ def test_options_of_other_programs_change_nothing():
         options[key] = value
     try:
         scene = do.load_scene(SCENE, ("arms.cells=[16,3]",))
-        share = do.share_arms(COMM, scene.cell_counts)
-        for arm in do.build_arms(scene, share, do.Ledger()).values():
+        partition = do.partition_arms(COMM, scene.cell_counts)
+        for arm in do.build_arms(scene, partition, do.Profile()).values():
             arm.reduce(arm.uniform(0.5))
             assert arm.elastic.factorise().getType() == "preonly"
             assert arm.elastic.factorise().getPC().getType() == "cholesky"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from dolfinopt import profiling as ledger
-from dolfinopt.profiling import Ledger
+from dolfinopt import profiling as profile
+from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -13,8 +13,8 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 def test_nested_phases_share_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """An inner phase stops the clock of the outer one, also where it ends by an error."""
     now = 0.0
-    monkeypatch.setattr(ledger.time, "perf_counter", lambda: now)
-    found = Ledger()
+    monkeypatch.setattr(profile.time, "perf_counter", lambda: now)
+    found = Profile()
     with found.phase("outer"):
         now += 1.0
         with found.phase("inner"):

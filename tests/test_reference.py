@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.multibody.shape_integrals import first_frequency
-from dolfinopt.parallel import gather_arms, share_arms
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import gather_arms, partition_arms
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.objective import load_cases
 from dolfinopt.responses.sensitivity import esl_gradient
@@ -43,7 +43,7 @@ class Run:
     """A scene simulated with given designs; what is sampled of the trajectory is on all ranks."""
 
     scene: object
-    share: object
+    partition: object
     arms: dict
     trajectory: object  # on the root
     evaluation: object
@@ -57,12 +57,12 @@ class Run:
 
 def simulate(designs, *overrides):
     scene = load_scene(TWO_ARM, overrides)
-    share = share_arms(COMM, scene.cell_counts)
-    arms = build_arms(scene, share, Ledger())
+    partition = partition_arms(COMM, scene.cell_counts)
+    arms = build_arms(scene, partition, Profile())
     x_phys = {k: DESIGNS[designs[k]](arm.mesh.centroid) for k, arm in arms.items()}
-    evaluation, trajectory = evaluate(scene, share, arms, x_phys, Ledger())
+    evaluation, trajectory = evaluate(scene, partition, arms, x_phys, Profile())
     bodies = list(
-        gather_arms(share, {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}).values()
+        gather_arms(partition, {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}).values()
     )
     known = None
     if trajectory is not None:
@@ -74,7 +74,7 @@ def simulate(designs, *overrides):
             [trajectory.q_e[:, part] for part in trajectory.mechanism.slices],
             load_cases(trajectory, scene),
         )
-    return Run(scene, share, arms, trajectory, evaluation, *COMM.bcast(known, root=0))
+    return Run(scene, partition, arms, trajectory, evaluation, *COMM.bcast(known, root=0))
 
 
 # -- a NumPy/SciPy model of the same two arms -----------------------------------------------------
@@ -143,7 +143,7 @@ def test_gradient_of_the_integrated_compliance(kind):
     )
     # Measured: 4e-6.
     assert run.evaluation.objective == pytest.approx(values["value"], rel=1e-4)
-    for k, slope in gradient(run.scene, run.share, run.arms, run.trajectory, Ledger()).items():
+    for k, slope in gradient(run.scene, run.partition, run.arms, run.trajectory, Profile()).items():
         arm = run.arms[k]
         place = arm.mesh.centroid / [arm.scene.arms[k].length, arm.scene.arms[k].height] + [0, 0.5]
         i, j = (place * [10, 3]).astype(int).T
@@ -236,7 +236,7 @@ def test_esl_gradient_against_differences_of_the_frozen_problem(method, q):
         "objective.load_cases=10",
     )
     assert len(run.cases.indices) == 10
-    for k, slope in gradient(run.scene, run.share, run.arms, run.trajectory, Ledger()).items():
+    for k, slope in gradient(run.scene, run.partition, run.arms, run.trajectory, Profile()).items():
         arm = run.arms[k]
         x = wave(arm.mesh.centroid)
         displacements = arm.basis.V @ run.q_e[k][run.cases.indices].T

@@ -1,6 +1,6 @@
 """What a scene does not need is not done: the list, scene by scene, read from summary.json.
 
-Counters tell how often the costly things were done, see `ledger.Counts`; those of an optimisation
+Counters tell how often the costly things were done, see `profile.Counts`; those of an optimisation
 are its iterations'. What they cannot tell, imports and files, is looked at itself. That a part of
 the program does nothing twice is tested where that part is: stiffness, mass and factors in
 test_elasticity, bases in test_reduction, scenarios of one design in test_scenarios and test_cases,
@@ -221,7 +221,7 @@ class Watched(np.ndarray):
 def test_undamped_rows_have_no_damping_terms(damping: float) -> None:
     built = build(f"damping.stiffness_proportional={damping}")
     x = built.fields(wave)
-    owned = gather_arms(built.share, {k: a.reduce(x[k]) for k, a in built.arms.items()})
+    owned = gather_arms(built.partition, {k: a.reduce(x[k]) for k, a in built.arms.items()})
     bodies = [replace(b, D=b.D.view(Watched)) for b in chain_of(built.scene, owned)]
     mechanism = build_mechanism(built.scene, bodies)
     t = np.linspace(0.1, 1.0, 3)

@@ -29,7 +29,7 @@ from dolfinopt.parallel import (
     RaisedElsewhere,
     _pickled,
     on_root,
-    share_arms,
+    partition_arms,
     together,
 )
 from dolfinopt.responses import eigenfrequency, evaluation, motion, static, tip_deflection
@@ -165,20 +165,20 @@ class Model:
 
     def __init__(self, *overrides):
         self.scene = load_scene(paper_scene(), (*COARSE, *overrides))
-        self.share = share_arms(COMM, self.scene.cell_counts)
-        self.ledger = do.Ledger()
-        self.arms = do.build_arms(self.scene, self.share, self.ledger)
+        self.partition = partition_arms(COMM, self.scene.cell_counts)
+        self.profile = do.Profile()
+        self.arms = do.build_arms(self.scene, self.partition, self.profile)
         self.x = {k: one.uniform(0.5) for k, one in self.arms.items()}
 
     @property
     def place(self):
-        return self.scene, self.share, self.arms
+        return self.scene, self.partition, self.arms
 
     def evaluate(self):
-        return do.evaluate(*self.place, self.x, self.ledger)
+        return do.evaluate(*self.place, self.x, self.profile)
 
     def gradient(self, trajectory):
-        return do.gradient(*self.place, trajectory, self.ledger)
+        return do.gradient(*self.place, trajectory, self.profile)
 
 
 EVALUATIONS = {
@@ -222,7 +222,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 
     monkeypatch.setattr(design_state, "shape_integrals", stuck)
     found = evaluation.evaluate_batch(
-        [model.scene] * 2, model.share, model.arms, model.x, do.Ledger()
+        [model.scene] * 2, model.partition, model.arms, model.x, do.Profile()
     )
     assert [str(one) for one in found] == ["stuck", "stuck"]
     assert all(isinstance(one, ConvergenceError) for one in found)
@@ -233,7 +233,7 @@ def test_a_batch_under_other_scenes(monkeypatch):
     model = Model('objective.kind="static"')
     fail_on(monkeypatch, LONE, arm.Arm, "under")
     with pytest.raises(Unusual):
-        evaluation.evaluate_batch([model.scene], model.share, model.arms, model.x, do.Ledger())
+        evaluation.evaluate_batch([model.scene], model.partition, model.arms, model.x, do.Profile())
     COMM.Barrier()
 
 
@@ -291,7 +291,7 @@ def test_coordinates_are_chosen(owner, name, monkeypatch):
     model = Model('reduction.coordinates="auto"', "reduction.tolerance=0.1")
     fail_on(monkeypatch, 0 if name == "_largest" else LONE, owner, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
-        do.choose_coordinates(*model.place, model.x, model.ledger)
+        do.choose_coordinates(*model.place, model.x, model.profile)
     COMM.Barrier()
 
 
@@ -352,7 +352,7 @@ def test_results_are_written(place, monkeypatch, shared_tmp_path):
     model = Model()
     evaluated, trajectory = model.evaluate()
     fail_on(monkeypatch, rank, owner, name)
-    simulated = Simulated(*model.place, model.x, evaluated, trajectory, model.ledger)
+    simulated = Simulated(*model.place, model.x, evaluated, trajectory, model.profile)
     with pytest.raises(Unusual, match=f"^{name}$"):
         write_simulation(shared_tmp_path, simulated, 1.0)
     COMM.Barrier()
@@ -383,7 +383,7 @@ def test_designs_are_read(monkeypatch, shared_tmp_path):
     COMM.Barrier()
     fail_on(monkeypatch, LONE, files, "_fit")
     with pytest.raises(Unusual):
-        files.read_design(shared_tmp_path / "design.npz", model.share, model.arms)
+        files.read_design(shared_tmp_path / "design.npz", model.partition, model.arms)
     COMM.Barrier()
 
 
@@ -392,7 +392,7 @@ def test_taylor_test(name, monkeypatch):
     model = Model()
     fail_on(monkeypatch, LONE, arm.Arm, name)
     with pytest.raises(Unusual):
-        taylor_test(*model.place, model.x, model.ledger)
+        taylor_test(*model.place, model.x, model.profile)
     COMM.Barrier()
 
 

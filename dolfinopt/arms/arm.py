@@ -25,8 +25,8 @@ from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.multibody.standard_input import load_body
-from dolfinopt.parallel import ArmShare, sum_over_arms, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, sum_over_arms, together
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
 
@@ -65,20 +65,20 @@ class Arm:
         places: of the arms in the chain that have this design.
     """
 
-    def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, ledger: Ledger):
+    def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, profile: Profile):
         """Mesh arm number `index` on the ranks of `comm` (collective there)."""
         arm = scene.arms[index]
         self.scene = scene
         self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
         self.solid = scene.material_of(index)
-        with ledger.phase("mesh"):
+        with profile.phase("mesh"):
             self.mesh = arm_mesh(comm, arm)
             self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
-        with ledger.phase("element operators"):
+        with profile.phase("element operators"):
             operators = ELEMENTS["linear"].operators(
                 self.mesh, arm.thickness, self.solid.poisson_ratio
             )
-            self.substructure = Substructure(self.mesh, operators, ledger)
+            self.substructure = Substructure(self.mesh, operators, profile)
             design = scene.design
             # A member along an edge would be half as thin if the filter mirrored it there.
             self.filter = HelmholtzFilter(self.mesh, design.radius, design.minimum_member > 0.0)
@@ -90,7 +90,7 @@ class Arm:
                 f"at most {self.substructure.T.num_dofs}, the degrees of freedom of arm "
                 f"{arm.name!r}"
             )
-        self.ledger = ledger
+        self.profile = profile
         self.initial = InitialVectors()
         self._state: DesignState | None = None
 
@@ -107,7 +107,7 @@ class Arm:
         what is cut off there has no derivative, and `chain` knows.
         """
         x = np.where(self.mesh.passive, 1.0, x)
-        with self.ledger.phase("filter"):
+        with self.profile.phase("filter"):
             if self.symmetry is not None:
                 x = self.symmetry.forward(x)
             x_filtered = self.filter.forward(x)
@@ -166,7 +166,7 @@ class Arm:
             slope = realised.projected.backward(self._active(slope))
         if realised is not None and realised.clipped is not None:
             slope = np.where(realised.clipped, 0.0, slope)
-        with self.ledger.phase("filter"):
+        with self.profile.phase("filter"):
             slope = self.filter.backward(self._active(slope))
             if self.symmetry is not None:
                 slope = self.symmetry.backward(slope)
@@ -326,8 +326,8 @@ class Arm:
         return float(grey / total)
 
 
-def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int, Arm]:
-    """Build this rank's arms, keyed by their index in the scene (collective on `share.world`).
+def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> dict[int, Arm]:
+    """Build this rank's arms, keyed by their index in the scene (collective on `partition.world`).
 
     Only arms with a design of their own: those that share one, rigid arms and those from a file
     need no mesh.
@@ -336,18 +336,18 @@ def build_arms(scene: scenes.Scene, share: ArmShare, ledger: Ledger) -> dict[int
         InputError: the meshes exceed the memory; a mesh file cannot be an arm, or holds more solid
             cells than the volume allows.
     """
-    check_budget(share.world, scene)
-    with together(share.world):
-        arms = {index: Arm(scene, index, share.comm, ledger) for index in share.arms}
+    check_budget(partition.world, scene)
+    with together(partition.world):
+        arms = {index: Arm(scene, index, partition.comm, profile) for index in partition.arms}
     if any(scene.arms[index].mesh is not None for index in scene.cell_counts):
-        _check_solid(scene, share, arms)
+        _check_solid(scene, partition, arms)
     return arms
 
 
-def _check_solid(scene: scenes.Scene, share: ArmShare, arms: Mapping[int, Arm]) -> None:
+def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, Arm]) -> None:
     """Raise InputError if solid cells exceed the volume limit, which a scene cannot know.
 
-    Collective on `share.world`.
+    Collective on `partition.world`.
     """
     owners = list(scene.cell_counts)
     parts = {}
@@ -358,7 +358,7 @@ def _check_solid(scene: scenes.Scene, share: ArmShare, arms: Mapping[int, Arm]) 
             weight * arm.mesh.area @ arm.mesh.passive,
             weight * arm.mesh.area.sum(),
         ]
-    volumes = sum_over_arms(share, parts)
+    volumes = sum_over_arms(partition, parts)
     names = [f"arm {scene.arms[k].name!r}" for k in owners]
     if scene.design.shared_volume:
         volumes, names = volumes.sum(axis=0, keepdims=True), ["all arms together"]

@@ -85,7 +85,7 @@ class DesignState:
     def basis(self) -> Basis:
         """The reduced basis by the scene's method."""
         if self._basis is None:
-            with self.elastic.ledger.phase("reduction"):
+            with self.elastic.profile.phase("reduction"):
                 reduce = METHODS[self.scene.reduction.method].reduce
                 self._basis = reduce(self.elastic, self.reduction_options, self._initial.basis)
             self._initial.basis = self._basis.start
@@ -96,7 +96,7 @@ class DesignState:
         """The floating body."""
         if self._body is None:
             basis = self.basis
-            with self.elastic.ledger.phase("inertia integrals"):
+            with self.elastic.profile.phase("inertia integrals"):
                 damping = self.scene.damping.stiffness_proportional
                 self._body = shape_integrals(self.elastic, basis, damping)
         return self._body
@@ -111,7 +111,7 @@ class DesignState:
         known = self._loaded.get(place)
         if known is None or known[0] != carried:
             count, guess = self.scene.objective.modes, self._initial.loaded.get(place)
-            with self.elastic.ledger.phase("vibration"):
+            with self.elastic.profile.phase("vibration"):
                 known = carried, loaded_modes(self.elastic, carried, count, guess)
             self._loaded[place] = known
             self._initial.loaded[place] = known[1].start

@@ -23,9 +23,9 @@ from dolfinopt.arms.arm import Arm, build_arms, chain_of
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.files import write_text
 from dolfinopt.output.run import optimize
-from dolfinopt.parallel import share_arms
+from dolfinopt.parallel import partition_arms
 from dolfinopt.plots.style import save
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.figures import line_figure
 from dolfinopt.study.tables import Cell, Line, LineFigure, Panel, Table
@@ -266,4 +266,4 @@ def bodies_of(
 
 def arms_of(scene: Scene) -> dict[int, Arm]:
     """Return the scene's arms on this rank alone."""
-    return build_arms(scene, share_arms(MPI.COMM_SELF, scene.cell_counts), Ledger())
+    return build_arms(scene, partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile())

@@ -16,7 +16,7 @@ from dolfinopt.fem.elements import ElementOperators, LagrangeElement, plane_stre
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.compat import cell_coordinates, local_cell_counts
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency, shape_integrals
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Panel
@@ -217,7 +217,7 @@ def respond(scene: Scene, element: Element, cells: tuple[int, int], repeats: int
     def set_up() -> Substructure:
         mesh = element.arm(arm.length, arm.height, cells)
         operators = element.operators(mesh, arm.thickness, solid.poisson_ratio)
-        return Substructure(mesh, operators, Ledger())
+        return Substructure(mesh, operators, Profile())
 
     setup, substructure = timed(set_up, 1)
     ones = np.ones(substructure.mesh.num_cells)
@@ -239,7 +239,7 @@ def respond(scene: Scene, element: Element, cells: tuple[int, int], repeats: int
         now, body = timed(reduce, 1)
         seconds = min(seconds, now)
     flexibility = np.linalg.inv(at(1.0).constraint_modes().stiffness)
-    moved = simulate(scene, [body] * len(scene.arms), Ledger())
+    moved = simulate(scene, [body] * len(scene.arms), Profile())
     return Response(
         float(flexibility[1, 1]),
         first_frequency(body),

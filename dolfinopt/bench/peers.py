@@ -33,7 +33,7 @@ from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.run import optimize
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Panel
@@ -138,18 +138,18 @@ def _moved(scene: Scene, element: Element, cells: tuple[int, int]) -> Trajectory
     mesh = element.arm(arm.length, arm.height, cells)
     operators = element.operators(mesh, arm.thickness, solid.poisson_ratio)
     ones = np.ones(mesh.num_cells)
-    elastic = Substructure(mesh, operators, Ledger()).at(
+    elastic = Substructure(mesh, operators, Profile()).at(
         solid.young_modulus * ones, solid.density * ones
     )
     basis = METHODS["craig-bampton"].reduce(elastic, Options(COORDINATES), None)
     body = shape_integrals(elastic, basis, scene.damping.stiffness_proportional)
-    return simulate(scene, [body] * len(scene.arms), Ledger())
+    return simulate(scene, [body] * len(scene.arms), Profile())
 
 
 def _reduced_and_moved(
     scene: Scene, arms: dict[int, Arm], x_phys: dict[int, np.ndarray]
 ) -> Trajectory:
-    return simulate(scene, bodies_of(scene, arms, x_phys), Ledger())
+    return simulate(scene, bodies_of(scene, arms, x_phys), Profile())
 
 
 def _motions(plan: Plan, tell: Tell) -> list[Row]:

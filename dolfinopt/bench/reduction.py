@@ -11,7 +11,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, bodies_of, curves, designs, timed
 from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Panel
@@ -55,7 +55,7 @@ class Response:
 
 
 def _response(scene: Scene, arms: dict[int, Arm], x_phys: dict[int, np.ndarray]) -> Response:
-    moved = simulate(scene, bodies_of(scene, arms, x_phys), Ledger())
+    moved = simulate(scene, bodies_of(scene, arms, x_phys), Profile())
     return Response(moved.compliance.sum(axis=1), moved.deviation)
 
 

@@ -30,7 +30,7 @@ from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.mechanism import deviation, inverse_dynamics, tangent
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.study.tables import Panel
 from dolfinopt.study.variants import reduced
 
@@ -102,7 +102,7 @@ def judge(problem: ElasticSystem, tolerance: float = REFERENCE_TOLERANCE) -> Jud
     """Solve by Radau of six stages to `tolerance`, or to what rounding leaves of it."""
     while True:
         try:
-            solution = radau.integrate(problem, tolerance, REFERENCE_STAGES, Ledger())
+            solution = radau.integrate(problem, tolerance, REFERENCE_STAGES, Profile())
             break
         except ConvergenceError:
             if tolerance > 1e-7:
@@ -194,7 +194,7 @@ def _ours(judge: Judge, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solve
     tolerances = QUICK_TOLERANCES if plan.quick else TOLERANCES
 
     def collocated(stages: int, tolerance: float) -> np.ndarray:
-        return radau.integrate(problem, tolerance, stages, Ledger()).sample(t)
+        return radau.integrate(problem, tolerance, stages, Profile()).sample(t)
 
     def stepped(rho_inf: float, count: int) -> np.ndarray:
         edges = even_steps(problem, count)

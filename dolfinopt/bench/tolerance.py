@@ -25,7 +25,7 @@ from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Line, Panel
 from dolfinopt.study.variants import changed, reduced
@@ -274,7 +274,7 @@ def run(problem: ElasticSystem, tolerance: float) -> Run:
 
     def solve() -> Solution | ConvergenceError:
         try:
-            return radau.integrate(problem, tolerance, STAGES, Ledger())
+            return radau.integrate(problem, tolerance, STAGES, Profile())
         except ConvergenceError as error:
             return error
 

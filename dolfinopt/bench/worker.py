@@ -19,7 +19,7 @@ from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.run import optimize
 from dolfinopt.scene.load import Scene, scene_from_dict
 
-# Phases of the ledger that stand for themselves; the others are parts of `bodies`.
+# Phases of the profile that stand for themselves; the others are parts of `bodies`.
 BODIES = "assembly", "reduction", "inertia integrals"
 GRADIENT = "objective", "gradient", "adjoint"
 
@@ -69,7 +69,7 @@ def iterate(scene: Scene, world: MPI.Comm) -> Iteration:
     share = (cpu[-1] - cpu[0]) / (wall[-1] - wall[0]) / (result.iterations + 1)
 
     def seconds(*phases: str) -> float:
-        return share * sum(result.ledger.seconds.get(phase, 0.0) for phase in phases)
+        return share * sum(result.profile.seconds.get(phase, 0.0) for phase in phases)
 
     return Iteration(
         iterations=result.iterations,

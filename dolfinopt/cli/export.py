@@ -43,16 +43,16 @@ def export(
     from dolfinopt.multibody.mbdyn import fem_text
     from dolfinopt.output.files import write_arrays, write_text
     from dolfinopt.parallel import gather_arms
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.order_selection import choose_coordinates
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
     claim(world, folder, overwrite, names)
-    share, arms, x_phys = design_of(world, loaded, design, Ledger())
+    partition, arms, x_phys = design_of(world, loaded, design, Profile())
     prepare(world, folder)
-    tell(world, choose_coordinates(loaded, share, arms, x_phys, Ledger()))
+    tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))
     exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
-    bodies = gather_arms(share, exported)
+    bodies = gather_arms(partition, exported)
     if world.rank != 0:
         return
     for arm, owner in zip(loaded.arms, loaded.owners, strict=True):

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.parallel import ArmShare
+    from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene
 
 
@@ -55,7 +55,7 @@ def gradient(
     world, loaded = load(scene, overrides)
     from dolfinopt.optimization.gradient_check import check_exact
     from dolfinopt.output.files import write_gradient
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes
     from dolfinopt.responses.order_selection import choose_coordinates
@@ -64,35 +64,35 @@ def gradient(
     claim(world, out.parent, overwrite, [out.name])
     if check:
         check_exact(loaded)
-    ledger = Ledger()
-    share, arms, x_phys = design_of(world, loaded, design, ledger)
+    profile = Profile()
+    partition, arms, x_phys = design_of(world, loaded, design, profile)
     prepare(world, out.parent)
     moves = needs(loaded, "motion")
     if moves:
-        tell(world, choose_coordinates(loaded, share, arms, x_phys, ledger))
-    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger, simulated=False)
-    by_cell = slopes(loaded, share, arms, trajectory, ledger)
-    write_gradient(out, loaded, share, arms, by_cell, evaluation.objective)
+        tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
+    evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile, simulated=False)
+    by_cell = slopes(loaded, partition, arms, trajectory, profile)
+    write_gradient(out, loaded, partition, arms, by_cell, evaluation.objective)
     if world.rank == 0:
         unit = objective_of(loaded).unit
         name = loaded.objective.gradient if moves else "exact"
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
     if check:
-        _check_gradient(world, loaded, share, arms, x_phys, ledger)
+        _check_gradient(world, loaded, partition, arms, x_phys, profile)
 
 
 def _check_gradient(
     world: MPI.Comm,
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     x: Mapping[int, Any],
-    ledger: Any,
+    profile: Any,
 ) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
     from dolfinopt.optimization.gradient_check import PASSES, STEPS, taylor_test
 
-    test = taylor_test(scene, share, arms, x, ledger)
+    test = taylor_test(scene, partition, arms, x, profile)
     if world.rank == 0:
         steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
         click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")

@@ -23,14 +23,14 @@ def plot(folder: Path, animation: bool) -> None:
     world = start()
     from dolfinopt.output.files import gather_views, read_history, read_initial_deviation
     from dolfinopt.parallel import on_root
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
 
     loaded = on_root(world, scene_of, folder)
-    ledger = Ledger()
-    share, arms, x_phys = design_of(world, loaded, folder / "design.npz", ledger)
-    _, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
-    views = gather_views(loaded, share, arms, x_phys)
+    profile = Profile()
+    partition, arms, x_phys = design_of(world, loaded, folder / "design.npz", profile)
+    _, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
+    views = gather_views(loaded, partition, arms, x_phys)
     if trajectory is None:
         return
     history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []

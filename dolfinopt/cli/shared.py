@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.files import ArmView
-    from dolfinopt.parallel import ArmShare
+    from dolfinopt.parallel import Partition
     from dolfinopt.responses.order_selection import OrderSelection
     from dolfinopt.scene.load import Scene
 
@@ -117,18 +117,18 @@ def scene_of(folder: Path) -> Scene:
 
 
 def design_of(
-    world: MPI.Comm, scene: Scene, design: Path | None, ledger: Any
-) -> tuple[ArmShare, dict[int, Arm], dict[int, Any]]:
+    world: MPI.Comm, scene: Scene, design: Path | None, profile: Any
+) -> tuple[Partition, dict[int, Arm], dict[int, Any]]:
     """Build the arms and return them with the physical densities of a file or the initial ones."""
     from dolfinopt.arms.arm import build_arms
     from dolfinopt.output.files import read_design
-    from dolfinopt.parallel import share_arms
+    from dolfinopt.parallel import partition_arms
 
-    share = share_arms(world, scene.cell_counts)
-    arms = build_arms(scene, share, ledger)
+    partition = partition_arms(world, scene.cell_counts)
+    arms = build_arms(scene, partition, profile)
     if design is not None:
-        return share, arms, read_design(design, share, arms)
-    return share, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+        return partition, arms, read_design(design, partition, arms)
+    return partition, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
 
 
 def draw(

@@ -47,17 +47,17 @@ def simulate(
     from dolfinopt.output.folders import remove_stale
     from dolfinopt.output.run_folder import Simulated, write_simulation
     from dolfinopt.parallel import on_root
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.order_selection import choose_coordinates
 
     claim(world, folder, overwrite)
-    ledger = Ledger()
-    share, arms, x_phys = design_of(world, loaded, design, ledger)
+    profile = Profile()
+    partition, arms, x_phys = design_of(world, loaded, design, profile)
     prepare(world, folder)
-    choice = choose_coordinates(loaded, share, arms, x_phys, ledger)
-    evaluation, trajectory = evaluate(loaded, share, arms, x_phys, ledger)
-    simulated = Simulated(loaded, share, arms, x_phys, evaluation, trajectory, ledger, choice)
+    choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
+    evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
+    simulated = Simulated(loaded, partition, arms, x_phys, evaluation, trajectory, profile, choice)
 
     def pictures(views: list[ArmView]) -> None:
         assert trajectory is not None

@@ -27,7 +27,7 @@ from dolfinopt.dynamics.time_grid import (
     steps_between_breakpoints,
 )
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 # Of runs that share a matrix. Coordinates are slow up to an angle of 20: with 40, as for one
 # system, nine take a third longer with 4 coordinates an arm. What needs more than 6 matrices needs
@@ -57,7 +57,7 @@ def integrate(
     systems: Sequence[ElasticSystem],
     tolerance: float,
     stages: int,
-    ledger: Ledger,
+    profile: Profile,
     guesses: Sequence[Solution | None],
     goal: float = GOAL,
 ) -> list[Solution | ConvergenceError]:
@@ -67,7 +67,7 @@ def integrate(
 
     Args:
         systems: what to solve.
-        tolerance, stages, ledger: as there.
+        tolerance, stages, profile: as there.
         guesses: solution of a nearby system for each, or None.
         goal: what Newton's method may leave, as a share of the tolerance.
 
@@ -82,20 +82,20 @@ def integrate(
         if len(mine) > 1:
             batch = batch_of([systems[i] for i in mine], [s for s in scales if s is not None])
             given = [guesses[i] for i in mine]
-            solutions = _together(batch, tolerance, stages, ledger, given, goal)
+            solutions = _together(batch, tolerance, stages, profile, given, goal)
         else:
             solutions = [None]
         for i, solution in zip(mine, solutions, strict=True):
-            found[i] = solution or _alone(systems[i], tolerance, stages, ledger, guesses[i])
+            found[i] = solution or _alone(systems[i], tolerance, stages, profile, guesses[i])
         order = [i for i, scale in zip(order, scales, strict=True) if scale is None]
     return [one for one in found if one is not None]
 
 
 def _alone(
-    system: ElasticSystem, tolerance: float, stages: int, ledger: Ledger, guess: Solution | None
+    system: ElasticSystem, tolerance: float, stages: int, profile: Profile, guess: Solution | None
 ) -> Solution | ConvergenceError:
     try:
-        return radau.integrate(system, tolerance, stages, ledger, guess)
+        return radau.integrate(system, tolerance, stages, profile, guess)
     except ConvergenceError as error:
         return error
 
@@ -122,7 +122,7 @@ def _together(
     batch: BatchSystem,
     tolerance: float,
     stages: int,
-    ledger: Ledger,
+    profile: Profile,
     known: Sequence[Solution | None],
     goal: float,
 ) -> list[Solution | None]:
@@ -135,7 +135,7 @@ def _together(
     rest, able = static_equilibrium(batch)
     left, guesses, more = np.flatnonzero(able), list(known), 1.0
     if any(guesses[i] is None for i in left):
-        pilot, more = _pilot(modes, left, rest, tolerance, stages, ledger)
+        pilot, more = _pilot(modes, left, rest, tolerance, stages, profile)
         guesses = [pilot if one is None else one for one in guesses]
         if pilot is None:
             left = np.array([i for i in left if guesses[i] is not None], dtype=int)
@@ -160,7 +160,7 @@ def _together(
                 for i, solution in zip(members, solutions, strict=True):
                     if solution is None:
                         continue
-                    ledger.counts.newton_iterations += solution.iterations
+                    profile.counts.newton_iterations += solution.iterations
                     guesses[i], own[i] = solution, True
                     if solution.error <= radau.ACCEPT * tolerance:
                         found[i] = solution
@@ -208,7 +208,7 @@ def _pilot(
     rest: np.ndarray,
     tolerance: float,
     stages: int,
-    ledger: Ledger,
+    profile: Profile,
 ) -> tuple[Solution | None, float]:
     """Solve the middle one of the systems, or one beside it, on a first grid.
 
@@ -225,7 +225,7 @@ def _pilot(
         chosen = modes.chosen(own)
         (solution,) = _on_grid(chosen, grid, stages, rest[own], [None], tolerance, tuning)
         if solution is not None:
-            ledger.counts.newton_iterations += solution.iterations
+            profile.counts.newton_iterations += solution.iterations
             return solution, max(1.0, float(speeds.max() / speeds[k]) ** GROWTH)
     return None, 1.0
 

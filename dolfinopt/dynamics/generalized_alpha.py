@@ -22,7 +22,7 @@ from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import Instants, System, relative_error
 from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 MAX_STEPS = 400_000
 MAX_NEWTON = 12
@@ -59,7 +59,7 @@ def parameters(rho_inf: float) -> Parameters:
     return Parameters(alpha_m, alpha_f, 0.25 * (1.0 + surplus) ** 2, 0.5 + surplus)
 
 
-def integrate(system: System, tolerance: float, rho_inf: float, ledger: Ledger) -> Solution:
+def integrate(system: System, tolerance: float, rho_inf: float, profile: Profile) -> Solution:
     """Solve to `tolerance`, dividing the steps until Richardson's estimate is below it.
 
     Measured on the paper's example (4 coordinates per arm, rho_inf = 0.8, tolerance 1e-4) on one
@@ -70,7 +70,7 @@ def integrate(system: System, tolerance: float, rho_inf: float, ledger: Ledger) 
         tolerance: relative error of the elastic coordinates, energy norm, largest in time.
         rho_inf: spectral radius at infinity, from 0 (unresolved vibrations die in a step) to 1
             (nothing is damped).
-        ledger: counts Newton iterations.
+        profile: counts Newton iterations.
 
     Raises:
         ConvergenceError: more than `MAX_STEPS` steps are needed, or Newton's method fails in a
@@ -94,7 +94,7 @@ def integrate(system: System, tolerance: float, rho_inf: float, ledger: Ledger) 
             difference = _difference(system, coarse, fine)
             error = _error(difference, scaled * (1.0 - 1.0 / ratio**2), ratio)
             if error <= ACCEPT * tolerance:
-                ledger.counts.newton_iterations += iterations
+                profile.counts.newton_iterations += iterations
                 return replace(fine, error=error, iterations=iterations)
             scaled = difference / (ratio**2 - 1.0)
             growth = float(np.sqrt(error / (AIM * tolerance)))

@@ -25,7 +25,7 @@ from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import Preconditioner, System
 from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.progress import SlowWork
 
 GOAL = ONE_RUN.goal  # what Newton may leave, as a share of the tolerance
@@ -62,7 +62,7 @@ def integrate(
     system: System,
     tolerance: float,
     stages: int,
-    ledger: Ledger,
+    profile: Profile,
     guess: Solution | None = None,
 ) -> Solution:
     """Solve to `tolerance`, refining the steps until the estimated error is below it.
@@ -71,7 +71,7 @@ def integrate(
         system: what to solve.
         tolerance: relative error of the elastic coordinates, energy norm, largest in time.
         stages: 1 <= s.
-        ledger: counts Newton iterations.
+        profile: counts Newton iterations.
         guess: solution of a nearby system: gives steps and first guess.
 
     Raises:
@@ -96,7 +96,7 @@ def integrate(
             continue
         iterations += guess.iterations
         if guess.error <= ACCEPT * tolerance:
-            ledger.counts.newton_iterations += iterations
+            profile.counts.newton_iterations += iterations
             return replace(guess, iterations=iterations)
         if guess.windows > 1 and guess.error > LOST:
             lost += 2 if guess.error > before else 1

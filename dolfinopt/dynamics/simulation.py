@@ -15,7 +15,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.mechanism import Mechanism, compliance, deviation, inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 
 
@@ -137,14 +137,14 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
 
 
 def simulate(
-    scene: Scene, bodies: list[ShapeIntegrals], ledger: Ledger, start: Solution | None = None
+    scene: Scene, bodies: list[ShapeIntegrals], profile: Profile, start: Solution | None = None
 ) -> Trajectory:
     """Integrate the elastic coordinates over the horizon to `simulation.tolerance`.
 
     Args:
         scene: motion, payload, damping and integrator.
         bodies: from the cart outwards.
-        ledger: counts the simulation.
+        profile: counts the simulation.
         start: solution of a nearby design, or None.
 
     Raises:
@@ -154,21 +154,21 @@ def simulate(
     problem = ElasticSystem(
         build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), breakpoints(scene)
     )
-    with ledger.phase("simulation"):
+    with profile.phase("simulation"):
         if options.integrator == "radau":
-            solution = radau.integrate(problem, options.tolerance, options.stages, ledger, start)
+            solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
         else:
             solution = generalized_alpha.integrate(
-                problem, options.tolerance, options.rho_inf, ledger
+                problem, options.tolerance, options.rho_inf, profile
             )
-    ledger.counts.simulations += 1
+    profile.counts.simulations += 1
     return _trajectory(problem, scene, solution)
 
 
 def simulate_batch(
     scenes: Sequence[Scene],
     bodies: Sequence[list[ShapeIntegrals]],
-    ledger: Ledger,
+    profile: Profile,
     starts: Sequence[Solution | None] = (),
     *,
     differentiated: bool = False,
@@ -183,7 +183,7 @@ def simulate_batch(
     Args:
         scenes: any number of them.
         bodies: of each, from the cart outwards.
-        ledger: counts the simulations.
+        profile: counts the simulations.
         starts: solution of a nearby design for each, or None.
         differentiated: whether slopes are asked of the trajectories: Newton's method then leaves
             1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
@@ -201,20 +201,20 @@ def simulate_batch(
             groups.setdefault((options.tolerance, options.stages), []).append(i)
             continue
         try:
-            found[i] = simulate(scene, own, ledger, starts[i])
+            found[i] = simulate(scene, own, profile, starts[i])
         except ConvergenceError as error:
             found[i] = error
     for (tolerance, stages), group in groups.items():
-        with ledger.phase("simulation"):
+        with profile.phase("simulation"):
             goal = radau.GOAL if differentiated else batch.GOAL
             own, begun = [problems[i] for i in group], [starts[i] for i in group]
-            solutions = batch.integrate(own, tolerance, stages, ledger, begun, goal)
+            solutions = batch.integrate(own, tolerance, stages, profile, begun, goal)
         for i, one in zip(group, solutions, strict=True):
             if isinstance(one, ConvergenceError):
                 found[i] = one
                 continue
             found[i] = _trajectory(problems[i], scenes[i], one)
-            ledger.counts.simulations += 1
+            profile.counts.simulations += 1
     return [one for one in found if one is not None]
 
 

@@ -24,7 +24,7 @@ from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.interior import InteriorSystem
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 
 class Substructure:
@@ -33,12 +33,12 @@ class Substructure:
     Attributes:
         mesh: the arm.
         operators: its element operators.
-        ledger: of this rank.
+        profile: of this rank.
         T: the interface transformation.
         interior: the interior block in PETSc; one factorisation, of the design that asked last.
     """
 
-    def __init__(self, mesh: ArmMesh, operators: ElementOperators, ledger: Ledger):
+    def __init__(self, mesh: ArmMesh, operators: ElementOperators, profile: Profile):
         """Number the interior dofs and lay down the sparsity patterns (collective).
 
         Raises:
@@ -46,7 +46,7 @@ class Substructure:
         """
         self.mesh = mesh
         self.operators = operators
-        self.ledger = ledger
+        self.profile = profile
         size = len(operators.points)
         dofs = np.repeat(2 * operators.cells, 2, axis=1)
         dofs[:, 1::2] += 1
@@ -54,7 +54,7 @@ class Substructure:
             self._stiffness = AffineMatrix(dofs, operators.stiffness, 2 * size)
             self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        self.interior = InteriorSystem(self.T, ledger)
+        self.interior = InteriorSystem(self.T, profile)
         self._last: ElasticArm | None = None
 
     @cached_property
@@ -76,8 +76,8 @@ class Substructure:
         same = self._same(last, young, density) if last else (False, False)
         if last and all(same):
             return last
-        K = last.K if last and same[0] else AssembledMatrix(self._stiffness, young, self.ledger)
-        M = last.M if last and same[1] else AssembledMatrix(self._mass, density, self.ledger)
+        K = last.K if last and same[0] else AssembledMatrix(self._stiffness, young, self.profile)
+        M = last.M if last and same[1] else AssembledMatrix(self._mass, density, self.profile)
         self._last = ElasticArm(self, K, M)
         return self._last
 
@@ -96,16 +96,16 @@ class AssembledMatrix:
         scale: (n_cells,) s, not to be changed.
     """
 
-    def __init__(self, affine: AffineMatrix, scale: np.ndarray, ledger: Ledger):
+    def __init__(self, affine: AffineMatrix, scale: np.ndarray, profile: Profile):
         self.scale = scale.copy()
-        self._affine, self._ledger = affine, ledger
+        self._affine, self._profile = affine, profile
 
     @cached_property
     def matrix(self) -> sp.csr_matrix:
         """The contributions of this rank's cells, over local dofs."""
-        with self._ledger.phase("assembly"):
+        with self._profile.phase("assembly"):
             matrix = self._affine.assemble(self.scale)
-        self._ledger.counts.assemblies += 1
+        self._profile.counts.assemblies += 1
         return matrix
 
 
@@ -115,7 +115,7 @@ class ElasticArm:
     Attributes:
         substructure: what it shares with other designs of the same arm.
         K, M: assembled stiffness (dofs) and mass (nodes) of this rank's cells.
-        mesh, operators, ledger: of the substructure.
+        mesh, operators, profile: of the substructure.
         comm, inboard, outboard, rigid, interior_nodes, num_interior, num_dofs, expand, restrict:
             of its `InterfaceTransformation`.
         points: (n_nodes, 2) reference positions, m.
@@ -125,7 +125,7 @@ class ElasticArm:
         self.substructure = substructure
         self.K, self.M = K, M
         self.mesh, self.operators = substructure.mesh, substructure.operators
-        self.ledger = substructure.ledger
+        self.profile = substructure.profile
         self.points = self.operators.points
         T = substructure.T
         self.comm = T.comm
@@ -178,7 +178,7 @@ class ElasticArm:
 
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
-        self.ledger.counts.energy_fields += left.shape[2]
+        self.profile.counts.energy_fields += left.shape[2]
         return cells.stiffness_products(self.operators, left, right)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -186,7 +186,7 @@ class ElasticArm:
 
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
-        self.ledger.counts.energy_fields += left.shape[2]
+        self.profile.counts.energy_fields += left.shape[2]
         return cells.mass_products(self.operators, left, right)
 
     # -- the interior ------------------------------------------------------------------------
@@ -213,7 +213,7 @@ class ElasticArm:
         b, x = ksp.getOperators()[0].createVecs()
         out = np.empty_like(right)
         failed = False
-        with self.ledger.phase("solves"):
+        with self.profile.phase("solves"):
             for k in range(right.shape[1]):
                 b.array = right[:, k]
                 self.solve_vector(b, x)
@@ -229,7 +229,7 @@ class ElasticArm:
     def solve_vector(self, right: PETSc.Vec, solution: PETSc.Vec) -> None:
         """Solve K_II u = right for PETSc vectors of owned interior dofs."""
         self.factorise().solve(right, solution)
-        self.ledger.counts.solves += 1
+        self.profile.counts.solves += 1
 
     @cached_property
     def _constraint_modes(self) -> ConstraintModes:

@@ -7,7 +7,7 @@ from petsc4py import PETSc
 
 from dolfinopt.fem.assembly import InteriorMatrix
 from dolfinopt.fem.interface import InterfaceTransformation
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.solver import direct_solver, obeying_options
 
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
@@ -20,9 +20,9 @@ class InteriorSystem:
     overwritten when another one asks; the first one then pays, and counts, another factorisation.
     """
 
-    def __init__(self, T: InterfaceTransformation, ledger: Ledger):
+    def __init__(self, T: InterfaceTransformation, profile: Profile):
         self._T = T
-        self._ledger = ledger
+        self._profile = profile
         self._stiffness: InteriorMatrix | None = None
         self._mass: InteriorMatrix | None = None
         self._ksp: PETSc.KSP | None = None
@@ -40,12 +40,12 @@ class InteriorSystem:
         if self._ksp is None:
             # Natural: the interior dofs are numbered for it.
             self._ksp = direct_solver(self._stiffness.mat, "natural", OPTIONS)
-        with self._ledger.phase("factorisation"):
+        with self._profile.phase("factorisation"):
             self._stiffness.update(K.data)
             self._ksp.setOperators(self._stiffness.mat)
             with obeying_options(OPTIONS):
                 self._ksp.setUp()
-        self._ledger.counts.factorisations += 1
+        self._profile.counts.factorisations += 1
         self._factorised = K
         return self._ksp
 

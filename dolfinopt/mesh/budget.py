@@ -9,7 +9,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.parallel import share_arms
+from dolfinopt.parallel import partition_arms
 from dolfinopt.scene.schema import Arm, Scene
 
 # Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
@@ -35,10 +35,10 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     cells = {index: estimated_cells(scene.arms[index]) for index in scene.cell_counts}
     if sum(cells.values()) <= FEW:
         return
-    share = share_arms(world, scene.cell_counts)
-    mine = sum(_bytes(cells[k]) for k in share.arms) / share.comm.size + PROCESS
-    seconds = sum(_seconds(cells[k]) for k in share.arms) / share.comm.size
-    share.comm.Free()
+    partition = partition_arms(world, scene.cell_counts)
+    mine = sum(_bytes(cells[k]) for k in partition.arms) / partition.comm.size + PROCESS
+    seconds = sum(_seconds(cells[k]) for k in partition.arms) / partition.comm.size
+    partition.comm.Free()
     ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
     needed: dict[str, float] = defaultdict(float)
     free: dict[str, float] = {}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.parallel import ArmShare, together
+from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ class Continuation:
             would be one more way to stay grey.
     """
 
-    def __init__(self, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
+    def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
         """Begin with the gentlest projection."""
-        self.scene, self.share, self.arms = scene, share, arms
+        self.scene, self.partition, self.arms = scene, partition, arms
         self.beta = 1.0
         self.thresholds: dict[int, float] = dict.fromkeys(arms, 0.5)
 
@@ -46,7 +46,7 @@ class Continuation:
 
     def realise(self, x: Mapping[int, np.ndarray]) -> dict[int, tuple[Realised, ...]]:
         """Return the designs that x stands for, the nominal one last (collective)."""
-        with together(self.share.world):
+        with together(self.partition.world):
             return {
                 k: arm.realise(x[k], self.beta, self.thresholds[k]) for k, arm in self.arms.items()
             }
@@ -61,7 +61,7 @@ class Continuation:
             return
         design = self.scene.design
         self.beta = min(2.0 ** (1.0 / design.continuation) * self.beta, design.sharpness)
-        with together(self.share.world):
+        with together(self.partition.world):
             self.thresholds = {
                 k: arm.preserving_threshold(x[k], self.beta) for k, arm in self.arms.items()
             }

@@ -11,8 +11,8 @@ import numpy as np
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
-from dolfinopt.parallel import ArmShare, on_root, sum_over_arms, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.objective import load_cases, objective
@@ -70,7 +70,7 @@ class TaylorTest:
 
 
 def taylor_test(
-    scene: Scene, share: ArmShare, arms: Mapping[int, Arm], x: Cells, ledger: Ledger
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x: Cells, profile: Profile
 ) -> TaylorTest:
     """Test the gradient by the design variables x: filter, reduction, simulation, objective.
 
@@ -78,7 +78,7 @@ def taylor_test(
     objective is smooth. Variables are moved `MARGIN` inside their bounds first.
 
     Args:
-        scene, share, arms, ledger: as for `evaluate`.
+        scene, partition, arms, profile: as for `evaluate`.
         x: (n_cells,) design variables of this rank's arms, in [0, 1].
 
     Raises:
@@ -87,29 +87,29 @@ def taylor_test(
     check_exact(scene)
     exact = _with(scene, gradient="exact")
     x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
-    x_phys = _physical(share, arms, x)
-    evaluation, base = evaluate(exact, share, arms, x_phys, ledger, simulated=False)
-    slope = _by_x(share, arms, gradient(exact, share, arms, base, ledger), x)
+    x_phys = _physical(partition, arms, x)
+    evaluation, base = evaluate(exact, partition, arms, x_phys, profile, simulated=False)
+    slope = _by_x(partition, arms, gradient(exact, partition, arms, base, profile), x)
     frozen = None
     if needs(scene, "motion"):
         esl = _with(scene, gradient="esl")
-        frozen = _by_x(share, arms, gradient(esl, share, arms, base, ledger), x)
+        frozen = _by_x(partition, arms, gradient(esl, partition, arms, base, profile), x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    value = _fixed_objective(exact, share, arms, ledger, base)
+    value = _fixed_objective(exact, partition, arms, profile, base)
     here = value(x)
     rows = []
     for name, direction in _directions(scene, arms).items():
-        along = _dot(share, slope, direction)
-        frozen_along = np.nan if frozen is None else _dot(share, frozen, direction)
+        along = _dot(partition, slope, direction)
+        frozen_along = np.nan if frozen is None else _dot(partition, frozen, direction)
         remainders = tuple(
             abs(value({k: x[k] + h * direction[k] for k in x}) - here - h * along) for h in STEPS
         )
         rows.append(TaylorRow(name, along, frozen_along, remainders, _rate(remainders, here)))
     if frozen is None:
         return TaylorTest(tuple(rows), np.nan, np.nan)
-    lengths = [np.sqrt(_dot(share, g, g)) for g in (slope, frozen)]
-    cosine = _dot(share, slope, frozen) / (lengths[0] * lengths[1])
+    lengths = [np.sqrt(_dot(partition, g, g)) for g in (slope, frozen)]
+    cosine = _dot(partition, slope, frozen) / (lengths[0] * lengths[1])
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     return TaylorTest(tuple(rows), angle, lengths[1] / lengths[0])
 
@@ -142,36 +142,36 @@ def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None 
     return scene.model_copy(update=update)
 
 
-def _physical(share: ArmShare, arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
-    with together(share.world):
+def _physical(partition: Partition, arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
+    with together(partition.world):
         return {k: arm.physical(x[k]) for k, arm in arms.items()}
 
 
 def _by_x(
-    share: ArmShare, arms: Mapping[int, Arm], slopes: Cells, x: Cells
+    partition: Partition, arms: Mapping[int, Arm], slopes: Cells, x: Cells
 ) -> dict[int, np.ndarray]:
-    with together(share.world):
+    with together(partition.world):
         return {k: arm.chain(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
 
 
-def _dot(share: ArmShare, a: Cells, b: Cells) -> float:
-    return float(sum_over_arms(share, {k: np.array(a[k] @ b[k]) for k in a}))
+def _dot(partition: Partition, a: Cells, b: Cells) -> float:
+    return float(sum_over_arms(partition, {k: np.array(a[k] @ b[k]) for k in a}))
 
 
 def _fixed_objective(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
-    ledger: Ledger,
+    profile: Profile,
     base: Trajectory | None,
 ) -> Callable[[Cells], float]:
     """Return J(x), of a motion with the load cases and time steps of `base`."""
     start = () if base is None else base.solutions
 
     def value(x: Cells) -> float:
-        x_phys = _physical(share, arms, x)
+        x_phys = _physical(partition, arms, x)
         evaluation, trajectory = evaluate(
-            scene, share, arms, x_phys, ledger, start, simulated=False
+            scene, partition, arms, x_phys, profile, start, simulated=False
         )
         if not needs(scene, "motion"):
             return evaluation.objective
@@ -184,7 +184,7 @@ def _fixed_objective(
                 return combined(scene, values)[0]
             return objective(trajectory, scene, load_cases(base, scene))
 
-        return on_root(share.world, at_base_instants)
+        return on_root(partition.world, at_base_instants)
 
     return value
 

@@ -22,8 +22,8 @@ from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.optimization.result import Result
 from dolfinopt.optimization.variables import Variables
-from dolfinopt.parallel import ArmShare, sum_over_arms, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, sum_over_arms, together
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of, violated, worst_limits
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
 from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
@@ -60,9 +60,9 @@ class Recorder(Protocol):
 
 def run(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
-    ledger: Ledger,
+    profile: Profile,
     *,
     memory: Memory | None = None,
     recorder: Recorder | None = None,
@@ -74,7 +74,7 @@ def run(
 
     Args:
         scene: what to optimise.
-        share, arms, ledger: which ranks do which arm, this rank's arms, seconds and counts.
+        partition, arms, profile: which ranks do which arm, this rank's arms, seconds and counts.
         memory: of a run that goes on.
         recorder: keeps history and memory.
         report: called on the root with every row of the history.
@@ -82,7 +82,7 @@ def run(
     Raises:
         ConvergenceError: a simulation failed.
     """
-    return _Run(scene, share, arms, ledger, recorder, report).go(memory)
+    return _Run(scene, partition, arms, profile, recorder, report).go(memory)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,18 +122,18 @@ class _Run:
     def __init__(
         self,
         scene: Scene,
-        share: ArmShare,
+        partition: Partition,
         arms: Mapping[int, Arm],
-        ledger: Ledger,
+        profile: Profile,
         recorder: Recorder | None,
         report: Report | None,
     ):
-        self.scene, self.share, self.arms, self.ledger = scene, share, arms, ledger
+        self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
         self.recorder = recorder
         self.report = report
         self.moves = needs(scene, "motion")  # else only the result is simulated
-        self.variables = Variables(scene, share, arms)
-        self.continuation = Continuation(scene, share, arms)
+        self.variables = Variables(scene, partition, arms)
+        self.continuation = Continuation(scene, partition, arms)
         self.x = np.maximum(np.full(self.variables.size, scene.design.initial), self.variables.xmin)
         self.state = initial_state(self.x)
         self.solutions: tuple[Solution, ...] = ()
@@ -173,11 +173,11 @@ class _Run:
             self._record(designs, problem)
             self._checkpoint(force=False)
         self._checkpoint(force=True)
-        counts = replace(self.ledger.counts)
+        counts = replace(self.profile.counts)
         evaluation, crisp = self._assess(designs)
         converged = self.finished == "converged"
         return Result(
-            share=self.share,
+            partition=self.partition,
             arms=self.arms,
             x_phys=designs[-1].x_phys,
             evaluation=evaluation,
@@ -197,7 +197,7 @@ class _Run:
             ),
             kkt=self.kkt,
             limits=self.limits,
-            ledger=self.ledger,
+            profile=self.profile,
             counts=counts,
             choice=self.choice,
         )
@@ -235,7 +235,7 @@ class _Run:
 
     def _choose(self, x_phys: Mapping[int, np.ndarray], reserve: float) -> OrderSelection | None:
         return choose_coordinates(
-            self.scene, self.share, self.arms, x_phys, self.ledger, reserve=reserve
+            self.scene, self.partition, self.arms, x_phys, self.profile, reserve=reserve
         )
 
     def _evaluate_one(
@@ -243,20 +243,20 @@ class _Run:
     ) -> tuple[Evaluation, Trajectory | None]:
         return evaluate(
             self.scene,
-            self.share,
+            self.partition,
             self.arms,
             x_phys,
-            self.ledger,
+            self.profile,
             self.solutions,
             simulated=simulated,
         )
 
     def _gradients(self, realised: Mapping[int, Realised]) -> _Gradients:
         """Return the gradients by x of the design evaluated last (collective)."""
-        place = self.scene, self.share, self.arms
-        analysed = *place, self.trajectory, self.ledger
+        place = self.scene, self.partition, self.arms
+        analysed = *place, self.trajectory, self.profile
         rows = [gradient(*analysed), *constraint_gradients(*analysed)]
-        with together(self.share.world):
+        with together(self.partition.world):
             objective, *limits = (self.variables.by_x(row, realised) for row in rows)
             return _Gradients(objective, np.array(limits).reshape(len(limits), self.variables.size))
 
@@ -286,7 +286,7 @@ class _Run:
     def _residual(self, problem: _Problem) -> float:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
         variables = self.variables
-        with self.ledger.phase("kkt residual"):
+        with self.profile.phase("kkt residual"):
             return kkt_residual(
                 self.x,
                 variables.xmin,
@@ -295,12 +295,12 @@ class _Run:
                 problem.f,
                 problem.dfdx,
                 variables.slices,
-                partial(sum_over_arms, self.share),
+                partial(sum_over_arms, self.partition),
             )[0]
 
     def _update(self, problem: _Problem) -> None:
         """Make one MMA step."""
-        with self.ledger.phase("mma"):
+        with self.profile.phase("mma"):
             x, self.state = mma_step(
                 self.x,
                 problem.df0dx,
@@ -310,11 +310,11 @@ class _Run:
                 self.variables.xmax,
                 self.state,
                 move=self.continuation.move,
-                comm=self.share.world,
+                comm=self.partition.world,
                 pieces=self.variables.pieces,
             )
         change = np.abs(x - self.x).max() if len(x) else 0.0
-        self.change = float(self.share.world.allreduce(change, op=MPI.MAX))
+        self.change = float(self.partition.world.allreduce(change, op=MPI.MAX))
         self.x = x
         self.iteration += 1
         self.continuation.advance(self.variables.split(self.x))
@@ -326,7 +326,7 @@ class _Run:
         # A followed mode is known by those before it: the initial and the crisp design's are not.
         starts = {k: arm.initial_vectors for k, arm in self.arms.items()}
         if not self.moves:
-            with together(self.share.world):
+            with together(self.partition.world):
                 initial = {k: a.uniform(self.scene.design.initial) for k, a in self.arms.items()}
             _, trajectory = self._evaluate_one(initial, simulated=True)
             if trajectory is not None:
@@ -345,9 +345,9 @@ class _Run:
         if not self.moves:
             self.choice = self._choose(x_phys, 1.0)
         elif self.choice is not None:
-            place = self.scene, self.share, self.arms
+            place = self.scene, self.partition, self.arms
             try:
-                error = estimated_error(*place, x_phys, self.choice.coordinates, self.ledger)
+                error = estimated_error(*place, x_phys, self.choice.coordinates, self.profile)
             except ConvergenceError:  # of the richer motion; the design is not lost for it
                 error = np.inf
             self.choice = replace(self.choice, error=error)
@@ -360,9 +360,9 @@ class _Run:
         for k, volume in self.variables.volume.items():
             x = nominal.x_phys[k]
             parts[k] = np.array([volume.sum(), volume @ x, volume @ (4.0 * x * (1.0 - x))])
-        total, volume, grey = sum_over_arms(self.share, parts)
-        with together(self.share.world):
-            if self.share.world.rank == 0:
+        total, volume, grey = sum_over_arms(self.partition, parts)
+        with together(self.partition.world):
+            if self.partition.world.rank == 0:
                 self._add_row(designs, float(volume / total), float(grey / total))
 
     def _add_row(
@@ -394,9 +394,9 @@ class _Run:
         if self.recorder is None:
             return
         due = force or time.perf_counter() - self.saved >= CHECKPOINT_INTERVAL
-        if not self.share.world.bcast(due, root=0):
+        if not self.partition.world.bcast(due, root=0):
             return
-        with self.ledger.phase("checkpoint"):
+        with self.profile.phase("checkpoint"):
             self.recorder.save(self._memory())
         self.saved = time.perf_counter()
 
@@ -434,7 +434,7 @@ class _Run:
             if memory.choice is not None:
                 arm.set_order(memory.choice.coordinates)
             arm.initial_vectors = memory.modes[k]
-        self.history = memory.history if self.share.world.rank == 0 else []
+        self.history = memory.history if self.partition.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
         self.iteration = memory.iteration
         self.continuation.beta = memory.beta

@@ -10,8 +10,8 @@ import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.parallel import ArmShare
-from dolfinopt.profiling import Counts, Ledger
+from dolfinopt.parallel import Partition
+from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit, violated
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.order_selection import OrderSelection
@@ -25,7 +25,7 @@ class Result:
     """An optimised design.
 
     Attributes:
-        share, arms: which ranks did what, and this rank's arms with the final design reduced.
+        partition, arms: which ranks did what, and this rank's arms with the final design reduced.
         x_phys: physical densities (n_cells,) of this rank's arms.
         evaluation: of the final design.
         trajectory: of the final design; on the root only.
@@ -38,13 +38,13 @@ class Result:
         stop_reason: in words.
         kkt: the residual of the final design, see `optimality.kkt_residual`.
         limits: every constraint and its value.
-        ledger: seconds and counts of this rank.
+        profile: seconds and counts of this rank.
         counts: those of the iterations alone, on this rank.
         choice: of the coordinates, and the error that they make of the final design's motion;
             None where the scene states a number.
     """
 
-    share: ArmShare
+    partition: Partition
     arms: Mapping[int, Arm]
     x_phys: Mapping[int, np.ndarray]
     evaluation: Evaluation
@@ -57,7 +57,7 @@ class Result:
     stop_reason: str
     kkt: float
     limits: tuple[Limit, ...]
-    ledger: Ledger
+    profile: Profile
     counts: Counts
     choice: OrderSelection | None = None
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.parallel import ArmShare, sum_over_arms, together
+from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -26,13 +26,13 @@ class Variables:
         count: m, number of volume constraints.
     """
 
-    def __init__(self, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
+    def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
         self.arms = arms
-        self.share = share
+        self.partition = partition
         sizes = [arm.mesh.num_cells for arm in arms.values()]
         ends = np.cumsum([0, *sizes])
         # Whole arms add up in the same order on any number of ranks; parts of one are numbered on.
-        first = share.comm.rank * len(scene.arms)
+        first = partition.comm.rank * len(scene.arms)
         self.pieces = {first + k: size for k, size in zip(arms, sizes, strict=True)}
         self.slices = {k: slice(a, b) for k, a, b in zip(arms, ends[:-1], ends[1:], strict=True)}
         self.size = int(ends[-1])
@@ -100,7 +100,7 @@ class Variables:
         alone = len(designs) == 1 or not minimum_member
         limited = designs[-1] if alone else designs[1]
         ratio = (1.0 + nominal) / (1.0 + self.volume_constraints(_densities(limited)))
-        with together(self.share.world):
+        with together(self.partition.world):
             gradients = self.volume_gradients(limited)
         return nominal, gradients if alone else ratio[:, None] * gradients
 
@@ -110,7 +110,7 @@ class Variables:
         for k in self.arms:
             volume[k] = np.zeros(self.count)
             volume[k][self.rows[k]] = self.volume[k] @ x_phys[k]
-        return sum_over_arms(self.share, volume)
+        return sum_over_arms(self.partition, volume)
 
 
 def _densities(realised: Mapping[int, Realised]) -> dict[int, np.ndarray]:

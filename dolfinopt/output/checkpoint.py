@@ -15,7 +15,7 @@ from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
 from dolfinopt.output.files import write_arrays
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
-from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, on_root, together
+from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.contents import DIGEST, program, with_digests
 from dolfinopt.scene.load import Scene
@@ -52,26 +52,28 @@ def reopen(folder: Path) -> None:
 
 
 def save(
-    folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm], memory: Memory
+    folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm], memory: Memory
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
     number = len(scene.arms) + 1
-    with together(share.world):
+    with together(partition.world):
         points = {k: _interior_points(arm) for k, arm in arms.items()}
         known = [
             {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()} for j in range(number)
         ]
     columns: dict[str, Mapping[int, Any]] = {
-        "centroid": gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()}),
-        "cells": gather_cells(share, memory.cells),
-        "threshold": gather_arms(share, memory.thresholds),
-        "points": gather_cells(share, points),
+        "centroid": gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()}),
+        "cells": gather_cells(partition, memory.cells),
+        "threshold": gather_arms(partition, memory.thresholds),
+        "points": gather_cells(partition, points),
     }
     for j, by_arm in enumerate(known):
-        columns[f"modes{j}"] = gather_cells(share, {k: rows for k, (rows, _) in by_arm.items()})
-        columns[f"outboard{j}"] = gather_cells(share, {k: last for k, (_, last) in by_arm.items()})
-    with together(share.world):
-        if share.world.rank == 0:
+        columns[f"modes{j}"] = gather_cells(partition, {k: rows for k, (rows, _) in by_arm.items()})
+        columns[f"outboard{j}"] = gather_cells(
+            partition, {k: last for k, (_, last) in by_arm.items()}
+        )
+    with together(partition.world):
+        if partition.world.rank == 0:
             _write(folder, scene, memory, columns)
 
 
@@ -106,7 +108,9 @@ def check(folder: Path, scene: Scene) -> None:
     _read(folder, scene)
 
 
-def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -> Memory | None:
+def load(
+    folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm]
+) -> Memory | None:
     """Return the memory of an interrupted run, or None when it had only begun (collective).
 
     Rows go to the cells and nodes at the same place, on any number of ranks.
@@ -114,10 +118,10 @@ def load(folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]) -
     Raises:
         InputError: no checkpoint, a damaged one, or one of another scene.
     """
-    arrays = on_root(share.world, _read, folder, scene)
+    arrays = on_root(partition.world, _read, folder, scene)
     if int(arrays["iteration"]) < 0:
         return None
-    with together(share.world):
+    with together(partition.world):
         return _memory(arrays, arms)
 
 

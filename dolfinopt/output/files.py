@@ -21,7 +21,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.parallel import ArmShare, gather_cells, on_root, together
+from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.version import __version__
@@ -205,14 +205,14 @@ class ArmView:
 
 
 def gather_views(
-    scene: Scene, share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> list[ArmView]:
     """Collect every arm on the root (collective); empty list elsewhere."""
 
     def collect(values: Any) -> dict[int, np.ndarray]:
-        with together(share.world):
+        with together(partition.world):
             mine = {index: values(index, arm) for index, arm in arms.items()}
-        return gather_cells(share, mine)
+        return gather_cells(partition, mine)
 
     def modes(index: int, arm: Arm) -> np.ndarray:
         cells = arm.substructure.operators.cells
@@ -228,8 +228,8 @@ def gather_views(
     centroids = collect(lambda _, arm: arm.mesh.centroid)
     densities = collect(lambda index, _: x_phys[index])
     shapes = collect(modes)
-    with together(share.world):
-        if share.world.rank == 0:
+    with together(partition.world):
+        if partition.world.rank == 0:
             return _views(scene, corners, centroids, densities, shapes)
         return []
 
@@ -313,7 +313,7 @@ def write_design(folder: Path, views: Sequence[ArmView]) -> None:
 def write_gradient(
     path: Path,
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     by_cell: Mapping[int, np.ndarray],
     objective: float,
@@ -322,10 +322,10 @@ def write_gradient(
 
     Of a shared design once, under the name of the arm it belongs to.
     """
-    centroids = gather_cells(share, {k: arm.mesh.centroid for k, arm in arms.items()})
-    gathered = gather_cells(share, by_cell)
-    with together(share.world):
-        if share.world.rank != 0:
+    centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
+    gathered = gather_cells(partition, by_cell)
+    with together(partition.world):
+        if partition.world.rank != 0:
             return
         arrays: dict[str, Any] = {"objective": objective}
         for index, centroid in centroids.items():
@@ -461,7 +461,7 @@ def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # -- reading designs -------------------------------------------------------------------------
 
 
-def read_design(path: Path, share: ArmShare, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
+def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
     """Return the physical densities of a design.npz on this rank's cells (collective).
 
     Cells take the value of the nearest centroid in the file.
@@ -469,8 +469,8 @@ def read_design(path: Path, share: ArmShare, arms: Mapping[int, Arm]) -> dict[in
     Raises:
         InputError: the file is missing, damaged, or made for other arms.
     """
-    arrays = on_root(share.world, _load_design, path)
-    with together(share.world):
+    arrays = on_root(partition.world, _load_design, path)
+    with together(partition.world):
         return {index: _fit(path, arm, arrays) for index, arm in arms.items()}
 
 

@@ -15,8 +15,8 @@ from dolfinopt.optimization.memory import Memory
 from dolfinopt.optimization.result import Result
 from dolfinopt.output import checkpoint
 from dolfinopt.output.files import HistoryWriter
-from dolfinopt.parallel import ArmShare, on_root, share_arms, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, on_root, partition_arms, together
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 class FolderRecorder:
     """Writes history.csv and checkpoint.npz, see `loop.Recorder`."""
 
-    def __init__(self, folder: Path, scene: Scene, share: ArmShare, arms: Mapping[int, Arm]):
+    def __init__(self, folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
         """Take the folder, which exists, and what the checkpoint describes."""
-        self.folder, self.scene, self.share, self.arms = folder, scene, share, arms
+        self.folder, self.scene, self.partition, self.arms = folder, scene, partition, arms
         self._writer: HistoryWriter | None = None
 
     def begin(self, rows: Sequence[HistoryRow]) -> None:
         """Write the history anew with the rows known so far (collective)."""
-        with together(self.share.world):
-            if self.share.world.rank == 0:
+        with together(self.partition.world):
+            if self.partition.world.rank == 0:
                 self._writer = HistoryWriter(self.folder / "history.csv", rows)
 
     def append(self, row: HistoryRow) -> None:
@@ -44,7 +44,7 @@ class FolderRecorder:
 
     def save(self, memory: Memory) -> None:
         """Replace the checkpoint (collective)."""
-        checkpoint.save(self.folder, self.scene, self.share, self.arms, memory)
+        checkpoint.save(self.folder, self.scene, self.partition, self.arms, memory)
 
 
 def optimize(
@@ -77,14 +77,16 @@ def optimize(
     # Only now, so that a run killed while DOLFINx is imported can be resumed like any other.
     from dolfinopt.arms.arm import build_arms
 
-    ledger = Ledger()
-    share = share_arms(world, scene.cell_counts)
-    arms = build_arms(scene, share, ledger)
+    profile = Profile()
+    partition = partition_arms(world, scene.cell_counts)
+    arms = build_arms(scene, partition, profile)
     memory, recorder = None, None
     if resume:
         assert folder is not None
-        memory = checkpoint.load(folder, scene, share, arms)
+        memory = checkpoint.load(folder, scene, partition, arms)
         on_root(world, checkpoint.reopen, folder)
     if folder is not None:
-        recorder = FolderRecorder(folder, scene, share, arms)
-    return loop.run(scene, share, arms, ledger, memory=memory, recorder=recorder, report=report)
+        recorder = FolderRecorder(folder, scene, partition, arms)
+    return loop.run(
+        scene, partition, arms, profile, memory=memory, recorder=recorder, report=report
+    )

@@ -24,8 +24,8 @@ from dolfinopt.output.files import (
     write_trajectory,
 )
 from dolfinopt.output.summary import summarise
-from dolfinopt.parallel import ArmShare, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, together
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.contents import named_files, with_relative_paths
@@ -45,12 +45,12 @@ class Simulated:
     """
 
     scene: Scene
-    share: ArmShare
+    partition: Partition
     arms: Mapping[int, Arm]
     x_phys: Mapping[int, np.ndarray]
     evaluation: Evaluation
     trajectory: Trajectory | None
-    ledger: Ledger
+    profile: Profile
     choice: OrderSelection | None = None
 
 
@@ -80,19 +80,19 @@ def write_simulation(
         pictures: called with the arms' views before the summary is written, on the root.
     """
     s, begun = simulated, time.perf_counter() - wall
-    views = gather_views(s.scene, s.share, s.arms, s.x_phys)
+    views = gather_views(s.scene, s.partition, s.arms, s.x_phys)
     summary = summarise(
         s.scene,
-        s.share,
+        s.partition,
         s.arms,
         s.x_phys,
         s.evaluation,
-        s.ledger,
+        s.profile,
         wall=wall,
         choice=s.choice,
         trajectory=s.trajectory,
     )
-    with together(s.share.world):
+    with together(s.partition.world):
         return _write(folder, views, s.trajectory, None, summary, paraview, pictures, begun)
 
 
@@ -116,14 +116,14 @@ def write_result(
         pictures: called with the arms' views before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
-    views = gather_views(scene, result.share, result.arms, result.x_phys)
+    views = gather_views(scene, result.partition, result.arms, result.x_phys)
     summary = summarise(
         scene,
-        result.share,
+        result.partition,
         result.arms,
         result.x_phys,
         result.evaluation,
-        result.ledger,
+        result.profile,
         wall=wall,
         counts=result.counts,
         crisp=result.crisp,
@@ -136,7 +136,7 @@ def write_result(
         trajectory=result.trajectory,
     )
     initial = result.initial_deviation
-    with together(result.share.world):
+    with together(result.partition.world):
         return _write(folder, views, result.trajectory, initial, summary, paraview, pictures, begun)
 
 

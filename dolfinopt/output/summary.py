@@ -16,8 +16,8 @@ from dolfinopt.density.members import thinnest
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.output.files import drive_units, trajectory_units, versions
-from dolfinopt.parallel import ArmShare, gather_arms, gather_cells, together
-from dolfinopt.profiling import Counts, Ledger
+from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
+from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit, limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
@@ -37,11 +37,11 @@ FILTER_CELLS = 2.0
 
 def summarise(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Mapping[int, np.ndarray],
     evaluation: Evaluation,
-    ledger: Ledger,
+    profile: Profile,
     *,
     wall: float,
     counts: Counts | None = None,
@@ -57,29 +57,31 @@ def summarise(
     """Return the content of summary.json on the root, an empty dict elsewhere (collective).
 
     Args:
-        scene, share, arms, x_phys, evaluation: of the design the summary is about.
-        ledger: this rank's.
+        scene, partition, arms, x_phys, evaluation: of the design the summary is about.
+        profile: this rank's.
         wall: seconds since the command began, s.
-        counts: this rank's, where not all of the ledger's belong to the run.
+        counts: this rank's, where not all of the profile's belong to the run.
         crisp: evaluation of the design cut at one half.
         choice: what `reduction.coordinates = "auto"` came to.
         iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
         limits: the constraints; by default those of `evaluation` and `x_phys`.
         trajectory: of the design, on the root.
     """
-    with together(share.world):
+    with together(partition.world):
         mine = {k: _traits(scene, k, a, x_phys[k]) for k, a in arms.items()}
-    every = gather_arms(share, mine)
+    every = gather_arms(partition, mine)
     volumes, sides, sizes, notes, greys = (
         {k: one[j] for k, one in every.items()} for j in range(5)
     )
-    widths = _widths(share, arms, x_phys)
-    seconds = _slowest(share.world, ledger.seconds)
-    own = (counts or ledger.counts) if share.leads else Counts()
-    counted = share.world.gather(own, root=0)
-    memory = share.world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
-    errors = _frequency_errors(share, arms, x_phys, ledger)
-    with together(share.world):
+    widths = _widths(partition, arms, x_phys)
+    seconds = _slowest(partition.world, profile.seconds)
+    own = (counts or profile.counts) if partition.is_root else Counts()
+    counted = partition.world.gather(own, root=0)
+    memory = partition.world.gather(
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0
+    )
+    errors = _frequency_errors(partition, arms, x_phys, profile)
+    with together(partition.world):
         if counted is None or memory is None:
             return {}
         if limits is None:
@@ -134,7 +136,7 @@ def summarise(
             "seconds": {**seconds, "total": wall},
             "counts": asdict(sum(counted, Counts())),
             "peak_memory_mb": max(memory),
-            "ranks": share.world.size,
+            "ranks": partition.world.size,
             "units": _units(scene, trajectory),
             "versions": versions(),
             "scene": scene.to_dict(),
@@ -177,34 +179,37 @@ def _limited_fractions(
 
 
 def _frequency_errors(
-    share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray], ledger: Ledger
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    profile: Profile,
 ) -> dict[int, float]:
     """Return `frequency_excess` of every design that is reduced, on the root (collective).
 
     It is not counted: nothing depends on it.
     """
-    counts, errors = replace(ledger.counts), {}
-    with ledger.phase("frequency error"), together(share.world):
+    counts, errors = replace(profile.counts), {}
+    with profile.phase("frequency error"), together(partition.world):
         for index, arm in arms.items():
             if arm.basis is not None:
                 body = arm.reduce(x_phys[index])
                 errors[index] = frequency_excess(arm.elastic, arm.basis.V, body.K, body.M)
-    ledger.counts = counts
-    return gather_arms(share, errors)
+    profile.counts = counts
+    return gather_arms(partition, errors)
 
 
 def _widths(
-    share: ArmShare, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+    partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, tuple[float | None, float | None]]:
     """Return the widths of member and gap of the designs cut at one half, m; on the root."""
     corners, solid = {}, {}
-    with together(share.world):
+    with together(partition.world):
         for k, arm in arms.items():
             points = compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)[:, :, :2]
             corners[k] = points[:, [0, 1, 3, 2]] if points.shape[1] == 4 else points
             solid[k] = x_phys[k] > 0.5
-    whole, cut = gather_cells(share, corners), gather_cells(share, solid)
-    with together(share.world):
+    whole, cut = gather_cells(partition, corners), gather_cells(partition, solid)
+    with together(partition.world):
         return {k: thinnest(whole[k], cut[k]) for k in whole}
 
 

@@ -233,19 +233,19 @@ class _Gallery:
         from mpi4py import MPI
 
         from dolfinopt.arms.arm import build_arms
-        from dolfinopt.parallel import share_arms
-        from dolfinopt.profiling import Ledger
+        from dolfinopt.parallel import partition_arms
+        from dolfinopt.profiling import Profile
 
         self.outcomes, self.scene = done.outcomes, done.plan.scene
-        self.share = share_arms(MPI.COMM_SELF, self.scene.cell_counts)
-        self.arms = build_arms(self.scene, self.share, Ledger())
+        self.partition = partition_arms(MPI.COMM_SELF, self.scene.cell_counts)
+        self.arms = build_arms(self.scene, self.partition, Profile())
 
     def views(self, outcome: Outcome) -> Sequence[ArmView]:
         """Return the arms of a design."""
         from dolfinopt.output.files import designed, gather_views, read_design
 
-        x_phys = read_design(outcome.design, self.share, self.arms)
-        return designed(gather_views(self.scene, self.share, self.arms, x_phys))
+        x_phys = read_design(outcome.design, self.partition, self.arms)
+        return designed(gather_views(self.scene, self.partition, self.arms, x_phys))
 
     def show(self, cases: Iterable[Case]) -> list[dict[str, Any]]:
         """Return the designs, all to one scale; those without a result are left out."""

@@ -95,7 +95,7 @@ def lowest_eigenpairs(
     Krylov-Schur on K^-1 M with the factorisation at hand.
 
     Args:
-        arm: for its communicator and ledger.
+        arm: for its communicator and profile.
         stiffness, mass: symmetric positive definite.
         solve: solve(b, x) applies the inverse of `stiffness`.
         count: number of eigenpairs.
@@ -108,7 +108,7 @@ def lowest_eigenpairs(
         ConvergenceError: SLEPc found fewer than `count` eigenpairs.
     """
     problem = _Eigenproblem(arm, stiffness, mass, solve)
-    with arm.ledger.phase("eigenproblem"):
+    with arm.profile.phase("eigenproblem"):
         warm = start is not None and start.shape[1] > 0
         first, *others = _searches(count, warm)
         pairs = problem.search(count, *first, start)
@@ -120,7 +120,7 @@ def lowest_eigenpairs(
             pairs = problem.without_gaps(*pairs)
         if len(pairs[0]) == count and pairs[0][-1] > WIDE * pairs[0][0]:
             pairs = pairs[0], problem.orthonormal(pairs[1])
-    arm.ledger.counts.eigenproblems += 1
+    arm.profile.counts.eigenproblems += 1
     if len(pairs[0]) < count:
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: only {len(pairs[0])} of {count} eigenmodes converged; "

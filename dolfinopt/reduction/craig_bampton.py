@@ -29,7 +29,7 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
         options: coordinates q >= 3; with q = 3 no eigenproblem is solved.
         start: `Basis.start` of a nearby design, or None.
     """
-    arm.ledger.counts.reductions += 1
+    arm.profile.counts.reductions += 1
     normal = options.coordinates - 3
     static = arm.constraint_modes()
     modes = np.empty((arm.num_interior, 0))

@@ -52,7 +52,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     Raises:
         ConvergenceError: no convergence in the band, or fewer than q directions in it.
     """
-    arm.ledger.counts.reductions += 1
+    arm.profile.counts.reductions += 1
     free = FreeArm(arm)
     space = InverseSpace(free, free.solve(_inputs(free)), INDEPENDENT)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)

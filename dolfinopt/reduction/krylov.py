@@ -41,7 +41,7 @@ def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -
     Raises:
         ConvergenceError: fewer than q independent vectors, or a shift at a natural frequency.
     """
-    arm.ledger.counts.reductions += 1
+    arm.profile.counts.reductions += 1
     return ritz(arm, _recursion(arm, options).V)
 
 

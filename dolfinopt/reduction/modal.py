@@ -24,7 +24,7 @@ def modal(arm: ElasticArm, options: Options, start: np.ndarray | None = None) ->
         options: coordinates q >= 1.
         start: `Basis.start` of a nearby design, or None.
     """
-    arm.ledger.counts.reductions += 1
+    arm.profile.counts.reductions += 1
     operator = FreeOperators(arm)
     _, vectors = lowest_eigenpairs(
         arm, operator.stiffness, operator.mass, operator.solve, options.coordinates, start

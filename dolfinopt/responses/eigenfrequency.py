@@ -59,14 +59,14 @@ class Eigenfrequency(Response):
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return squared period and first frequency of every flexible arm (collective)."""
-        scene, share, arms = analysis.scene, analysis.share, analysis.arms
+        scene, partition, arms = analysis.scene, analysis.partition, analysis.arms
         chain = _chain(analysis)
-        with together(share.world):
+        with together(partition.world):
             mine = {
                 place: (squared_period(one, self.options.exponent, self.follow)[0], one.frequency)
                 for place, one in _modes(arms, chain).items()
             }
-        found = on_all_ranks(share, mine)
+        found = on_all_ranks(partition, mine)
         periods, frequencies = zip(*found.values(), strict=True)
         names = tuple(scene.arms[place].name for place in found)
         return Measured(self.name, names, frequencies, periods)
@@ -76,19 +76,19 @@ class Eigenfrequency(Response):
 
         What an arm carries depends on the designs outboard of it.
         """
-        scene, share, arms = analysis.scene, analysis.share, analysis.arms
+        scene, partition, arms = analysis.scene, analysis.partition, analysis.arms
         chain = _chain(analysis)
-        with together(share.world):
+        with together(partition.world):
             modes = _modes(arms, chain)
             own = {}
             for owner in arms:
                 for place in arms[owner].places:
                     _, by_values = squared_period(modes[place], self.options.exponent, self.follow)
                     own[place] = period_gradient(arms[owner], modes[place], by_values)
-        by_carried = on_all_ranks(share, {place: one.carried for place, one in own.items()})
+        by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
         zero = [np.zeros((3, 3))] * len(scene.arms)
-        with together(share.world):
+        with together(partition.world):
             for place, matrix in by_carried.items():
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
                 by_body = by_owner(scene, chain.body_slopes(carried))
@@ -115,10 +115,10 @@ class Eigenfrequency(Response):
 
 def _chain(analysis: Analysis) -> Chain:
     """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
-    scene, share = analysis.scene, analysis.share
-    with together(share.world):
+    scene, partition = analysis.scene, analysis.partition
+    with together(partition.world):
         mine = {k: rigid_integrals(arm.elastic) for k, arm in analysis.arms.items()}
-    owned = on_all_ranks(share, mine)
+    owned = on_all_ranks(partition, mine)
 
     def freeze() -> Chain:
         bodies, reach = [], []
@@ -139,7 +139,7 @@ def _chain(analysis: Analysis) -> Chain:
         load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.inertia)
         return Chain(bodies, reach, angles, load, scene.objective.attached)
 
-    return on_root(share.world, freeze)
+    return on_root(partition.world, freeze)
 
 
 def _modes(arms: Mapping[int, Arm], chain: Chain) -> dict[int, LoadedModes]:

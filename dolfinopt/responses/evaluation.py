@@ -17,8 +17,8 @@ from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency
-from dolfinopt.parallel import ArmShare, gather_arms, on_root, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.motion import motion_objective, worst_instants
 from dolfinopt.responses.response import (
     Analysis,
@@ -92,10 +92,10 @@ class Evaluation(Motion):
 
 def evaluate(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Cells,
-    ledger: Ledger,
+    profile: Profile,
     start: Sequence[Solution] = (),
     *,
     simulated: bool = True,
@@ -104,10 +104,10 @@ def evaluate(
 
     Args:
         scene: what is simulated and minimised.
-        share: which ranks do which arm.
+        partition: which ranks do which arm.
         arms: this rank's.
         x_phys: their physical densities (n_cells,).
-        ledger: of this rank.
+        profile: of this rank.
         start: `Trajectory.solutions` of a nearby design; read on the root only.
         simulated: False leaves out the motion where no response needs it.
 
@@ -118,36 +118,36 @@ def evaluate(
         InputError: densities that are none, see `Arm.refusal`; on all ranks.
         ConvergenceError: on all ranks alike.
     """
-    _check_densities(share, arms, x_phys)
-    with together(share.world):
+    _check_densities(partition, arms, x_phys)
+    with together(partition.world):
         for index, arm in arms.items():
             arm.set_design(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or needs(scene, "motion"):
-        owned = _reduced(share, arms, x_phys)
-        [(found, trajectory)] = _simulated([scene], share, owned, ledger, [start])
+        owned = _reduced(partition, arms, x_phys)
+        [(found, trajectory)] = _simulated([scene], partition, owned, profile, [start])
         if isinstance(found, ConvergenceError):
             raise found
         motion = found
-    return _measured(Analysis(scene, share, arms, trajectory, ledger), motion), trajectory
+    return _measured(Analysis(scene, partition, arms, trajectory, profile), motion), trajectory
 
 
 def evaluate_batch(
     scenes: Sequence[Scene],
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Cells,
-    ledger: Ledger,
+    profile: Profile,
 ) -> list[tuple[Evaluation, Trajectory | None] | ConvergenceError]:
     """Evaluate one design in many scenes, whose motions are simulated in one batch (collective).
 
     Args:
         scenes: of one reduction, in which the arms are the same, see `Arm.under`; or, if nothing
             but their motion is asked for, scaled, see `scenarios.factors`.
-        share: which ranks do which arm.
+        partition: which ranks do which arm.
         arms: this rank's, in the first scene.
         x_phys: their physical densities (n_cells,).
-        ledger: of this rank.
+        profile: of this rank.
 
     Returns:
         What `evaluate` does of every scene, or the error that it would raise.
@@ -155,31 +155,31 @@ def evaluate_batch(
     Raises:
         InputError: as `evaluate` does.
     """
-    _check_densities(share, arms, x_phys)
+    _check_densities(partition, arms, x_phys)
     try:
-        owned = _reduced(share, arms, x_phys)
+        owned = _reduced(partition, arms, x_phys)
     except ConvergenceError as error:
         return [error] * len(scenes)
     found: list[tuple[Evaluation, Trajectory | None] | ConvergenceError] = []
-    moved = _simulated(scenes, share, owned, ledger, [()] * len(scenes))
+    moved = _simulated(scenes, partition, owned, profile, [()] * len(scenes))
     for scene, (motion, trajectory) in zip(scenes, moved, strict=True):
         try:
             if isinstance(motion, ConvergenceError):
                 raise motion
             under = arms
             if constraints_of(scene) or "motion" not in objective_of(scene).needs:
-                with together(share.world):
+                with together(partition.world):
                     under = {k: arm.under(scene) for k, arm in arms.items()}
-            analysis = Analysis(scene, share, under, trajectory, ledger)
+            analysis = Analysis(scene, partition, under, trajectory, profile)
             found.append((_measured(analysis, motion), trajectory))
         except ConvergenceError as error:
             found.append(error)
     return found
 
 
-def _check_densities(share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells) -> None:
+def _check_densities(partition: Partition, arms: Mapping[int, Arm], x_phys: Cells) -> None:
     """Raise InputError on all ranks where densities of one cannot be those of a design."""
-    with together(share.world):
+    with together(partition.world):
         for k, arm in arms.items():
             missing = "" if k in x_phys else f"arm {arm.mesh.name!r}: expected densities"
             if reason := missing or arm.refusal(x_phys[k]):
@@ -208,20 +208,20 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
 
 def gradient(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None,
-    ledger: Ledger,
+    profile: Profile,
 ) -> dict[int, np.ndarray]:
     """Return the objective's gradient by the physical densities of this rank's arms (collective).
 
     Args:
         scene: says which gradient: "esl" freezes the loads, "exact" follows everything.
-        share, arms: as for `evaluate`, with the design reduced.
+        partition, arms: as for `evaluate`, with the design reduced.
         trajectory: what `evaluate` returned.
-        ledger: of this rank.
+        profile: of this rank.
     """
-    rows = objective_of(scene).gradients(Analysis(scene, share, arms, trajectory, ledger))
+    rows = objective_of(scene).gradients(Analysis(scene, partition, arms, trajectory, profile))
     if len(rows) == 1:
         return rows[0]
     return {k: np.sum([row[k] for row in rows], axis=0) for k in arms}
@@ -229,18 +229,18 @@ def gradient(
 
 def constraint_gradients(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None = None,
-    ledger: Ledger | None = None,
+    profile: Profile | None = None,
 ) -> list[dict[int, np.ndarray]]:
     """Return the gradients of `Evaluation.constraints` by the physical densities (collective).
 
     Args:
-        scene, share, arms, trajectory, ledger: as for `gradient`; the last two are for constraints
-            of the motion alone.
+        scene, partition, arms, trajectory, profile: as for `gradient`; the last two are for
+            constraints of the motion alone.
     """
-    analysis = Analysis(scene, share, arms, trajectory, ledger or Ledger())
+    analysis = Analysis(scene, partition, arms, trajectory, profile or Profile())
     rows = []
     for bound in constraints_of(scene):
         for row in bound.response.gradients(analysis):
@@ -254,26 +254,26 @@ def constraint_gradients(
 
 
 def _reduced(
-    share: ArmShare, arms: Mapping[int, Arm], x_phys: Cells
+    partition: Partition, arms: Mapping[int, Arm], x_phys: Cells
 ) -> Mapping[int, ShapeIntegrals]:
     """Return the bodies of the arms with a design of their own, on the root (collective)."""
-    with together(share.world):
+    with together(partition.world):
         bodies = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
-    return gather_arms(share, bodies)
+    return gather_arms(partition, bodies)
 
 
 def _simulated(
     scenes: Sequence[Scene],
-    share: ArmShare,
+    partition: Partition,
     owned: Mapping[int, ShapeIntegrals],
-    ledger: Ledger,
+    profile: Profile,
     starts: Sequence[Sequence[Solution]],
 ) -> list[tuple[Motion | ConvergenceError, Trajectory | None]]:
     """Simulate the scenes and their scenarios in one batch (collective).
 
     Args:
         scenes: the bodies are those of the first one.
-        share, owned, ledger: as elsewhere.
+        partition, owned, profile: as elsewhere.
         starts: of every scene, see `evaluate`.
 
     Returns:
@@ -282,11 +282,11 @@ def _simulated(
     kept: list[Trajectory | ConvergenceError] = []
 
     def run() -> list[Motion | ConvergenceError]:
-        kept.extend(_simulate(scenes, owned, ledger, starts))
-        with ledger.phase("objective"):
+        kept.extend(_simulate(scenes, owned, profile, starts))
+        with profile.phase("objective"):
             return [one if isinstance(one, ConvergenceError) else _motion(one) for one in kept]
 
-    motions = on_root(share.world, run)
+    motions = on_root(partition.world, run)
     trajectories = [one if isinstance(one, Trajectory) else None for one in kept]
     return list(zip(motions, trajectories or [None] * len(motions), strict=True))
 
@@ -294,7 +294,7 @@ def _simulated(
 def _simulate(
     scenes: Sequence[Scene],
     owned: Mapping[int, ShapeIntegrals],
-    ledger: Ledger,
+    profile: Profile,
     starts: Sequence[Sequence[Solution]],
 ) -> list[Trajectory | ConvergenceError]:
     """Simulate scenes, with all their scenarios."""
@@ -310,7 +310,7 @@ def _simulate(
     bodies = [nominal, *(bodies_in(scenes[0], other, owned) for other in posed[1:])]
     # Slopes are asked of a single evaluation at most.
     alone = len(scenes) == 1
-    every = simulate_batch(posed, bodies, ledger, begun, differentiated=alone)
+    every = simulate_batch(posed, bodies, profile, begun, differentiated=alone)
     found: list[Trajectory | ConvergenceError] = []
     for size in sizes:
         parts, every = every[:size], every[size:]

@@ -141,13 +141,13 @@ class MotionResponse(Response):
             assert analysis.trajectory is not None
             return self.of_trajectory(analysis.trajectory)
 
-        found = on_root(analysis.share.world, value)
+        found = on_root(analysis.partition.world, value)
         return Measured(self.name, ("",), (found,), (found,))
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient by the physical densities, see `objective.gradient` (collective)."""
-        scene, share, arms = analysis.scene, analysis.share, analysis.arms
-        ledger, trajectory = analysis.ledger, analysis.trajectory
+        scene, partition, arms = analysis.scene, analysis.partition, analysis.arms
+        profile, trajectory = analysis.profile, analysis.trajectory
 
         def moments() -> dict[int, np.ndarray]:
             assert trajectory is not None
@@ -155,16 +155,16 @@ class MotionResponse(Response):
 
         def cotangents() -> dict[int, ShapeIntegrals]:
             assert trajectory is not None
-            ledger.counts.adjoints += max(1, len(trajectory.scenarios))
-            with ledger.phase("adjoint"):
+            profile.counts.adjoints += max(1, len(trajectory.scenarios))
+            with profile.phase("adjoint"):
                 return by_owner(scene, _cotangents(self, trajectory))
 
         if self.options.gradient == "esl":
-            A = on_root(share.world, moments)
-            with together(share.world):
+            A = on_root(partition.world, moments)
+            with together(partition.world):
                 return [{k: esl_gradient(arm, A[k]) for k, arm in arms.items()}]
-        by_body = on_root(share.world, cotangents)
-        with together(share.world):
+        by_body = on_root(partition.world, cotangents)
+        with together(partition.world):
             return [{k: exact_gradient(arm, by_body[k]) for k, arm in arms.items()}]
 
 

@@ -17,8 +17,8 @@ from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
-from dolfinopt.parallel import ArmShare, gather_arms, on_root, together
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis
 from dolfinopt.responses.scenarios import bodies_in, factors
 from dolfinopt.scene.load import Scene, pose_scenarios
@@ -53,10 +53,10 @@ class OrderSelection:
 
 def choose_coordinates(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Mapping[int, np.ndarray],
-    ledger: Ledger,
+    profile: Profile,
     *,
     reserve: float = 1.0,
 ) -> OrderSelection | None:
@@ -66,7 +66,7 @@ def choose_coordinates(
     not meet the tolerance. Where the scene states a number nothing is done.
 
     Args:
-        scene, share, arms, ledger: as for `evaluate`.
+        scene, partition, arms, profile: as for `evaluate`.
         x_phys: the design that decides.
         reserve: how many times less than the tolerance the estimate must be.
 
@@ -78,7 +78,7 @@ def choose_coordinates(
     """
     if scene.reduction.coordinates != "auto":
         return None
-    comparison = _Comparison(scene, share, arms, x_phys, ledger)
+    comparison = _Comparison(scene, partition, arms, x_phys, profile)
     least, goal = scene.reduction.fewest, scene.reduction.tolerance / reserve
     most = min(max(MOST, least), comparison.limit)
     tried: dict[int, float] = {}
@@ -100,24 +100,24 @@ def choose_coordinates(
 
 def estimated_error(
     scene: Scene,
-    share: ArmShare,
+    partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Mapping[int, np.ndarray],
     coordinates: int,
-    ledger: Ledger,
+    profile: Profile,
 ) -> float:
     """Return the error that so many coordinates make, see `OrderSelection`; inf if impossible.
 
     Collective; the arms keep what they have.
 
     Args:
-        scene, share, arms, x_phys, ledger: as for `evaluate`.
+        scene, partition, arms, x_phys, profile: as for `evaluate`.
         coordinates: of every arm.
 
     Raises:
         ConvergenceError: the motion cannot be simulated with the richer basis; on all ranks.
     """
-    return _Comparison(scene, share, arms, x_phys, ledger).error(coordinates)
+    return _Comparison(scene, partition, arms, x_phys, profile).error(coordinates)
 
 
 def _none_found(scene: Scene, tried: Mapping[int, float], goal: float) -> ConvergenceError:
@@ -139,19 +139,19 @@ class _Comparison:
     def __init__(
         self,
         scene: Scene,
-        share: ArmShare,
+        partition: Partition,
         arms: Mapping[int, Arm],
         x_phys: Mapping[int, np.ndarray],
-        ledger: Ledger,
+        profile: Profile,
     ):
-        self.share, self.arms, self.ledger = share, arms, ledger
+        self.partition, self.arms, self.profile = partition, arms, profile
         self.method = scene.reduction.method
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
-        with together(share.world):
+        with together(partition.world):
             for k, arm in arms.items():
                 arm.set_design(x_phys[k])
         dofs = min((arm.elastic.num_dofs for arm in arms.values()), default=None)
-        known = share.world.allgather(dofs)
+        known = partition.world.allgather(dofs)
         self.limit: int = min(one for one in known if one is not None)
         self.richer = 0  # coordinates
         self.bases: dict[int, Basis] = {}
@@ -169,16 +169,16 @@ class _Comparison:
             motions = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do
-        with together(self.share.world):
+        with together(self.partition.world):
             both = {k: np.concatenate([b.V, self.bases[k].V], axis=2) for k, b in bases.items()}
             mine = {k: self.arms[k].elastic.energy_matrix(V) for k, V in both.items()}
-        energy = gather_arms(self.share, mine)
-        return on_root(self.share.world, _largest, self.scenes, motions, self.motions, energy)
+        energy = gather_arms(self.partition, mine)
+        return on_root(self.partition.world, _largest, self.scenes, motions, self.motions, energy)
 
     def _reduced(self, method: str, count: int) -> dict[int, Basis]:
         """Return this rank's bases (collective)."""
         bases = {}
-        with self.ledger.phase("choice of coordinates"), together(self.share.world):
+        with self.profile.phase("choice of coordinates"), together(self.partition.world):
             for k, arm in self.arms.items():
                 if method == RICHER_METHOD and count <= self.richer:
                     bases[k] = _leading(self.bases[k], count)
@@ -189,11 +189,13 @@ class _Comparison:
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
         beta = self.scenes[0].damping.stiffness_proportional
-        with together(self.share.world):
+        with together(self.partition.world):
             mine = {k: shape_integrals(self.arms[k].elastic, b, beta) for k, b in bases.items()}
-        owned = gather_arms(self.share, mine)
+        owned = gather_arms(self.partition, mine)
         kept: list[Trajectory] = []
-        on_root(self.share.world, lambda: kept.extend(_simulate(self.scenes, owned, self.ledger)))
+        on_root(
+            self.partition.world, lambda: kept.extend(_simulate(self.scenes, owned, self.profile))
+        )
         return kept
 
 
@@ -219,13 +221,13 @@ def _leading(basis: Basis, count: int) -> Basis:
 
 
 def _simulate(
-    scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals], ledger: Ledger
+    scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals], profile: Profile
 ) -> list[Trajectory]:
     """Simulate a scene and its scenarios."""
     scene, *others = scenes
     bodies = [chain_of(scene, owned), *(bodies_in(scene, other, owned) for other in others)]
     found = []
-    for one in simulate_batch(scenes, bodies, ledger):
+    for one in simulate_batch(scenes, bodies, profile):
         if isinstance(one, ConvergenceError):
             raise one
         found.append(one)

@@ -19,8 +19,8 @@ import numpy as np
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.parallel import ArmShare
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.parallel import Partition
+    from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
     from dolfinopt.scene.schema import Objective
 
@@ -37,17 +37,17 @@ class Analysis:
 
     Attributes:
         scene: says what is asked.
-        share: which ranks do which arm.
+        partition: which ranks do which arm.
         arms: this rank's.
         trajectory: on the root, where a response needs a motion; None elsewhere.
-        ledger: of this rank.
+        profile: of this rank.
     """
 
     scene: Scene
-    share: ArmShare
+    partition: Partition
     arms: Mapping[int, Arm]
     trajectory: Trajectory | None
-    ledger: Ledger
+    profile: Profile
 
 
 @dataclass(frozen=True)
@@ -178,8 +178,8 @@ def occurrences(scene: Scene) -> dict[int, int]:
     return by_owner(scene, [1] * len(scene.arms))
 
 
-def on_all_ranks(share: ArmShare, mine: Mapping[int, T]) -> dict[int, T]:
+def on_all_ranks(partition: Partition, mine: Mapping[int, T]) -> dict[int, T]:
     """Return one object an arm on all ranks, in the arms' order (collective)."""
     from dolfinopt.parallel import gather_arms
 
-    return share.world.bcast(gather_arms(share, mine), root=0)
+    return partition.world.bcast(gather_arms(partition, mine), root=0)

@@ -35,7 +35,7 @@ def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
         (n_cells,) over this rank's cells.
     """
     state = arm.current
-    with arm.ledger.phase("gradient"):
+    with arm.profile.phase("gradient"):
         left, values, right = np.linalg.svd(A)
         keep = values > RANK_TOLERANCE * values[0]
         V = state.basis.V
@@ -60,7 +60,7 @@ def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
         (n_cells,) over this rank's cells.
     """
     state = arm.current
-    with arm.ledger.phase("gradient"):
+    with arm.profile.phase("gradient"):
         elastic, basis = state.elastic, state.basis
         V = basis.V
         damping = arm.scene.damping.stiffness_proportional
@@ -97,7 +97,7 @@ def deflection_gradient(arm: Arm, response: StaticResponse, exponent: float) -> 
 
 def _static_slope(arm: Arm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard displacements (3, k)."""
-    with arm.ledger.phase("gradient"):
+    with arm.profile.phase("gradient"):
         field = arm.elastic.constraint_modes().field
         energies = arm.elastic.cell_stiffness_products(field @ left, field @ right)
         return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
@@ -121,7 +121,7 @@ def period_gradient(arm: Arm, modes: LoadedModes, by_values: np.ndarray) -> Peri
 
     d lambda = phi' (dK - lambda dM) phi, phi of unit mass.
     """
-    with arm.ledger.phase("gradient"):
+    with arm.profile.phase("gradient"):
         weighted = modes.field * by_values
         energies = arm.elastic.cell_stiffness_products(weighted, modes.field)
         masses = arm.elastic.cell_mass_products(weighted * modes.values, modes.field)

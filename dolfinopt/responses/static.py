@@ -27,12 +27,12 @@ class StaticCompliance(Response):
     def measure(self, analysis: Analysis) -> Measured:
         """Return the compliance of every design (collective)."""
         scene, uses, loads = analysis.scene, occurrences(analysis.scene), self._loads
-        with together(analysis.share.world):
+        with together(analysis.partition.world):
             mine = {
                 k: uses[k] * static_response(arm.elastic, loads).compliance
                 for k, arm in analysis.arms.items()
             }
-        found = on_all_ranks(analysis.share, mine)
+        found = on_all_ranks(analysis.partition, mine)
         values = tuple(found.values())
         return Measured(self.name, tuple(scene.arms[k].name for k in found), values, values)
 
@@ -40,7 +40,7 @@ class StaticCompliance(Response):
         """Return the gradient of every design's compliance (collective)."""
         uses, arms = occurrences(analysis.scene), analysis.arms
         rows = []
-        with together(analysis.share.world):
+        with together(analysis.partition.world):
             for owner in analysis.scene.cell_counts:
                 row: CellGradient = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
                 if owner in arms:

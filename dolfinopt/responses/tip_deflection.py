@@ -26,11 +26,11 @@ class TipDeflection(Response):
     def measure(self, analysis: Analysis) -> Measured:
         """Return the deflection of every design (collective)."""
         mine = {}
-        with together(analysis.share.world):
+        with together(analysis.partition.world):
             for k, arm in analysis.arms.items():
                 response = static_response(arm.elastic, self._loads)
                 mine[k] = response.deflection(self.options.exponent), response.largest
-        found = on_all_ranks(analysis.share, mine)
+        found = on_all_ranks(analysis.partition, mine)
         smooth, largest = zip(*found.values(), strict=True)
         names = tuple(analysis.scene.arms[k].name for k in found)
         return Measured(self.name, names, largest, smooth)
@@ -40,7 +40,7 @@ class TipDeflection(Response):
         arms, rows = analysis.arms, []
         for owner in analysis.scene.cell_counts:
             row = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
-            with together(analysis.share.world):
+            with together(analysis.partition.world):
                 if owner in arms:
                     response = static_response(arms[owner].elastic, self._loads)
                     row[owner] = deflection_gradient(arms[owner], response, self.options.exponent)

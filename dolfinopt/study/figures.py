@@ -23,7 +23,7 @@ from dolfinopt.plots.style import (
     save,
     spans_decade,
 )
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import tables as findings
 from dolfinopt.study.tables import (
@@ -316,11 +316,11 @@ def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import build_arms
-    from dolfinopt.parallel import share_arms
+    from dolfinopt.parallel import partition_arms
 
-    share = share_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = build_arms(scene, share, Ledger())
-    return designed(gather_views(scene, share, arms, read_design(path, share, arms)))
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, partition, Profile())
+    return designed(gather_views(scene, partition, arms, read_design(path, partition, arms)))
 
 
 # -- random values ---------------------------------------------------------------------------

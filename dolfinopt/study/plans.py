@@ -64,16 +64,16 @@ def _check_designs(scene: Scene, designs: Sequence[Path]) -> None:
 
     from dolfinopt.arms.arm import build_arms
     from dolfinopt.output.files import read_design
-    from dolfinopt.parallel import share_arms
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.parallel import partition_arms
+    from dolfinopt.profiling import Profile
 
     for path in designs:
         if not path.is_file():
             raise InputError(f"{path}: --design: no such file; give design.npz files")
-    share = share_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = build_arms(scene, share, Ledger())
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, partition, Profile())
     for path in designs:
-        read_design(path, share, arms)
+        read_design(path, partition, arms)
 
 
 # -- tables and figures ----------------------------------------------------------------------

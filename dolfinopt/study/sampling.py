@@ -24,7 +24,7 @@ import numpy as np
 from dolfinopt.disk import make_folder
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.responses.scenarios import bodies_in
 from dolfinopt.scene.load import Scene
@@ -117,7 +117,7 @@ class _Nominal:
             bodies = [bodies_in(self.scene, scene, owned) for scene in scenes]
             # At once: less than half the time of one after the other.
             starts = [found.trajectory.solution] * len(scenes)
-            yield from simulate_batch(scenes, bodies, Ledger(), starts)
+            yield from simulate_batch(scenes, bodies, Profile(), starts)
         else:
             for scene in scenes:
                 for anew in simulate_scenarios([scene], self.design):

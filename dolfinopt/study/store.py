@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.run_folder import Simulated
-    from dolfinopt.parallel import ArmShare
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.parallel import Partition
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import Evaluation
 
 Action = Literal["optimize", "simulate", "compare"]
@@ -537,27 +537,27 @@ def simulate_scenarios(
         InputError: the design does not fit the arms.
     """
     from dolfinopt.output.run_folder import Simulated
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate_batch
     from dolfinopt.responses.order_selection import choose_coordinates
 
-    ledger = Ledger()
-    share, arms, x_phys = _posed(scenes[0], design, ledger)
+    profile = Profile()
+    partition, arms, x_phys = _posed(scenes[0], design, profile)
     for batch in _neighbours(scenes):
         arms = {k: arm.under(batch[0]) for k, arm in arms.items()}
         every: Sequence[tuple[Evaluation, Trajectory | None] | ConvergenceError]
         choice = None
         try:
-            choice = choose_coordinates(batch[0], share, arms, x_phys, ledger)
-            every = evaluate_batch(batch, share, arms, x_phys, ledger)
+            choice = choose_coordinates(batch[0], partition, arms, x_phys, profile)
+            every = evaluate_batch(batch, partition, arms, x_phys, profile)
         except ConvergenceError as error:
             every = [error]
         for scene, found in zip(batch, every, strict=True):
             if isinstance(found, ConvergenceError):
                 yield found
             else:
-                yield Simulated(scene, share, arms, x_phys, *found, ledger, choice)
-            _clear(ledger)
+                yield Simulated(scene, partition, arms, x_phys, *found, profile, choice)
+            _clear(profile)
 
 
 def _neighbours(scenes: Sequence[Scene]) -> Iterator[list[Scene]]:
@@ -581,12 +581,12 @@ def compare(
     Raises:
         InputError: the design does not fit the arms.
     """
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.profiling import Profile
     from dolfinopt.reduction import METHODS, Options, basis_errors
     from dolfinopt.responses.order_selection import choose_coordinates
 
-    ledger = Ledger()
-    share, arms, x_phys = _posed(scenes[0], design, ledger)
+    profile = Profile()
+    partition, arms, x_phys = _posed(scenes[0], design, profile)
     richer = {}
     for k, arm in arms.items():
         arm.set_design(x_phys[k])
@@ -596,7 +596,7 @@ def compare(
         figures = []
         try:
             arms = {k: arm.under(scene) for k, arm in arms.items()}
-            choose_coordinates(scene, share, arms, x_phys, ledger)
+            choose_coordinates(scene, partition, arms, x_phys, profile)
             for k, arm in arms.items():
                 arm.reduce(x_phys[k])
                 assert arm.basis is not None
@@ -610,28 +610,28 @@ def compare(
 
 
 def _posed(
-    scene: Scene, design: Path | None, ledger: Ledger
-) -> tuple[ArmShare, dict[int, Arm], dict[int, np.ndarray]]:
+    scene: Scene, design: Path | None, profile: Profile
+) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
     """Build the arms on this rank; return them with the physical densities of the design."""
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import build_arms
     from dolfinopt.output.files import read_design
-    from dolfinopt.parallel import share_arms
+    from dolfinopt.parallel import partition_arms
 
-    share = share_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = build_arms(scene, share, ledger)
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, partition, profile)
     if design is not None:
-        return share, arms, read_design(design, share, arms)
-    return share, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+        return partition, arms, read_design(design, partition, arms)
+    return partition, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
 
 
-def _clear(ledger: Ledger) -> None:
-    """Begin the account of the next scene; its ledger is known to the arms."""
+def _clear(profile: Profile) -> None:
+    """Begin the account of the next scene; its profile is known to the arms."""
     from dolfinopt.profiling import Counts
 
-    ledger.seconds.clear()
-    ledger.counts = Counts()
+    profile.seconds.clear()
+    profile.counts = Counts()
 
 
 def _unnamed(case: Case) -> Scene:

@@ -16,12 +16,12 @@ SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 
 def small_arm(*overrides: str) -> Arm:
     scene = do.load_scene(SCENE, ("arms.cells=[16,3]", *overrides))
-    return Arm(scene, 0, MPI.COMM_SELF, do.Ledger())
+    return Arm(scene, 0, MPI.COMM_SELF, do.Profile())
 
 
 def test_a_state_is_computed_once_and_lasts() -> None:
     arm = small_arm()
-    counts = arm.ledger.counts
+    counts = arm.profile.counts
     x, other = arm.uniform(0.5), arm.uniform(0.7)
     state = arm.state(x)
     assert arm.state(x.copy()) is state is arm.current
@@ -48,7 +48,7 @@ def test_a_state_is_computed_once_and_lasts() -> None:
 def test_what_states_share() -> None:
     """Another order or scene reduces anew only where it must; the factor at hand serves all."""
     arm = small_arm()
-    counts = arm.ledger.counts
+    counts = arm.profile.counts
     x = arm.uniform(0.5)
     body = arm.reduce(x)
     damped = arm.under(

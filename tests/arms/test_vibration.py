@@ -32,7 +32,7 @@ NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 def arm_of(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
     """Return the first arm, solid, on its own ranks."""
     scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    arm = Arm(scene, 0, comm, do.Ledger())
+    arm = Arm(scene, 0, comm, do.Profile())
     arm.set_design(np.ones(arm.mesh.num_cells))
     return arm
 
@@ -423,7 +423,7 @@ def test_the_outboard_arm_weighs_on_the_inboard_one() -> None:
     """Without the coupling the gradient of arm 1's period by arm 2's mass would be missing."""
     built = build("objective.kind=eigenfrequency", "constraints.first_frequency=1.0")
     built.evaluate(built.fields(wave))
-    first, second = constraint_gradients(built.scene, built.share, built.arms)
+    first, second = constraint_gradients(built.scene, built.partition, built.arms)
     ones = built.fields(lambda k, x, y: np.full(len(x), float(k == 1)))
     others = built.fields(lambda k, x, y: np.full(len(x), float(k == 0)))
     assert built.dot(first, ones) > 0.0  # heavier outboard: longer period

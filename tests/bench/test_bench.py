@@ -24,7 +24,7 @@ from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.multibody.mechanism import inverse_dynamics
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.paper.reproduction import load_paper
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.study.tables import Panel
 from dolfinopt.study.variants import changed
 
@@ -141,7 +141,7 @@ def test_scipy_and_radau_agree(problem, judge):
     found = times.scipy_motion(modes.system, "Radau", 1e-4, judge.t, (0.1, 10.0))
     assert max(judge.errors(modes.from_modes(found))) < 3e-2
     ours = [
-        radau.integrate(problem, tolerance, 3, Ledger()).sample(judge.t)
+        radau.integrate(problem, tolerance, 3, Profile()).sample(judge.t)
         for tolerance in (1e-3, 1e-5)
     ]
     errors = [judge.errors(q)[0] for q in ours]

@@ -126,7 +126,7 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
     width, cell = 0.012, 0.06 / 18
     scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}", "design.erosion=0.25"))
     result = do.optimize(scene)
-    widths = _widths(result.share, result.arms, result.x_phys)
+    widths = _widths(result.partition, result.arms, result.x_phys)
     volume = WORLD.bcast(result.history[-1].volume_fraction if WORLD.rank == 0 else None, root=0)
     assert volume == pytest.approx(0.5, abs=0.01)  # of the nominal design
     if WORLD.rank == 0:
@@ -139,9 +139,12 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
 def test_which_design_carries_the_volume(width):
     """With a width the dilated one, scaled so that the nominal one meets its limit; else that."""
     scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}"))
-    share = do.share_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, share, do.Ledger())
-    variables, continuation = Variables(scene, share, arms), Continuation(scene, share, arms)
+    partition = do.partition_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, partition, do.Profile())
+    variables, continuation = (
+        Variables(scene, partition, arms),
+        Continuation(scene, partition, arms),
+    )
     continuation.beta = 4.0
     realised = continuation.realise(variables.split(np.linspace(0.1, 0.9, variables.size)))
     designs = [{k: one[i] for k, one in realised.items()} for i in range(3)]

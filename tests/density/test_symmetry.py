@@ -101,7 +101,7 @@ def test_mesh_without_symmetry_is_refused():
 def test_chain_is_the_transpose_of_physical(shape):
     """Symmetry, filter and solid cells together, on an arm that the ranks share."""
     overrides = ["arms.mesh_size=0.012", f'arms.cell_shape="{shape}"']
-    arm = Arm(do.load_scene(SCENE, overrides), 0, COMM, do.Ledger())
+    arm = Arm(do.load_scene(SCENE, overrides), 0, COMM, do.Profile())
     centroid = arm.mesh.centroid
     x, dx = 0.35 + 0.3 * wave(centroid), 0.3 * np.cos(60.0 * centroid[:, 1] + 20.0 * centroid[:, 0])
     w = arm.mesh.area * np.sin(45.0 * centroid[:, 0] + 90.0 * centroid[:, 1])

@@ -35,7 +35,7 @@ from dolfinopt.multibody.mechanism import (
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.paths.time_laws import quintic
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
@@ -86,10 +86,10 @@ def various() -> list[ElasticSystem]:
 
 
 def solve(problems: list[ElasticSystem], starts_: list[Solution | None] | None = None):
-    """Return the solutions and the ledger; nothing may have been left to the single method."""
-    ledger = Ledger()
-    found = batch.integrate(problems, TOLERANCE, 3, ledger, starts_ or [None] * len(problems))
-    return found, ledger
+    """Return the solutions and the profile; nothing may have been left to the single method."""
+    profile = Profile()
+    found = batch.integrate(problems, TOLERANCE, 3, profile, starts_ or [None] * len(problems))
+    return found, profile
 
 
 @pytest.fixture
@@ -251,12 +251,12 @@ def test_runs_begin_anew():
 def test_batch_is_each_of_them_alone(alone):
     """To the tolerance with steps of its own, and to Newton's remainder on the same steps."""
     problems = various()
-    found, ledger = solve(problems)
+    found, profile = solve(problems)
     assert not alone  # all of them in the batch
-    assert ledger.counts.newton_iterations > 0
+    assert profile.counts.newton_iterations > 0
     assert len({len(one.a) for one in found}) == 2  # without damping it takes more of them
     for problem, one in zip(problems, found, strict=True):
-        single = radau.integrate(problem, TOLERANCE, 3, Ledger())
+        single = radau.integrate(problem, TOLERANCE, 3, Profile())
         assert one.error <= TOLERANCE
         assert distance(problem, one, single) <= 2.0 * TOLERANCE
         same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
@@ -288,7 +288,7 @@ def test_a_start_keeps_its_steps(alone):
 def test_one_problem_is_solved_as_ever(alone):
     problem = two_arms()
     (one,), _ = solve([problem])
-    single = radau.integrate(problem, TOLERANCE, 3, Ledger())
+    single = radau.integrate(problem, TOLERANCE, 3, Profile())
     assert np.array_equal(one.a, single.a) and len(alone) == 1
 
 
@@ -299,7 +299,7 @@ def test_other_bodies_are_solved_alone(alone):
     found, _ = solve(problems)
     assert alone == [stiffer]
     for problem, one in zip(problems, found, strict=True):
-        single = radau.integrate(problem, TOLERANCE, 3, Ledger())
+        single = radau.integrate(problem, TOLERANCE, 3, Profile())
         assert distance(problem, one, single) <= 2.0 * TOLERANCE
 
 
@@ -307,7 +307,7 @@ def test_failure_stays_alone():
     """Arms spun too fast for their stiffness fail; the others do not notice."""
     soft = two_arms(factors=(1.0, 1e-2, DAMPING), size=300.0)
     with pytest.raises(ConvergenceError) as error:
-        radau.integrate(soft, TOLERANCE, 3, Ledger())
+        radau.integrate(soft, TOLERANCE, 3, Profile())
     good = [two_arms(), two_arms(payload=1.3)]
     found, _ = solve([good[0], soft, good[1]])
     assert isinstance(found[1], ConvergenceError) and str(found[1]) == str(error.value)
@@ -336,7 +336,7 @@ def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
 def test_adjoint_of_a_solution_from_the_batch():
     """Slopes through a solution of the batch are those through the same one found alone."""
     problems = [two_arms(), two_arms(payload=1.5)]
-    found = batch.integrate(problems, TOLERANCE, 3, Ledger(), [None] * 2, radau.GOAL)
+    found = batch.integrate(problems, TOLERANCE, 3, Profile(), [None] * 2, radau.GOAL)
     problem, one = problems[1], found[1]
     same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
     t = np.linspace(0.1, 1.0, 7)

@@ -29,7 +29,7 @@ from dolfinopt.multibody.mechanism import Mechanism, inverse_dynamics, tangent
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.paths.time_laws import Limits, law_for, quintic
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
@@ -112,13 +112,13 @@ def pushed(t: np.ndarray) -> RigidMotion:
 
 
 def solve(
-    integrator: str, problem: ElasticSystem, tolerance: float, ledger: Ledger | None = None
+    integrator: str, problem: ElasticSystem, tolerance: float, profile: Profile | None = None
 ) -> Solution:
     """Run one of the two integrators."""
-    ledger = ledger or Ledger()
+    profile = profile or Profile()
     if integrator == "radau":
-        return radau.integrate(problem, tolerance, 3, ledger)
-    return generalized_alpha.integrate(problem, tolerance, 0.8, ledger)
+        return radau.integrate(problem, tolerance, 3, profile)
+    return generalized_alpha.integrate(problem, tolerance, 0.8, profile)
 
 
 def distance(problem: ElasticSystem, one: Solution, other: Solution, count: int = 1000) -> float:
@@ -312,7 +312,7 @@ def test_order_of_radau_with_jumps(name: str, stages: int, counts: tuple[int, in
 def test_jumps_of_acceleration_meet_the_tolerance(integrator: str) -> None:
     """Against finer steps of one stage more; every jump is at the end of a step."""
     problem, _ = two_arms(*profile("trapezoidal"))
-    exact = radau.integrate(problem, 1e-8, 5, Ledger())
+    exact = radau.integrate(problem, 1e-8, 5, Profile())
     tolerance = 1e-5 if integrator == "radau" else 1e-3
     found = solve(integrator, problem, tolerance)
     assert np.isin(problem.breakpoints, found.time_grid).all()
@@ -342,7 +342,7 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
 def test_work_of_the_joints_becomes_energy(damping: float) -> None:
     """Work of cart and joints = change of kinetic + potential energy + what damping took."""
     problem, chain = two_arms(damping=damping, gravity=(0.0, -9.81))
-    solution = radau.integrate(problem, 1e-7, 3, Ledger())
+    solution = radau.integrate(problem, 1e-7, 3, Profile())
     nodes, weights = np.polynomial.legendre.leggauss(6)
     h = np.diff(solution.time_grid)
     t = (solution.time_grid[:-1, None] + h[:, None] * 0.5 * (nodes + 1.0)).ravel()
@@ -372,9 +372,9 @@ def test_work_of_the_joints_becomes_energy(damping: float) -> None:
 def test_radau_meets_the_tolerance(stages: int, damping: float) -> None:
     """The true error is below it, and the estimate is near the true error."""
     problem, _ = two_arms(damping=damping)
-    reference = radau.integrate(problem, 1e-10, 5, Ledger())
+    reference = radau.integrate(problem, 1e-10, 5, Profile())
     for tolerance in (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)[: 4 if stages == 2 else None]:
-        solution = radau.integrate(problem, tolerance, stages, Ledger())
+        solution = radau.integrate(problem, tolerance, stages, Profile())
         true = distance(problem, solution, reference)
         assert true <= tolerance
         assert solution.error <= tolerance
@@ -392,8 +392,8 @@ def test_generalized_alpha_meets_the_tolerance(
 ) -> None:
     """The estimate is up to three times too large as long as it counts on first order."""
     problem, _ = two_arms(bending=bending, axial=30.0 * bending, damping=damping)
-    reference = radau.integrate(problem, 1e-6, 4, Ledger())
-    solution = generalized_alpha.integrate(problem, tolerance, rho_inf, Ledger())
+    reference = radau.integrate(problem, 1e-6, 4, Profile())
+    solution = generalized_alpha.integrate(problem, tolerance, rho_inf, Profile())
     true = distance(problem, solution, reference)
     assert true <= tolerance
     assert solution.error <= tolerance
@@ -420,9 +420,9 @@ def test_tolerance_beyond_rounding() -> None:
     """Radau says what it reached; generalised-alpha what it would take."""
     problem, _ = two_arms(swing, (0.0, 0.5))
     with pytest.raises(ConvergenceError, match=r"reaches an error of \S+e-1\d .*tolerance"):
-        radau.integrate(problem, 1e-17, 4, Ledger())
+        radau.integrate(problem, 1e-17, 4, Profile())
     with pytest.raises(ConvergenceError, match=r"needs about \S+ steps"):
-        generalized_alpha.integrate(problem, 1e-11, 0.8, Ledger())
+        generalized_alpha.integrate(problem, 1e-11, 0.8, Profile())
 
 
 @BOTH
@@ -563,9 +563,9 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
             f"simulation.stages={stages}",
         ),
     )
-    ledger = Ledger()
-    share = do.share_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, share, ledger)
+    profile = Profile()
+    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = do.build_arms(scene, partition, profile)
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
     grids, work, told = [], [], []
     on_grid, newton = radau._on_grid, march.newton
@@ -585,7 +585,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     monkeypatch.setattr("dolfinopt.progress.log.info", lambda *words: told.append(words))
     remedy = r"beyond small-deflection theory.*material\.young_modulus.*motion\.duration"
     with pytest.raises(ConvergenceError, match=remedy):
-        do.evaluate(scene, share, arms, x, ledger)
+        do.evaluate(scene, partition, arms, x, profile)
     assert len(grids) == 2
     assert sum(work) <= march.MAX_SWEEPS * sum(grids)
     assert len(told) >= 2
@@ -820,7 +820,7 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
     iterations, slow, found = [], [], []
     for bending, axial in ((3, 1), (9, 3), (36, 12)):
         matrices.clear()
-        solution = radau.integrate(fine_arms(bending, axial), 1e-4, 3, Ledger())
+        solution = radau.integrate(fine_arms(bending, axial), 1e-4, 3, Profile())
         iterations.append(solution.iterations)
         slow.append(max(size for _, size in matrices))
         found.append(solution.error)
@@ -835,10 +835,10 @@ def test_poor_contraction_makes_the_matrix_denser(
 ) -> None:
     """With one slow coordinate where eight are: widened, and solved all the same."""
     problem = fine_arms()
-    plain = radau.integrate(problem, 1e-6, 3, Ledger())
+    plain = radau.integrate(problem, 1e-6, 3, Profile())
     slow_up_to(monkeypatch, (1e-3, np.inf))
     matrices.clear()
-    forced = radau.integrate(problem, 1e-6, 3, Ledger())
+    forced = radau.integrate(problem, 1e-6, 3, Profile())
     assert {size for _, size in matrices} == {1, 16}
     assert distance(problem, forced, plain) <= 1e-6
     assert forced.error == pytest.approx(plain.error, rel=0.3)  # other steps
@@ -896,12 +896,12 @@ def test_warm_start_saves_iterations() -> None:
     """From a design one percent stiffer, and from the solution itself."""
     near, _ = two_arms(bending=10.1, axial=303.0)
     problem, _ = two_arms()
-    start = radau.integrate(near, 1e-5, 3, Ledger())
-    ledgers = [Ledger() for _ in range(3)]
-    cold = radau.integrate(problem, 1e-5, 3, ledgers[0])
-    warm = radau.integrate(problem, 1e-5, 3, ledgers[1], start)
-    again = radau.integrate(problem, 1e-5, 3, ledgers[2], warm)
-    counts = [ledger.counts.newton_iterations for ledger in ledgers]
+    start = radau.integrate(near, 1e-5, 3, Profile())
+    profiles = [Profile() for _ in range(3)]
+    cold = radau.integrate(problem, 1e-5, 3, profiles[0])
+    warm = radau.integrate(problem, 1e-5, 3, profiles[1], start)
+    again = radau.integrate(problem, 1e-5, 3, profiles[2], warm)
+    counts = [profile.counts.newton_iterations for profile in profiles]
     assert counts == [cold.iterations, warm.iterations, again.iterations]
     assert counts[2] == 1
     assert 1 < counts[1] < counts[0]
@@ -912,21 +912,21 @@ def test_warm_start_saves_iterations() -> None:
 def test_start_of_other_stages_or_size_is_used_or_ignored() -> None:
     """Another number of stages gives a first guess, another number of coordinates none."""
     problem, _ = two_arms()
-    cold = radau.integrate(problem, 1e-5, 3, Ledger())
-    warm = radau.integrate(problem, 1e-5, 4, Ledger(), cold)
+    cold = radau.integrate(problem, 1e-5, 3, Profile())
+    warm = radau.integrate(problem, 1e-5, 4, Profile(), cold)
     assert distance(problem, warm, cold) <= 2e-5
     single, _ = two_arms(lambda t: reach(t, (0.2, 1.0)), arms=1)
-    start = radau.integrate(single, 1e-5, 3, Ledger())
-    other = radau.integrate(problem, 1e-5, 3, Ledger(), start)
+    start = radau.integrate(single, 1e-5, 3, Profile())
+    other = radau.integrate(problem, 1e-5, 3, Profile(), start)
     assert distance(problem, other, cold) <= 2e-5
 
 
 def test_generalized_alpha_counts_its_iterations() -> None:
     """At least one a step and grid; the coarser grids count too."""
     problem, _ = two_arms()
-    ledger = Ledger()
-    solution = generalized_alpha.integrate(problem, 1e-2, 0.8, ledger)
-    assert ledger.counts.newton_iterations == solution.iterations > len(solution.a)
+    profile = Profile()
+    solution = generalized_alpha.integrate(problem, 1e-2, 0.8, profile)
+    assert profile.counts.newton_iterations == solution.iterations > len(solution.a)
 
 
 @BOTH

@@ -45,15 +45,15 @@ EXTENDED = pytest.mark.skipif(
 def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
     """Build the two-arm scene on few cells."""
     scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    ledger = do.Ledger()
-    share = do.share_arms(MPI.COMM_SELF, scene.cell_counts)
-    return Built(scene, share, do.build_arms(scene, share, ledger), ledger)
+    profile = do.Profile()
+    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
 
 
 def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3), comm: MPI.Comm | None = None) -> Arm:
     """Build the first arm of that scene."""
     scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    return Arm(scene, 0, comm or MPI.COMM_SELF, do.Ledger())
+    return Arm(scene, 0, comm or MPI.COMM_SELF, do.Profile())
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -256,11 +256,11 @@ def test_designs_that_hang_together_cost_nothing_more() -> None:
     arm = one_arm("interpolation.law=simp", "interpolation.floor=1e-6", cells=(40, 6))
     arm.set_design(windows(arm, 5, 0.0))
     arm.elastic.constraint_modes()
-    assert arm.ledger.counts.solves == 3
+    assert arm.profile.counts.solves == 3
     arm.set_design(islands(0, *arm.mesh.centroid.T))
     with pytest.raises(ConvergenceError, match="float in a void"):
         arm.elastic.constraint_modes()
-    assert arm.ledger.counts.solves > 9
+    assert arm.profile.counts.solves > 9
 
 
 @pytest.mark.serial
@@ -340,10 +340,10 @@ def test_ordinary_modes_cost_what_they_did() -> None:
     """Of a warm start one sweep of count + 4 solves, and three of the constraint modes."""
     arm = one_arm(cells=(60, 6))
     arm.reduce(arm.uniform(0.5))
-    before = arm.ledger.counts.solves
+    before = arm.profile.counts.solves
     arm.reduce(arm.uniform(0.5) + 0.01 * np.sin(30.0 * arm.mesh.centroid[:, 0]))
-    assert arm.ledger.counts.solves - before <= 3 + 10
-    assert arm.ledger.counts.eigenproblems == 2
+    assert arm.profile.counts.solves - before <= 3 + 10
+    assert arm.profile.counts.eigenproblems == 2
 
 
 @pytest.mark.serial
@@ -411,7 +411,7 @@ def distance(trajectory: Trajectory, other: Solution) -> float:
 def test_motions(overrides: list[str]) -> None:
     """The tolerance is met, measured by a method of other order on other, finer steps."""
     trajectory = moved(*overrides)
-    fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Ledger())
+    fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
     assert np.isfinite(trajectory.deviation).all() and np.isfinite(trajectory.joint_forces).all()
     assert distance(trajectory, fine) < 1.1e-4
 
@@ -495,7 +495,7 @@ def test_tolerances() -> None:
     best = moved(*overrides, "simulation.tolerance=1e-12", field=wave)
     for tolerance in (1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10):
         solution = radau.integrate(
-            best.problem, tolerance, 3 if tolerance > 1e-7 else 5, do.Ledger()
+            best.problem, tolerance, 3 if tolerance > 1e-7 else 5, do.Profile()
         )
         assert distance(best, solution) < tolerance
 
@@ -537,11 +537,11 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
         cells=(48, 6),
     )
     assert trajectory.turns.max() > 0.5  # far from small
-    fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Ledger())
+    fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
     assert distance(trajectory, fine) < 1e-4
     # Long steps damp vibrations out by any number of stages: the estimate must know of them.
     for stages in (3, 4, 5):
-        rough = radau.integrate(trajectory.problem, 1e-2, stages, do.Ledger())
+        rough = radau.integrate(trajectory.problem, 1e-2, stages, do.Profile())
         assert distance(trajectory, rough) < 1e-2
 
 
@@ -558,7 +558,7 @@ def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPa
         return method(stages, state, a, *others, **options)
 
     monkeypatch.setattr(march, "newton", stubborn)
-    again = radau.integrate(trajectory.problem, 1e-4, 3, do.Ledger())
+    again = radau.integrate(trajectory.problem, 1e-4, 3, do.Profile())
     assert refused
     assert distance(trajectory, again) < 2e-4
 
@@ -714,7 +714,7 @@ def taylor_rate(built: Built, x: dict, slopes: dict, trajectory: Trajectory | No
     def value(h: float) -> float:
         moved_x = {k: x[k] + h * d[k] for k in x}
         evaluation, there = do.evaluate(
-            scene, built.share, built.arms, moved_x, built.ledger, start, simulated=False
+            scene, built.partition, built.arms, moved_x, built.profile, start, simulated=False
         )
         if there is None or trajectory is None:
             return evaluation.objective
@@ -733,9 +733,9 @@ def outcome(seed: int, folder: Path) -> str:
     data, _ = drawn(rng, folder)
     try:
         scene = do.scene_from_dict(data, source=f"scene {seed}")
-        ledger = do.Ledger()
-        share = do.share_arms(MPI.COMM_SELF, scene.cell_counts)
-        built = Built(scene, share, do.build_arms(scene, share, ledger), ledger)
+        profile = do.Profile()
+        partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+        built = Built(scene, partition, do.build_arms(scene, partition, profile), profile)
         crisp = rng.random() < 0.25
         x = {k: 0.55 + 0.35 * field for k, field in built.fields(uneven).items()}
         if crisp:

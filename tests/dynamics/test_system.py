@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -112,7 +112,7 @@ def error(solution: radau.Solution) -> float:
 
 def test_constraint_is_met_at_every_stage() -> None:
     """Positions on the circle to Newton's goal, and the motion to the tolerance."""
-    solution = radau.integrate(Pendulum(), 1e-6, 3, Ledger())
+    solution = radau.integrate(Pendulum(), 1e-6, 3, Profile())
     assert np.abs(np.hypot(*solution.q[:, :2].T) - 1.0).max() <= 1e-9
     assert error(solution) <= 1e-6
 

@@ -18,7 +18,7 @@ from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, THICKNESS = 1.0, 0.2, 0.01  # m
@@ -47,7 +47,9 @@ def bulge(points):
 
 def make_arm(mesh, degree=1):
     """Return an arm without a design."""
-    return Substructure(mesh, LagrangeElement(degree).operators(mesh, THICKNESS, POISSON), Ledger())
+    return Substructure(
+        mesh, LagrangeElement(degree).operators(mesh, THICKNESS, POISSON), Profile()
+    )
 
 
 def rough_design(mesh):
@@ -327,7 +329,7 @@ def test_solution_of_the_interior_satisfies_the_assembled_equations():
 
 def test_nothing_is_assembled_or_factorised_twice_for_a_design():
     substructure = make_arm(make_mesh((6, 2)))
-    counts = substructure.ledger.counts
+    counts = substructure.profile.counts
     assert dataclasses.asdict(counts) == dict.fromkeys(dataclasses.asdict(counts), 0)
     young, density = rough_design(substructure.mesh)
     right = np.ones((substructure.T.num_interior, 2))
@@ -385,7 +387,7 @@ def test_a_change_that_one_rank_sees_alone():
     if COMM.rank == 0:
         young[0] *= 2.0
     substructure.at(young, density).solve(right)
-    assert substructure.ledger.counts.factorisations == 2
+    assert substructure.profile.counts.factorisations == 2
 
 
 def test_missing_interface_is_named():

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import Element, LagrangeElement, plane_stress, strains
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
@@ -75,7 +75,7 @@ def solid_arm(element: Element, cells, poisson_ratio, distort=False):
         points[:, 1] += 0.02 * inside * np.sin(9.0 * x + y)
     operators = element.operators(mesh, THICKNESS, poisson_ratio)
     ones = np.ones(mesh.num_cells)
-    return Substructure(mesh, operators, Ledger()).at(YOUNG * ones, 2700.0 * ones)
+    return Substructure(mesh, operators, Profile()).at(YOUNG * ones, 2700.0 * ones)
 
 
 ELEMENTS = [LagrangeElement(1), LagrangeElement(2), BendingQuadrilateral()]

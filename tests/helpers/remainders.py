@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.parallel import ArmShare, sum_over_arms
+from dolfinopt.parallel import Partition, sum_over_arms
 from dolfinopt.scene.load import Scene
 
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
@@ -23,22 +23,22 @@ class Built:
     """A scene with this rank's arms."""
 
     scene: Scene
-    share: ArmShare
+    partition: Partition
     arms: dict[int, Arm]
-    ledger: do.Ledger
+    profile: do.Profile
 
     def evaluate(self, x_phys: Cells, simulated: bool = False):
         """Evaluate physical densities."""
-        place = self.scene, self.share, self.arms
-        return do.evaluate(*place, x_phys, self.ledger, simulated=simulated)
+        place = self.scene, self.partition, self.arms
+        return do.evaluate(*place, x_phys, self.profile, simulated=simulated)
 
     def gradient(self, trajectory=None):
         """Return the objective's gradient at the design evaluated last."""
-        return do.gradient(self.scene, self.share, self.arms, trajectory, self.ledger)
+        return do.gradient(self.scene, self.partition, self.arms, trajectory, self.profile)
 
     def dot(self, a: Cells, b: Cells) -> float:
         """Return the product over all cells of all arms, on all ranks."""
-        return float(sum_over_arms(self.share, {k: np.array(a[k] @ b[k]) for k in self.arms}))
+        return float(sum_over_arms(self.partition, {k: np.array(a[k] @ b[k]) for k in self.arms}))
 
     def fields(self, function: Callable[[int, np.ndarray, np.ndarray], np.ndarray]) -> Cells:
         """Return function(arm, x, y) of the cells' centroids over the arm's length."""
@@ -52,9 +52,9 @@ class Built:
 def build(*overrides: str, cells: tuple[int, int] = (24, 3)) -> Built:
     """Build the two-arm scene on few cells (collective)."""
     scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    ledger = do.Ledger()
-    share = do.share_arms(MPI.COMM_WORLD, scene.cell_counts)
-    return Built(scene, share, do.build_arms(scene, share, ledger), ledger)
+    profile = do.Profile()
+    partition = do.partition_arms(MPI.COMM_WORLD, scene.cell_counts)
+    return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
 
 
 def wave(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:

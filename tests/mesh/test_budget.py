@@ -15,8 +15,8 @@ from dolfinopt.arms.arm import build_arms
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import budget
 from dolfinopt.mesh.budget import check_budget, estimated_cells, free_memory
-from dolfinopt.parallel import share_arms
-from dolfinopt.profiling import Ledger
+from dolfinopt.parallel import partition_arms
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm, load_scene
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +32,7 @@ def test_what_exceeds_the_memory_is_refused(override):
     scene = load_scene(SCENE, [override] if isinstance(override, str) else override)
     for attempt in (
         lambda: check_budget(COMM, scene),
-        lambda: build_arms(scene, share_arms(COMM, scene.cell_counts), Ledger()),
+        lambda: build_arms(scene, partition_arms(COMM, scene.cell_counts), Profile()),
     ):
         with pytest.raises(InputError) as caught:
             attempt()

@@ -256,7 +256,7 @@ def solid(size, shape, comm=COMM):
     }
     material = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
     data = {"material": material, "arms": [entry], "design": {"filter_radius": 0.0}}
-    arm = ScenesArm(do.scene_from_dict(data), 0, comm, do.Ledger())
+    arm = ScenesArm(do.scene_from_dict(data), 0, comm, do.Profile())
     body = arm.reduce(np.ones(arm.mesh.num_cells))
     squares = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real
     flexibility = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
@@ -314,10 +314,10 @@ def test_limits_that_only_the_mesh_can_tell(override, reason):
     """The solid rings of the demo are 0.0207 of an arm; its coarse mesh has some 1000 dofs."""
     file = Path(__file__).parents[2] / "demos" / "two_arm_bores.toml"
     scene = do.load_scene(file, ["arms.mesh_size=0.015", override])
-    share = do.share_arms(COMM, scene.cell_counts)
+    partition = do.partition_arms(COMM, scene.cell_counts)
     problem = ""
     try:
-        do.build_arms(scene, share, do.Ledger())
+        do.build_arms(scene, partition, do.Profile())
     except InputError as error:
         problem = str(error)
     problems = [text for text in COMM.allgather(problem) if text]  # some ranks may have no arm

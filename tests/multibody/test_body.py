@@ -11,7 +11,7 @@ from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.shape_integrals import first_frequency, plane_body, shape_integrals
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options, craig_bampton, modal
 
 COMM = MPI.COMM_WORLD
@@ -27,7 +27,7 @@ ROUNDING = 1e-12
 
 def make_arm(cells=(10, 3), comm=COMM):
     mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
-    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Ledger())
+    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Profile())
 
 
 def uneven(place):

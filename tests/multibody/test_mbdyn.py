@@ -24,7 +24,7 @@ from dolfinopt.multibody.mbdyn import (
 )
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.multibody.standard_input import load_body, spatial_moments
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
@@ -37,7 +37,7 @@ PLACING = 1e-10
 def reduced(cells, comm=MPI.COMM_SELF, uneven=False):
     """Return the body, its moments and nodes; nodes are None but on the first rank."""
     mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
-    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Ledger())
+    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Profile())
     x = np.ones(mesh.num_cells)
     if uneven:
         place = np.round(mesh.centroid, 9)

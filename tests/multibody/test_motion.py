@@ -534,11 +534,11 @@ HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `sce
 
 def simulated(of: Scene, density: float = 1.0) -> Trajectory | None:
     """Return the trajectory of uniform arms; None but on the root."""
-    ledger = do.Ledger()
-    share = do.share_arms(WORLD, of.cell_counts)
-    arms = do.build_arms(of, share, ledger)
+    profile = do.Profile()
+    partition = do.partition_arms(WORLD, of.cell_counts)
+    arms = do.build_arms(of, partition, profile)
     x_phys = {k: arm.uniform(density) for k, arm in arms.items()}
-    return do.evaluate(of, share, arms, x_phys, ledger)[1]
+    return do.evaluate(of, partition, arms, x_phys, profile)[1]
 
 
 def bar(length: float) -> Cloud:
@@ -650,9 +650,9 @@ def test_exact_gradient_of_one_and_three_arms(
     lengths = {1: (1.0,), 3: (0.7, 0.7, 0.7)}[arms]
     tables = {"payload": {"mass": 1.0}, "objective": {"load_cases": 5}}
     of = scene(lengths, tables, **motion)
-    ledger = do.Ledger()
-    share = do.share_arms(WORLD, of.cell_counts)
-    built = do.build_arms(of, share, ledger)
+    profile = do.Profile()
+    partition = do.partition_arms(WORLD, of.cell_counts)
+    built = do.build_arms(of, partition, profile)
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in built.items()}
-    test = taylor_test(of, share, built, x, ledger)
+    test = taylor_test(of, partition, built, x, profile)
     assert test.passed, {row.direction: round(row.rate, 3) for row in test.rows}

@@ -25,7 +25,7 @@ from dolfinopt.multibody.standard_input import (
     spatial_moments,
     to_sid,
 )
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
@@ -60,7 +60,7 @@ def same(body: ShapeIntegrals, other: ShapeIntegrals) -> None:
 @pytest.fixture(scope="module")
 def arm():
     mesh = structured_arm(COMM, "arm", 1.2, 0.3, (10, 3))
-    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Ledger())
+    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Profile())
     place = np.round(mesh.centroid, 9)
     x = 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
     elastic = substructure.at(70e9 * x**3, 2700.0 * x)
@@ -249,7 +249,7 @@ def test_moments_of_an_arm_agree_with_its_planar_integrals(arm):
 def test_moments_of_a_plate_in_closed_form():
     """A uniform 1.2 m x 0.3 m plate of 2 cm under rigid motions: cuboid's moments of inertia."""
     mesh = structured_arm(COMM, "arm", 1.2, 0.3, (6, 2))
-    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Ledger())
+    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Profile())
     elastic = substructure.at(np.full(mesh.num_cells, 70e9), np.full(mesh.num_cells, 2700.0))
     basis = craig_bampton(elastic, Options(3))
     data = to_sid(shape_integrals(elastic, basis, 0.0), spatial_moments(elastic, basis, THICKNESS))

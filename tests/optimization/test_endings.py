@@ -18,7 +18,7 @@ from dolfinopt.cli import commands
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.output.files import ArmView, read_history, write_fields
-from dolfinopt.parallel import ArmShare, on_root, sum_over_arms
+from dolfinopt.parallel import Partition, on_root, sum_over_arms
 from dolfinopt.responses import scenarios
 from dolfinopt.responses.constraints import Limit, distinct, violated, worst_limits
 
@@ -36,7 +36,7 @@ def scene(*overrides, iterations):
 
 # -- Karush-Kuhn-Tucker residual -------------------------------------------------------------
 
-ALONE = partial(sum_over_arms, ArmShare(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
+ALONE = partial(sum_over_arms, Partition(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
 
 
 def residual(x, xmin, xmax, df0dx, f, dfdx):
@@ -268,10 +268,10 @@ def test_machine_figures(shared_tmp_path):
 
 
 def test_settling_of_a_horizon_that_ends_with_the_motion():
-    share = do.share_arms(WORLD, (one := scene(iterations=1)).cell_counts)
-    arms = do.build_arms(one, share, ledger := do.Ledger())
+    partition = do.partition_arms(WORLD, (one := scene(iterations=1)).cell_counts)
+    arms = do.build_arms(one, partition, profile := do.Profile())
     x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-    _, trajectory = do.evaluate(one, share, arms, x, ledger)
+    _, trajectory = do.evaluate(one, partition, arms, x, profile)
     if trajectory is not None:
         assert trajectory.settling == pytest.approx(np.hypot(*trajectory.deviation[-1]))
 
@@ -281,8 +281,8 @@ def test_first_frequency_error_is_that_to_the_full_model():
 
     def first(coordinates):
         one = scene(f"reduction.coordinates={coordinates}", iterations=1)
-        share = do.share_arms(MPI.COMM_SELF, one.cell_counts)
-        arms = do.build_arms(one, share, do.Ledger())
+        partition = do.partition_arms(MPI.COMM_SELF, one.cell_counts)
+        arms = do.build_arms(one, partition, do.Profile())
         x = arms[0].uniform(0.5)
         body = arms[0].reduce(x)
         found = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real.min()

@@ -60,7 +60,7 @@ def test_volume_limits():
         settings = ["design.shared_volume=true"] if shared else []
         result = do.optimize(small(*settings, iterations=25))
         mine = {k: arm.volume_fraction(result.x_phys[k]) for k, arm in result.arms.items()}
-        fractions = list(do.gather_arms(result.share, mine).values())
+        fractions = list(do.gather_arms(result.partition, mine).values())
         if WORLD.rank == 0:
             assert np.mean(fractions) == pytest.approx(0.5, abs=2e-3)
             if shared:
@@ -234,7 +234,7 @@ def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
     result = do.optimize(settings, shared_tmp_path)
     for arm in result.arms.values():  # what a third iteration would set out from
         assert [len(start) for start in arm.initial_vectors] == [arm.elastic.num_dofs] * 2
-    memory = checkpoint.load(shared_tmp_path, settings, result.share, result.arms)
+    memory = checkpoint.load(shared_tmp_path, settings, result.partition, result.arms)
     for k, arm in result.arms.items():
         empty, loaded = memory.modes[k]  # the objective needs no reduced model
         assert empty.shape[1] == 0 and loaded.shape == (arm.elastic.num_dofs, 3)

@@ -30,10 +30,12 @@ def result():
 
 
 def simulated(result):
-    scene, ledger = do.load_scene(SCENE, SMALL), do.Ledger()
-    evaluation, trajectory = do.evaluate(scene, result.share, result.arms, result.x_phys, ledger)
+    scene, profile = do.load_scene(SCENE, SMALL), do.Profile()
+    evaluation, trajectory = do.evaluate(
+        scene, result.partition, result.arms, result.x_phys, profile
+    )
     return Simulated(
-        scene, result.share, result.arms, result.x_phys, evaluation, trajectory, ledger
+        scene, result.partition, result.arms, result.x_phys, evaluation, trajectory, profile
     )
 
 
@@ -77,9 +79,9 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
 def test_views_of_arms_without_a_current_design():
     """Studies and the paper's page draw designs that they have read but never assembled."""
     scene = do.load_scene(SCENE, SMALL)
-    share = do.share_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, share, do.Ledger())
-    views = gather_views(scene, share, arms, {k: arm.uniform(0.5) for k, arm in arms.items()})
+    partition = do.partition_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, partition, do.Profile())
+    views = gather_views(scene, partition, arms, {k: arm.uniform(0.5) for k, arm in arms.items()})
     if WORLD.rank == 0:
         assert [view.name for view in views] == ["arm1", "arm2"]
         for view in views:

@@ -16,7 +16,7 @@ import dolfinopt as do
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import breakpoints, check_motion, desired_path, rigid_motion
 from dolfinopt.paths.time_laws import Law, Limits, law_for
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import evaluate_batch
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
@@ -304,12 +304,12 @@ def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:
     motion = {"path": "points", "file": str(file), "law": "trapezoidal", "horizon": 1.5}
     of = posed(**motion)
     scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 2.0, 3.0)]
-    ledger = Ledger()
-    share = do.share_arms(MPI.COMM_SELF, of.cell_counts)
-    arms = do.build_arms(of, share, ledger)
+    profile = Profile()
+    partition = do.partition_arms(MPI.COMM_SELF, of.cell_counts)
+    arms = do.build_arms(of, partition, profile)
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    together = evaluate_batch(scenes, share, arms, x, ledger)
+    together = evaluate_batch(scenes, partition, arms, x, profile)
     for scene, both in zip(scenes, together, strict=True):
         assert isinstance(both, tuple)
-        alone = do.evaluate(scene, share, arms, x, ledger)[0]
+        alone = do.evaluate(scene, partition, arms, x, profile)[0]
         assert_close(both[0].max_deviation, alone.max_deviation, 2e-4)

@@ -502,17 +502,17 @@ def test_real_arms_join():
     from dolfinopt.arms.arm import build_arms
     from dolfinopt.dynamics.simulation import build_mechanism
     from dolfinopt.output.files import gather_views
-    from dolfinopt.parallel import gather_arms, share_arms
-    from dolfinopt.profiling import Ledger
+    from dolfinopt.parallel import gather_arms, partition_arms
+    from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import load_scene
 
     cells = ["arms.0.cells=[20,4]", "arms.1.cells=[16,4]", "reduction.coordinates=5"]
     scene = load_scene(TWO_ARM, cells)
-    share = share_arms(MPI.COMM_SELF, {0: 80, 1: 64})
-    arms = build_arms(scene, share, Ledger())
+    partition = partition_arms(MPI.COMM_SELF, {0: 80, 1: 64})
+    arms = build_arms(scene, partition, Profile())
     x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    bodies = list(gather_arms(share, {k: arm.reduce(x[k]) for k, arm in arms.items()}).values())
-    views = gather_views(scene, share, arms, x)
+    bodies = list(gather_arms(partition, {k: arm.reduce(x[k]) for k, arm in arms.items()}).values())
+    views = gather_views(scene, partition, arms, x)
     mechanism = build_mechanism(scene, bodies)
     q_e = 0.01 * np.sin(np.arange(30.0)).reshape(3, 10)
     film = animation.make_film(views, mechanism, np.arange(3.0), np.zeros((3, 3)), q_e, 2.0, 3)

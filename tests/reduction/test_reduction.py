@@ -19,7 +19,7 @@ from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.shape_integrals import shape_integrals
-from dolfinopt.profiling import Ledger
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import (
     METHODS,
     Basis,
@@ -50,7 +50,7 @@ DENSE = 1e-7
 
 def make_arm(cells=(20, 4), comm=SELF, length=LENGTH):
     mesh = structured_arm(comm, "arm", length, HEIGHT, cells)
-    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Ledger())
+    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Profile())
 
 
 def with_densities(arm, x):
@@ -231,7 +231,7 @@ def test_too_many_modes_are_an_error_that_says_so():
 
 def test_counts():
     arm = make_arm(comm=COMM)
-    counts = arm.ledger.counts
+    counts = arm.profile.counts
     arm = with_densities(arm, graded(arm.mesh.centroid))
 
     def tally():
@@ -257,7 +257,7 @@ def test_counts():
 )
 def test_a_warm_start_finds_the_same_modes_with_less_work(shared_arm, method, q):
     arm = shared_arm
-    counts = arm.ledger.counts
+    counts = arm.profile.counts
     x = graded(arm.mesh.centroid)
     arm = with_densities(arm, 0.97 * x)
     before = REDUCTORS[method](arm, Options(q))
@@ -539,7 +539,7 @@ def test_subspaces_repeat_themselves_and_ignore_the_start(own_arm, method):
 
 def test_what_subspaces_cost():
     arm = make_arm(comm=COMM)
-    counts = arm.ledger.counts
+    counts = arm.profile.counts
     arm = with_densities(arm, graded(arm.mesh.centroid))
     krylov(arm, Options(3))
     assert (counts.factorisations, counts.eigenproblems, counts.solves) == (1, 0, 3)
@@ -580,12 +580,12 @@ MOTION = ["arms.cells=[30,4]", "motion.duration=0.9", "motion.horizon=1.0"]
 def simulated(*overrides):
     """Return scene, arms, evaluation and gradient of the demo's graded arms."""
     scene = do.load_scene(TWO_ARM, [*MOTION, *overrides])
-    share, ledger = do.share_arms(COMM, scene.cell_counts), do.Ledger()
-    arms = do.build_arms(scene, share, ledger)
+    partition, profile = do.partition_arms(COMM, scene.cell_counts), do.Profile()
+    arms = do.build_arms(scene, partition, profile)
     x = {k: 0.3 + 0.7 * graded(arm.mesh.centroid) for k, arm in arms.items()}
-    evaluation, trajectory = do.evaluate(scene, share, arms, x, ledger)
-    slopes = do.gradient(scene, share, arms, trajectory, ledger)
-    return scene, share, arms, x, evaluation, slopes
+    evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
+    slopes = do.gradient(scene, partition, arms, trajectory, profile)
+    return scene, partition, arms, x, evaluation, slopes
 
 
 def test_simulations_agree_between_methods():
@@ -651,12 +651,12 @@ def test_exact_gradient_of_krylov(q, shifts):
     overrides = ["objective.kind=compliance", "objective.gradient=exact", "payload.mass=1"]
     overrides += [f"reduction.coordinates={q}", "reduction.method=krylov"]
     overrides += [f"reduction.shifts={shifts}", "motion.horizon=0.9", "simulation.tolerance=1e-6"]
-    scene, share, arms, x, _, slopes = simulated(*overrides)
+    scene, partition, arms, x, _, slopes = simulated(*overrides)
     direction = {k: np.cos(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
 
     def along(h):
         moved = {k: x[k] + h * direction[k] for k in x}
-        return do.evaluate(scene, share, arms, moved, do.Ledger())[0].objective
+        return do.evaluate(scene, partition, arms, moved, do.Profile())[0].objective
 
     expected = sum(slopes[k] @ direction[k] for k in slopes)
     expected = COMM.allreduce(expected)

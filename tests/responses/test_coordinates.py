@@ -30,12 +30,12 @@ def auto(*overrides: str, tolerance: float = 1e-2, cells: tuple[int, int] = (24,
 
 
 def error(built: Built, x: dict[int, np.ndarray], count: int) -> float:
-    place = built.scene, built.share, built.arms
-    return estimated_error(*place, x, count, built.ledger)
+    place = built.scene, built.partition, built.arms
+    return estimated_error(*place, x, count, built.profile)
 
 
 def choose(built: Built, x: dict[int, np.ndarray]) -> OrderSelection:
-    choice = do.choose_coordinates(built.scene, built.share, built.arms, x, built.ledger)
+    choice = do.choose_coordinates(built.scene, built.partition, built.arms, x, built.profile)
     assert choice is not None
     return choice
 
@@ -85,8 +85,8 @@ def padded_error(built: Built, x, few: int, many: int) -> float:
         data["simulation"]["tolerance"] = 3e-5
         scene = do.scene_from_dict(data)
         arms = {k: arm.under(scene) for k, arm in built.arms.items()}
-        bodies = gather_arms(built.share, {k: arm.reduce(x[k]) for k, arm in arms.items()})
-        found.append(simulate(scene, list(bodies.values()), do.Ledger()) if bodies else None)
+        bodies = gather_arms(built.partition, {k: arm.reduce(x[k]) for k, arm in arms.items()})
+        found.append(simulate(scene, list(bodies.values()), do.Profile()) if bodies else None)
     result = None
     if WORLD.rank == 0:
         short, long = found
@@ -124,8 +124,8 @@ def test_estimate_of_other_bases(method):
         data["simulation"]["tolerance"] = 3e-5
         scene = do.scene_from_dict(data)
         arms = {k: arm.under(scene) for k, arm in built.arms.items()}
-        bodies = gather_arms(built.share, {k: arm.reduce(x[k]) for k, arm in arms.items()})
-        motion = simulate(scene, list(bodies.values()), do.Ledger()) if bodies else None
+        bodies = gather_arms(built.partition, {k: arm.reduce(x[k]) for k, arm in arms.items()})
+        motion = simulate(scene, list(bodies.values()), do.Profile()) if bodies else None
         moved.append(WORLD.bcast(motion and (motion.q_e, motion.mechanism.slices), root=0))
         fields.append({k: arm.basis.V for k, arm in arms.items()})
     worst = {}
@@ -194,19 +194,19 @@ def test_three_arms():
         SCENE.parent / "three_arm.toml",
         (AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"),
     )
-    share = do.share_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, share, do.Ledger())
+    partition = do.partition_arms(WORLD, scene.cell_counts)
+    arms = do.build_arms(scene, partition, do.Profile())
     x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-    choice = do.choose_coordinates(scene, share, arms, x, do.Ledger())
+    choice = do.choose_coordinates(scene, partition, arms, x, do.Profile())
     assert choice.error <= 1e-2
 
 
 def test_a_given_number_costs_nothing():
     built = build("reduction.coordinates=5", SHORT)
-    before = replace(built.ledger.counts)
-    place = built.scene, built.share, built.arms, built.fields(wave), built.ledger
+    before = replace(built.profile.counts)
+    place = built.scene, built.partition, built.arms, built.fields(wave), built.profile
     assert do.choose_coordinates(*place) is None
-    assert built.ledger.counts == before
+    assert built.profile.counts == before
     assert all(arm.coordinates == 5 and arm.basis is None for arm in built.arms.values())
 
 
@@ -251,7 +251,7 @@ def test_optimises_with_the_choice():
     for k in found.x_phys:
         np.testing.assert_array_equal(found.x_phys[k], same.x_phys[k])
     assert dict(found.choice.tried)[count] <= 0.01 / optimization.RESERVE
-    built = Built(small(), found.share, dict(found.arms), do.Ledger())
+    built = Built(small(), found.partition, dict(found.arms), do.Profile())
     assert found.choice.error == error(built, found.x_phys, count)
     assert found.choice.error != dict(found.choice.tried)[count]
 

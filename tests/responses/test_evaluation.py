@@ -48,10 +48,10 @@ def test_a_shared_design_is_two_equal_ones(overrides: list[str]) -> None:
     for sharing in ([], [SHARED]):
         built = build(*overrides, *sharing)
         evaluation, trajectory = built.evaluate(built.fields(same))
-        slopes = built.share.world.allgather(built.gradient(trajectory))
+        slopes = built.partition.world.allgather(built.gradient(trajectory))
         rows = [
             WORLD.allgather(row)
-            for row in constraint_gradients(built.scene, built.share, built.arms)
+            for row in constraint_gradients(built.scene, built.partition, built.arms)
         ]
         found.append((evaluation, slopes, rows))
     (two, two_slopes, two_rows), (one, one_slopes, one_rows) = found
@@ -149,7 +149,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
     built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
     body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0, 1.0)})[0]
     scene = do.load_scene(SCENE, ("arms.cells=[24,3]", "arms.length=0.8", "material.density=5e3"))
-    meshed = Arm(scene, 0, MPI.COMM_SELF, do.Ledger())
+    meshed = Arm(scene, 0, MPI.COMM_SELF, do.Profile())
     twin = meshed.reduce(np.ones(meshed.mesh.num_cells))
     # Gmsh places nodes to 1e-12 of the length.
     assert body.mass == pytest.approx(twin.mass, rel=1e-11)
@@ -164,7 +164,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
 def body_of(*overrides: str, index: int = 1) -> ShapeIntegrals:
     """Return one arm's body, on its own ranks."""
     arm = Arm(
-        do.load_scene(SCENE, ("arms.cells=[24,3]", *overrides)), index, MPI.COMM_SELF, do.Ledger()
+        do.load_scene(SCENE, ("arms.cells=[24,3]", *overrides)), index, MPI.COMM_SELF, do.Profile()
     )
     return arm.reduce(wave(index, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0])))
 
@@ -367,7 +367,7 @@ def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None
     assert second.objective < 0.5 * first.objective
     np.testing.assert_allclose(second.constraints, first.constraints, rtol=1e-9)
     d = built.fields(uneven)
-    for j, row in enumerate(constraint_gradients(built.scene, built.share, built.arms)):
+    for j, row in enumerate(constraint_gradients(built.scene, built.partition, built.arms)):
 
         def value(h: float, j: int = j) -> float:
             return built.evaluate({k: x[k] + h * d[k] for k in x})[0].constraints[j]
@@ -416,23 +416,23 @@ def test_densities_that_are_none_are_refused(change, reason) -> None:
     with pytest.raises(do.InputError, match=f"arm 'arm2': {reason}"):
         built.evaluate(x)
     with pytest.raises(do.InputError, match=reason):
-        evaluate_batch([built.scene] * 2, built.share, built.arms, x, do.Ledger())
+        evaluate_batch([built.scene] * 2, built.partition, built.arms, x, do.Profile())
 
 
 def test_arms_under_another_scene_keep_their_own_design() -> None:
     """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
     built = build("objective.kind=static", "constraints.first_frequency=4.0")
     stiff, weak = built.fields(same), {k: 0.8 * v for k, v in built.fields(same).items()}
-    place = built.scene, built.share
-    expected = [evaluate(*place, built.arms, x, do.Ledger())[0] for x in (weak, stiff)]
+    place = built.scene, built.partition
+    expected = [evaluate(*place, built.arms, x, do.Profile())[0] for x in (weak, stiff)]
     slopes = built.gradient()
     other = {k: arm.under(built.scene) for k, arm in built.arms.items()}
     for _ in range(2):
         for arms, x, want in ((other, weak, expected[0]), (built.arms, stiff, expected[1])):
-            found = evaluate(*place, arms, x, do.Ledger())[0]
+            found = evaluate(*place, arms, x, do.Profile())[0]
             assert found.objective == pytest.approx(want.objective, rel=1e-9)
             assert found.compliance == pytest.approx(want.compliance, rel=1e-6)
             assert found.constraints == pytest.approx(want.constraints, rel=1e-7)
-    evaluate(*place, other, weak, do.Ledger())
+    evaluate(*place, other, weak, do.Profile())
     for k, slope in built.gradient().items():
         np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())

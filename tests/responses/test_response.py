@@ -38,12 +38,12 @@ class Roughness(Response):
     level = 0.3
 
     def measure(self, analysis: Analysis) -> Measured:
-        with together(analysis.share.world):
+        with together(analysis.partition.world):
             mine = {
                 k: float(arm.mesh.area @ (arm.current.x_phys - self.level) ** 2)
                 for k, arm in analysis.arms.items()
             }
-        found = on_all_ranks(analysis.share, mine)
+        found = on_all_ranks(analysis.partition, mine)
         values = tuple(found.values())
         return Measured(
             self.name, tuple(analysis.scene.arms[k].name for k in found), values, values
@@ -108,7 +108,7 @@ def limited(scene: Scene, **limits: float) -> Scene:
 
 
 def rebuilt(built: Built, scene: Scene) -> Built:
-    return Built(scene, built.share, built.arms, built.ledger)
+    return Built(scene, built.partition, built.arms, built.profile)
 
 
 QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
@@ -151,7 +151,7 @@ def test_a_new_response_of_the_motion_has_an_exact_gradient() -> None:
     built = build(*QUICK, "objective.gradient=exact")
     built = rebuilt(built, minimised(built.scene, "mean_square"))
     x = built.fields(wave)
-    test = taylor_test(built.scene, built.share, built.arms, x, built.ledger)
+    test = taylor_test(built.scene, built.partition, built.arms, x, built.profile)
     assert test.passed, test
 
 
@@ -164,7 +164,9 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert needs(built.scene, "motion")
     x, d = built.fields(wave), built.fields(uneven)
     _, trajectory = built.evaluate(x)
-    [row] = constraint_gradients(built.scene, built.share, built.arms, trajectory, built.ledger)
+    [row] = constraint_gradients(
+        built.scene, built.partition, built.arms, trajectory, built.profile
+    )
 
     def value(h: float) -> float:
         moved = {k: x[k] + h * d[k] for k in x}

@@ -106,7 +106,7 @@ def test_one_reduction_for_all_scenarios():
     for changes in ([], [PATH], [PATH, MATERIAL, (DAMPING,), ("payload.mass=4",)]):
         built = build(*([scenarios(*changes)] if changes else []))
         built.evaluate(built.fields(wave))
-        counted = built.ledger.counts
+        counted = built.profile.counts
         counts.append((counted.assemblies, counted.factorisations, counted.solves))
     assert counts[0] == counts[1] == counts[2]
 
@@ -131,7 +131,7 @@ def test_gradient_of_all_scenarios(combination, options):
         cells=(12, 2),
     )
     x = built.fields(wave)
-    test = taylor_test(built.scene, built.share, built.arms, x, built.ledger)
+    test = taylor_test(built.scene, built.partition, built.arms, x, built.profile)
     assert test.passed, [row.rate for row in test.rows]
 
 
@@ -181,8 +181,8 @@ def test_robust_against_two_payloads():
     scene = do.load_scene(SCENE, [*fast, uses, "objective.scenarios=worst"])
     robust = do.optimize(scene)
     nominal = do.optimize(do.load_scene(SCENE, fast))
-    share, arms = robust.share, robust.arms
-    other, _ = do.evaluate(scene, share, arms, nominal.x_phys, do.Ledger())
+    partition, arms = robust.partition, robust.arms
+    other, _ = do.evaluate(scene, partition, arms, nominal.x_phys, do.Profile())
     first = on_root(WORLD, lambda: robust.history[0].objective)
     assert robust.evaluation.objective < 0.2 * first
     assert robust.evaluation.objective <= other.objective

@@ -238,10 +238,10 @@ def _finer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def taylor(loaded: Scene, design: Callable[[Arm, int], np.ndarray] = noise) -> TaylorTest:
     """Run the Taylor test at a design."""
-    ledger = do.Ledger()
-    share = do.share_arms(WORLD, loaded.cell_counts)
-    arms = do.build_arms(loaded, share, ledger)
-    return taylor_test(loaded, share, arms, {k: design(a, k) for k, a in arms.items()}, ledger)
+    profile = do.Profile()
+    partition = do.partition_arms(WORLD, loaded.cell_counts)
+    arms = do.build_arms(loaded, partition, profile)
+    return taylor_test(loaded, partition, arms, {k: design(a, k) for k, a in arms.items()}, profile)
 
 
 def rates(test: TaylorTest) -> dict[str, float]:
@@ -444,7 +444,7 @@ def fixed_frequencies(height: float) -> tuple[float, float]:
     The axial one is the only mode with a mean displacement along the arm.
     """
     loaded = scene("reduction.coordinates=6", f"arms.height={height!r}")
-    arm = Arm(loaded, 0, MPI.COMM_SELF, do.Ledger())
+    arm = Arm(loaded, 0, MPI.COMM_SELF, do.Profile())
     body = arm.reduce(arm.uniform(0.5))
     values = np.diag(body.K)[3:]
     axial = int(np.argmax(np.abs(body.C[0, 3:])))
@@ -484,14 +484,14 @@ def test_exact_gradient_factorises_nothing(method: str) -> None:
     counts = {}
     for kind in ("esl", "exact"):
         loaded = scene(f"reduction.method={method}", f"objective.gradient={kind}")
-        ledger = do.Ledger()
-        share = do.share_arms(WORLD, loaded.cell_counts)
-        arms = do.build_arms(loaded, share, ledger)
+        profile = do.Profile()
+        partition = do.partition_arms(WORLD, loaded.cell_counts)
+        arms = do.build_arms(loaded, partition, profile)
         x_phys = {k: arm.physical(wave(arm, k)) for k, arm in arms.items()}
-        _, trajectory = do.evaluate(loaded, share, arms, x_phys, ledger)
-        slopes = do.gradient(loaded, share, arms, trajectory, ledger)
-        assert sum_over_arms(share, {k: np.array(g @ g) for k, g in slopes.items()}) > 0.0
-        counts[kind] = ledger.counts
+        _, trajectory = do.evaluate(loaded, partition, arms, x_phys, profile)
+        slopes = do.gradient(loaded, partition, arms, trajectory, profile)
+        assert sum_over_arms(partition, {k: np.array(g @ g) for k, g in slopes.items()}) > 0.0
+        counts[kind] = profile.counts
     solves = counts["exact"].solves - counts["esl"].solves
     adjoint = {"solves": 0, "adjoints": 0, "energy_fields": 0}
     assert replace(counts["exact"], **adjoint) == replace(counts["esl"], **adjoint)

@@ -22,7 +22,7 @@ UNIT = np.eye(3)  # a force along the arm, one across it, a moment
 def solid(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
     """Return the first arm, solid, on its own ranks."""
     scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    arm = Arm(scene, 0, comm, do.Ledger())
+    arm = Arm(scene, 0, comm, do.Profile())
     arm.set_design(np.ones(arm.mesh.num_cells))
     return arm
 
@@ -111,7 +111,7 @@ def test_unit_loads_of_both_arms() -> None:
     evaluation, trajectory = built.evaluate(built.fields(wave))
     expected = 0.0
     for k in (0, 1):
-        arm = Arm(built.scene, k, MPI.COMM_SELF, do.Ledger())
+        arm = Arm(built.scene, k, MPI.COMM_SELF, do.Profile())
         x, y = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
         arm.set_design(wave(k, x, y))
         S = arm.elastic.constraint_modes().stiffness
@@ -189,7 +189,7 @@ def test_gradients_are_ones(overrides: list[str], direction) -> None:
     x, d = built.fields(wave), built.fields(direction)
     built.evaluate(x)
     slope = built.dot(built.gradient(), d)
-    rows = constraint_gradients(built.scene, built.share, built.arms)
+    rows = constraint_gradients(built.scene, built.partition, built.arms)
     assert len(rows) == 2
 
     def at(h: float):

@@ -238,7 +238,7 @@ def test_scenarios_share_what_they_can():
     ]
     counts = []
     for one, found in zip(scenes, simulate_scenarios(scenes, None)):
-        counts.append(found.ledger.counts)
+        counts.append(found.profile.counts)
         [alone] = simulate_scenarios([one], None)
         assert_close(found.evaluation, alone.evaluation)
         assert found.scene is one and found.trajectory.scene is one

@@ -63,10 +63,10 @@ def test_samples_are_scenes_by_themselves(changes, scaling, shared_tmp_path):
     figures = []
     for texts in ((), (f"{key}={value}" for key, value in changes.items())):
         other = scene(*FINE, *texts)
-        share = do.share_arms(SELF, other.cell_counts)
-        arms = do.build_arms(other, share, do.Ledger())
+        partition = do.partition_arms(SELF, other.cell_counts)
+        arms = do.build_arms(other, partition, do.Profile())
         x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-        expected, _ = do.evaluate(other, share, arms, x, do.Ledger())
+        expected, _ = do.evaluate(other, partition, arms, x, do.Profile())
         figures.append((expected.compliance, expected.max_deviation, expected.max_deviation_time))
     # Both are right to the tolerance in the coordinates; some of it is lost in their squares.
     np.testing.assert_allclose(arrays(found).T, figures, rtol=1e-5)

@@ -169,7 +169,7 @@ def test_payload(folder, capsys):
             ("initial design", {k: arm.uniform(0.5) for k, arm in result.arms.items()}),
             ("optimised design", result.x_phys),
         ):
-            evaluation, _ = do.evaluate(other, result.share, result.arms, x, do.Ledger())
+            evaluation, _ = do.evaluate(other, result.partition, result.arms, x, do.Profile())
             assert float(row[f"{label}: compliance [N m]"]) == pytest.approx(
                 evaluation.compliance, rel=4.0 * TOLERANCE
             )
@@ -204,7 +204,9 @@ def test_cross_evaluation(folder):
         design = do.optimize(scene(f"payload.mass={made}"), world=SELF)
         for j, used in enumerate((4, 8)):
             other = scene(f"payload.mass={used}")
-            found, _ = do.evaluate(other, design.share, design.arms, design.x_phys, do.Ledger())
+            found, _ = do.evaluate(
+                other, design.partition, design.arms, design.x_phys, do.Profile()
+            )
             assert values[i, j] == pytest.approx(found.compliance, rel=4.0 * TOLERANCE)
     # Those made for each scenario stand in the main table, too.
     made_for_it = [row[-2] for row in cells_of(tables[""])]

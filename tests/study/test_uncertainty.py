@@ -203,10 +203,10 @@ def test_small_scatter_is_linear(folder, given):
 
     def simulate(key, value):
         other = scene("simulation.tolerance=1e-4", "motion.horizon=2.2", f"{key}={value!r}")
-        share = do.share_arms(MPI.COMM_SELF, other.cell_counts)
-        arms = do.build_arms(other, share, do.Ledger())
+        partition = do.partition_arms(MPI.COMM_SELF, other.cell_counts)
+        arms = do.build_arms(other, partition, do.Profile())
         x = {k: arm.uniform(1.0) for k, arm in arms.items()}
-        evaluation, _ = do.evaluate(other, share, arms, x, do.Ledger())
+        evaluation, _ = do.evaluate(other, partition, arms, x, do.Profile())
         return np.array([evaluation.compliance, 1e3 * evaluation.max_deviation])
 
     parts = [
