@@ -49,7 +49,7 @@ from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
-from dolfinopt.scene.schema import GradientKind
+from dolfinopt.scene.tables.objective import GradientKind
 from dolfinopt.study.studies import Preset, study
 
 if TYPE_CHECKING:

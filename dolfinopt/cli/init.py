@@ -30,7 +30,8 @@ TEMPLATES = {
 def init(name: Path, template: str) -> None:
     from dolfinopt.output.folders import write_new
     from dolfinopt.scene.json_schema import SCHEMA_FILE, scene_schema
-    from dolfinopt.scene.schema import Refusal, check_scene_name
+    from dolfinopt.scene.schema import check_scene_name
+    from dolfinopt.scene.tables.base import Refusal
 
     path = name if name.suffix == ".toml" else name.with_name(f"{name.name}.toml")
     try:

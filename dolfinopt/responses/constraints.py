@@ -9,7 +9,7 @@ from typing import Any
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.response import constraints_of, find
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import Constraints
+from dolfinopt.scene.tables.constraints import Constraints
 
 # Relative violation up to which a constraint counts as met: MMA meets an active one to a fraction
 # of its last change.

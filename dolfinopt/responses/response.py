@@ -2,8 +2,8 @@
 
 Objective and constraints of a scene are responses: `objective.kind = "deviation"` and every key of
 [constraints] name one. To add one, write `responses/NAME.py` with a subclass of `Response` under
-`@register`, and add NAME to the literal of `objective.kind` or to the keys of [constraints] in
-scene/schema.py.
+`@register`, and add NAME to the literal of `objective.kind` in scene/tables/objective.py or to the
+keys in scene/tables/constraints.py.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dolfinopt.parallel import Partition
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
-    from dolfinopt.scene.schema import Objective
+    from dolfinopt.scene.tables.objective import Objective
 
 T = TypeVar("T")
 R = TypeVar("R", bound="type[Response]")

@@ -1,4 +1,5 @@
 """What a user asks for: scene files, their keys and limits, messages.
 
-schema: every key with type, limits, unit and meaning. load: from a TOML file to a `Scene`.
+tables: every key with type, limits, unit and meaning, a file a table. schema: the whole `Scene`.
+load: from a TOML file to a `Scene`.
 """

@@ -10,7 +10,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.paths.tables import last_instant, read_table
 from dolfinopt.paths.time_laws import Law, Limits, law_for
-from dolfinopt.scene.schema import Motion
+from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points
 SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ

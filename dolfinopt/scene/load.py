@@ -2,7 +2,7 @@
 
 `load_scene` reads a file, `scene_from_dict` plain data; both return a `Scene` or raise one
 `InputError` of one line that names file, key, value and remedy. The keys themselves stand in
-`scene_keys.py`.
+`schema.py` and `tables/`.
 """
 
 from __future__ import annotations
@@ -32,20 +32,14 @@ from dolfinopt.scene.messages import (
     model_at,
     unknown_key,
 )
-from dolfinopt.scene.schema import (
-    FILE_KEYS,
-    MAX_CELLS,
-    Arm,
-    Law,
-    Loc,
-    Motion,
-    Reduction,
-    Refusal,
-    Scene,
-    WorstBy,
-    check_scene_name,
-)
+from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.spelling import cut, input_error, shown
+from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, Arm
+from dolfinopt.scene.tables.base import Loc, Refusal
+from dolfinopt.scene.tables.interpolation import Law
+from dolfinopt.scene.tables.motion import Motion
+from dolfinopt.scene.tables.objective import WorstBy
+from dolfinopt.scene.tables.reduction import Reduction
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -316,12 +310,6 @@ def _copy_tables(data: Mapping[str, Any]) -> dict[str, Any]:
             value = [dict(item) if isinstance(item, Mapping) else item for item in value]
         tree[key] = value
     return tree
-
-
-# What an arm is, is its own; sizes and material are taken from the arm before.
-# What an arm is meshed from: an arm that states one of the first two takes none of the others.
-MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
-OWN_KEYS = ("name", "design", "rigid", "sid")
 
 
 def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:

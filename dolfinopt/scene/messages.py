@@ -11,8 +11,10 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
-from dolfinopt.scene.schema import Arm, Loc, Refusal, Scene, Table, check_arm_name, without_none
+from dolfinopt.scene.schema import Scene
 from dolfinopt.scene.spelling import cut, key_text, one_line, shown
+from dolfinopt.scene.tables.arms import Arm, check_arm_name
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, table_in, without_none
 
 
 @dataclass(frozen=True)
@@ -133,21 +135,14 @@ def model_at(loc: Loc) -> type[Table] | None:
         if isinstance(part, int):
             continue  # an arm: the model is that of the array's elements
         field = model.model_fields.get(part) if model else None
-        model = _element_model(field.annotation) if field else None
+        model = table_in(field.annotation) if field else None
     return model
-
-
-def _element_model(annotation: Any) -> type[Table] | None:
-    """Return the model a field holds, itself or as elements of an array."""
-    if get_origin(annotation) is tuple:
-        annotation = get_args(annotation)[0]
-    return annotation if isinstance(annotation, type) and issubclass(annotation, Table) else None
 
 
 def field_at(loc: Loc) -> FieldInfo:
     """Return the field at `loc`; an element of `arms` counts as a field of its own."""
     if isinstance(loc[-1], int):
-        one = _element_model(Scene.model_fields[loc[0]].annotation)
+        one = table_in(Scene.model_fields[loc[0]].annotation)
         return FieldInfo(annotation=one, description=f"one of {loc[0]}")
     model = model_at(loc[:-1])
     assert model is not None, loc
@@ -174,8 +169,8 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
         return " | ".join(_allowed_type(one, metadata) for one in args)
     if origin is Literal:
         return " | ".join(shown(value) for value in args)
-    if origin is tuple and _element_model(annotation):
-        if _element_model(annotation) is Arm:
+    if origin is tuple and table_in(annotation):
+        if table_in(annotation) is Arm:
             return "an array of tables [[arms]], at least one"
         return "an array of tables"
     if origin is tuple:
@@ -243,7 +238,7 @@ def describe_keys() -> list[KeyInfo]:
 
 def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
     for key, field in model.model_fields.items():
-        below = _element_model(field.annotation)
+        below = table_in(field.annotation)
         if below is not None:
             yield from _describe(below, f"{prefix}{key}.")
             continue

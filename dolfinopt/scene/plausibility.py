@@ -1,6 +1,6 @@
 """What is possible in a scene, but hardly meant: a sentence each, told before the run.
 
-`scene_keys.py` refuses what the arithmetic cannot do; these ranges hold every structural material
+The tables refuse what the arithmetic cannot do; these ranges hold every structural material
 and any machine, so that what lies outside is most likely a wrong unit or a slipped digit.
 """
 

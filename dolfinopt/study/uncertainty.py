@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
-from dolfinopt.scene.schema import without_none
+from dolfinopt.scene.tables.base import without_none
 from dolfinopt.study.plans import given_designs
 from dolfinopt.study.sampling import Responses, Samples, posed, respond
 from dolfinopt.study.statistics import (

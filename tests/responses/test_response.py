@@ -28,7 +28,7 @@ from dolfinopt.responses.response import (
     on_all_ranks,
 )
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import Constraints
+from dolfinopt.scene.tables.constraints import Constraints
 
 
 class Roughness(Response):

@@ -1,0 +1,238 @@
+"""`[[arms]]`."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from dolfinopt.scene.spelling import shown
+from dolfinopt.scene.tables.base import FileName, Length, Loc, Refusal, Table
+from dolfinopt.scene.tables.material import MassDensity, PoissonRatio, YoungModulus
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+CellShape = Literal["quadrilateral", "triangle"]
+MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
+CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
+MESH_FILES = (".geo", ".msh", ".step", ".stp")
+
+# What an arm is meshed from: an arm that states one of the first two takes none of the others from
+# the arm before.
+MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
+OWN_KEYS = ("name", "design", "rigid", "sid")  # never taken from the arm before
+
+
+def check_arm_name(name: str) -> str:
+    """Return `name` if it can be a file name and the key of an array in a .npz file."""
+    if not re.fullmatch(r"[A-Za-z0-9_](?:[A-Za-z0-9_ -]{0,62}[A-Za-z0-9_-])?", name):
+        raise Refusal(
+            "expected 1 to 64 letters, digits, _, - or spaces, first neither - nor space, "
+            "last no space"
+        )
+    if name.isdigit():  # "arms.1.length" would be ambiguous
+        raise Refusal("expected at least one character that is not a digit")
+    return name
+
+
+class Arm(Table):
+    """One flexible arm; a key left out in a scene is taken from the arm before."""
+
+    name: Annotated[str, AfterValidator(check_arm_name)] = Field(
+        description="unique name, used in files and messages [-]"
+    )
+    length: Length = Field(description="from joint axis to joint axis, or to the end [m]")
+    height: Length = Field(description="height in the plane of motion [m]")
+    thickness: Length = Field(description="thickness normal to the plane of motion [m]")
+    cells: tuple[CellCount, CellCount] | None = Field(
+        default=(200, 12), description="number of cells along and across a rectangular arm [-]"
+    )
+    mesh: FileName | None = Field(
+        default=None, description="geometry or mesh (.geo, .msh, .step) in place of cells [-]"
+    )
+    mesh_size: Length | None = Field(
+        default=None, description="of the cells of a .geo or .step file [m]"
+    )
+    cell_shape: CellShape | None = Field(
+        default=None, description="of the cells of a .geo or .step file [-]"
+    )
+    passive: float | None = Field(
+        default=None,
+        ge=0,
+        description="solid material kept around both interfaces; 0 leaves it to a mesh file; "
+        "default: that, or a quarter of a rectangular arm's height, at most a tenth of its "
+        "length [m]",
+    )
+    symmetric: bool = Field(
+        default=False, description="design symmetric about the arm's axis y = 0 [-]"
+    )
+    design: str | None = Field(
+        default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
+    )
+    rigid: bool = Field(
+        default=False, description="a solid bar that does not bend and is not optimised [-]"
+    )
+    sid: FileName | None = Field(
+        default=None, description="standard input data file (SID) in place of a geometry [-]"
+    )
+    young_modulus: YoungModulus | None = Field(
+        default=None, description="instead of material.young_modulus [Pa]"
+    )
+    poisson_ratio: PoissonRatio | None = Field(
+        default=None, description="instead of material.poisson_ratio [-]"
+    )
+    density: MassDensity | None = Field(
+        default=None, description="instead of material.density [kg/m3]"
+    )
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Arm:
+        stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
+        if self.rigid:
+            stated.append("rigid")
+        if len(stated) > 1:
+            raise Refusal(
+                f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
+                *((key,) for key in stated),
+            )
+        return self
+
+    @property
+    def own(self) -> bool:
+        """Whether the arm has a design of its own."""
+        return self.flexible and self.design is None
+
+    @property
+    def flexible(self) -> bool:
+        """Whether the arm is meshed and reduced here, alone or with the arm it shares with."""
+        return not self.rigid and self.sid is None
+
+    @model_validator(mode="after")
+    def _check_ends(self) -> Arm:
+        if 2.0 * self.solid_ends >= self.length:
+            raise Refusal(
+                f"expected less than half of length = {self.length} [m]", ("passive",), ("length",)
+            )
+        return self
+
+    @model_validator(mode="before")
+    @classmethod
+    def _mesh_or_cells(cls, data: Any) -> Any:
+        """Let a mesh take the place of the default of `cells`."""
+        if not isinstance(data, dict):
+            return data
+        if data.get("mesh") is not None:
+            return {"cells": None} | data
+        return {key: value for key, value in data.items() if (key, value) != ("cells", None)}
+
+    @model_validator(mode="after")
+    def _check_mesh(self) -> Arm:
+        if self.mesh is None:
+            for key in ("mesh_size", "cell_shape"):
+                if getattr(self, key) is not None:
+                    raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
+            return self
+        if self.cells is not None:
+            raise Refusal(
+                "expected either cells (a rectangular arm) or mesh (a file), not both",
+                ("mesh",),
+                ("cells",),
+            )
+        if self.mesh_size is not None and self.mesh_size > self.height:
+            raise Refusal(
+                f"expected at most height = {self.height} [m]: a cell must fit into the arm",
+                ("mesh_size",),
+                ("height",),
+            )
+        kind = Path(self.mesh).suffix.lower()
+        if kind not in MESH_FILES:
+            raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
+        for key in ("mesh_size", "cell_shape"):
+            if kind == ".msh" and getattr(self, key) is not None:
+                raise Refusal(
+                    "expected only with .geo or .step: a .msh file has its cells", (key,), ("mesh",)
+                )
+        return self
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells; of a mesh file an estimate, 0 where there is nothing to go by."""
+        if self.cells is not None:
+            return self.cells[0] * self.cells[1]
+        if self.mesh_size is None:
+            return 0
+        squares = self.length * self.height / self.mesh_size**2
+        return round(2.0 * squares if self.cell_shape == "triangle" else squares)
+
+    @property
+    def solid_ends(self) -> float:
+        """Return the length kept solid around both interfaces, m: `passive`, or its default.
+
+        The edges at the ends are rigid and the joint axes lie on them: without solid cells there
+        an optimised design may hold its joint in void. 0 for a mesh file, which has its own groups.
+        """
+        if self.passive is not None:
+            return self.passive
+        return 0.0 if self.cells is None else min(self.height / 4.0, self.length / 10.0)
+
+    @property
+    def passive_columns(self) -> int:
+        """Count the columns of cells at each end with centroids nearer to it than `solid_ends`.
+
+        0 for a mesh file, whose solid cells are known when it is read.
+        """
+        if self.cells is None:
+            return 0
+        # The expression of meshes/arm.geo, so that rounding cannot tell the two apart.
+        return math.ceil(self.solid_ends / self.length * self.cells[0] - 0.5)
+
+    @property
+    def passive_share(self) -> float:
+        """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
+        return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
+
+    @property
+    def cell_size(self) -> float | None:
+        """Longest side of a cell, m; None for a mesh file that does not depend on it."""
+        if self.cells is None:
+            return self.mesh_size
+        return max(self.length / self.cells[0], self.height / self.cells[1])
+
+    @property
+    def n_reducible(self) -> int | None:
+        """Count the dofs a reduction can keep: interior nodes, and 3 of the outboard interface.
+
+        None for a mesh file.
+        """
+        if self.cells is None:
+            return None
+        n_along, n_across = self.cells
+        return 2 * (n_along - 1) * (n_across + 1) + 3
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse a name that is taken, and values that differ from those of a shared design."""
+        before = scene.arms[: at[-1]]
+        # Some file systems do not tell capitals apart.
+        if self.name.casefold() in (arm.name.casefold() for arm in before):
+            raise Refusal("expected a name that no other arm has", (*at, "name"))
+        if self.design is None:
+            return
+        owners = {arm.name: arm for arm in before if arm.own}
+        if self.design not in owners:
+            allowed = " | ".join(map(shown, owners)) or "no arm before it has one"
+            raise Refusal(
+                f"expected the name of an earlier arm with a design of its own: {allowed}",
+                (*at, "design"),
+            )
+        for key in Arm.model_fields:
+            value = getattr(owners[self.design], key)
+            if key not in ("name", "design") and getattr(self, key) != value:
+                raise Refusal(
+                    f"expected {shown(value)} as {self.design} has, whose design it shares",
+                    (*at, key),
+                    (*at, "design"),
+                )

@@ -1,0 +1,91 @@
+"""What all tables of a scene have in common: validation, refusals, ranges of quantities."""
+
+from __future__ import annotations
+
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from dolfinopt.scene.spelling import shown
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+# Ranges far beyond what machines need, within which products and quotients of all quantities stay
+# within double precision. What is merely improbable is for `plausibility.py` to say.
+Length = Annotated[float, Field(ge=1e-6, le=1e4)]  # m
+Position = Annotated[float, Field(ge=-1e4, le=1e4)]  # m
+Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
+Frequency = Annotated[float, Field(ge=0, le=1e9)]  # Hz
+MAX_ITERATIONS = 1_000_000
+
+NAMES_FILE = "names a file"
+FileName = Annotated[str, NAMES_FILE]  # path of a file; a scene holds it absolute
+
+Loc = tuple[Any, ...]  # path of a key in the scene's data, e.g. ("arms", 0, "length")
+
+
+class Refusal(ValueError):
+    """Reject a value for a reason that needs more than one key or a sentence of its own.
+
+    `keys` are paths below the refusing model; the first one is reported, all are involved.
+    """
+
+    def __init__(self, reason: str, *keys: Loc):
+        super().__init__(reason)
+        self.reason = reason
+        self.keys = keys
+
+
+class Table(BaseModel):
+    """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Check what this table at `at` and other tables of `scene` must agree on.
+
+        Raises:
+            Refusal: they do not; its keys are paths from the scene.
+        """
+
+    def refuse_unused(self, used: bool, choice: str, *keys: str) -> None:
+        """Raise unless `keys` have their defaults, or are `used` with this value of `choice`."""
+        for key in keys:
+            default = type(self).model_fields[key].default
+            if used or getattr(self, key) == default:
+                continue
+            expected = "none" if default is None else f"{shown(default)}, the default,"
+            found = f"{type(self).__name__.lower()}.{choice} = {shown(getattr(self, choice))}"
+            raise Refusal(
+                f"expected {expected} with {found}, which does not use it", (key,), (choice,)
+            )
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _check_type(cls, value: Any, info: ValidationInfo) -> Any:
+        """Turn a TOML array into a tuple; keep 1, 1.0 and true apart where choices are listed."""
+        annotation = without_none(cls.model_fields[str(info.field_name)].annotation)
+        if get_origin(annotation) is tuple and isinstance(value, list):
+            return tuple(tuple(item) if isinstance(item, list) else item for item in value)
+        # Literal compares with ==, for which True, 1 and 1.0 are the same.
+        kinds = map(type, get_args(annotation))
+        if get_origin(annotation) is Literal and value is not None and type(value) not in kinds:
+            raise ValueError
+        return value
+
+
+def without_none(annotation: Any) -> Any:
+    """Return T for an annotation `T | None`, which stands for a key that may be left out."""
+    kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+    union = get_origin(annotation) in (Union, UnionType)  # of a Literal it is the former
+    return kinds[0] if union and len(kinds) == 1 else annotation
+
+
+def table_in(annotation: Any) -> type[Table] | None:
+    """Return the table that a field holds, itself or as elements of an array; None for a value."""
+    annotation = without_none(annotation)
+    if get_origin(annotation) is tuple:
+        annotation = get_args(annotation)[0]
+    return annotation if isinstance(annotation, type) and issubclass(annotation, Table) else None

@@ -1,0 +1,26 @@
+"""`[constraints]`."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from dolfinopt.scene.tables.base import Table
+
+
+class Constraints(Table):
+    """What a design must keep besides its volume, arm by arm."""
+
+    first_frequency: float | None = Field(
+        default=None,
+        ge=1e-6,
+        le=1e9,
+        description="least first frequency of every arm with what it carries "
+        "(objective.attached) [Hz]",
+    )
+    tip_deflection: float | None = Field(
+        default=None,
+        ge=1e-15,
+        le=1e4,
+        description="largest static deflection of every arm's outboard interface under "
+        "objective.loads [m]",
+    )

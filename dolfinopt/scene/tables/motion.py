@@ -1,0 +1,154 @@
+"""`[motion]`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from dolfinopt.scene.spelling import shown
+from dolfinopt.scene.tables.base import Duration, FileName, Length, Loc, Position, Refusal, Table
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+Path2D = Literal["arc", "line", "points", "joints"]
+TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
+Base = Literal["cart", "fixed"]
+Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
+PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
+
+
+class Motion(Table):
+    """The prescribed motion of the end-effector and the mechanism that follows it."""
+
+    path: Path2D = Field(
+        default="arc",
+        description="of the end-effector: arc, line or table of points; or a table of joint "
+        "coordinates [-]",
+    )
+    radius: Length = Field(
+        default=1.0, description="radius of the semicircle about the origin, of an arc [m]"
+    )
+    flattening: float = Field(
+        default=1.0, ge=0, le=1, description="factor of an arc's y; 0 is the straight line [-]"
+    )
+    start: tuple[Position, Position] = Field(
+        default=(-1.0, 0.0), description="where a line begins [m]"
+    )
+    end: tuple[Position, Position] = Field(default=(1.0, 0.0), description="where a line ends [m]")
+    file: FileName | None = Field(
+        default=None,
+        description="table (CSV) of points or joints, from the scene's folder or the working "
+        "directory [-]",
+    )
+    law: TimeLaw = Field(
+        default="quintic",
+        description="time law along the path; of a table with times from stop to stop [-]",
+    )
+    acceleration_share: float = Field(
+        default=0.25,
+        ge=1e-3,
+        le=0.5,
+        description='share of the time in which "trapezoidal" and "s-curve" accelerate, and as '
+        "long in which they brake, unless their last limit tells [-]",
+    )
+    max_speed: PathLimit | None = Field(
+        default=None, description="limit of the speed along the path [m/s]"
+    )
+    max_acceleration: PathLimit | None = Field(
+        default=None, description="limit of the acceleration along the path [m/s2]"
+    )
+    max_jerk: PathLimit | None = Field(
+        default=None, description='limit of the jerk along the path; not of "trapezoidal" [m/s3]'
+    )
+    duration: Duration = Field(
+        default=1.9,
+        description="time from start to end of the path; unless stated the last t of a table, or "
+        "what the limits need [s]",
+    )
+    horizon: Duration = Field(
+        default=3.0,
+        description="simulated time, the duration or more; at rest after duration; unless stated "
+        "the duration where that is longer than the default [s]",
+    )
+    base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
+    base_position: Position = Field(
+        default=0.0, description="x of the shoulder joint on a fixed base [m]"
+    )
+    cart_follow: float = Field(
+        default=0.5,
+        ge=-1e3,
+        le=1e3,
+        description="position of the cart over the desired x of the end-effector; with one arm, a "
+        "fixed base or a table of joints there is no choice [-]",
+    )
+    joint_height: Position = Field(default=-0.5, description="y of the shoulder joint [m]")
+    elbow: Literal[-1, 1] = Field(
+        default=-1,
+        description="sign of the elbow angle beta; with one arm, of its cosine with +x [-]",
+    )
+    gravity: tuple[Acceleration, Acceleration] = Field(
+        default=(0.0, 0.0), description="gravitational acceleration in x and y [m/s2]"
+    )
+
+    @model_validator(mode="after")
+    def _check_path(self) -> Motion:
+        tabulated = self.path in ("points", "joints")
+        if tabulated and self.file is None:
+            raise Refusal(
+                f'expected the path of a table (CSV) with motion.path = "{self.path}"',
+                ("file",),
+                ("path",),
+            )
+        if self.path == "line" and self.start == self.end:
+            raise Refusal("expected another point than motion.start", ("end",), ("start",))
+        self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
+        self.refuse_unused(self.path == "line", "path", "start", "end")
+        self.refuse_unused(tabulated, "path", "file")
+        self.refuse_unused(self.path != "joints", "path", "cart_follow", "elbow")
+        self._check_law()
+        self.refuse_unused(self.base == "cart", "base", "cart_follow")
+        self.refuse_unused(self.base == "fixed", "base", "base_position")
+        return self
+
+    def _check_law(self) -> None:
+        """Raise where the law does not use a limit, or the path ends behind the horizon."""
+        profile = self.law in ("trapezoidal", "s-curve")
+        self.refuse_unused(profile, "law", "acceleration_share")
+        self.refuse_unused(self.law != "trapezoidal", "law", "max_jerk")
+        limits = ("max_speed", "max_acceleration", "max_jerk")
+        self.refuse_unused(self.path != "joints", "path", *limits)
+        last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
+        share = type(self).model_fields["acceleration_share"].default
+        if profile and getattr(self, last) is not None and self.acceleration_share != share:
+            raise Refusal(
+                f"expected {shown(share)}, the default, with motion.{last}, which tells how long "
+                "the law accelerates",
+                ("acceleration_share",),
+                (last,),
+            )
+        if self.horizon < self.duration:
+            raise Refusal(
+                f"expected at least motion.duration = {self.duration:g} [s], the end of the path",
+                ("horizon",),
+                ("duration",),
+            )
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse what a single joint cannot do."""
+        if len(scene.arms) > 1 or self.path == "joints":
+            return
+        if self.base == "fixed":
+            raise Refusal(
+                f'expected "cart" with one arm and motion.path = "{self.path}": a single joint '
+                'follows no path; prescribe its angle with motion.path = "joints"',
+                ("motion", "base"),
+                ("motion", "path"),
+            )
+        if self.cart_follow != type(self).model_fields["cart_follow"].default:
+            raise Refusal(
+                "expected 0.5, the default, with one arm: its angle and the path leave the cart "
+                "no choice",
+                ("motion", "cart_follow"),
+            )

@@ -1,0 +1,141 @@
+"""`[objective]`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field, field_validator
+
+from dolfinopt.scene.tables.base import Loc, Refusal, Table
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+ObjectiveKind = Literal["esl", "compliance", "deviation", "static", "eigenfrequency"]
+GradientKind = Literal["esl", "exact"]
+Attached = Literal["rigid-body", "point-mass", "none"]
+Combination = Literal["sum", "worst"]
+WorstBy = Literal["compliance", "deviation"]
+LARGEST_LOAD = 1e9  # N, N m
+Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
+
+
+class Objective(Table):
+    """What is minimised."""
+
+    kind: ObjectiveKind = Field(
+        default="esl",
+        description="compliance of load cases or over the horizon, deviation, static "
+        "compliance, or first eigenfrequency [-]",
+    )
+    load_cases: int = Field(
+        default=30,
+        ge=1,
+        description="equal intervals of the horizon; each gives its worst instant [-]",
+    )
+    worst: WorstBy = Field(
+        default="compliance", description="what makes an instant the worst of its interval [-]"
+    )
+    gradient: GradientKind = Field(default="esl", description="with the loads frozen, or exact [-]")
+    exponent: float = Field(
+        default=20.0,
+        ge=2,
+        le=200,
+        description="p of p-means: deviation over time, squared periods over modes, worst "
+        "scenario or robust design [-]",
+    )
+    scenarios: Combination = Field(
+        default="sum", description="of the scenarios: weighted sum, or smooth worst case [-]"
+    )
+    loads: tuple[Load, ...] = Field(
+        default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        description="static load cases (F_x N, F_y N, moment N m) at each arm's outboard "
+        "interface [-]",
+    )
+    attached: Attached = Field(
+        default="rigid-body", description="what an arm carries while it vibrates [-]"
+    )
+    elbow_angle: float | None = Field(
+        default=None,
+        ge=-100,
+        le=100,
+        description="of every joint behind an arm while it vibrates; default: mid-path [rad]",
+    )
+    modes: int = Field(
+        default=3, ge=1, le=50, description="lowest modes in the p-mean of the eigenfrequency [-]"
+    )
+    follow: bool = Field(
+        default=False,
+        description="follow the initial design's first mode by MAC instead of the p-mean [-]",
+    )
+
+    @field_validator("loads")
+    @classmethod
+    def _check_loads(cls, loads: tuple[Load, ...]) -> tuple[Load, ...]:
+        if not loads or not all(any(load) for load in loads):
+            raise Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
+        sizes = [max(map(abs, load)) for load in loads]
+        if min(sizes) < 1.0 / LARGEST_LOAD or max(sizes) > LARGEST_LOAD:
+            raise Refusal(
+                f"expected loads whose largest component is between {1.0 / LARGEST_LOAD:g} and "
+                f"{LARGEST_LOAD:g} [N, N m]"
+            )
+        return loads
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the objective needs the motion."""
+        return self.kind in ("esl", "compliance", "deviation")
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse what this objective, its gradient or the scenarios cannot have."""
+        self._check_attached(scene)
+        self._check_load_cases(scene)
+        if not self.simulated:
+            if scene.scenarios:
+                raise Refusal(
+                    'expected "esl", "compliance" or "deviation" with [[scenarios]]: the others '
+                    "know no motion",
+                    ("objective", "kind"),
+                    ("scenarios", 0, "changes"),
+                )
+            return
+        if self.gradient == "exact" and scene.reduction.method == "balanced":
+            raise Refusal(
+                'expected "craig-bampton", "modal" or "krylov" with objective.gradient = "exact": '
+                "the Gramian's basis has no adjoint",
+                ("reduction", "method"),
+                ("objective", "gradient"),
+            )
+        if self.gradient == "exact" and scene.simulation.integrator != "radau":
+            raise Refusal(
+                'expected "radau" with objective.gradient = "exact": only its trajectory has an '
+                "adjoint",
+                ("simulation", "integrator"),
+                ("objective", "gradient"),
+            )
+
+    def _check_load_cases(self, scene: Scene) -> None:
+        num_samples = scene.simulation.num_samples(scene.motion.horizon)
+        if self.load_cases > num_samples:
+            raise Refusal(
+                f"expected at most {int(num_samples)}, so that each of the equal intervals of "
+                f"motion.horizon = {scene.motion.horizon} [s] holds a sample (simulation.sample = "
+                f"{scene.simulation.sample} [s])",
+                ("objective", "load_cases"),
+                ("simulation", "sample"),
+                ("motion", "horizon"),
+            )
+
+    def _check_attached(self, scene: Scene) -> None:
+        vibrates = self.kind == "eigenfrequency" or scene.constraints.first_frequency
+        if not vibrates or self.attached != "none":
+            return
+        for i in scene.cell_counts:
+            if scene.arms[i].solid_ends == 0.0:
+                raise Refusal(
+                    'expected more than 0 with objective.attached = "none": without a mass at its '
+                    "end the optimiser would cut an arm off",
+                    ("arms", i, "passive"),
+                    ("objective", "attached"),
+                )

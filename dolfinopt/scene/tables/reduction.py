@@ -1,0 +1,109 @@
+"""`[reduction]`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from dolfinopt.scene.tables.base import Frequency, Loc, Refusal, Table
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
+Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
+
+
+class Reduction(Table):
+    """Model reduction of every arm."""
+
+    method: ReductionMethod = Field(
+        default="craig-bampton", description="how the basis is made [-]"
+    )
+    coordinates: Coordinates = Field(
+        default=4,
+        description='elastic coordinates q of each arm; "auto": the fewest that meet '
+        "reduction.tolerance [-]",
+    )
+    tolerance: float = Field(
+        default=1e-3,
+        ge=1e-6,
+        le=0.5,
+        description='with "auto": relative error that too few coordinates may make, energy norm '
+        "[-]",
+    )
+    shifts: tuple[Frequency, ...] = Field(
+        default=(0.0,), description='where "krylov" matches moments [Hz]'
+    )
+    band: tuple[Frequency, Frequency] = Field(
+        default=(0.0, 50.0), description='from where to where "balanced" weights responses [Hz]'
+    )
+
+    @field_validator("shifts")
+    @classmethod
+    def _check_shifts(cls, shifts: tuple[float, ...]) -> tuple[float, ...]:
+        if not shifts or len(set(shifts)) < len(shifts):
+            raise Refusal("expected at least one number >= 0, none of them twice")
+        return shifts
+
+    @field_validator("band")
+    @classmethod
+    def _check_band(cls, band: tuple[float, float]) -> tuple[float, float]:
+        if band[0] >= band[1]:
+            raise Refusal("expected the lower of the two frequencies first")
+        return band
+
+    @model_validator(mode="after")
+    def _check_coordinates(self) -> Reduction:
+        if self.coordinates == "auto" or self.count >= self.fewest:
+            return self
+        if self.method == "craig-bampton":
+            raise Refusal(
+                'expected an integer >= 3 with reduction.method = "craig-bampton" '
+                "(its constraint modes)",
+                ("coordinates",),
+                ("method",),
+            )
+        raise Refusal(
+            f'expected an integer >= {self.fewest} with reduction.method = "krylov" '
+            "(the interface loads at each of reduction.shifts)",
+            ("coordinates",),
+            ("method",),
+            ("shifts",),
+        )
+
+    @property
+    def count(self) -> int:
+        """The stated number of coordinates; 0 with "auto"."""
+        return 0 if self.coordinates == "auto" else self.coordinates
+
+    @property
+    def fewest(self) -> int:
+        """The least number of coordinates that the method can have."""
+        return {"craig-bampton": 3, "krylov": 3 * len(self.shifts)}.get(self.method, 1)
+
+    @model_validator(mode="after")
+    def _check_unused(self) -> Reduction:
+        self.refuse_unused(self.method == "krylov", "method", "shifts")
+        self.refuse_unused(self.method == "balanced", "method", "band")
+        self.refuse_unused(self.coordinates == "auto", "coordinates", "tolerance")
+        return self
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse more coordinates than an arm has dofs, and undamped resonances in a Gramian."""
+        for i, arm in enumerate(scene.arms):
+            if arm.flexible and arm.n_reducible is not None and self.count > arm.n_reducible:
+                raise Refusal(
+                    f"expected at most {arm.n_reducible}, the degrees of freedom of "
+                    f'arm "{arm.name}" with cells = {list(arm.cells or ())}',
+                    ("reduction", "coordinates"),
+                    ("arms", i, "cells"),
+                )
+        if self.method == "balanced" and not scene.damping.stiffness_proportional:
+            raise Refusal(
+                'expected a number > 0 with reduction.method = "balanced": the Gramian of '
+                "undamped resonances is infinite",
+                ("damping", "stiffness_proportional"),
+                ("reduction", "method"),
+            )

@@ -1,0 +1,31 @@
+"""`[[scenarios]]`."""
+
+from __future__ import annotations
+
+from pydantic import Field, field_validator
+
+from dolfinopt.scene.spelling import shown
+from dolfinopt.scene.tables.base import Refusal, Table
+
+
+class Scenario(Table):
+    """Another use of the same design, which the objective counts in."""
+
+    changes: tuple[str, ...] = Field(
+        description='what differs, as "key=value" of motion, payload, damping or material [-]'
+    )
+    weight: float = Field(default=1.0, ge=1e-9, le=1e9, description="of its objective [-]")
+
+    @field_validator("changes")
+    @classmethod
+    def _check_changes(cls, changes: tuple[str, ...]) -> tuple[str, ...]:
+        for change in changes:
+            key = change.partition("=")[0].strip()
+            table = key.partition(".")[0]
+            if table not in ("motion", "payload", "damping", "material"):
+                raise Refusal(
+                    f"expected keys of motion, payload, damping or material, found {shown(key)}"
+                )
+            if key == "material.poisson_ratio":
+                raise Refusal("expected no material.poisson_ratio: it changes the arms' basis")
+        return changes
