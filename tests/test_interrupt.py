@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from dolfinopt import interrupt
 from dolfinopt.data import paper_scene
-from dolfinopt.mesh.geometry import gmsh_on_root
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
 
 # Interrupts this process when a module is first imported, or when MPI is left.
 SCRIPT = """

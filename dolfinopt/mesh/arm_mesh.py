@@ -10,7 +10,9 @@ from mpi4py import MPI
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.geometry import INBOARD, OUTBOARD, PASSIVE, build_model, gmsh_on_root, mesh_geo
+from dolfinopt.mesh.geometry import build_model
+from dolfinopt.mesh.gmsh_session import gmsh_on_root, mesh_geo
+from dolfinopt.mesh.groups import INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
 

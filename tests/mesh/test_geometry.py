@@ -10,10 +10,12 @@ from mpi4py import MPI
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.mesh import compat, geometry
+from dolfinopt.mesh import checks, compat, geometry
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.mesh.geometry import FlatMesh, _joint_curves, check_mesh, gmsh_on_root
-from dolfinopt.mesh.step import read_shapes
+from dolfinopt.mesh.checks import FlatMesh, check_mesh
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.mesh.step_model import _joint_curves
+from dolfinopt.mesh.step_names import read_shapes
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD
@@ -633,7 +635,7 @@ def horseshoe(turn):
 
 
 def check_cells(points, cells):
-    geometry._check_cells(FlatMesh(points, cells, cells[:1, :2], cells[:1, :2]))
+    checks._check_cells(FlatMesh(points, cells, cells[:1, :2], cells[:1, :2]))
 
 
 def pushed():

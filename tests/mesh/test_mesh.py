@@ -18,7 +18,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import interior_facets, structured_arm
-from dolfinopt.mesh.geometry import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.groups import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD

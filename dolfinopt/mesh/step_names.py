@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# How far vertices may be off, relative to the extent of all.
-TOLERANCE = 1e-6
+TOLERANCE = 1e-6  # distance of vertices relative to the extent of all: digits of a file
 
 _STATEMENT = re.compile(r"#(\d+)\s*=\s*([A-Z0-9_]+)\s*\(((?:'[^']*'|[^';])*)\)\s*;")
 _EDGES = ("EDGE_CURVE",)

@@ -1,0 +1,128 @@
+"""Sessions of Gmsh on the root, that leave signals, terminal and the next session alone."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from dolfinopt.parallel import together
+
+# Gmsh's numbers of straight triangles and quadrilaterals.
+TRIANGLE, QUADRILATERAL = 2, 3
+MAX_STATEMENTS = 1000  # of a .geo file that Gmsh gave up: no file of an arm has more
+
+
+@contextmanager
+def gmsh_on_root(comm: MPI.Comm) -> Iterator[Any]:
+    """Yield the module gmsh, with a session of it on rank 0 of `comm` (collective)."""
+    with together(comm), _interrupts_kept():
+        import gmsh
+
+        if comm.rank == 0:
+            _begin(gmsh)
+    failed = True
+    try:
+        yield gmsh
+        failed = False
+    finally:
+        if comm.rank == 0:
+            with _interrupts_kept():
+                gmsh.finalize()
+                if failed:
+                    _finish_reading(gmsh)
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """Keep what Ctrl-C does: Gmsh would have it kill the process without a word.
+
+    4.8 from its import, which takes 0.2 s, until a session ends, which only the root has; later
+    ones during a session.
+    """
+    change = signal.signal
+
+    def keep(number: int, handler: Any) -> Any:
+        return signal.getsignal(number) if number == signal.SIGINT else change(number, handler)
+
+    signal.signal = keep  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        signal.signal = change
+
+
+def _begin(gmsh: Any) -> None:
+    gmsh.initialize()
+    gmsh.option.setNumber("General.Terminal", 0)
+    # Parameters outlive gmsh.finalize: drop those of the mesh before.
+    gmsh.onelab.clear()
+
+
+def _finish_reading(gmsh: Any) -> None:
+    """Have Gmsh's parser come to the end of a text it gave up, a statement a session.
+
+    It would go on with the rest of it when it is asked to read the next file.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        empty = Path(folder) / "empty.geo"
+        empty.write_text("\n")
+        for _ in range(MAX_STATEMENTS):
+            _begin(gmsh)
+            try:
+                gmsh.open(str(empty))
+                return
+            except Exception:  # of the rest of the text
+                continue
+            finally:
+                gmsh.finalize()
+
+
+@contextmanager
+def silent_terminal() -> Iterator[None]:
+    """Keep off the terminal what Open CASCADE writes there itself, past Gmsh's options."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(1), os.dup(2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # what C has buffered belongs there, too
+        for target, copy in enumerate(kept, start=1):
+            os.dup2(copy, target)
+            os.close(copy)
+        os.close(nowhere)
+
+
+def mesh_geo(gmsh: Any, path: Path, parameters: Mapping[str, float]) -> None:
+    """Mesh a parametric .geo file; ONELAB `parameters` override its DefineConstant defaults."""
+    for name, value in parameters.items():
+        gmsh.onelab.setNumber(name, [float(value)])
+    gmsh.open(str(path))
+    gmsh.model.mesh.generate(2)
+
+
+def mesh_surfaces(gmsh: Any, shape: str | None) -> None:
+    """Mesh the surfaces of the open model, in cells of `shape` if one is asked for."""
+    gmsh.option.setNumber("Mesh.ElementOrder", 1)
+    gmsh.model.mesh.generate(2)
+    kinds = set(gmsh.model.mesh.getElementTypes(2))
+    if shape == "quadrilateral" and kinds - {QUADRILATERAL}:
+        gmsh.option.setNumber("Mesh.RecombineAll", 1)
+        # Blossom, then all cells divided: the only algorithm that leaves no triangle.
+        gmsh.option.setNumber("Mesh.RecombinationAlgorithm", 3)
+        gmsh.model.mesh.clear()
+        gmsh.model.mesh.generate(2)
+    elif shape == "triangle" and QUADRILATERAL in kinds:
+        gmsh.model.mesh.splitQuadrangles(2.0)  # those of less than twice the best quality: all
