@@ -28,8 +28,9 @@ from remainders import build, wave
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
 from dolfinopt.dynamics.simulation import build_mechanism
-from dolfinopt.multibody.mechanism import inverse_dynamics, linearise
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.output import run_folder as results
 from dolfinopt.parallel import gather_arms
 
@@ -225,12 +226,12 @@ def test_undamped_rows_have_no_damping_terms(damping: float) -> None:
     bodies = [replace(b, D=b.D.view(Watched)) for b in chain_of(built.scene, owned)]
     mechanism = build_mechanism(built.scene, bodies)
     t = np.linspace(0.1, 1.0, 3)
-    motion, q = rigid_motion(t, built.scene), np.full((3, mechanism.coordinates), 1e-6)
+    motion, q = rigid_motion(t, built.scene), np.full((3, mechanism.num_coordinates), 1e-6)
     before = Watched.products
     inverse_dynamics(mechanism, motion, q, q, q)
     tangent = linearise(mechanism, motion, q, q, q)
     tangent.dense()
-    tangent.times(q, q, q, np.arange(mechanism.coordinates))
+    tangent.times(q, q, q, np.arange(mechanism.num_coordinates))
     tangent.transposed(q)
     assert (Watched.products > before) == (damping > 0.0)
 

@@ -28,7 +28,7 @@ from dolfinopt.bench.whole import mpirun, run_worker
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import Substructure
-from dolfinopt.multibody.mechanism import end_effector
+from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.optimization.history import HistoryRow

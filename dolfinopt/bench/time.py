@@ -28,8 +28,10 @@ from dolfinopt.dynamics.simulation import build_mechanism
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import deviation, inverse_dynamics, tangent
+from dolfinopt.multibody.end_effector import deviation
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.profiling import Profile
 from dolfinopt.study.tables import Panel
 from dolfinopt.study.variants import reduced
@@ -124,7 +126,7 @@ def accelerations(problem: ElasticSystem, t: float, q: np.ndarray, qd: np.ndarra
     state = (q[None], qd[None], rest)
     motion = problem.motion(np.array([t]))
     rows = inverse_dynamics(problem.mechanism, motion, *state)[0][0]
-    mass = tangent(problem.mechanism, motion, *state)[0, :, 2 * len(q) :]
+    mass = linearise(problem.mechanism, motion, *state).dense()[0, :, 2 * len(q) :]
     return np.linalg.solve(mass, -rows)
 
 
@@ -134,7 +136,7 @@ def jacobian(problem: ElasticSystem, t: float, y: np.ndarray) -> np.ndarray:
     q, qd = y[:size], y[size:]
     qdd = accelerations(problem, t, q, qd)
     motion = problem.motion(np.array([t]))
-    slopes = tangent(problem.mechanism, motion, q[None], qd[None], qdd[None])[0]
+    slopes = linearise(problem.mechanism, motion, q[None], qd[None], qdd[None]).dense()[0]
     lower = np.linalg.solve(slopes[:, 2 * size :], -slopes[:, : 2 * size])
     upper = np.hstack([np.zeros((size, size)), np.eye(size)])
     return np.vstack([upper, lower])

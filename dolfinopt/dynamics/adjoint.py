@@ -34,7 +34,7 @@ from dolfinopt.dynamics.newton_matrix import (
 )
 from dolfinopt.dynamics.solution import Solution, lagrange_integrals
 from dolfinopt.dynamics.system import Linearisation
-from dolfinopt.multibody.mechanism import body_gradient
+from dolfinopt.multibody.body_gradient import body_gradient
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 # Share of the multipliers that a correction may have left: their error is a tenth of it or less.

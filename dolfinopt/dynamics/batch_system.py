@@ -11,7 +11,8 @@ from dolfinopt.dynamics.elastic_system import ElasticInstants, ElasticSystem, st
 from dolfinopt.dynamics.modal_coordinates import REFERENCES, Modes, modes_of, proportion
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import Mechanism, Scale
+from dolfinopt.multibody.instants import Scale
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, proportional, same_geometry
 

@@ -10,8 +10,10 @@ import numpy as np
 from dolfinopt.dynamics import modal_coordinates
 from dolfinopt.dynamics.system import Preconditioner, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import Mechanism, Tangent, elastic_residual, linearise
+from dolfinopt.multibody.inverse_dynamics import elastic_residual
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.tangent import Tangent, linearise
 
 MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
 ROUNDING = 1e-14  # a step below it changes nothing
@@ -63,7 +65,7 @@ class ElasticSystem:
     @property
     def num_coordinates(self) -> int:
         """Number N of elastic coordinates."""
-        return self.mechanism.coordinates
+        return self.mechanism.num_coordinates
 
     @property
     def runs(self) -> int:

@@ -12,7 +12,9 @@ from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import Mechanism, compliance, deviation, inverse_dynamics
+from dolfinopt.multibody.end_effector import deviation
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile

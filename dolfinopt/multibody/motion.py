@@ -13,6 +13,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.instants import FEW, repeated
 from dolfinopt.paths.tables import (
     TIME,
     Curve,
@@ -44,17 +45,6 @@ CART = "cart"  # first column of a table of joints
 MAX_KINKS = 20
 
 
-# Fewer instants are computed as so many. On processors with AVX-512, NumPy 1.24 multiplies complex
-# arrays of less than 64 bytes in one of two ways that round differently, and chooses by how far the
-# arrays lie from each other in memory: equal runs would end in different bits.
-FEW = 4
-
-
-def repeated(count: int) -> np.ndarray:
-    """Return indices that make `count` instants `FEW`, the last one repeated."""
-    return np.minimum(np.arange(FEW), count - 1)
-
-
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
     """Rigid coordinates q_r = (x_cart, joint angles...) at n instants, with derivatives.
@@ -74,7 +64,7 @@ class RigidMotion:
         return RigidMotion(self.q[part], self.qd[part], self.qdd[part])
 
     @cached_property
-    def swings(self) -> tuple[np.ndarray, ...]:
+    def joint_rotations(self) -> tuple[np.ndarray, ...]:
         """Return exp(i angle) (n,) of every joint."""
         return tuple(np.exp(1j * self.q[:, k]) for k in range(1, self.q.shape[1]))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.mechanism import end_effector_gradient
+from dolfinopt.multibody.end_effector import end_effector_gradient
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.p_norm import p_norm_of_lengths
 from dolfinopt.responses.response import register

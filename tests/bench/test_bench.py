@@ -21,7 +21,7 @@ from dolfinopt.dynamics.simulation import build_mechanism
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elements import LagrangeElement
-from dolfinopt.multibody.mechanism import inverse_dynamics
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.paper.reproduction import load_paper
 from dolfinopt.profiling import Profile
@@ -110,7 +110,7 @@ def test_graded_reference():
 
 
 def test_accelerations_solve_the_rows(problem):
-    size = problem.mechanism.coordinates
+    size = problem.mechanism.num_coordinates
     rng = np.random.default_rng(1)
     q, qd = 1e-3 * rng.normal(size=size), 1e-2 * rng.normal(size=size)
     qdd = times.accelerations(problem, 0.7, q, qd)
@@ -122,7 +122,7 @@ def test_accelerations_solve_the_rows(problem):
 
 def test_jacobian_is_the_slope_of_accelerations(problem):
     problem = modes_of(problem).system
-    size = problem.mechanism.coordinates
+    size = problem.mechanism.num_coordinates
     rng = np.random.default_rng(2)
     y, d = 1e-3 * rng.normal(size=2 * size), rng.normal(size=2 * size)
     exact = times.jacobian(problem, 0.7, y) @ d

@@ -25,15 +25,12 @@ from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import (
-    Mechanism,
-    Scale,
-    inverse_dynamics,
-    linearise,
-    tangent,
-)
+from dolfinopt.multibody.instants import Scale
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.paths.time_laws import quintic
 from dolfinopt.profiling import Profile
 
@@ -154,7 +151,7 @@ def test_scales_are_those_of_scaled_bodies():
         # The same sums in another order: rounding.
         np.testing.assert_allclose(rows[n], alone[0][0], rtol=1e-11, atol=1e-11)
         np.testing.assert_allclose(drives[n], alone[1][0], rtol=1e-11, atol=1e-11)
-        matrix = tangent(one, at, *here)[0]
+        matrix = linearise(one, at, *here).dense()[0]
         np.testing.assert_allclose(slopes.dense()[n], matrix, rtol=1e-11, atol=1e-11)
         moved = matrix @ np.concatenate([x[n] for x in change])
         np.testing.assert_allclose(felt[n], moved, rtol=1e-10, atol=1e-10)

@@ -25,9 +25,11 @@ from dolfinopt.dynamics.solution import Solution, lagrange_integrals
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.mechanism import Mechanism, inverse_dynamics, tangent
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.paths.time_laws import Limits, law_for, quintic
 from dolfinopt.profiling import Profile
 
@@ -439,12 +441,12 @@ def test_steps_end_at_the_breakpoints(integrator: str) -> None:
 
 def scipy_solution(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
     """Return q (n, N) from SciPy's own Radau, adaptive, of the first-order system."""
-    size = problem.mechanism.coordinates
+    size = problem.mechanism.num_coordinates
 
     def rates(instant: float, y: np.ndarray) -> np.ndarray:
         motion = problem.motion(np.array([instant]))
         q, qd, zero = y[None, :size], y[None, size:], np.zeros((1, size))
-        mass = tangent(problem.mechanism, motion, q, qd, zero)[0, :, 2 * size :]
+        mass = linearise(problem.mechanism, motion, q, qd, zero).dense()[0, :, 2 * size :]
         rows = inverse_dynamics(problem.mechanism, motion, q, qd, zero)[0]
         return np.concatenate([y[size:], -np.linalg.solve(mass, rows[0])])
 

@@ -28,7 +28,8 @@ from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.constraint_modes import MOST_ROUNDING, floats, rounding_error
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.multibody.mechanism import Mechanism, inverse_dynamics
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.reduction.basis import lowest_eigenpairs
 from dolfinopt.responses.objective import load_cases, objective
@@ -418,7 +419,7 @@ def test_motions(overrides: list[str]) -> None:
 
 def quasi_static(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
     """Return K^-1 (- rows of the undeformed mechanism) at instants t."""
-    rest = np.zeros((len(t), problem.mechanism.coordinates))
+    rest = np.zeros((len(t), problem.mechanism.num_coordinates))
     rows = inverse_dynamics(problem.mechanism, problem.motion(t), rest, rest, rest)[0]
     return -np.linalg.solve(problem.mechanism.stiffness(), rows.T).T
 
@@ -454,7 +455,7 @@ def test_vibrations_of_megahertz() -> None:
 
 def mass_matrix(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return M(q) (N, N) at one instant, from unit accelerations."""
-    N = mechanism.coordinates
+    N = mechanism.num_coordinates
     repeated = RigidMotion(
         *(np.repeat(v, N + 1, axis=0) for v in (motion.q, motion.qd, motion.qdd))
     )

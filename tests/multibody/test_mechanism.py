@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bodies import Chain, assert_close, derivative, random_cloud
 
-from dolfinopt.multibody.mechanism import (
-    Mechanism,
-    body_gradient,
-    compliance,
-    deviation,
-    elastic_residual,
-    end_effector,
-    end_effector_gradient,
-    inverse_dynamics,
-    tangent,
-)
+from dolfinopt.multibody.body_gradient import body_gradient
+from dolfinopt.multibody.end_effector import deviation, end_effector, end_effector_gradient
+from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.multibody.tangent import Tangent, linearise
 from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -66,24 +61,103 @@ def test_forces_are_those_of_lagranges_equations(rng: np.random.Generator, arms:
         assert_close(found[n], expected, DIFFERENCES)
 
 
+def split_tangent(
+    model: Chain, state: np.ndarray, keep: np.ndarray | None, rigid: np.ndarray | None
+) -> Tangent:
+    """Return the tangent at states y, yd, ydd (3, n, size)."""
+    r = model.rigid
+    motion = RigidMotion(*(x[:, :r] for x in state))
+    return linearise(model.mechanism(), motion, *(x[:, r:] for x in state), keep, rigid)
+
+
+def full_tangent(model: Chain, state: np.ndarray) -> np.ndarray:
+    """Return the derivative (n, size, 3, size) of all forces by y, yd, ydd, by differences."""
+    columns = []
+    for k in range(3):
+        for unit in np.eye(model.size):
+
+            def moved(t: float, k: int = k, unit: np.ndarray = unit) -> np.ndarray:
+                other = state.copy()
+                other[k] += t * unit
+                return forces(model, *other)
+
+            columns.append(derivative(moved))
+    return np.stack(columns, axis=2).reshape(state.shape[1], model.size, 3, model.size)
+
+
+@pytest.mark.parametrize("base", ["cart", "fixed", "prescribed", "one joint"])
 @ARMS
-def test_tangent_is_the_derivative_of_the_rows(rng: np.random.Generator, arms: int) -> None:
-    """Column by column of q, qd and qdd."""
+def test_tangent_is_the_derivative_of_the_forces(
+    rng: np.random.Generator, arms: int, base: str
+) -> None:
+    """By free rigid coordinates on a cart or a fixed base, by one of them, and by elastic ones."""
+    model = chain(rng, arms)
+    r = model.rigid
+    state = states(rng, model, 4)
+    if base == "fixed":
+        state[1:, :, 0] = 0.0
+    free = {"cart": np.arange(r), "fixed": np.arange(1, r), "one joint": np.array([r - 1])}
+    rigid = free.get(base)
+    own = np.concatenate([np.zeros(0, int) if rigid is None else rigid, np.arange(r, model.size)])
+    exact = full_tangent(model, state)[:, own][:, :, :, own]
+    found = split_tangent(model, state, None, rigid).dense()
+    assert_close(found.reshape(exact.shape), exact, DIFFERENCES)
+
+
+@ARMS
+def test_parts_of_the_tangent_are_those_of_the_dense_one(
+    rng: np.random.Generator, arms: int
+) -> None:
+    """Some columns, some rows, and products from both sides, rigid coordinates free."""
+    model = chain(rng, arms)
+    r, size = model.rigid, model.size
+    state = states(rng, model, 4)
+    rigid, every = np.arange(r), np.arange(size)
+    whole = split_tangent(model, state, None, rigid)
+    dense = whole.dense().reshape(4, size, 3, size)
+    rows = rng.normal(size=(4, size))
+    expected = np.einsum("ni,nikj->knj", rows, dense)
+    assert_close(np.stack(whole.transposed(rows)), expected, 1e-13)
+    keep = np.flatnonzero(rng.uniform(size=size - r) < 0.6)
+    columns = np.concatenate([rigid, r + keep])
+    part = split_tangent(model, state, keep, rigid)
+    assert_close(
+        part.dense().reshape(4, len(columns), 3, -1), dense[:, columns][..., columns], 1e-13
+    )
+    change = rng.normal(size=(3, 4, len(columns)))
+    wanted = every[::2]
+    expected = np.einsum("nikj,knj->ni", dense[:, wanted][..., columns], change)
+    assert_close(part.times(*change, wanted), expected, 1e-13)
+    assert_close(part.window(1, 3).dense(), part.dense()[1:3], 0.0, 1.0)
+
+
+@ARMS
+def test_gradient_of_virtual_work_of_all_forces(rng: np.random.Generator, arms: int) -> None:
+    """By the integrals of every body, multipliers on cart and joints included."""
     model = chain(rng, arms)
     mechanism, r = model.mechanism(), model.rigid
-    y, yd, ydd = states(rng, model, 4)
-    motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
-    state = np.concatenate([y[:, r:], yd[:, r:], ydd[:, r:]], axis=1)
+    state = states(rng, model, 4)
+    motion, rates = RigidMotion(*(x[:, :r] for x in state)), [x[:, r:] for x in state]
+    weights = rng.normal(size=(4, model.size))
 
-    unit = np.eye(state.shape[1])
+    def work(t: float, k: int, change: ShapeIntegrals) -> float:
+        bodies = list(mechanism.bodies)
+        names = ("mass", "w", "W", "K", "D", "outboard")
+        bodies[k] = replace(
+            bodies[k], **{n: getattr(bodies[k], n) + t * getattr(change, n) for n in names}
+        )
+        rows, drives = inverse_dynamics(replace(mechanism, bodies=tuple(bodies)), motion, *rates)
+        return float((np.concatenate([drives, rows], axis=1) * weights).sum())
 
-    def rows(t: float) -> np.ndarray:
-        moved = (np.split(state + t * e, 3, axis=1) for e in unit)
-        return np.stack([inverse_dynamics(mechanism, motion, *x)[0] for x in moved], axis=2)
-
-    found = tangent(mechanism, motion, *np.split(state, 3, axis=1))
-    expected = derivative(rows)
-    assert_close(found, expected, DIFFERENCES)
+    gradient = body_gradient(mechanism, motion, *rates, weights[:, r:], weights[:, :r])
+    for k in range(arms):
+        change = random_cloud(rng, COORDINATES[k]).body()
+        expected = derivative(lambda t, k=k, change=change: work(t, k, change))
+        found = sum(
+            np.sum(getattr(gradient[k], n) * getattr(change, n))
+            for n in ("mass", "w", "W", "K", "D", "outboard")
+        )
+        assert_close(found, expected, DIFFERENCES, np.abs(weights).sum())
 
 
 @ARMS
@@ -102,7 +176,9 @@ def test_mass_matrix_is_that_of_the_points(rng: np.random.Generator, arms: int) 
     assert np.linalg.eigvalsh(mass).min() > 0.0
     motion = RigidMotion(*(x[None, : model.rigid] for x in (y, yd, yd)))
     elastic = (x[None, model.rigid :] for x in (y, yd, yd))
-    by_qdd = tangent(model.mechanism(), motion, *elastic)[0, :, -(model.size - model.rigid) :]
+    by_qdd = linearise(model.mechanism(), motion, *elastic).dense()[
+        0, :, -(model.size - model.rigid) :
+    ]
     part = mass[model.rigid :, model.rigid :]
     assert_close(by_qdd, part, 1e-13)
 
@@ -195,14 +271,14 @@ def test_instants_do_not_feel_one_another(rng: np.random.Generator, arms: int) -
     y, yd, ydd = states(rng, model, 5)
     together = forces(model, y, yd, ydd)
     motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
-    slopes = tangent(mechanism, motion, y[:, r:], yd[:, r:], ydd[:, r:])
+    slopes = linearise(mechanism, motion, y[:, r:], yd[:, r:], ydd[:, r:]).dense()
     for n in range(5):
         part = slice(n, n + 1)
         one = forces(model, y[part], yd[part], ydd[part])
         # Matrix products of other shapes sum in another order.
         assert_close(one[0], together[n], 1e-14, np.abs(together).max())
         motion = RigidMotion(y[part, :r], yd[part, :r], ydd[part, :r])
-        slope = tangent(mechanism, motion, y[part, r:], yd[part, r:], ydd[part, r:])
+        slope = linearise(mechanism, motion, y[part, r:], yd[part, r:], ydd[part, r:]).dense()
         assert_close(slope[0], slopes[n], 1e-14, np.abs(slopes).max())
 
 
@@ -225,7 +301,7 @@ def test_compliance_is_twice_the_elastic_energy(rng: np.random.Generator) -> Non
     """Arm by arm, from the block-diagonal stiffness."""
     model = chain(rng, 3)
     mechanism = model.mechanism()
-    q = rng.normal(size=(4, mechanism.coordinates))
+    q = rng.normal(size=(4, mechanism.num_coordinates))
     found = compliance(mechanism.bodies, mechanism.slices, q)
     assert found.shape == (4, 3)
     total = np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q)
@@ -265,7 +341,7 @@ def test_few_instants_do_not_depend_on_memory(rng: np.random.Generator, count: i
         arrays = [
             *inverse_dynamics(mechanism, motion, q, qd, qdd),
             elastic_residual(mechanism, motion, q, qd, qdd),
-            tangent(mechanism, motion, q, qd, qdd),
+            linearise(mechanism, motion, q, qd, qdd).dense(),
             end_effector(mechanism, motion, q),
             *(value for one in slopes for value in (one.w, one.W, one.K, one.outboard)),
             *(by_q, *by_outboard),
@@ -285,7 +361,7 @@ def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) ->
     rates, weights = (y[:, r:], yd[:, r:], ydd[:, r:]), rng.normal(size=(8, 2))
     first = slice(count)
     few = tuple(x[first] for x in rates)
-    for function in (inverse_dynamics, elastic_residual, tangent):
+    for function in (inverse_dynamics, elastic_residual, lambda *x: linearise(*x).dense()):
         whole, part = function(mechanism, many, *rates), function(mechanism, many[first], *few)
         if not isinstance(whole, tuple):
             whole, part = (whole,), (part,)

@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.mechanism import inverse_dynamics
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import (
     MAX_KINKS,
     Bend,
@@ -624,7 +624,7 @@ def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
         chain = Chain(clouds, 2.0, 0.1, (gravity[0], gravity[1]), of.motion.joint_height)
         rows = zip(rigid.q, rigid.qd, rigid.qdd, strict=True)
         expected = np.array([chain.forces(*row) for row in rows])
-        still = np.zeros((len(rigid.q), trajectory.mechanism.coordinates))
+        still = np.zeros((len(rigid.q), trajectory.mechanism.num_coordinates))
         found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
         assert_close(found, expected, 1e-10)  # differences of a function of size ten
         # The arms bend by some thousandths of their length, and a vibration of 8 % goes on.

@@ -13,7 +13,8 @@ from dolfinopt.exchange.sid import Taylor, read_sid, read_sid_npz, write_sid, wr
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.multibody.mechanism import Mechanism, inverse_dynamics
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, shape_integrals
 from dolfinopt.multibody.standard_input import (

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
 
-from dolfinopt.multibody.mechanism import Mechanism, end_effector
+from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow

@@ -12,7 +12,7 @@ from remainders import SCENE, build, rates, tip, uneven, wave
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm, chain_of
-from dolfinopt.multibody.mechanism import deviation
+from dolfinopt.multibody.end_effector import deviation
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.responses.evaluation import constraint_gradients, evaluate, evaluate_batch

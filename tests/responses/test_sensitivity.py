@@ -26,13 +26,10 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.mechanism import (
-    Mechanism,
-    body_gradient,
-    end_effector,
-    end_effector_gradient,
-    inverse_dynamics,
-)
+from dolfinopt.multibody.body_gradient import body_gradient
+from dolfinopt.multibody.end_effector import end_effector, end_effector_gradient
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion, check_motion
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, scaled
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
@@ -71,7 +68,7 @@ def random_instants(
 ) -> tuple[RigidMotion, np.ndarray]:
     """Return a motion and q, qd, qdd, multipliers (4, count, N)."""
     rigid = rng.normal(scale=0.7, size=(3, count, 1 + len(model.bodies)))
-    return RigidMotion(*rigid), rng.normal(scale=0.7, size=(4, count, model.coordinates))
+    return RigidMotion(*rigid), rng.normal(scale=0.7, size=(4, count, model.num_coordinates))
 
 
 def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
@@ -177,7 +174,7 @@ def test_trajectory_slopes(
     problem = ElasticSystem(chain.mechanism(), swing(arms), (0.0, 0.1, 0.25))
     edges = even_steps(problem, 15)
     t = np.linspace(0.0, 0.25, 18)
-    weights = rng.uniform(0.5, 1.5, size=(len(t), problem.mechanism.coordinates))
+    weights = rng.uniform(0.5, 1.5, size=(len(t), problem.mechanism.num_coordinates))
 
     base = radau.on_grid(problem, edges, 1e-12, stages)
 

@@ -1,0 +1,78 @@
+"""Where the end-effector is, how far off the equivalent rigid machine's, and derivatives of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dolfinopt.multibody.instants import FEW, several
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+
+
+def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
+    if 0 < len(q) < FEW:
+        return end_effector(*several(mechanism, motion, q))[: len(q)]
+    place = motion.q[:, 0] + 1j * mechanism.joint_height
+    joint_rotation = np.ones(len(q), dtype=complex)
+    for k, (part, constants) in enumerate(
+        zip(mechanism.slices, mechanism.modal_constants, strict=True)
+    ):
+        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
+        place = place + joint_rotation * (constants.outboard_position + q[:, part] @ constants.B)
+        joint_rotation = joint_rotation * np.exp(1j * (q[:, part] @ constants.rotation))
+    return np.stack([place.real, place.imag], axis=1)
+
+
+def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the flexible minus the equivalent rigid end-effector (n, 2), m.
+
+    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
+    """
+    rigid = end_effector(mechanism, motion, np.zeros_like(q))
+    return end_effector(mechanism, motion, q) - rigid
+
+
+def end_effector_gradient(
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the gradient of sum_n weights_n . end_effector_n.
+
+    Args:
+        mechanism, motion, q: as for `end_effector`, n instants.
+        weights: (n, 2).
+
+    Returns:
+        By q (n, N), and by every body's outboard modes (3, q).
+    """
+    if 0 < len(q) < FEW:
+        few = several(mechanism, motion, q, weights)
+        few[-1][len(q) :] = 0.0
+        by_q, by_bodies = end_effector_gradient(*few)
+        return by_q[: len(q)], by_bodies
+    w = weights[:, 0] + 1j * weights[:, 1]
+    rotations, levers = [], []
+    joint_rotation = np.ones(len(q), dtype=complex)
+    for k, (part, constants) in enumerate(
+        zip(mechanism.slices, mechanism.modal_constants, strict=True)
+    ):
+        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
+        rotations.append(joint_rotation)
+        levers.append(joint_rotation * (constants.outboard_position + q[:, part] @ constants.B))
+        joint_rotation = joint_rotation * np.exp(1j * (q[:, part] @ constants.rotation))
+    by_q = np.empty_like(q)
+    by_outboard: list[np.ndarray] = []
+    beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
+    for k in reversed(range(len(rotations))):
+        part, constants = mechanism.slices[k], mechanism.modal_constants[k]
+        place = np.conj(rotations[k]) * w
+        rotation = (np.conj(w) * 1j * beyond).real
+        by_q[:, part] = (
+            np.outer(place.real, constants.B.real)
+            + np.outer(place.imag, constants.B.imag)
+            + np.outer(rotation, constants.rotation)
+        )
+        rows = [weight @ q[:, part] for weight in (place.real, place.imag, rotation)]
+        by_outboard.insert(0, np.stack(rows))
+        beyond = beyond + levers[k]
+    return by_q, by_outboard

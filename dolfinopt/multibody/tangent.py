@@ -1,0 +1,399 @@
+"""Tangent of inverse dynamics: derivative of drive forces and elastic residual by coordinates.
+
+Both passes of `inverse_dynamics` are differentiated. Columns are made of the coordinates that are
+asked for alone: with prescribed rigid coordinates no array knows of them. A body feels those
+inboard of it through the four numbers (a_x, a_y, w, wd) of its frame, and those outboard of it
+through force and moment: its rows are a block of its own coordinates and a rank of seven.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from dolfinopt.multibody.instants import FEW, PerInstant, Scale, as_column, several
+from dolfinopt.multibody.inverse_dynamics import Frame, Rates, body_force, inertia, outward_pass
+from dolfinopt.multibody.mechanism import Mechanism, ModalConstants
+from dolfinopt.multibody.motion import RigidMotion
+
+_FrameDerivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # of (a, w, wd), each (n, 3 S)
+_Columns = tuple[slice, slice, slice]  # of q, qd, qdd among the 3 S
+
+
+@dataclass(frozen=True, eq=False)
+class _BodyTangent:
+    """Derivative of one body's elastic residual by S coordinates; arrays over n instants.
+
+    r' = K q' + D qd' + M (qdd' - w^2 q') + G (wd q' + 2 w qd') + left (right y') with
+    y = [q, qd, qdd] of all S coordinates.
+
+    Attributes:
+        constants: its constants.
+        rows, columns: its place among all rows and among the S columns.
+        kept: those of its coordinates that have a column.
+        w, wd: of its frame.
+        scale: of its constants; not of left and right.
+        left: (n, q, r).
+        right: (n, r, 3 S).
+    """
+
+    constants: ModalConstants
+    rows: slice
+    columns: slice
+    kept: np.ndarray
+    w: np.ndarray
+    wd: np.ndarray
+    scale: Scale
+    left: np.ndarray
+    right: np.ndarray
+
+    @property
+    def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return K, D, M, G (q, q)."""
+        body = self.constants.body
+        return body.K, body.D, body.M, body.G
+
+    def at(self, part: slice) -> _BodyTangent:
+        """Return it at some of the instants."""
+        names = ("w", "wd", "scale", "left", "right")
+        return replace(self, **{name: getattr(self, name)[part] for name in names})
+
+    def factors(self, times: int = 1) -> tuple[PerInstant, ...]:
+        """Return what K and M, by q; D and G, by qd; M, by qdd, are multiplied by, as columns.
+
+        (k, m_q, g_q, d, g_v, m): of K and M and G by q, of D and G by qd, of M by qdd.
+
+        Args:
+            times: how often every instant is repeated.
+        """
+        w, wd = np.repeat(self.w, times)[:, None], np.repeat(self.wd, times)[:, None]
+        m, k, d = (
+            as_column(np.repeat(x, times) if isinstance(x, np.ndarray) else x)
+            for x in (self.scale.mass, self.scale.stiffness, self.scale.damping)
+        )
+        return k, -m * w * w, m * wd, d, 2.0 * m * w, m
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """Derivative of the rows [drive forces asked for (R), elastic residual (N)] by S coordinates.
+
+    The S coordinates are the R rigid ones, then those elastic ones that are kept; n instants.
+
+    Attributes:
+        bodies: from the cart outwards.
+        size: S.
+        drives: (n, R, 3 S) of the forces of the rigid coordinates, columns ordered q, qd, qdd.
+    """
+
+    bodies: tuple[_BodyTangent, ...]
+    size: int
+    drives: np.ndarray
+
+    def window(self, first: int, last: int) -> Tangent:
+        """Return the instants first..last - 1."""
+        part = slice(first, last)
+        return replace(
+            self, bodies=tuple(b.at(part) for b in self.bodies), drives=self.drives[part]
+        )
+
+    def dense(self) -> np.ndarray:
+        """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
+        size = self.size
+        jacobian = np.empty((len(self.drives), size, 3 * size))
+        jacobian[:, : self.drives.shape[1]] = self.drives
+        for part in self.bodies:
+            rows = jacobian[:, part.columns]
+            rows[:] = part.left[:, part.kept] @ part.right
+            k, m_q, g_q, d, g_v, m = (
+                x[:, None] if isinstance(x, np.ndarray) else x for x in part.factors()
+            )
+            own = np.ix_(part.kept, part.kept)
+            K, D, M, G = (x[own] for x in part.matrices)
+            columns = _columns(part.columns, size)
+            rows[:, :, columns[0]] += k * K + m_q * M + g_q * G
+            rows[:, :, columns[1]] += g_v * G
+            if part.constants.D is not None:
+                rows[:, :, columns[1]] += d * D
+            rows[:, :, columns[2]] += m * M
+        return jacobian
+
+    def times(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of W wanted rows (m, W) by one of the S coordinates, each (m, S).
+
+        With m a multiple of the n instants, each of them stands for as many rows in turn.
+
+        Args:
+            q, qd, qdd: (m, S).
+            wanted: (W,) ascending, of the R + N rows.
+        """
+        count, rigid = self.drives.shape[:2]
+        times = len(q) // count
+        change = np.concatenate([q, qd, qdd], axis=1).reshape(count, times, -1).swapaxes(1, 2)
+        out = []
+        if rigid:
+            rows = self.drives[:, wanted[wanted < rigid]]
+            out.append((rows @ change).swapaxes(1, 2).reshape(len(q), -1))
+        for part in self.bodies:
+            own = wanted[(wanted >= part.rows.start) & (wanted < part.rows.stop)] - part.rows.start
+            K, D, M, G = (x[np.ix_(own, part.kept)].T for x in part.matrices)
+            k, m_q, g_q, d, g_v, m = part.factors(times)
+            e, ed, edd = q[:, part.columns], qd[:, part.columns], qdd[:, part.columns]
+            coupled = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
+            coupled += (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
+            if K.any():  # not of the rows of other coordinates that vibrate by themselves
+                coupled += (k * e) @ K
+            if D.any():
+                coupled += (d * ed) @ D
+            out.append(coupled)
+        return np.concatenate(out, axis=1)
+
+    def transposed(self, rows: np.ndarray) -> Rates:
+        """Return the gradient of sum_n rows_n . [drives, residual]_n by q, qd, qdd, each (n, S).
+
+        Args:
+            rows: (n, R + N).
+        """
+        size, rigid = self.size, self.drives.shape[1]
+        gradient = np.zeros((len(rows), 3 * size))
+        if rigid:
+            gradient += (rows[:, None, :rigid] @ self.drives)[:, 0]
+        for part in self.bodies:
+            y = rows[:, part.rows]
+            gradient += ((y[:, None] @ part.left) @ part.right)[:, 0]
+        by_q, by_v, by_a = gradient[:, :size], gradient[:, size : 2 * size], gradient[:, 2 * size :]
+        for part in self.bodies:
+            y = rows[:, part.rows]
+            body = part.constants.body
+            K, M, G = (y @ x[:, part.kept] for x in (body.K, body.M, body.G))
+            k, m_q, g_q, d, g_v, m = part.factors()
+            by_q[:, part.columns] += k * K + m_q * M + g_q * G
+            by_v[:, part.columns] += g_v * G
+            if part.constants.D is not None:
+                by_v[:, part.columns] += d * (y @ body.D[:, part.kept])
+            by_a[:, part.columns] += m * M
+        return by_q, by_v, by_a
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the coordinates asked for stand among the S columns.
+
+    Attributes:
+        size: S.
+        rigid: (R,) indices of the rigid coordinates asked for, ascending.
+        kept: of every body, those of its coordinates that have a column.
+        bodies: of every body, their place among the S.
+    """
+
+    size: int
+    rigid: np.ndarray
+    kept: list[np.ndarray]
+    bodies: list[slice]
+
+    def of_body(self, k: int) -> _Columns:
+        """Return a body's columns in [q, qd, qdd]."""
+        return _columns(self.bodies[k], self.size)
+
+    def of_rigid(self, i: int) -> _Columns | None:
+        """Return the column of a rigid coordinate (0 the cart, k + 1 the joint of body k), if any.
+
+        As slices of one: they fit wherever a body's do.
+        """
+        place = np.flatnonzero(self.rigid == i)
+        return _columns(slice(place[0], place[0] + 1), self.size) if len(place) else None
+
+
+def _columns(part: slice, size: int) -> _Columns:
+    a, b = part.start, part.stop
+    return slice(a, b), slice(size + a, size + b), slice(2 * size + a, 2 * size + b)
+
+
+def _places(mechanism: Mechanism, keep: np.ndarray | None, rigid: np.ndarray | None) -> _Places:
+    rigid = np.zeros(0, dtype=int) if rigid is None else rigid
+    keep = np.arange(mechanism.num_coordinates) if keep is None else keep
+    ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
+    parts = zip(pairwise(ends), mechanism.slices, strict=True)
+    kept = [keep[a:b] - part.start for (a, b), part in parts]
+    bodies = [slice(a, b) for a, b in pairwise(ends + len(rigid))]
+    return _Places(len(rigid) + len(keep), rigid, kept, bodies)
+
+
+def linearise(
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    keep: np.ndarray | None = None,
+    rigid: np.ndarray | None = None,
+) -> Tangent:
+    """Return the derivative of `inverse_dynamics` by the coordinates asked for and their rates.
+
+    Args:
+        mechanism, motion, q, qd, qdd: as for `inverse_dynamics`; n instants.
+        keep: ascending elastic coordinates by which to differentiate; all by default.
+        rigid: ascending rigid coordinates (R,), 0 the cart, that have columns and whose forces
+            have rows; none by default.
+    """
+    if 0 < len(q) < FEW:
+        few, at, *rates = several(mechanism, motion, q, qd, qdd)
+        return linearise(few, at, rates[0], rates[1], rates[2], keep, rigid).window(0, len(q))
+    frames, tip = outward_pass(mechanism, motion, q, qd, qdd)
+    places = _places(mechanism, keep, rigid)
+    motions = _outward_derivatives(frames, motion, places)
+    tip_v, _, rotation_v = motions[-1]
+    force, force_v = mechanism.payload_mass * tip[0], as_column(mechanism.payload_mass) * tip_v
+    moment_v = as_column(mechanism.payload_inertia) * rotation_v
+    bodies: list[_BodyTangent] = []
+    drives = np.empty((len(q), len(places.rigid), 3 * places.size))
+    for k in reversed(range(len(frames))):
+        part, scale = mechanism.slices[k], mechanism.scale(k)
+        frame, chosen = frames[k], places.kept[k]
+        rates = (q[:, part], qd[:, part], qdd[:, part])
+        force = frame.joint_rotation * force
+        force_v = frame.joint_rotation[:, None] * force_v
+        for columns, rotation in _rotating(frame, k, places):
+            force_v[:, columns[0]] += 1j * force[:, None] * rotation
+        moves = k > 0 or len(places.rigid) > 0
+        load = (force_v, moment_v)
+        left, right = _coupling(frame, motions[k], rates[1], load, scale.mass, moves)
+        rows = slice(len(places.rigid) + part.start, len(places.rigid) + part.stop)
+        own = (frame.constants, rows, places.bodies[k], chosen, frame.w, frame.wd, scale)
+        bodies.insert(0, _BodyTangent(*own, left, right))
+        if not moves:
+            break
+        columns = places.of_body(k)
+        moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
+        moment_v[:, columns[0]] += (np.conj(frame.constants.B[chosen]) * force[:, None]).imag
+        force_b, moment_b = _body_load(frame, motions[k], columns, chosen, rates)
+        mass = as_column(scale.mass)
+        force_v, moment_v = force_v + mass * force_b, moment_v + mass * moment_b
+        force = force + scale.mass * body_force(frame)
+        drives[:, places.rigid == k + 1] = moment_v[:, None]
+    if 0 in places.rigid:
+        drives[:, 0] = _cart_force(motion, force, force_v, places)
+    return Tangent(tuple(bodies), places.size, drives)
+
+
+def _rotating(frame: Frame, k: int, places: _Places) -> list[tuple[_Columns, np.ndarray | float]]:
+    """Return the columns that rotate the next frame against body k's, and by how much each.
+
+    They are the body's own, by its outboard rotation, and the joint behind it.
+    """
+    found: list[tuple[_Columns, np.ndarray | float]] = [
+        (places.of_body(k), frame.constants.rotation[places.kept[k]])
+    ]
+    joint = places.of_rigid(k + 2)
+    return found if joint is None else [*found, (joint, 1.0)]
+
+
+def _cart_force(
+    motion: RigidMotion, force: np.ndarray, force_v: np.ndarray, places: _Places
+) -> np.ndarray:
+    """Return the derivative (n, 3 S) of the cart's force Re(exp(i angle) F)."""
+    rotation = motion.joint_rotations[0]
+    out = (rotation[:, None] * force_v).real
+    joint = places.of_rigid(1)
+    if joint is not None:
+        out[:, joint[0]] += (1j * rotation * force).real[:, None]
+    return out
+
+
+def _outward_derivatives(
+    frames: list[Frame], motion: RigidMotion, places: _Places
+) -> list[_FrameDerivatives]:
+    """Return the derivatives of every frame's (a, w, wd), and of the payload's."""
+    count, width = len(frames[0].w), 3 * places.size
+    a_v, w_v, wd_v = np.zeros((count, width), dtype=complex), *np.zeros((2, count, width))
+    cart, joint = places.of_rigid(0), places.of_rigid(1)
+    if cart is not None:
+        a_v[:, cart[2]] = np.conj(motion.joint_rotations[0])[:, None]
+    if joint is not None:
+        a_v[:, joint[0]] = -1j * frames[0].a[:, None]
+        w_v[:, joint[1]], wd_v[:, joint[2]] = 1.0, 1.0
+    motions: list[_FrameDerivatives] = [(a_v, w_v, wd_v)]
+    for k, frame in enumerate(frames):
+        motions.append(_next_motion(frame, k, places, motions[-1]))
+    return motions
+
+
+def _next_motion(
+    frame: Frame, k: int, places: _Places, motion: _FrameDerivatives
+) -> _FrameDerivatives:
+    """Return the derivatives of (a, w, wd) of the frame behind body k."""
+    a_v, w_v, wd_v = motion
+    cq, cv, ca = places.of_body(k)
+    B = frame.constants.B[places.kept[k]]
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    d, dd = frame.d[:, None], frame.dd[:, None]
+    inner = a_v + 1j * d * wd_v + (2j * dd - 2.0 * w * d) * w_v
+    inner[:, cq] += (1j * wd - w * w) * B
+    inner[:, cv] += 2j * w * B
+    inner[:, ca] += B
+    next_a = frame.a + (1j * frame.wd - frame.w**2) * frame.d + 2j * frame.w * frame.dd + frame.ddd
+    w_v, wd_v = w_v.copy(), wd_v.copy()
+    for (rq, rv, ra), rotation in _rotating(frame, k, places):
+        inner[:, rq] -= 1j * next_a[:, None] * rotation
+        w_v[:, rv] += rotation
+        wd_v[:, ra] += rotation
+    return np.conj(frame.joint_rotation)[:, None] * inner, w_v, wd_v
+
+
+def _coupling(
+    frame: Frame,
+    motion: _FrameDerivatives,
+    ed: np.ndarray,
+    load: tuple[np.ndarray, np.ndarray],
+    mass: PerInstant,
+    moves: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
+    force_v, moment_v = load
+    constants = frame.constants
+    by = [constants.B.real, constants.B.imag, constants.rotation]
+    coupled = [force_v.real, force_v.imag, moment_v]
+    if moves:
+        a_v, w_v, wd_v = motion
+        by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ constants.body.G)
+        by += [constants.C.real, constants.C.imag, by_w, frame.rG]
+        coupled += [as_column(mass) * x for x in (a_v.real, a_v.imag, w_v, wd_v)]
+    left = np.empty((*ed.shape, len(by)))
+    for i, column in enumerate(by):
+        left[:, :, i] = column
+    return left, np.stack(coupled, axis=1)
+
+
+def _body_load(
+    frame: Frame,
+    motion: _FrameDerivatives,
+    columns: _Columns,
+    chosen: np.ndarray,
+    rates: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (n, 3 S) of one body's own force F and moment T."""
+    body, C = frame.constants.body, frame.constants.C[chosen]
+    _, ed, edd = rates
+    a_v, w_v, wd_v = motion
+    cq, cv, ca = columns
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    s, sd = frame.s[:, None], frame.sd[:, None]
+    force = body.mass * a_v + 1j * s * wd_v + (2j * sd - 2.0 * w * s) * w_v
+    force[:, cq] += (1j * wd - w * w) * C
+    force[:, cv] += 2j * w * C
+    force[:, ca] += C
+    spin = 2.0 * np.einsum("nk,nk->n", frame.jM, ed)[:, None]
+    moment = (np.conj(s) * a_v).imag + inertia(frame)[:, None] * wd_v + spin * w_v
+    moment[:, cq] += (
+        (np.conj(C) * frame.a[:, None]).imag
+        + 2.0 * wd * frame.jM[:, chosen]
+        + 2.0 * w * (ed @ body.M[:, chosen])
+        + edd @ body.G[:, chosen]  # (G q) . qdd = qdd' G q
+    )
+    moment[:, cv] += 2.0 * w * frame.jM[:, chosen]
+    moment[:, ca] += frame.rG[:, chosen]
+    return force, moment
