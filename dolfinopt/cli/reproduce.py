@@ -36,27 +36,29 @@ def reproduce(
     """
     world = start()
     from dolfinopt.output.summary import filter_warnings
-    from dolfinopt.paper.checks import failed_checks
     from dolfinopt.paper.page import write_reproduction
-    from dolfinopt.paper.reproduction import Plan, cell_sizes, load_paper
+    from dolfinopt.paper.reproduction import Plan, cell_sizes, load_paper, setting_of
     from dolfinopt.paper.reproduction import reproduce as run
+    from dolfinopt.paper.statements import check_paper, failed_checks
     from dolfinopt.parallel import on_root
 
     folder = out or Path("results") / "paper"
     scene = on_root(world, load_paper, coarse, overrides)
     if world.rank == 0:
         warn(filter_warnings(scene, cell_sizes(scene)))
-    done = run(Plan(scene), folder, world)
+    plan = Plan(scene)
+    results, outcomes = run(plan, folder, world)
+    checks = check_paper(results, setting_of(scene))
 
     def conclude() -> None:
-        write_reproduction(done, folder, plots=plots)
-        for check in done.checks:
+        write_reproduction(plan, results, outcomes, checks, folder, plots=plots)
+        for check in checks:
             click.echo(f"{check.name} (paper: {check.paper}). {check.sentence}")
         page = " and report.html" if plots else ""
-        click.echo(f"{done.outcomes.computed} cases computed; figures{page} in {folder}")
+        click.echo(f"{outcomes.computed} cases computed; figures{page} in {folder}")
 
     on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
-    failures = [f"{o.case.label}: {o.failure}" for o in done.outcomes.failures]
-    wrong = [*failures, *(failed_checks(done.checks) if check else ())]
+    failures = [f"{o.case.label}: {o.failure}" for o in outcomes.failures]
+    wrong = [*failures, *(failed_checks(checks) if check else ())]
     if wrong:
         raise ConvergenceError("; ".join(wrong))

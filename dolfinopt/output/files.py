@@ -234,6 +234,23 @@ def gather_views(
         return []
 
 
+def read_views(scene: Scene, path: Path) -> list[ArmView]:
+    """Return the arms of a design file, on this rank alone.
+
+    Raises:
+        InputError: the file cannot be read, or does not fit the scene's arms.
+    """
+    from mpi4py import MPI
+
+    from dolfinopt.arms.arm import build_arms
+    from dolfinopt.parallel import partition_arms
+    from dolfinopt.profiling import Profile
+
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, partition, Profile())
+    return gather_views(scene, partition, arms, read_design(path, partition, arms))
+
+
 def _views(
     scene: Scene,
     corners: Mapping[int, np.ndarray],

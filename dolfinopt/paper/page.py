@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,35 +15,55 @@ import numpy as np
 import pandas as pd
 
 from dolfinopt.data import page_folder
-from dolfinopt.paper.checks import Ends, Measured, ValueSweep, mm, percent
-from dolfinopt.paper.reproduction import INITIAL, OPTIMUM, Numbered, Reproduction, cell_sizes
-from dolfinopt.study.tables import DesignFigure, LineFigure, Table, as_text
+from dolfinopt.paper.figures import LABELS, Numbered, all_figures
+from dolfinopt.paper.reproduction import (
+    INITIAL,
+    OPTIMUM,
+    SWEEPS,
+    Plan,
+    as_json,
+    cell_sizes,
+    load_paper,
+    loss,
+    setting_of,
+)
+from dolfinopt.paper.statements import Check, mm, percent
+from dolfinopt.study.tables import DesignFigure, LineFigure, as_text
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.output.files import ArmView
     from dolfinopt.scene.load import Scene
-    from dolfinopt.study.store import Case, Outcome
+    from dolfinopt.study.store import Case, Outcomes
 
 WIDTH = 900  # px of a picture of the longest arm
 FRAMES = 121  # of the animation
 SLOWER = 2.0  # than the motion itself
-# Headings of the page and the paper's figures that belong under each.
+# Headings of the page, the paper's figures that belong under each, and whose designs are shown.
 SECTIONS = (
-    ("What the arms are made stiff for", (3, 4)),
-    ("How the arms are reduced", (5, 6)),
-    ("How many coordinates it takes", (7, 8)),
-    ("Designs made with modes", (9,)),
-    ("Another payload", (10, 11)),
-    ("Another path", (12, 13, 14, 15)),
+    ("What the arms are made stiff for", (3, 4), "objectives"),
+    ("How the arms are reduced", (5, 6), "reductions"),
+    ("How many coordinates it takes", (7, 8), ""),
+    ("Designs made with modes", (9,), ""),
+    ("Another payload", (10, 11), "payload"),
+    ("Another path", (12, 13, 14, 15), "path"),
 )
 
 
-def write_reproduction(done: Reproduction, folder: Path, *, plots: bool = True) -> None:
+def write_reproduction(
+    plan: Plan,
+    results: pd.DataFrame,
+    outcomes: Outcomes,
+    checks: Sequence[Check],
+    folder: Path,
+    *,
+    plots: bool = True,
+) -> None:
     """Write figNN.csv and .png, measured.json and report.html into the folder (root only).
 
     Args:
-        done: what was reproduced.
+        plan, results, outcomes: see `reproduction.reproduce`.
+        checks: of the results.
         folder: exists.
         plots: False leaves out pictures and page.
     """
@@ -52,44 +71,78 @@ def write_reproduction(done: Reproduction, folder: Path, *, plots: bool = True) 
     from dolfinopt.plots.style import save
     from dolfinopt.study.figures import column_figure, common_looks, draw
 
-    styles = common_looks(numbered.figure for numbered in done.figures)
-    write_text(folder / "measured.json", done.measured.json())
-    for numbered in done.figures:
+    figures = all_figures(results, outcomes)
+    styles = common_looks(numbered.figure for numbered in figures)
+    write_text(folder / "measured.json", as_json(plan, results))
+    for numbered in figures:
         write_text(folder / f"{numbered.name}.csv", numbered.csv())
         if plots:
-            figure = numbered.figure
-            if isinstance(figure, LineFigure):
-                drawn = column_figure(figure, styles)
+            if isinstance(numbered.figure, LineFigure):
+                drawn = column_figure(numbered.figure, styles)
             else:
-                drawn = draw(figure, styles)
+                drawn = draw(numbered.figure, styles)
             save(drawn, folder / f"{numbered.name}.png")
     if plots:
-        write_text(folder / "report.html", page(done, folder))
+        text = page(plan, results, outcomes, checks, figures, folder)
+        write_text(folder / "report.html", text)
 
 
-def page(done: Reproduction, folder: Path) -> str:
+def page(
+    plan: Plan,
+    results: pd.DataFrame,
+    outcomes: Outcomes,
+    checks: Sequence[Check],
+    figures: Sequence[Numbered],
+    folder: Path,
+) -> str:
     """Return report.html; the figures' pictures lie in the folder."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    used = {number for _, numbers in SECTIONS for number in numbers}
-    assert used == {numbered.number for numbered in done.figures}
-    gallery, outcomes, scene = _Gallery(done), done.outcomes, done.plan.scene
+    scene, by = plan.scene, dict(iter(results.groupby("table")))
+    tables = {
+        "objectives": _ends_table(by["ends objectives"], by["ends reductions"]),
+        "reductions": _reduction_table(by["reductions"]),
+        "payload": _loss_table(by["payload"]),
+    }
+    designs = {name: by[name].made for name in ("objectives", "reductions")}
+    designs["path"] = by["path"].made[by["path"].made_for.notna()]
+    sections = []
+    for title, numbers, name in SECTIONS:
+        shown = [numbered for numbered in figures if numbered.number in numbers]
+        of_figures = [(one.title, one.table.frame) for one in shown if one.table is not None]
+        sections.append(
+            {
+                "title": title,
+                "checks": [check for check in checks if set(check.figures) <= set(numbers)],
+                "plots": [
+                    (one, _png((folder / f"{one.name}.png").read_bytes()), _about(one))
+                    for one in shown
+                    if not isinstance(one.figure, DesignFigure)
+                ],
+                "tables": of_figures + [tables[key] for key in tables if key == name],
+                "designs_title": f"Designs by {name.removesuffix('s')}",
+                "designs": _gallery(designs.get(name, ()), outcomes),
+            }
+        )
     optimised = [o for case, o in outcomes.by_case.items() if case.action == "optimize"]
-    size = max(cell_sizes(scene).values(), default=0.0)
     templates = Environment(
         loader=FileSystemLoader(page_folder()),
         autoescape=lambda name: str(name).endswith(".html"),
         undefined=StrictUndefined,
         trim_blocks=True,
     )
+    templates.filters |= {"mm": mm, "percent": percent}
+    size = max(cell_sizes(scene).values(), default=0.0)
     text = templates.get_template("report.html").render(
         as_text=as_text,
-        measured=done.measured,
-        cards=_cards(done),
-        player=_player(done),
-        checks=done.checks,
-        sections=[_section(title, n, done, gallery, folder) for title, n in SECTIONS],
+        setting=setting_of(scene),
+        initial=by["objectives"].iloc[0],
+        best=by["objectives"].query("kind == 'esl'").iloc[0],
+        player=_player(plan, outcomes),
+        checks=checks,
+        sections=sections,
         scene=scene,
+        cells=scene.arms[0].cells or (),
         cases=outcomes.by_case,
         optimised=optimised,
         seconds=sum(o.seconds for o in optimised if not o.failure),
@@ -101,51 +154,6 @@ def page(done: Reproduction, folder: Path) -> str:
 
 
 # -- words and tables ------------------------------------------------------------------------
-
-
-def _cards(done: Reproduction) -> list[tuple[str, str]]:
-    """Return names and values of the figures one looks for first."""
-    initial = done.measured.objectives[0]
-    best = next(m for m in done.measured.objectives if m.kind == "esl")
-    holds = sum(check.holds for check in done.checks)
-    return [
-        ("compliance", f"{initial.compliance:.4g} → {best.compliance:.4g} N m"),
-        ("largest deviation", f"{1e3 * initial.deviation:.3g} → {1e3 * best.deviation:.3g} mm"),
-        ("material", percent(done.plan.scene.design.volume_fraction).replace(".0 %", " %")),
-        ("of the paper’s statements hold", f"{holds} of {len(done.checks)}"),
-    ]
-
-
-def _section(
-    title: str, numbers: Sequence[int], done: Reproduction, gallery: _Gallery, folder: Path
-) -> dict[str, Any]:
-    """Return one part of the paper: its statements, our figures, tables and designs."""
-    plan, measured = done.plan, done.measured
-    shown = [numbered for numbered in done.figures if numbered.number in numbers]
-    tables = [numbered.table for numbered in shown if numbered.table is not None]
-    designs: tuple[str, Iterable[Case]] = ("", ())
-    if 4 in numbers:
-        designs = "Designs by objective", (plan.initial, *plan.objectives)
-        tables.append(_ends_table(measured.ends))
-    elif 5 in numbers:
-        designs = "Designs by reduction", plan.reductions
-        tables.append(_reduction_table(measured))
-    elif 10 in numbers:
-        tables.append(_loss_table(measured.payload))
-    elif 12 in numbers:
-        designs = "Designs by path", plan.paths
-    return {
-        "title": title,
-        "checks": [f for f in done.checks if set(f.figures) <= set(numbers)],
-        "plots": [
-            (n, _png((folder / f"{n.name}.png").read_bytes()), _about(n))
-            for n in shown
-            if not isinstance(n.figure, DesignFigure)
-        ],
-        "tables": tables,
-        "designs_title": designs[0],
-        "designs": gallery.show(designs[1]),
-    }
 
 
 def _about(numbered: Numbered) -> str:
@@ -164,46 +172,53 @@ def _png(data: bytes) -> dict[str, Any]:
     return {"data": base64.b64encode(data).decode(), "width": width, "height": height}
 
 
-def _reduction_table(measured: Measured) -> Table:
-    columns = ["made with", "coordinates", "compliance, own model [N m]", "compliance [N m]",
-               "maximal deviation [mm]", "cells on the other side of one half [%]",
-               "iterations"]  # fmt: skip
-    rows = tuple(
-        (r.method, r.coordinates, r.own, r.compliance, 1e3 * r.deviation, 100.0 * r.apart,
-         r.iterations)
-        for r in measured.reductions
-    )  # fmt: skip
-    finest = measured.reductions[-1].coordinates
-    title = f"Designs by reduction, all simulated with {finest} Craig-Bampton coordinates"
-    return Table("", title, pd.DataFrame(rows, columns=columns))
+def _reduction_table(rows: pd.DataFrame) -> tuple[str, pd.DataFrame]:
+    columns = {
+        "made with": rows.kind,
+        "coordinates": rows.x.astype(int),
+        "compliance, own model [N m]": rows.own,
+        LABELS["compliance"]: rows.compliance,
+        LABELS["deviation"]: 1e3 * rows.deviation,
+        "cells on the other side of one half [%]": 100.0 * rows.apart,
+        "iterations": rows.iterations,
+    }
+    title = f"Designs by reduction, all simulated with {rows.x.max():g} Craig-Bampton coordinates"
+    return title, pd.DataFrame(columns)
 
 
-def _ends_table(ends: Ends) -> Table:
+def _ends_table(objectives: pd.DataFrame, reductions: pd.DataFrame) -> tuple[str, pd.DataFrame]:
     """Return all designs with solid ends, by what they were made for and with."""
-    initial = ends.objectives[0].deviation
-    columns = ["made for or with", "compliance [N m]", "maximal deviation [mm]",
-               "of the initial design's [%]"]  # fmt: skip
-    made = [(m.label, m.compliance, m.deviation) for m in ends.objectives]
-    made += [(f"{r.method} {r.coordinates}", r.compliance, r.deviation) for r in ends.reductions]
-    rows = [(name, c, 1e3 * d, 100.0 * d / initial) for name, c, d in made]
-    frame = pd.DataFrame(rows, columns=columns)
-    return Table("", f"{ends.words}; nothing else differs", frame)
+    rows = pd.concat([objectives, reductions])
+    columns = {
+        "made for or with": rows.label,
+        LABELS["compliance"]: rows.compliance,
+        LABELS["deviation"]: 1e3 * rows.deviation,
+        "of the initial design's [%]": 100.0 * rows.deviation / objectives.deviation.iloc[0],
+    }
+    length = 1e3 * objectives.case.iloc[0].scene.arms[0].passive
+    title = f"With {length:.0f} mm of solid material at both ends of the arms; nothing else differs"
+    return title, pd.DataFrame(columns)
 
 
-def _loss_table(sweep: ValueSweep) -> Table:
-    labels = [f"{used.made_for:g}" for used in sweep.optima]
-    frame = pd.DataFrame({f"made for {sweep.axis}": labels})
-    for quantity in ("compliance", "deviation"):
-        columns = [f"{quantity} lost at {label} [%]" for label in labels]
-        frame[columns] = 100.0 * sweep.loss(quantity)
-    return Table("", "Loss against the design made for the payload", frame)
+def _loss_table(rows: pd.DataFrame) -> tuple[str, pd.DataFrame]:
+    parts = []
+    for quantity in LABELS:
+        part = 100.0 * loss(rows, quantity)
+        parts.append(part.rename(columns=lambda x: f"{quantity} lost at {x:g} [%]"))  # noqa: B023
+    frame = pd.concat(parts, axis=1)
+    frame.insert(0, f"made for {SWEEPS['payload'][1]}", [f"{x:g}" for x in frame.index])
+    return "Loss against the design made for the payload", frame
 
 
 def _overridden(scene: Scene) -> list[str]:
     """Return where the scene is not the paper's, which every figure here is compared with."""
-    from dolfinopt.paper.reproduction import load_paper
 
-    theirs, ours = _flat(load_paper().to_dict()), _flat(scene.to_dict())
+    def flat(one: Scene) -> dict[str, Any]:
+        data = one.to_dict()
+        nested = pd.json_normalize({**data, "arms": dict(enumerate(data["arms"]))})
+        return {str(key): values[0] for key, values in nested.to_dict("list").items()}
+
+    theirs, ours = flat(load_paper()), flat(scene)
     return [
         f"{key} = {ours.get(key)} in place of {theirs.get(key)}"
         for key in dict.fromkeys([*theirs, *ours])
@@ -211,59 +226,32 @@ def _overridden(scene: Scene) -> list[str]:
     ]
 
 
-def _flat(data: Any, key: str = "") -> dict[str, Any]:
-    """Return nested tables as one, keys dotted."""
-    if isinstance(data, list) and data and isinstance(data[0], dict):
-        data = {str(k): row for k, row in enumerate(data)}
-    if not isinstance(data, dict):
-        return {key: data}
-    found: dict[str, Any] = {}
-    for name, value in data.items():
-        found |= _flat(value, f"{key}.{name}" if key else name)
-    return found
-
-
 # -- designs ---------------------------------------------------------------------------------
 
 
-class _Gallery:
-    """Pictures of designs; owns the arms, which are built once."""
+def _gallery(cases: Iterable[Case], outcomes: Outcomes) -> list[dict[str, Any]]:
+    """Return the designs, all to one scale; those without a result are left out."""
+    from dolfinopt.output.files import designed, read_views
 
-    def __init__(self, done: Reproduction) -> None:
-        from mpi4py import MPI
-
-        from dolfinopt.arms.arm import build_arms
-        from dolfinopt.parallel import partition_arms
-        from dolfinopt.profiling import Profile
-
-        self.outcomes, self.scene = done.outcomes, done.plan.scene
-        self.partition = partition_arms(MPI.COMM_SELF, self.scene.cell_counts)
-        self.arms = build_arms(self.scene, self.partition, Profile())
-
-    def views(self, outcome: Outcome) -> Sequence[ArmView]:
-        """Return the arms of a design."""
-        from dolfinopt.output.files import designed, gather_views, read_design
-
-        x_phys = read_design(outcome.design, self.partition, self.arms)
-        return designed(gather_views(self.scene, self.partition, self.arms, x_phys))
-
-    def show(self, cases: Iterable[Case]) -> list[dict[str, Any]]:
-        """Return the designs, all to one scale; those without a result are left out."""
-        items = []
-        for case in dict.fromkeys(cases):
-            outcome = self.outcomes[case]
-            if outcome.failure:
-                continue
-            views = self.views(outcome)
-            lengths = [float(np.ptp(view.corners[..., 0])) for view in views]
-            arms = []
-            for view, length in zip(views, lengths):
-                part = length / max(lengths)
-                png = _png(arm_picture(view, round(WIDTH * part)))
-                arms.append({"name": view.name, "width": f"{100.0 * part:.4g}", "png": png})
-            figures = f"{outcome.compliance:.4g} N m, {mm(outcome.max_deviation)}"
-            items.append({"label": case.label, "figures": figures, "arms": arms})
-        return items
+    items = []
+    for case in dict.fromkeys(cases):
+        outcome = outcomes[case]
+        if outcome.failure:
+            continue
+        views = designed(read_views(case.scene, outcome.design))
+        lengths = [float(np.ptp(view.corners[..., 0])) for view in views]
+        parts = [length / max(lengths) for length in lengths]
+        arms = [
+            {
+                "name": view.name,
+                "width": f"{100.0 * part:.4g}",
+                "png": _png(arm_picture(view, round(WIDTH * part))),
+            }
+            for view, part in zip(views, parts)
+        ]
+        figures = f"{outcome.compliance:.4g} N m, {mm(outcome.max_deviation)}"
+        items.append({"label": case.label, "figures": figures, "arms": arms})
+    return items
 
 
 def arm_picture(view: ArmView, width: int) -> bytes:
@@ -296,28 +284,12 @@ def arm_picture(view: ArmView, width: int) -> bytes:
 # -- the animation ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Strip:
-    """A moving design as paths of SVG, one a frame.
-
-    Attributes:
-        arms: centre lines of all arms.
-        tips: (n, 2) m, the end-effector.
-        carts: (n,) m.
-        deviation: (n,) mm, not magnified.
-    """
-
-    arms: list[str]
-    tips: np.ndarray
-    carts: np.ndarray
-    deviation: np.ndarray
-
-
-def strip(trajectory: Trajectory, at: np.ndarray, magnification: float) -> Strip:
-    """Return the frames of a trajectory.
+def centre_lines(trajectory: Trajectory, at: np.ndarray, magnification: float) -> np.ndarray:
+    """Return the arms' centre lines as cubic Bezier curves (n, 1 + 3 arms), m, complex x + i y.
 
     Between its interfaces an arm is drawn as the cubic that has their places and directions,
-    which is how a beam bends without loads between its ends.
+    which is how a beam bends without loads between its ends. The first point is the shoulder, the
+    last the end-effector.
 
     Args:
         trajectory: sampled.
@@ -329,95 +301,66 @@ def strip(trajectory: Trajectory, at: np.ndarray, magnification: float) -> Strip
     mechanism = trajectory.mechanism
     q = magnification * trajectory.q_e[at]
     place, swing = chain(mechanism, trajectory.q_r[at], q)
-    parts = []
+    points = [place[:, 0]]
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         turn = swing[:, k] * np.exp(1j * (q[:, part] @ body.outboard[2]))
         third = np.abs(place[:, k + 1] - place[:, k]) / 3.0
-        parts.append(
-            (place[:, k] + third * swing[:, k], place[:, k + 1] - third * turn, place[:, k + 1])
-        )
-    arms = []
-    for n in range(len(at)):
-        curves = "".join(f"C{' '.join(_point(part[n]) for part in three)}" for three in parts)
-        arms.append(f"M{_point(place[n, 0])}{curves}")
-    tips = np.stack([place[:, -1].real, place[:, -1].imag], axis=1)
-    return Strip(arms, tips, place[:, 0].real, 1e3 * np.hypot(*trajectory.deviation[at].T))
+        inner = place[:, k] + third * swing[:, k], place[:, k + 1] - third * turn
+        points += [*inner, place[:, k + 1]]
+    return np.stack(points, axis=1)
 
 
-def _point(place: complex) -> str:
-    return f"{place.real:.4f},{place.imag:.4f}"
+def svg_path(points: Iterable[complex]) -> str:
+    """Return cubic curves as a path of SVG."""
+    first, *others = (f"{point.real:.4f},{point.imag:.4f}" for point in points)
+    return f"M{first}C{' '.join(others)}"
 
 
-def _player(done: Reproduction) -> dict[str, Any] | None:
-    """Return the moving mechanism, initial and optimised design together; None without results."""
+def _player(plan: Plan, outcomes: Outcomes) -> dict[str, Any] | None:
+    """Return the moving mechanism, initial and optimised design together; None without results.
+
+    The page is complete without its script, which only moves the picture.
+    """
     from dolfinopt.plots.animation import round_magnification
     from dolfinopt.study.store import simulate_scenarios
 
-    optimum = done.outcomes[done.plan.optimum]
+    optimum = outcomes[plan.optimum]
     if optimum.failure:
         return None
     moved = []
     for design in (None, optimum.design):
-        simulated = next(iter(simulate_scenarios([done.plan.scene], design)))
+        simulated = next(iter(simulate_scenarios([plan.scene], design)))
         if isinstance(simulated, Exception) or simulated.trajectory is None:
             return None
         moved.append(simulated.trajectory)
-    t = moved[0].t
+    t, mechanism = moved[0].t, moved[0].mechanism
     at = np.unique(np.round(np.linspace(0, len(t) - 1, FRAMES)).astype(int))
-    reach = sum(float(np.hypot(*body.outboard_point)) for body in moved[0].mechanism.bodies)
-    largest = float(np.hypot(*moved[0].deviation.T).max())
-    magnification = round_magnification(largest, reach)
-    before, after = (strip(one, at, magnification) for one in moved)
-    rigid = strip(moved[1], at, 0.0)
-    return _frames(t[at], before, after, rigid, magnification, moved[0].mechanism.joint_height)
-
-
-def _frames(
-    t: np.ndarray, before: Strip, after: Strip, rigid: Strip, magnification: float, joint: float
-) -> dict[str, Any]:
-    """Return what player.html shows: complete without its script, which only moves it."""
-    places = np.concatenate([s.tips for s in (before, after, rigid)])
-    left = float(min(places[:, 0].min(), rigid.carts.min())) - 0.16
-    right = float(max(places[:, 0].max(), rigid.carts.max())) + 0.16
-    low, high = joint - 0.14, float(places[:, 1].max()) + 0.1
-    width, height = right - left, high - low
-    here = int(np.argmax(before.deviation))
-    frames = {
-        "t": [round(float(v), 3) for v in t],
-        "cart": [round(float(v), 4) for v in rigid.carts],
-        "before": before.arms,
-        "after": after.arms,
-        "tips": [[round(float(v), 4) for v in (*b, *a)] for b, a in zip(before.tips, after.tips)],
-        "mm": [
-            [round(float(v), 2) for v in pair] for pair in zip(before.deviation, after.deviation)
-        ],
-        "delay": 1e3 * SLOWER * float(t[-1] - t[0]) / (len(t) - 1),
-    }
-    path = "M" + "L".join(_point(complex(x, y)) for x, y in rigid.tips)
+    reach = sum(float(np.hypot(*body.outboard_point)) for body in mechanism.bodies)
+    deviation = 1e3 * np.stack([np.hypot(*one.deviation.T) for one in moved], axis=1)  # mm
+    magnification = round_magnification(1e-3 * deviation[:, 0].max(), reach)
+    lines = [centre_lines(one, at, magnification) for one in moved]
+    rigid = centre_lines(moved[1], at, 0.0)
+    tips = np.stack([line[:, -1] for line in lines], axis=1)
+    every = np.concatenate([*tips.T, rigid[:, -1], rigid[:, 0]])
     return {
-        "box": f"{left:.3f} {-high:.3f} {width:.3f} {height:.3f}",
-        "left": f"{left:.3f}",
-        "right": f"{right:.3f}",
-        "ground": f"{joint - 0.075:.3f}",
-        "cart_y": f"{joint - 0.06:.3f}",
-        "cart": f"{rigid.carts[here]:.4f}",
-        "path": path,
-        "before": before.arms[here],
-        "after": after.arms[here],
-        "bx": f"{before.tips[here, 0]:.4f}",
-        "by": f"{before.tips[here, 1]:.4f}",
-        "ax": f"{after.tips[here, 0]:.4f}",
-        "ay": f"{after.tips[here, 1]:.4f}",
-        "last": len(t) - 1,
-        "here": here,
-        "said": _said(float(t[here]), float(before.deviation[here]), float(after.deviation[here])),
-        "magnification": f"{magnification:g}",
-        "slower": f"{SLOWER:g}",
-        "frames": frames,
+        "left": every.real.min() - 0.16,
+        "right": every.real.max() + 0.16,
+        "low": mechanism.joint_height - 0.14,
+        "high": every.imag.max() + 0.1,
+        "joint": mechanism.joint_height,
+        "path": "M" + "L".join(f"{p.real:.4f},{p.imag:.4f}" for p in rigid[:, -1]),
+        "here": int(np.argmax(deviation[at, 0])),
+        "magnification": magnification,
+        "slower": SLOWER,
         "initial": INITIAL,
         "optimised": OPTIMUM,
+        "frames": {
+            "t": np.round(t[at], 3).tolist(),
+            "cart": np.round(rigid[:, 0].real, 4).tolist(),
+            "before": [svg_path(points) for points in lines[0]],
+            "after": [svg_path(points) for points in lines[1]],
+            "tips": np.round(tips.view(float), 4).tolist(),
+            "mm": np.round(deviation[at], 2).tolist(),
+            "delay": 1e3 * SLOWER * float(t[-1] - t[0]) / (len(at) - 1),
+        },
     }
-
-
-def _said(t: float, before: float, after: float) -> str:
-    return f"{t:.2f} s: {before:.1f} mm, {after:.1f} mm"

@@ -1,288 +1,75 @@
-"""The paper's results: which cases they need, what is measured in them, and figures 3 to 15.
+"""The paper's cases as a table, and the same table with what came out of them.
 
 R. Seifried, A. Moghadasi, A. Held: Analysis of design uncertainties in structurally optimized
 lightweight machines. Procedia IUTAM 13 (2015) 71-81, doi:10.1016/j.piutam.2015.01.018.
-Figures bear its numbers; where several show one thing, which of them shows what is our choice.
+
+Every row is one design in one scene:
+
+| column | meaning |
+|---|---|
+| table | "objectives", "reductions", "coordinates", "payload", "path", "ends objectives" ... |
+| label | what the design was made for or with |
+| kind | of its objective, or the reduction method; "" for neither |
+| x | number of coordinates, or value of the swept key; nan for neither |
+| made_for | value of the swept key that the design was made for; nan for none |
+| case, made | what is simulated; the optimisation that made the design, else `case` |
+
+`add_outcomes` adds compliance (N m), deviation (largest, m), grayness, iterations, note (how it
+ended), own (compliance as the design's own model sees it, N m) and apart: of "reductions" the
+part of the cells on the other side of one half than in the design made with the most Craig-Bampton
+coordinates, of "coordinates" the largest distance over time of the deviation from that with the
+most, over the latter's largest. What failed has nan.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from dolfinopt.data import paper_scene
 from dolfinopt.output.summary import FILTER_CELLS
-from dolfinopt.paper.checks import (
-    CRAIG_BAMPTON,
-    MODAL,
-    Check,
-    CoordinateSweep,
-    DesignResult,
-    Ends,
-    Measured,
-    ReducedResult,
-    Setting,
-    SweptDesign,
-    ValueSweep,
-    check_paper,
-)
 from dolfinopt.scene.load import Scene, load_scene
-from dolfinopt.study.plans import design_figure, deviation_panels
 from dolfinopt.study.store import Case, Outcome, Outcomes, run_cases
-from dolfinopt.study.tables import Figure, Line, LineFigure, MatrixFigure, Panel, Table
 from dolfinopt.study.variants import OBJECTIVES, changed, reduced, reference_scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+CRAIG_BAMPTON, MODAL = METHODS = ("craig-bampton", "modal")
+INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
+# The paper's design: load cases of the motion, frozen while it is improved.
+DYNAMIC = ("kind=esl", "gradient=esl", "worst=compliance")
 # A static load case without a moment, as one might pose it who thinks of the arm alone.
 FORCE_ALONE = ("static compliance, force alone", ("kind=static", "loads=[[0, 1, 0]]"))
 CUT_OFF = "attached=none"  # no mass at the ends: the optimiser would cut the arms off
-SHOWN = (
+# Objectives: label, and the settings that make it.
+VARIANTS = (*(one for one in OBJECTIVES if CUT_OFF not in one[1]), FORCE_ALONE)
+SHOWN = (  # in figure 3, and with solid ends
     "dynamic loads (esl)",
     "static compliance",
     "static compliance, force alone",
     "eigenfrequency, rigid bodies attached",
     "eigenfrequency, point masses attached",
 )
-METHODS = (CRAIG_BAMPTON, MODAL)
-OPTIMISED = (4, 48)  # coordinates
-SWEPT = (4, 6, 8, 12, 16, 24, 48, 100)
-PAYLOADS, MASSES = (4.0, 6.0, 8.0), tuple(4.0 + 0.5 * k for k in range(9))
-PATHS, FLATTENINGS = (0.0, 0.25, 0.5, 0.75, 1.0), tuple(0.125 * k for k in range(9))
-INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
+SWEEPS = {  # table: key, axis, what a value is called
+    "payload": ("payload.mass", "payload [kg]", "{:g} kg"),
+    "path": ("motion.flattening", "flattening s [-]", "s = {:g}"),
+}
 SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
-NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")
 # Both set the filter's radius; where neither is asked for, coarse cells get `FILTER_CELLS` of it.
 FILTER_KEYS = ("design.filter_radius", "design.minimum_member")
+NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
 
-
-# -- cases -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """Designs over the values of one key.
-
-    Attributes:
-        key: that varies.
-        axis: with its unit.
-        words: what a value is called.
-        values: simulated.
-        optimised: values a design is made for.
-        solid: whether solid arms are simulated, too.
-    """
-
-    key: str
-    axis: str
-    words: str
-    values: tuple[float, ...]
-    optimised: tuple[float, ...]
-    solid: bool = False
-
-
-PAYLOAD = Sweep("payload.mass", "payload [kg]", "{:g} kg", MASSES, PAYLOADS)
-PATH = Sweep("motion.flattening", "flattening s [-]", "s = {:g}", FLATTENINGS, PATHS, solid=True)
-# Objectives: label, and the settings that make it.
-VARIANTS = (*(one for one in OBJECTIVES if CUT_OFF not in one[1]), FORCE_ALONE)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything the paper asks of a scene.
-
-    Attributes:
-        scene: the paper's.
-        variants: objectives, see `VARIANTS`.
-        optimised, swept: coordinates that designs are made with, and simulated with.
-        payload, path: sweeps.
-    """
-
-    scene: Scene
-    variants: tuple[tuple[str, tuple[str, ...]], ...] = VARIANTS
-    optimised: tuple[int, ...] = OPTIMISED
-    swept: tuple[int, ...] = SWEPT
-    payload: Sweep = PAYLOAD
-    path: Sweep = PATH
-
-    @property
-    def initial(self) -> Case:
-        """The initial design in the scene."""
-        return Case(self.scene, label=INITIAL)
-
-    @property
-    def optimum(self) -> Case:
-        """The paper's design: load cases of the motion, frozen while it is improved."""
-        settings = ("kind=esl", "gradient=esl", "worst=compliance")
-        return Case(self._with("objective", settings), "optimize", label=OPTIMUM)
-
-    @cached_property
-    def objectives(self) -> tuple[Case, ...]:
-        """A design for every objective."""
-        return tuple(
-            Case(self._with("objective", settings), "optimize", label=label)
-            for label, settings in self.variants
-        )
-
-    @cached_property
-    def reference(self) -> Scene:
-        """The scene with so many coordinates that more make no difference."""
-        return reference_scene(self.scene)
-
-    @cached_property
-    def reductions(self) -> tuple[Case, ...]:
-        """A design for every reduction."""
-        return tuple(
-            Case(scene, "optimize", label=f"{method} {scene.reduction.coordinates}")
-            for method in METHODS
-            for scene in self._reduced(method, self.optimised)
-        )
-
-    def again(self, case: Case) -> Case:
-        """Return that design in the reference model."""
-        return Case(self.reference, "simulate", case, f"{case.label} in the reference")
-
-    @property
-    def given(self) -> tuple[tuple[str, Case | None], ...]:
-        """The two designs that are simulated with more and more coordinates."""
-        return (INITIAL, None), (OPTIMUM, self.optimum)
-
-    def resolved(self, label: str, design: Case | None, method: str) -> list[Case]:
-        """Return a design with one method and more and more coordinates."""
-        return [
-            Case(scene, "simulate", design, f"{label}, {method} {scene.reduction.coordinates}")
-            for scene in self._reduced(method, self.swept)
-        ]
-
-    def used(self, sweep: Sweep) -> list[tuple[str, float, list[Case]]]:
-        """Return label, value it was made for or nan, and cases of every design."""
-        scenes = [changed(self.scene, f"{sweep.key}={value}") for value in sweep.values]
-        designs: list[tuple[str, float, Case | None]] = [(INITIAL, math.nan, None)]
-        for value in sweep.optimised:
-            label = f"made for {sweep.words.format(value)}"
-            scene = changed(self.scene, f"{sweep.key}={value}")
-            designs.append((label, value, Case(scene, "optimize", label=label)))
-
-        def case(label: str, design: Case | None, scene: Scene, value: float) -> Case:
-            return Case(scene, "simulate", design, f"{label}, {sweep.words.format(value)}")
-
-        rows = [
-            (label, made_for, [case(label, d, s, v) for s, v in zip(scenes, sweep.values)])
-            for label, made_for, d in designs
-        ]
-        if sweep.solid:
-            full = [changed(scene, "design.initial=1.0") for scene in scenes]
-            solid = [case(SOLID, None, s, v) for s, v in zip(full, sweep.values)]
-            rows.insert(1, (SOLID, math.nan, solid))
-        return rows
-
-    @property
-    def paths(self) -> list[Case]:
-        """A design for every path."""
-        rows = self.used(self.path)
-        return [c[0].design for _, _, c in rows if isinstance(c[0].design, Case)]
-
-    @cached_property
-    def ends(self) -> Plan:
-        """The same where the ends of the arms stay solid; of it only `end_cases` are done."""
-        shown = tuple(one for one in self.variants if one[0] in SHOWN)
-        scene = changed(self.scene, f"arms.passive={SOLID_ENDS}")
-        return replace(self, scene=scene, variants=shown)
-
-    @property
-    def end_cases(self) -> list[Case]:
-        """What is done where ends are solid."""
-        again = [self.again(case) for case in self.compared]
-        return [self.initial, *self.objectives, *again]
-
-    @property
-    def compared(self) -> list[Case]:
-        """Designs by reduction but those made with many Craig-Bampton coordinates."""
-        return [
-            case
-            for case in self.reductions
-            if case.scene.reduction.method != CRAIG_BAMPTON or case == self.reductions[0]
-        ]
-
-    @property
-    def cases(self) -> list[Case]:
-        """All of them; what they depend on is left out."""
-        sweeps = [self.used(sweep) for sweep in (self.payload, self.path)]
-        return [
-            self.initial,
-            self.optimum,
-            *self.objectives,
-            *(self.again(case) for case in self.reductions),
-            *(c for one in self.given for m in METHODS for c in self.resolved(*one, m)),
-            *(case for sweep in sweeps for _, _, cases in sweep for case in cases),
-            *self.ends.end_cases,
-        ]
-
-    def _with(self, table: str, settings: Iterable[str]) -> Scene:
-        return changed(self.scene, *(f"{table}.{setting}" for setting in settings))
-
-    def _reduced(self, method: str, counts: Sequence[int]) -> list[Scene]:
-        """Return the scene with one method; small arms have no more than their own coordinates."""
-        most = min([arm.n_reducible for arm in self.scene.arms if arm.n_reducible] + [counts[-1]])
-        fitting = dict.fromkeys(min(count, most) for count in counts)
-        return [reduced(self.scene, method, count) for count in fitting]
-
-
-# -- the run ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Numbered:
-    """One of the paper's figures, as it comes out here.
-
-    Attributes:
-        number: the paper's.
-        title: of the figure.
-        figure: to draw.
-        table: its data, where the figure itself has none to write.
-    """
-
-    number: int
-    title: str
-    figure: Figure
-    table: Table | None = None
-
-    @property
-    def name(self) -> str:
-        """Of its files."""
-        return f"fig{self.number:02d}"
-
-    def csv(self) -> str:
-        """Return its data."""
-        if self.table is not None:
-            return self.table.csv()
-        assert isinstance(self.figure, LineFigure)
-        return self.figure.csv()
-
-
-@dataclass(frozen=True)
-class Reproduction:
-    """What became of the paper.
-
-    Attributes:
-        plan, outcomes: what was done, and what came of it.
-        measured, checks: figures, and what they say of the paper's.
-        figures: 3 to 15.
-    """
-
-    plan: Plan
-    outcomes: Outcomes
-    measured: Measured
-    checks: tuple[Check, ...]
-    figures: tuple[Numbered, ...]
+Row = tuple[str, str, str, float, float, Case, Case]
 
 
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
@@ -313,11 +100,125 @@ def cell_sizes(scene: Scene) -> dict[int, float]:
     return {k: arm.cell_size or 0.0 for k, arm in enumerate(scene.arms) if arm.flexible}
 
 
-def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) -> Reproduction:
-    """Do everything that is not done yet (collective); the same on all ranks.
+# -- cases -----------------------------------------------------------------------------------
 
-    Cases without a result stand in the outcomes; figures leave them out, and no check that needs
-    them holds.
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything the paper asks of a scene.
+
+    Attributes:
+        scene: the paper's.
+        variants: objectives, see `VARIANTS`.
+        optimised, swept: coordinates that designs are made with, and simulated with.
+        masses, payloads: kg, simulated and made for.
+        flattenings, paths: of the path, simulated and made for.
+    """
+
+    scene: Scene
+    variants: tuple[tuple[str, tuple[str, ...]], ...] = VARIANTS
+    optimised: tuple[int, ...] = (4, 48)
+    swept: tuple[int, ...] = (4, 6, 8, 12, 16, 24, 48, 100)
+    masses: tuple[float, ...] = tuple(4.0 + 0.5 * k for k in range(9))
+    payloads: tuple[float, ...] = (4.0, 6.0, 8.0)
+    flattenings: tuple[float, ...] = tuple(0.125 * k for k in range(9))
+    paths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """All cases, see the module."""
+        ends = changed(self.scene, f"arms.passive={SOLID_ENDS}")
+        shown = [one for one in self.variants if one[0] in SHOWN]
+        rows = [
+            *_objectives("objectives", self.scene, self.variants),
+            *_reductions("reductions", self.scene, self.optimised),
+            *_coordinates(self.scene, self.optimum, self.swept),
+            *_sweep("payload", self.scene, self.masses, self.payloads),
+            *_sweep("path", self.scene, self.flattenings, self.paths),
+            *_objectives("ends objectives", ends, shown),
+            # Many Craig-Bampton coordinates make no other design than few.
+            *_reductions("ends reductions", ends, self.optimised, {MODAL: self.optimised}),
+        ]
+        return pd.DataFrame(
+            rows, columns=["table", "label", "kind", "x", "made_for", "case", "made"]
+        )
+
+    @property
+    def optimum(self) -> Case:
+        """The paper's design."""
+        scene = changed(self.scene, *(f"objective.{setting}" for setting in DYNAMIC))
+        return Case(scene, "optimize", label=OPTIMUM)
+
+
+def _objectives(
+    table: str, scene: Scene, variants: Sequence[tuple[str, tuple[str, ...]]]
+) -> Iterator[Row]:
+    """Yield the initial design, and one for every objective."""
+    initial = Case(scene, label=INITIAL)
+    yield table, INITIAL, "", math.nan, math.nan, initial, initial
+    for label, settings in variants:
+        other = changed(scene, *(f"objective.{setting}" for setting in settings))
+        case = Case(other, "optimize", label=label)
+        yield table, label, other.objective.kind, math.nan, math.nan, case, case
+
+
+def _reductions(
+    table: str,
+    scene: Scene,
+    counts: tuple[int, ...],
+    by_method: Mapping[str, tuple[int, ...]] | None = None,
+) -> Iterator[Row]:
+    """Yield designs by reduction in the reference model; `by_method`: else the fewest alone."""
+    reference = reference_scene(scene)
+    for method in METHODS:
+        mine = counts if by_method is None else by_method.get(method, counts[:1])
+        for other in _reduced(scene, method, mine):
+            made = Case(other, "optimize", label=f"{method} {other.reduction.coordinates}")
+            again = Case(reference, "simulate", made, f"{made.label} in the reference")
+            yield table, made.label, method, other.reduction.count, math.nan, again, made
+
+
+def _coordinates(scene: Scene, optimum: Case, counts: tuple[int, ...]) -> Iterator[Row]:
+    """Yield the initial and the optimised design with either method and more coordinates."""
+    for label, design in ((INITIAL, None), (OPTIMUM, optimum)):
+        for method in METHODS:
+            for other in _reduced(scene, method, counts):
+                count = other.reduction.count
+                case = Case(other, "simulate", design, f"{label}, {method} {count}")
+                yield "coordinates", label, method, count, math.nan, case, case
+
+
+def _reduced(scene: Scene, method: str, counts: Sequence[int]) -> list[Scene]:
+    """Return the scene with one method; small arms have no more than their own coordinates."""
+    most = min([arm.n_reducible for arm in scene.arms if arm.n_reducible] + [max(counts)])
+    return [reduced(scene, method, n) for n in dict.fromkeys(min(n, most) for n in counts)]
+
+
+def _sweep(
+    table: str, scene: Scene, values: Sequence[float], optimised: Sequence[float]
+) -> Iterator[Row]:
+    """Yield the initial design, on paths solid arms, and designs made for some of the values."""
+    key, _, words = SWEEPS[table]
+    scenes = {value: changed(scene, f"{key}={value}") for value in values}
+    designs: list[tuple[str, float, Case | None]] = [(INITIAL, math.nan, None)]
+    designs += [(SOLID, math.nan, None)] * (table == "path")
+    for value in optimised:
+        label = f"made for {words.format(value)}"
+        designs.append((label, value, Case(scenes[value], "optimize", label=label)))
+    for label, made_for, design in designs:
+        for value, one in scenes.items():
+            there = changed(one, "design.initial=1.0") if label == SOLID else one
+            case = Case(there, "simulate", design, f"{label}, {words.format(value)}")
+            yield table, label, "", value, made_for, case, design or case
+
+
+# -- results ---------------------------------------------------------------------------------
+
+
+def reproduce(
+    plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True
+) -> tuple[pd.DataFrame, Outcomes]:
+    """Do everything that is not done yet (collective); the same on all ranks.
 
     Args:
         plan: of the paper's scene, see `load_paper`.
@@ -325,129 +226,52 @@ def reproduce(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) 
         world: all ranks.
         shown: draw progress.
 
+    Returns:
+        The plan's table with results, those of cases that failed nan; and all outcomes.
+
     Raises:
         InputError: the scene does not allow what the paper varies, or DIR cannot be written.
     """
     from dolfinopt.output.folders import prepare_folder
     from dolfinopt.parallel import on_root, together
 
-    cases = on_root(world, lambda: plan.cases)
+    with together(world):
+        cases = [*plan.table.case, *plan.table.made]
     on_root(world, prepare_folder, folder)
     outcomes = run_cases(cases, folder, world, shown=shown)
-    measured = on_root(world, measure, plan, outcomes)
-    with together(world):
-        drawn = figures(plan, outcomes, measured)
-        return Reproduction(plan, outcomes, measured, check_paper(measured), drawn)
+    return on_root(world, add_outcomes, plan.table, outcomes), outcomes
 
 
-# -- what is measured ------------------------------------------------------------------------
-
-
-def measure(plan: Plan, outcomes: Outcomes) -> Measured:
-    """Return the figures that the checks rest on."""
-    return Measured(
-        tuple(plan.scene.arms[0].cells or ()),
-        plan.scene.optimizer.max_iterations,
-        _all_made(plan, outcomes),
-        tuple(_reduced(plan, outcomes, case) for case in plan.reductions),
-        tuple(_resolved(plan, outcomes, *one, m) for one in plan.given for m in METHODS),
-        _swept(plan, outcomes, plan.payload),
-        _swept(plan, outcomes, plan.path),
-        Ends(
-            SOLID_ENDS,
-            _all_made(plan.ends, outcomes),
-            tuple(_reduced(plan.ends, outcomes, case) for case in plan.ends.compared),
-        ),
-        setting_of(plan.scene),
+def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
+    """Return the table with what came out of its cases, see the module."""
+    found, made = ([outcomes[case] for case in table[name]] for name in ("case", "made"))
+    results = table.assign(
+        compliance=[one.compliance for one in found],
+        deviation=[one.max_deviation for one in found],
+        grayness=[one.grayness for one in found],
+        iterations=[one.iterations for one in made],
+        note=[one.failure or one.stop_reason for one in found],
+        own=[one.compliance for one in made],
+        apart=math.nan,
     )
+    for names, by, distance in (
+        (["coordinates"], "label", _distance),
+        (["reductions", "ends reductions"], "table", _cells_apart),
+    ):
+        for _, group in results[results.table.isin(names)].groupby(by):
+            finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
+            apart = [distance(outcomes[case], finest) for case in group.made]
+            results.loc[group.index, "apart"] = apart
+    return results
 
 
-def setting_of(scene: Scene) -> Setting:
-    """Return what the texts say of a scene."""
-    from dolfinopt.density.interpolation import interpolate
-
-    options, x = scene.interpolation, scene.design.initial
-    law, p = options.law, options.penalty
-    stiffness = interpolate(np.array([x]), law, p, options.floor).stiffness[0]
-    count = len([arm for arm in scene.arms if arm.flexible])
-    arms = f"{NUMBERS.get(count, count)} flexible arm{'s' if count != 1 else ''}"
-    base = "A cart" if scene.motion.base == "cart" else "A fixed base"
-    verb = "moves" if count == 1 else "move"
-    return Setting(
-        scene.payload.mass,
-        f"{base} carries {arms} that {verb} {scene.payload.mass:g} kg along {_path_words(scene)}.",
-        round(float(stiffness), 4),
-        f"{x:g} with q = {p:g} of RAMP" if law == "ramp" else f"{x:g} to the power {p:g}",
-        scene.design.volume_fraction,
-    )
-
-
-def _path_words(scene: Scene) -> str:
-    """Return what the end-effector follows."""
-    motion = scene.motion
-    if motion.path == "arc" and motion.flattening == 1.0:
-        return "a semicircle"
-    if motion.path == "arc" and motion.flattening > 0.0:
-        return f"a semicircle flattened to {motion.flattening:g}"
-    if motion.path in ("arc", "line"):
-        return "a straight line"
-    return "a given path"
-
-
-def _all_made(plan: Plan, outcomes: Outcomes) -> tuple[DesignResult, ...]:
-    return tuple(_made(outcomes[case]) for case in (plan.initial, *plan.objectives))
-
-
-def _made(outcome: Outcome) -> DesignResult:
-    case = outcome.case
-    return DesignResult(
-        case.label,
-        case.scene.objective.kind if case.action == "optimize" else "",
-        outcome.compliance,
-        outcome.max_deviation,
-        outcome.grayness,
-        outcome.iterations,
-        outcome.failure or outcome.stop_reason,
-    )
-
-
-def _reduced(plan: Plan, outcomes: Outcomes, case: Case) -> ReducedResult:
-    own, again = outcomes[case], outcomes[plan.again(case)]
-    finest = [c for c in plan.reductions if c.scene.reduction.method == CRAIG_BAMPTON][-1]
-    best = finest if finest in outcomes.by_case else plan.reductions[0]
-    return ReducedResult(
-        case.scene.reduction.method,
-        case.scene.reduction.count,
-        own.compliance,
-        again.compliance,
-        again.max_deviation,
-        _apart(own, outcomes[best]),
-        own.iterations,
-    )
-
-
-def _apart(one: Outcome, other: Outcome) -> float:
-    """Return the share of cells on the other side of one half; both have the same cells."""
+def _cells_apart(one: Outcome, other: Outcome) -> float:
+    """Return the part of the cells on the other side of one half; both have the same cells."""
     if one.failure or other.failure:
         return math.nan
     with np.load(one.design) as a, np.load(other.design) as b:
         keys = [key for key in a.files if key.endswith("/density")]
         return float(np.mean([((a[key] > 0.5) != (b[key] > 0.5)).mean() for key in keys]))
-
-
-def _resolved(
-    plan: Plan, outcomes: Outcomes, label: str, design: Case | None, method: str
-) -> CoordinateSweep:
-    found = [outcomes[case] for case in plan.resolved(label, design, method)]
-    finest = outcomes[plan.resolved(label, design, CRAIG_BAMPTON)[-1]]
-    return CoordinateSweep(
-        label,
-        method,
-        tuple(o.case.scene.reduction.count for o in found),
-        tuple(o.compliance for o in found),
-        tuple(o.max_deviation for o in found),
-        tuple(_distance(o, finest) for o in found),
-    )
 
 
 def _distance(one: Outcome, other: Outcome) -> float:
@@ -458,149 +282,87 @@ def _distance(one: Outcome, other: Outcome) -> float:
     return float(np.abs(a - b).max() / b.max())
 
 
-def _swept(plan: Plan, outcomes: Outcomes, sweep: Sweep) -> ValueSweep:
-    designs = []
-    for label, made_for, cases in plan.used(sweep):
-        found = [outcomes[case] for case in cases]
-        values = tuple(o.compliance for o in found), tuple(o.max_deviation for o in found)
-        designs.append(SweptDesign(label, made_for, *values))
-    return ValueSweep(sweep.axis, sweep.values, tuple(designs))
+def cross_values(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
+    """Return the quantity of designs made for i at value j (n, n), of one sweep's rows."""
+    made = rows.dropna(subset="made_for")
+    return made.pivot(index="made_for", columns="x", values=quantity)[made.made_for.unique()]
 
 
-# -- figures ---------------------------------------------------------------------------------
+def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
+    """Return the relative loss (n, n) of a design made for i against the one made for j, at j."""
+    values = cross_values(rows, quantity)
+    return values / np.diag(values) - 1.0
 
 
-def figures(plan: Plan, outcomes: Outcomes, measured: Measured) -> tuple[Numbered, ...]:
-    """Return figures 3 to 15."""
-    return (
-        *_objective_figures(plan, outcomes, measured),
-        *_convergence_figures(plan, outcomes),
-        *_coordinate_figures(plan, outcomes, measured),
-        *_sweep_figures(measured.payload, 10),
-        *_sweep_figures(measured.path, 12),
-        *_loss_figures(measured.path, 14),
-    )
+# -- the scene in words, and everything as JSON ----------------------------------------------
 
 
-def _objective_figures(plan: Plan, outcomes: Outcomes, measured: Measured) -> list[Numbered]:
-    found = [outcomes[case] for case in (plan.initial, *plan.objectives)]
-    good = [o for o in found if not o.failure]
-    shown = [o for o in good if o.case.label in SHOWN]
-    paper = [o for o in good if o.case.label in (INITIAL, SHOWN[0])]
-    panels = (*deviation_panels("", paper), *deviation_panels("", shown))
-    title = "Deviation of the end-effector by objective"
-    columns = ["made for", "compliance [N m]", "maximal deviation [mm]", "grayness [-]",
-               "iterations", "ended by"]  # fmt: skip
-    rows = tuple(
-        (m.label, m.compliance, 1e3 * m.deviation, m.grayness, m.iterations, m.note)
-        for m in measured.objectives
-    )
-    designs = "Designs by objective"
-    return [
-        Numbered(3, title, _histories(title, *panels)),
-        Numbered(4, designs, design_figure("", designs, good),
-                 Table("", designs, pd.DataFrame(rows, columns=columns))),
-    ]  # fmt: skip
+def setting_of(scene: Scene) -> dict[str, Any]:
+    """Return what the texts say of a scene.
+
+    Returns:
+        payload (kg); machine, a sentence; relative_stiffness, Young's modulus of the initial
+        design over the solid one; interpolation, how that comes about; volume_fraction.
+    """
+    from dolfinopt.density.interpolation import interpolate
+
+    options, x, motion = scene.interpolation, scene.design.initial, scene.motion
+    stiffness = interpolate(np.array([x]), options.law, options.penalty, options.floor).stiffness
+    count = sum(arm.flexible for arm in scene.arms)
+    arms = "arm that moves" if count == 1 else "arms that move"
+    base = "cart carries" if motion.base == "cart" else "fixed base carries"
+    path = "a given path"
+    if motion.path in ("arc", "line"):
+        round_ = motion.path == "arc" and motion.flattening > 0.0
+        path = "a semicircle" if round_ else "a straight line"
+        if round_ and motion.flattening != 1.0:
+            path += f" flattened to {motion.flattening:g}"
+    number, p = NUMBERS.get(count, count), f"{options.penalty:g}"
+    law = f"{x:g} with q = {p} of RAMP" if options.law == "ramp" else f"{x:g} to the power {p}"
+    return {
+        "payload": scene.payload.mass,
+        "machine": f"A {base} {number} flexible {arms} {scene.payload.mass:g} kg along {path}.",
+        "relative_stiffness": round(float(stiffness[0]), 4),
+        "interpolation": law,
+        "volume_fraction": scene.design.volume_fraction,
+    }
 
 
-def _convergence_figures(plan: Plan, outcomes: Outcomes) -> list[Numbered]:
-    found = [outcomes[case] for case in plan.reductions]
-    histories = [(o.case.label, o.history()) for o in found if not o.failure]
+def as_json(plan: Plan, results: pd.DataFrame) -> str:
+    """Return measured.json: all results, curves as lists."""
+    made = ["label", "kind", "compliance", "deviation", "grayness", "iterations", "note"]
+    reduced_by = ["method", "coordinates", "own", "compliance", "deviation", "apart", "iterations"]
+    curves = ["coordinates", "compliance", "deviation", "apart"]
+    by = dict(iter(results.groupby("table")))
+    for name in ("reductions", "coordinates", "ends reductions"):
+        renamed = by[name].rename(columns={"kind": "method", "x": "coordinates"})
+        by[name] = renamed.astype({"coordinates": int})
 
-    def lines(take: Callable[..., float]) -> tuple[Line, ...]:
-        return tuple(
-            Line(label, np.array([row.iteration for row in rows]), np.array([*map(take, rows)]))
-            for label, rows in histories
-        )
-
-    compliance = Panel("", "iteration [-]", "compliance, own model [N m]",
-                       lines(lambda row: row.objective), y_log=True)  # fmt: skip
-    grayness = Panel("", "iteration [-]", "grayness [-]", lines(lambda row: row.grayness))
-    return [
-        _plot(5, "Convergence of the compliance by reduction", compliance),
-        _plot(6, "Convergence of the grayness by reduction", grayness),
-    ]
-
-
-def _coordinate_figures(plan: Plan, outcomes: Outcomes, measured: Measured) -> list[Numbered]:
-    panels = []
-    for design, _ in plan.given:
-        mine = [one for one in measured.coordinates if one.design == design]
-        lines = [
-            Line(one.method, np.array(one.coordinates), np.array(one.compliance)) for one in mine
+    def sweep(name: str) -> dict[str, Any]:
+        rows = by[name]
+        designs = [
+            {"label": label, "made_for": one.made_for.iloc[0]}
+            | one[["compliance", "deviation"]].to_dict("list")
+            for label, one in rows.groupby("label", sort=False)
         ]
-        panels.append(
-            Panel(
-                design,
-                "elastic coordinates of each arm [-]",
-                "compliance [N m]",
-                tuple(lines),
-                x_log2=True,
-            )
-        )
-    ends = [
-        outcomes[case]
-        for method in METHODS
-        for case in _ends(plan.resolved(*plan.given[1], method))
-    ]
-    made = [replace(outcomes[plan.again(case)], case=case) for case in plan.reductions]
-    with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
-    return [
-        _plot(7, "Compliance against the number of coordinates", *panels),
-        Numbered(8, title := "Deviation of the optimised design by reduction",
-                 _histories(title, *deviation_panels("", _good(ends)))),
-        Numbered(9, with_modes,
-                 _histories(with_modes, *deviation_panels("", _good(made)))),
-    ]  # fmt: skip
+        return {"axis": SWEEPS[name][1], "values": [*rows.x.unique()], "designs": designs}
 
-
-def _histories(title: str, *rows: tuple[Panel, ...]) -> LineFigure:
-    """Return a figure of deviations over time; empty axes where nothing could be simulated."""
-    nothing = (Panel("", "time [s]", "deviation [mm]", ()),)
-    return LineFigure("", title, rows or (nothing,))
-
-
-def _ends(cases: Sequence[Case]) -> list[Case]:
-    return list(dict.fromkeys((cases[0], cases[-1])))
-
-
-def _good(found: Sequence[Outcome]) -> list[Outcome]:
-    return [outcome for outcome in found if not outcome.failure]
-
-
-def _sweep_figures(sweep: ValueSweep, number: int) -> list[Numbered]:
-    """Return compliance and deviation; the initial design has a scale of its own."""
-    numbered: list[Numbered] = []
-    for quantity, factor, label in (
-        ("compliance", 1.0, "compliance [N m]"),
-        ("deviation", 1e3, "maximal deviation [mm]"),
-    ):
-        panels = []
-        for group in (sweep.designs[:1], sweep.designs[1:]):
-            lines = [
-                Line(u.label, np.array(sweep.values), factor * np.array(getattr(u, quantity)))
-                for u in group
-            ]
-            panels.append(Panel("", sweep.axis, label, tuple(lines)))
-        name, by = label.partition(" [")[0].capitalize(), sweep.axis.partition(" [")[0]
-        numbered.append(_plot(number + len(numbered), f"{name} against {by}", *panels))
-    return numbered
-
-
-def _loss_figures(sweep: ValueSweep, number: int) -> list[Numbered]:
-    labels = tuple(f"{used.made_for:g}" for used in sweep.optima)
-    numbered: list[Numbered] = []
-    for quantity in ("compliance", "deviation"):
-        loss = 100.0 * sweep.loss(quantity)
-        title = f"Loss of {quantity} against the design made for the path [%]"
-        made, used = f"made for {sweep.axis}", f"used at {sweep.axis}"
-        frame = pd.DataFrame(loss, columns=[f"used at {label}" for label in labels])
-        frame.insert(0, made, labels)
-        table = Table("", title, frame)
-        matrix = MatrixFigure("", title, made, used, labels, (("", loss),))
-        numbered.append(Numbered(number + len(numbered), title, matrix, table))
-    return numbered
-
-
-def _plot(number: int, title: str, *panels: Panel) -> Numbered:
-    return Numbered(number, title, LineFigure("", title, tuple((panel,) for panel in panels)))
+    content = {
+        "cells": plan.scene.arms[0].cells or (),
+        "iterations": plan.scene.optimizer.max_iterations,
+        "objectives": by["objectives"][made].to_dict("records"),
+        "reductions": by["reductions"][reduced_by].to_dict("records"),
+        "coordinates": [
+            {"design": design, "method": method} | one[curves].to_dict("list")
+            for (design, method), one in by["coordinates"].groupby(["label", "method"], sort=False)
+        ],
+        "payload": sweep("payload"),
+        "path": sweep("path"),
+        "ends": {
+            "length": SOLID_ENDS,
+            "objectives": by["ends objectives"][made].to_dict("records"),
+            "reductions": by["ends reductions"][reduced_by].to_dict("records"),
+        },
+        "setting": setting_of(plan.scene),
+    }
+    return json.dumps(content, indent=1) + "\n"

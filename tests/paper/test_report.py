@@ -13,7 +13,7 @@ from test_paper import tiny_plan
 from dolfinopt.output.files import ArmView
 from dolfinopt.paper import page as report
 from dolfinopt.paper import reproduction as paper
-from dolfinopt.paper.checks import check_paper, failed_checks
+from dolfinopt.paper.statements import check_paper, failed_checks
 
 WORLD = MPI.COMM_WORLD
 VOID = {"meta", "link", "img", "input", "br", "path", "rect", "circle"}
@@ -24,11 +24,13 @@ PHONE, DESK = (390, 844), (1280, 900)  # px
 def made(tmp_path_factory):
     """A reproduction with few cells and iterations and its folder, on all ranks."""
     path = WORLD.bcast(tmp_path_factory.mktemp("paper") if WORLD.rank == 0 else None, root=0)
-    done = paper.reproduce(tiny_plan(), path, WORLD, shown=False)
+    plan = tiny_plan()
+    results, outcomes = paper.reproduce(plan, path, WORLD, shown=False)
+    checks = check_paper(results, paper.setting_of(plan.scene))
     if WORLD.rank == 0:
-        report.write_reproduction(done, path)
+        report.write_reproduction(plan, results, outcomes, checks, path)
     WORLD.barrier()
-    return done, path
+    return (plan, outcomes, checks), path
 
 
 @pytest.fixture
@@ -116,36 +118,34 @@ def test_page_is_sound(page):
     assert len(page.all("img")) == 12 + 2 * (4 + 4 + 2)
 
 
-def test_every_finding_is_told(made, folder):
+def test_every_statement_is_told(made, folder):
     """With the paper's figure, ours, and the verdict."""
     from html import unescape
 
     text = unescape((folder / "report.html").read_text(encoding="utf-8"))
-    for check in made[0].checks:
-        for words in (check.statement, check.paper, check.ours, check.criterion):
+    for check in made[0][-1]:
+        for words in (check.statement, check.paper, check.found, check.criterion):
             assert words in text
         assert check.holds or check.reason in text
 
 
 def test_page_without_some_results(made, tmp_path):
     """Cases that failed are named; nothing that needs them holds, and the rest is told."""
-    done, _ = made
-    plan = done.plan
-    lost = {plan.optimum, plan.reductions[-1]}
-    lost |= {case for case in plan.cases if case.design in lost}
+    (plan, outcomes, _), _ = made
+    table = plan.table
+    lost = {plan.optimum, table.made[table.table == "reductions"].iloc[-1]}
+    lost |= {case for case in table.case if case.design in lost}
     nothing = {"failure": "it <diverged>", "compliance": np.nan, "max_deviation": np.nan}
     outcomes = replace(
-        done.outcomes,
+        outcomes,
         by_case={
             case: replace(outcome, **nothing) if case in lost else outcome
-            for case, outcome in done.outcomes.by_case.items()
+            for case, outcome in outcomes.by_case.items()
         },
     )
-    measured = paper.measure(plan, outcomes)
-    checks = check_paper(measured)
-    drawn = paper.figures(plan, outcomes, measured)
-    poorer = paper.Reproduction(plan, outcomes, measured, checks, drawn)
-    report.write_reproduction(poorer, tmp_path)
+    results = paper.add_outcomes(table, outcomes)
+    checks = check_paper(results, paper.setting_of(plan.scene))
+    report.write_reproduction(plan, results, outcomes, checks, tmp_path)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "it &lt;diverged&gt;" in text and len(Reader(text).all("article")) == 15
     wrong = {line.partition(":")[0] for line in failed_checks(checks)}
@@ -179,19 +179,17 @@ def test_animation_follows_the_mechanism():
     simulated = next(iter(simulate_scenarios([tiny_plan().scene], None)))
     trajectory = simulated.trajectory
     at = np.array([0, 80, len(trajectory.t) - 1])
-    flexible, rigid = (report.strip(trajectory, at, factor) for factor in (1.0, 0.0))
-    np.testing.assert_allclose(flexible.tips - rigid.tips, trajectory.deviation[at], atol=1e-12)
-    lengths = np.hypot(*trajectory.deviation[at].T)
-    np.testing.assert_allclose(flexible.deviation, 1e3 * lengths)
-    for text, tip in zip(flexible.arms, flexible.tips, strict=True):
-        numbers = [float(v) for v in re.findall(r"-?\d+\.\d+", text)]
-        assert len(numbers) == 2 + 2 * 6 and text.count("C") == 2
-        np.testing.assert_allclose(numbers[-2:], tip, atol=1e-4)
+    flexible, rigid = (report.centre_lines(trajectory, at, factor) for factor in (1.0, 0.0))
+    apart = flexible[:, -1] - rigid[:, -1]
+    np.testing.assert_allclose([apart.real, apart.imag], trajectory.deviation[at].T, atol=1e-12)
+    numbers = [float(v) for v in re.findall(r"-?\d+\.\d+", report.svg_path(flexible[1]))]
+    assert len(numbers) == 2 + 2 * 6  # three points of a cubic curve an arm
+    np.testing.assert_allclose(
+        numbers[-2:], [flexible[1, -1].real, flexible[1, -1].imag], atol=1e-4
+    )
     # Rigid arms are straight: all points of one lie on a line from joint to joint.
-    points = np.array(re.findall(r"(-?\d+\.\d+),(-?\d+\.\d+)", rigid.arms[1]), dtype=float)
-    a, b, c, d = points[:4]
-    for point in (b, c):
-        assert abs(np.cross(d - a, point - a)) < 2e-4
+    a, b, c, d = rigid[1, :4]
+    np.testing.assert_allclose([((p - a) / (d - a)).imag for p in (b, c)], 0.0, atol=1e-12)
 
 
 # -- in a browser ----------------------------------------------------------------------------
