@@ -59,12 +59,12 @@ def has_locks(folder: Path, world: MPI.Comm) -> bool:
         return True
     if world.size > 1:
         raise InputError(
-            f"{folder}: the file system has no locks ({reason}), by which ranks share the cases "
-            "out; use one rank, or name a folder on another file system with --out"
+            f"{folder}: the file system has no locks ({reason}), which ranks need to share the "
+            "cases; use one rank, or name a folder on another file system with --out"
         )
     print(
-        f"dolfinopt: warning: {folder}: the file system has no locks ({reason}); going on without: "
-        "start no second run in this folder meanwhile",
+        f"dolfinopt: warning: {folder}: the file system has no locks ({reason}); continuing "
+        "without: do not start a second run in this folder meanwhile",
         file=sys.stderr,
         flush=True,
     )

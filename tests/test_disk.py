@@ -178,7 +178,7 @@ def test_a_file_system_without_locks_is_told(number, shared_tmp_path, monkeypatc
     else:
         assert not has_locks(shared_tmp_path, COMM)
         (line,) = capsys.readouterr().err.splitlines()
-        assert f"has no locks ({os.strerror(number)}); going on without" in line
+        assert f"has no locks ({os.strerror(number)}); continuing without" in line
     assert not list(shared_tmp_path.iterdir())
 
 
@@ -197,7 +197,7 @@ def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
     samples = Samples(scene, ("payload.mass",), np.array([[5.0], [7.0]]))
     _, computed = respond(samples, [("initial", None)], tmp_path, SELF, shown=False)
     assert computed == 3
-    assert capsys.readouterr().err.count("going on without") == 2
+    assert capsys.readouterr().err.count("continuing without") == 2
 
 
 # -- what other programs have computed -------------------------------------------------------

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 @out_option("diagrams and bench.md; default: results/bench")
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some two minutes")
 def bench(out: Path | None, quick: bool) -> None:
-    """Measure run time against error: integrators, meshes, reductions, iterations, other programs.
+    """Measure run time against error.
+
+    Diagrams of integrators, meshes, reductions and iterations, beside other programs.
 
     What is measured is kept in DIR; a call that was interrupted goes on.
     """

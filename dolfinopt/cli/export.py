@@ -36,7 +36,10 @@ def export(
     overwrite: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Write the reduced arms of SCENE for other multibody codes: SID, .npz of it, MBDyn's .fem."""
+    """Write the reduced arms of SCENE for other multibody codes.
+
+    Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem).
+    """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.exchange.sid import sid_arrays, sid_text

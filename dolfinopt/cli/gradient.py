@@ -34,7 +34,11 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="gradient.npz; default: results/SCENE-gradient/gradient.npz",
 )
-@click.option("--check", is_flag=True, help="Taylor test along the complete chain")
+@click.option(
+    "--check",
+    is_flag=True,
+    help="compare with differences of the whole simulation",
+)
 @overwrite_option
 @set_option
 def gradient(
@@ -46,7 +50,7 @@ def gradient(
     overwrite: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Write the objective's gradient with respect to the physical densities to FILE."""
+    """Write the gradient by the physical densities to FILE."""
     out = out or Path("results") / f"{scene.stem}-gradient" / "gradient.npz"
     if out.is_dir():
         raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
@@ -107,6 +111,6 @@ def _check_gradient(
             )
     if not test.passed:
         raise ConvergenceError(
-            f"the remainders fall at a rate below {PASSES}: the gradient is not exact here; a "
-            "tighter simulation.tolerance tells whether the simulation is to blame"
+            f"the Taylor remainders fall at a rate below {PASSES}: the gradient is not exact here; "
+            "repeat with a smaller simulation.tolerance to see whether the simulation is the cause"
         )

@@ -20,7 +20,7 @@ TEMPLATES = {
 
 
 @click.command(
-    help="Write a commented scene to start from: NAME.toml, by default scene.toml.\n\n"
+    help="Write a commented scene, NAME.toml (default: scene.toml).\n\n"
     "\b\nTemplates:\n" + "\n".join(f"  {name:<16}{what}" for name, what in TEMPLATES.items())
 )
 @click.argument("name", default="scene", type=click.Path(path_type=Path))
@@ -46,10 +46,11 @@ def init(name: Path, template: str) -> None:
         texts[path.with_suffix(source.suffix)] = text
     schema = path.with_name(SCHEMA_FILE)
     write_new(texts, {schema: json.dumps(scene_schema(), indent=2) + "\n"})
-    click.echo(f"{', '.join(os.fspath(one) for one in texts)}: edit what differs on your machine")
+    written = ", ".join(os.fspath(one) for one in texts)
+    click.echo(f"{written}: edit the values that differ for your machine")
     click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
     if template == "step":
-        click.echo(f"put your STEP file beside, as {path.with_name('arm.step')}")
+        click.echo(f"put your STEP file beside it, as {path.with_name('arm.step')}")
     click.echo("then:")
     click.echo(f"  dolfinopt simulate {path}    # what the machine does with half the material")
     click.echo(f"  dolfinopt optimize {path}")

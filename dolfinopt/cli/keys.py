@@ -21,9 +21,10 @@ WIDTH = 92
 @click.command()
 @click.argument("pattern", required=False)
 def keys(pattern: str | None) -> None:
-    """Explain the keys of a scene: what is allowed, default, unit and meaning.
+    """Explain the keys of a scene.
 
-    PATTERN is a part of the key (payload, mass) or has wildcards ("arms.*"); default: all keys.
+    Lists unit, allowed values, default and meaning of the keys that contain PATTERN (payload, mass)
+    or match its wildcards ("arms.*"); without PATTERN of all keys.
     """
     from dolfinopt.scene.load import describe_keys
 
@@ -35,7 +36,7 @@ def keys(pattern: str | None) -> None:
             str(pattern), sorted({part for info in known for part in info.key.split(".")}), 3
         )
         hint = f"did you mean {' or '.join(near)}? " if near else ""
-        raise InputError(f"{pattern}: no key of a scene; {hint}dolfinopt keys lists all of them")
+        raise InputError(f"{pattern}: no such key; {hint}dolfinopt keys lists all of them")
     click.echo("\n".join(map(_explained, found)))
 
 

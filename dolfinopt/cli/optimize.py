@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.command()
 @scene_argument
 @out_option("the results; default: results/SCENE")
-@click.option("--resume", is_flag=True, help="go on from the folder's checkpoint")
+@click.option("--resume", is_flag=True, help="continue from the checkpoint in DIR")
 @overwrite_option
 @set_option
 @plots_option

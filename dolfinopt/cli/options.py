@@ -25,13 +25,11 @@ plots_option = click.option("--plots/--no-plots", default=True, help="draw pictu
 
 
 animation_option = click.option(
-    "--animation", is_flag=True, help="draw the moving machine, too: motion.gif"
+    "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
 )
 
 
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="replace the results that are there already"
-)
+overwrite_option = click.option("--overwrite", is_flag=True, help="replace existing results")
 
 
 def out_option(what: str) -> Callable[..., Any]:

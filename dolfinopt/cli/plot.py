@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @animation_option
 def plot(folder: Path, animation: bool) -> None:
-    """Draw the pictures of a finished run in DIR anew."""
+    """Redraw the pictures of a finished run in DIR."""
     world = start()
     from dolfinopt.output.files import gather_views, read_history, read_initial_deviation
     from dolfinopt.parallel import on_root

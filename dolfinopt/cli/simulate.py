@@ -41,7 +41,10 @@ def simulate(
     plots: bool,
     animation: bool,
 ) -> None:
-    """Simulate SCENE with a given design and report compliance and deviation."""
+    """Simulate SCENE with a given design.
+
+    Writes the trajectory, and prints compliance and deviation.
+    """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.output.folders import remove_stale

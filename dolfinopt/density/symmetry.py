@@ -41,7 +41,7 @@ class AxisSymmetry:
             raise InputError(
                 f"arm {mesh.name!r}: symmetric = true, but the mesh is not symmetric about y = 0: "
                 f"the cell at ({x:.4g}, {y:.4g}) m has no mirror image within {TOLERANCE:g} cell "
-                "sizes; mend the geometry, or mesh one half and mirror it"
+                "sizes; correct the geometry, or mesh one half and mirror it"
             )
         self.mirror = mirror
 

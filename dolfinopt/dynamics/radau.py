@@ -117,9 +117,9 @@ def integrate(
 def _lost_motion(system: System, found: Solution) -> str:
     """Return the message about a motion that is another one on every grid."""
     return (
-        f"the simulation finds another motion with every number of time steps, at last "
-        f"{len(found.a)}; in it {system.describe(found.q)}, beyond small-deflection "
-        f"theory; {REMEDY.replace('them', 'the arms', 1)}"
+        f"the simulation does not converge: its result still changes with the number of time "
+        f"steps, at last {len(found.a)}, in which {system.describe(found.q)}, beyond "
+        f"small-deflection theory; {REMEDY.replace('them', 'the arms', 1)}"
     )
 
 

@@ -142,8 +142,8 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
 def _lost_in_rounding(arm: ElasticArm) -> ConvergenceError:
     low, high = extremes(arm.comm, arm.young)
     return ConvergenceError(
-        f"arm {arm.mesh.name!r}: solid parts of the design float in a void "
-        f"{low / high:.1g} times as stiff, lost in their rounding; raise "
+        f"arm {arm.mesh.name!r}: solid parts of the design are connected by void alone, "
+        f"{low / high:.1g} times as stiff: too soft for double precision; raise "
         "interpolation.floor or design.minimum, or connect the design to both interfaces"
     )
 

@@ -221,8 +221,9 @@ class ElasticArm:
                 failed = failed or ksp.getConvergedReason() < 0
         if failed:  # the same on all ranks
             raise ConvergenceError(
-                f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is lost "
-                "in the rounding of solid; raise interpolation.floor or design.minimum"
+                f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is too "
+                "soft for double precision beside solid; raise "
+                "interpolation.floor or design.minimum"
             )
         return out
 

@@ -87,7 +87,7 @@ def _check_cells(flat: FlatMesh) -> None:
     if bad.any():
         x, y = corner[bad][0].mean(axis=0)
         raise InputError(
-            f"{bad.sum()} cells are folded or flat, the first at ({x:.4g}, {y:.4g}) m; mend the "
+            f"{bad.sum()} cells are folded or flat, the first at ({x:.4g}, {y:.4g}) m; repair the "
             "mesh"
         )
     _check_overlap(flat, corner)
@@ -98,12 +98,15 @@ def _check_cells(flat: FlatMesh) -> None:
     pieces = len(np.unique(parts))
     if pieces > 1:
         raise InputError(
-            f"it falls into {pieces} parts; neighbouring surfaces must share their curves and nodes"
+            f"it consists of {pieces} separate parts; neighbouring surfaces must share "
+            "their curves and nodes"
         )
     known = np.unique(np.sort(sides, axis=1) @ [count, 1])
     for name, lines in (("inboard", flat.inboard), ("outboard", flat.outboard)):
         if not np.isin(np.sort(lines, axis=1) @ [count, 1], known).all():
-            raise InputError(f'group "{name}" has lines that are no sides of cells; mend the mesh')
+            raise InputError(
+                f'group "{name}" has lines that are no sides of cells; repair the mesh'
+            )
 
 
 def _check_overlap(flat: FlatMesh, corner: np.ndarray) -> None:
@@ -143,7 +146,7 @@ def _check_overlap(flat: FlatMesh, corner: np.ndarray) -> None:
         x, y = centre[found[0]]
         raise InputError(
             f"{len(found)} cells overlap others, the first at ({x:.4g}, {y:.4g}) m: inverted "
-            "cells, or surfaces on top of each other; mend the mesh"
+            "cells, or surfaces on top of each other; repair the mesh"
         )
 
 
@@ -206,4 +209,4 @@ def _check_frame(flat: FlatMesh, arm: Arm, used: np.ndarray) -> None:
 def remedy(found: float, expected: float, keys: str = "length and height") -> str:
     if expected > 0.0 and 900.0 < found / expected < 1100.0:
         return "lengths are in metres, these look like millimetres"
-    return f"mend the geometry, or {keys} in the scene"
+    return f"correct the geometry, or {keys} in the scene"

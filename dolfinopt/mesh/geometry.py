@@ -51,7 +51,7 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
         if type(error) is not Exception:  # Gmsh raises no other
             raise
         text = " ".join(str(error).split()) or "Gmsh failed"
-        raise InputError(f"{where}: {text}; open the file in Gmsh to mend it") from None
+        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
     notes = (unknown_names(where, unknown),) if unknown else ()
     if solid_done or arm.solid_ends == 0.0:
         return np.empty((0, 2, 2)), notes

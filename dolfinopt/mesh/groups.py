@@ -104,6 +104,7 @@ def _check_kinds(gmsh: Any, surfaces: list[int]) -> None:
 def unknown_names(where: str, names: list[str]) -> str:
     listed = ", ".join(f'"{name}"' for name in sorted(set(names)))
     return (
-        f"{where}: surfaces named {listed} are no group of their own: names that count begin with "
-        "passive (stays solid) or design; all others are designed, or left out where one is design"
+        f"{where}: the names of surfaces {listed} have no meaning: expected names that "
+        "begin with passive (stays solid) or design; all other surfaces are "
+        "designed, or left out if one is named design"
     )

@@ -201,7 +201,7 @@ def read_fem(path: Path) -> ModalElement:
         if title:
             number = int(title[1])
             if number in groups:
-                raise InputError(f"{path}: record group {number} stands there twice")
+                raise InputError(f"{path}: record group {number} appears twice")
             groups[number] = []
         elif number and not line.startswith("**"):
             groups[number] += line.split()

@@ -425,7 +425,7 @@ def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
             f"MMA: the subproblem was not solved in {evaluations} evaluations of its dual: "
             f"constraint {i} (of those with a gradient) is left at {left[i]:.1e} in units of its "
             f"largest derivative, with multiplier {point.multipliers[i]:.1e}. Check that its "
-            "value and gradient belong together and that no two constraints say the same, or "
+            "value and gradient belong together and that no two constraints are equivalent, or "
             "reduce move."
         )
 
@@ -465,7 +465,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     """
     m = gradient.size
     # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
-    # is flat; the relative part is for constraints that say the same.
+    # is flat; the relative part is for equivalent constraints.
     diagonal = 1e-12 * np.diag(curvature) + 1e-6 * np.abs(gradient) + _TINY
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)

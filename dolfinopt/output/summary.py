@@ -244,9 +244,9 @@ def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
         return []
     return [
         f"the filter's radius of {radius:.4g} m is {radius / size:.2g} cells of arm "
-        f"{scene.arms[k].name!r}: below {FILTER_CELLS:g} cells designs may hang together by "
-        "corners of cells, which is stiff in the model alone; set design.filter_radius = "
-        f"{FILTER_CELLS * size:.4g} or more, or use finer cells"
+        f"{scene.arms[k].name!r}: below {FILTER_CELLS:g} cells parts of a design may be "
+        "connected at corners of cells only, which is stiff in the model alone; set "
+        f"design.filter_radius = {FILTER_CELLS * size:.4g} or more, or use finer cells"
     ]
 
 
@@ -263,7 +263,7 @@ def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
                     f"arm {arm.name!r} deflects by {100.0 * u:.3g} % of its length and its end "
                     f"turns by {np.degrees(turn):.3g} degrees{where}: beyond {100.0 * SMALL:g} % "
                     f"or {np.degrees(SMALL_TURN):.0f} degrees the model of small deflections is "
-                    "off; stiffen the arm or slow the motion"
+                    "inaccurate; stiffen the arm or slow the motion"
                 )
     return found
 

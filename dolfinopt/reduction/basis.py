@@ -359,8 +359,8 @@ def complement_solve(
             step = z + (energy / previous) * step
         else:
             raise ConvergenceError(
-                f"arm {arm.mesh.name!r}: the slopes of mode {k + 1} do not converge, the next "
-                "mode's frequency is too close; take one of reduction.coordinates more or less"
+                f"arm {arm.mesh.name!r}: the derivatives of mode {k + 1} do not converge, the "
+                "next mode's frequency is too close; change reduction.coordinates by one"
             )
     return out
 

@@ -53,12 +53,12 @@ class Limit:
 
     @property
     def sentence(self) -> str:
-        """E.g. "first frequency of arm2: 60.4 Hz, at least 80 Hz asked"."""
+        """E.g. "first frequency of arm2: 60.4 Hz, at least 80 Hz required"."""
         what = self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
         unit = "" if self.unit == "-" else f" {self.unit}"
         value, limit = distinct(self.value, self.limit)
         bound = "at least" if self.least else "at most"
-        return f"{what}: {value}{unit}, {bound} {limit}{unit} asked"
+        return f"{what}: {value}{unit}, {bound} {limit}{unit} required"
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of summary.json."""

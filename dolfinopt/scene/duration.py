@@ -42,7 +42,7 @@ def too_short(law: Law) -> str:
     """Return what is wrong with a duration that the limits do not allow."""
     return (
         f"expected at least {law.least:.6g} [s], which motion.max_speed, max_acceleration and "
-        "max_jerk need; leave it out, or raise them"
+        "max_jerk need; leave it out, or raise the limits"
     )
 
 

@@ -221,7 +221,7 @@ def _time_motion(
             raise input_error(
                 where,
                 f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s] by the "
-                f"limits ({keys}); leave it out to have just that, or raise them",
+                f"limits ({keys}); leave it out to use this value, or raise the limits",
             )
     duration = motion.get("duration")
     default = Motion.model_fields["horizon"].default

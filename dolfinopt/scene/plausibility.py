@@ -39,8 +39,8 @@ def _materials(scene: Scene) -> list[str]:
             where = f"arms.{arm.name}" if getattr(arm, key) is not None else "material"
             if not low <= value <= high:
                 found[
-                    f"{where}.{key} = {value:g} {unit} is no structural material's: these have "
-                    f"{low:g} to {high:g} {unit}; mind the unit"
+                    f"{where}.{key} = {value:g} {unit} is outside the range of structural "
+                    f"materials, {low:g} to {high:g} {unit}; check the unit"
                 ] = None
     return list(found)
 
@@ -54,16 +54,16 @@ def _sizes(scene: Scene) -> list[str]:
         if arm.height > arm.length:
             found.append(
                 f"arms.{arm.name}: its height, {arm.height:g} m, exceeds its length, "
-                f"{arm.length:g} m: it points along its length"
+                f"{arm.length:g} m, which is measured from joint to joint; check both"
             )
         if arm.length > SLENDER * arm.height or arm.thickness > SLENDER * arm.height:
             found.append(
                 f"arms.{arm.name}: length {arm.length:g} m, height {arm.height:g} m and thickness "
-                f"{arm.thickness:g} m differ by more than a factor of {SLENDER:g}; mind the units"
+                f"{arm.thickness:g} m differ by more than a factor of {SLENDER:g}; check the units"
             )
         if radius > arm.height:
             found.append(
-                f"design.filter_radius = {radius:g} m is beyond the height of arm {arm.name!r}, "
+                f"design.filter_radius = {radius:g} m exceeds the height of arm {arm.name!r}, "
                 f"{arm.height:g} m: its design cannot vary across the arm"
             )
     return found
@@ -75,8 +75,8 @@ def _motion(scene: Scene) -> list[str]:
     if scene.objective.simulated and damping > motion.duration:
         found.append(
             f"damping.stiffness_proportional = {damping:g} s: deflections relax in that time, "
-            f"longer than motion.duration = {motion.duration:g} s, so that the arms hardly move "
-            "in themselves; usual values are 1e-5 to 1e-2 s"
+            f"longer than motion.duration = {motion.duration:g} s, so that the arms hardly "
+            "deflect; usual values are 1e-5 to 1e-2 s"
         )
     if max(map(abs, motion.gravity)) > GRAVITY:
         found.append(

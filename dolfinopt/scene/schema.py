@@ -37,7 +37,7 @@ class Scene(Table):
     """A complete, valid scene. Two scenes are equal if all their keys are; `source` is no key."""
 
     name: Annotated[str, AfterValidator(check_scene_name)] = Field(
-        description="title of the scene; by default the file's name without extension [-]"
+        description="title of the scene; default: the file's name without extension [-]"
     )
     material: Material = Field(description="the solid material")
     interpolation: Interpolation = Field(default=Interpolation(), description="material law")
@@ -52,7 +52,7 @@ class Scene(Table):
     design: Design = Field(default=Design(), description="design variables")
     optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
     scenarios: tuple[Scenario, ...] = Field(
-        default=(), description="uses that the objective combines; none: the scene itself"
+        default=(), description="scenarios that the objective combines; none: the scene itself"
     )
 
     _source: str = PrivateAttr("<scene>")

@@ -196,7 +196,7 @@ def test_unknown_groups_of_surfaces_are_listed(write):
     mesh = arm_mesh(COMM, entry(write("own.geo", PLAIN + TIP + ENDS + groups)))
     assert figures(mesh)[2] == 0.0
     assert len(mesh.notes) == 1
-    assert 'surfaces named "boss", "web" are no group' in mesh.notes[0]
+    assert 'names of surfaces "boss", "web" have no meaning' in mesh.notes[0]
 
 
 def test_unknown_products_are_listed(shared_tmp_path):
@@ -581,7 +581,7 @@ def test_check_accepts():
     [
         ({"cells": np.array([[0, 1, 3, 4], [1, 2, 5, 4]])}, "1 cells are folded or flat"),
         ({"cells": np.array([[0, 1, 2], [0, 1, 4]])}, "1 cells are folded or flat"),
-        ({"cells": np.array([[0, 1, 3], [2, 5, 4]])}, "falls into 2 parts"),
+        ({"cells": np.array([[0, 1, 3], [2, 5, 4]])}, "consists of 2 separate parts"),
         ({"inboard": np.array([[0, 4]])}, '"inboard" has lines that are no sides'),
         ({"outboard": np.array([[1, 4]])}, '"outboard" has its middle at (1, 0) m'),
         ({"inboard": np.array([[0, 3, 1]])}, "its lines are curved"),

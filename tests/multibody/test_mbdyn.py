@@ -231,7 +231,7 @@ def test_nodes_of_an_arm_on_several_ranks(parts):
     ("old", "new", "words"),
     [
         ("** RECORD GROUP 9,", "** RECORD 9,", ["record group 9, MODAL MASS MATRIX, is missing"]),
-        ("** RECORD GROUP 10", "** RECORD GROUP 9", ["record group 9 stands there twice"]),
+        ("** RECORD GROUP 10", "** RECORD GROUP 9", ["record group 9 appears twice"]),
         ("REV0        38", "REV0        39", ["record group 2 has 38 labels, expected 39"]),
         ("REV0        38", "REV0     three", ["record group 1", "five integers"]),
         ("  4         0", "  5         0", ["record group 8 has 912 numbers, expected 1140"]),

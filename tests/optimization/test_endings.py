@@ -144,8 +144,8 @@ def test_a_large_residual_is_no_convergence():
 @pytest.mark.parametrize(
     ("bound", "words"),
     [
-        ("constraints.tip_deflection=1e-9", ["tip deflection of arm1", "at most 1e-09 m asked"]),
-        ("constraints.first_frequency=80", ["first frequency of arm2", "at least 80 Hz asked"]),
+        ("constraints.tip_deflection=1e-9", ["tip deflection of arm1", "at most 1e-09 m required"]),
+        ("constraints.first_frequency=80", ["first frequency of arm2", "at least 80 Hz required"]),
     ],
 )
 def test_an_infeasible_end_has_status_1_and_one_line(bound, words, shared_tmp_path):
@@ -186,7 +186,7 @@ def test_exit_status_of_an_optimisation(bound, tmp_path):
     assert done.returncode == (0 if feasible else 1)
     assert "minimised compliance under static loads" in done.stdout
     assert done.stdout.count("iterations") == 2  # "1 iterations (optimizer.max_iterations = 1)"
-    told = [text for text in done.stderr.splitlines() if "asked" in text]
+    told = [text for text in done.stderr.splitlines() if "required" in text]
     assert len(told) == (0 if feasible else 1) and "Traceback" not in done.stderr
 
 
@@ -211,14 +211,14 @@ def test_the_last_line_says_what_was_minimised(shared_tmp_path, capsys):
 
 def test_sentences_tell_a_value_from_its_limit():
     limit = Limit("first_frequency", "arm2", 60.4321, 80.0, "Hz", least=True)
-    assert limit.sentence == "first frequency of arm2: 60.4 Hz, at least 80 Hz asked"
+    assert limit.sentence == "first frequency of arm2: 60.4 Hz, at least 80 Hz required"
     assert distinct(80.0004, 80.0) == ("80.0004", "80")
     assert not limit.met and violated([limit]) == limit.sentence
     assert Limit("first_frequency", "arm2", 79.95, 80.0, "Hz", least=True).met  # to 1e-3
     both = worst_limits([[limit], [Limit("first_frequency", "arm2", 90.0, 80.0, "Hz", least=True)]])
     assert both == (limit,)
     assert Limit("volume_fraction", "", 0.6, 0.5, "-").sentence == (
-        "volume fraction: 0.6, at most 0.5 asked"
+        "volume fraction: 0.6, at most 0.5 required"
     )
 
 

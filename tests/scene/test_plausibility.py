@@ -26,15 +26,27 @@ def test_demos_are_plausible(demo):
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        (["material.young_modulus=70"], "material.young_modulus = 70 Pa is no structural"),
-        (["material.young_modulus=70e12"], "material.young_modulus = 7e+13 Pa is no structural"),
-        (["arms.arm2.young_modulus=70e12"], "arms.arm2.young_modulus = 7e+13 Pa is no structural"),
+        (
+            ["material.young_modulus=70"],
+            "material.young_modulus = 70 Pa is outside the range",
+        ),
+        (
+            ["material.young_modulus=70e12"],
+            "material.young_modulus = 7e+13 Pa is outside the range",
+        ),
+        (
+            ["arms.arm2.young_modulus=70e12"],
+            "arms.arm2.young_modulus = 7e+13 Pa is outside the range",
+        ),
         (["material.density=2.7"], None),  # aerogel and foam
-        (["material.density=0.27"], "material.density = 0.27 kg/m3 is no structural material's"),
-        (["material.density=2.7e5"], "material.density = 270000 kg/m3 is no"),
+        (
+            ["material.density=0.27"],
+            "material.density = 0.27 kg/m3 is outside the range",
+        ),
+        (["material.density=2.7e5"], "material.density = 270000 kg/m3 is outside"),
         (["arms.height=1.5"], "arms.arm1: its height, 1.5 m, exceeds its length, 1 m"),
         (["arms.thickness=100"], "thickness 100 m differ by more than a factor of 1000"),
-        (["design.filter_radius=0.061"], "design.filter_radius = 0.061 m is beyond the height"),
+        (["design.filter_radius=0.061"], "design.filter_radius = 0.061 m exceeds the height"),
         (["design.filter_radius=0.06"], None),
         (["damping.stiffness_proportional=2"], "stiffness_proportional = 2 s: deflections relax"),
         (["motion.gravity=[0, -981]"], "motion.gravity = [0.0, -981.0] m/s2 exceeds 30 m/s2"),
@@ -67,7 +79,7 @@ def test_warnings_come_before_the_run_once_and_are_kept(tmp_path):
     words = [sys.executable, "-m", "dolfinopt", "simulate", TWO_ARM, "--no-plots", "--out"]
     words += [tmp_path / "out", "--set", "arms.cells=[12,2]", "--set", "material.density=0.5"]
     run = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=True)
-    sentence = "material.density = 0.5 kg/m3 is no structural material's"
+    sentence = "material.density = 0.5 kg/m3 is outside the range"
     assert run.stderr.count(sentence) == 1
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert any(sentence in warning for warning in summary["warnings"])

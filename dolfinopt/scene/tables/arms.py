@@ -45,48 +45,52 @@ class Arm(Table):
     name: Annotated[str, AfterValidator(check_arm_name)] = Field(
         description="unique name, used in files and messages [-]"
     )
-    length: Length = Field(description="from joint axis to joint axis, or to the end [m]")
+    length: Length = Field(
+        description="distance from the inboard joint axis to the outboard one, or to the "
+        "end-effector [m]"
+    )
     height: Length = Field(description="height in the plane of motion [m]")
     thickness: Length = Field(description="thickness normal to the plane of motion [m]")
     cells: tuple[CellCount, CellCount] | None = Field(
         default=(200, 12), description="number of cells along and across a rectangular arm [-]"
     )
     mesh: FileName | None = Field(
-        default=None, description="geometry or mesh (.geo, .msh, .step) in place of cells [-]"
+        default=None, description="geometry or mesh file (.geo, .msh, .step) in place of cells [-]"
     )
     mesh_size: Length | None = Field(
-        default=None, description="of the cells of a .geo or .step file [m]"
+        default=None, description="cell size for a .geo or .step file [m]"
     )
     cell_shape: CellShape | None = Field(
-        default=None, description="of the cells of a .geo or .step file [-]"
+        default=None, description="cell shape for a .geo or .step file [-]"
     )
     passive: float | None = Field(
         default=None,
         ge=0,
-        description="solid material kept around both interfaces; 0 leaves it to a mesh file; "
-        "default: that, or a quarter of a rectangular arm's height, at most a tenth of its "
-        "length [m]",
+        description="length kept solid around both interfaces; default: a quarter of the "
+        "height, at most a tenth of the length; with a mesh file 0, its own groups "
+        "[m]",
     )
     symmetric: bool = Field(
-        default=False, description="design symmetric about the arm's axis y = 0 [-]"
+        default=False, description="keep the design symmetric about the arm's axis y = 0 [-]"
     )
     design: str | None = Field(
         default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
     )
     rigid: bool = Field(
-        default=False, description="a solid bar that does not bend and is not optimised [-]"
+        default=False, description="a rigid bar of solid material, not optimised [-]"
     )
     sid: FileName | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
     young_modulus: YoungModulus | None = Field(
-        default=None, description="instead of material.young_modulus [Pa]"
+        default=None,
+        description="Young's modulus of this arm; default: material.young_modulus [Pa]",
     )
     poisson_ratio: PoissonRatio | None = Field(
-        default=None, description="instead of material.poisson_ratio [-]"
+        default=None, description="Poisson's ratio of this arm; default: material.poisson_ratio [-]"
     )
     density: MassDensity | None = Field(
-        default=None, description="instead of material.density [kg/m3]"
+        default=None, description="mass density of this arm; default: material.density [kg/m3]"
     )
 
     @model_validator(mode="after")

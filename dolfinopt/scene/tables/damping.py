@@ -11,5 +11,5 @@ class Damping(Table):
     """Structural damping D = stiffness_proportional * K."""
 
     stiffness_proportional: float = Field(
-        default=2e-4, ge=0, le=1e3, description="factor of the stiffness matrix in D [s]"
+        default=2e-4, ge=0, le=1e3, description="factor d of the damping matrix D = d K [s]"
     )

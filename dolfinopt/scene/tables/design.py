@@ -20,47 +20,45 @@ class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
 
     volume_fraction: float = Field(
-        default=0.5, ge=1e-6, le=1, description="volume limit of each arm [-]"
+        default=0.5, ge=1e-6, le=1, description="upper limit of the volume fraction of each arm [-]"
     )
     shared_volume: bool = Field(
         default=False, description="one volume limit for all arms together [-]"
     )
-    initial: float = Field(
-        default=0.5, ge=1e-6, le=1, description="x of every cell at the start [-]"
-    )
+    initial: float = Field(default=0.5, ge=1e-6, le=1, description="initial x of every cell [-]")
     minimum: float = Field(default=1e-3, ge=1e-9, lt=1, description="lower bound of x [-]")
     filter_radius: float = Field(
         default=0.0075,
         ge=0,
         le=1e4,
-        description="radius of the equivalent cone filter; 0 is no filter [m]",
+        description="radius of the equivalent cone filter; 0: no filter [m]",
     )
     projection: Projection = Field(
         default=False,
-        description="after the filter: none, Heaviside, or eroded, nominal and dilated designs "
-        "at once [-]",
+        description="projection after the filter: none, Heaviside, or robust (eroded, nominal "
+        "and dilated designs together) [-]",
     )
     sharpness: float = Field(
-        default=128.0, ge=1, le=1e4, description="beta of the projection in the end [-]"
+        default=128.0, ge=1, le=1e4, description="final beta of the projection [-]"
     )
     continuation: int = Field(
         default=25,
         ge=1,
         le=MAX_ITERATIONS,
-        description="iterations until the projection's beta doubles [-]",
+        description="number of iterations after which beta doubles [-]",
     )
     erosion: float = Field(
         default=0.1,
         ge=1e-3,
         le=0.499,
-        description="distance of the robust thresholds from one half [-]",
+        description="distance of the thresholds of the eroded and dilated designs from 0.5 [-]",
     )
     minimum_member: float = Field(
         default=0.0,
         ge=0,
         le=1e4,
-        description="width of the thinnest member and gap of the robust designs, from which the "
-        "filter's radius follows (filter_radius stays at its default); 0 is off [m]",
+        description="smallest width of members and gaps with the robust projection; sets the "
+        "filter radius (filter_radius stays at its default); 0: no limit [m]",
     )
 
     @property
@@ -85,8 +83,8 @@ class Design(Table):
             return self
         if self.projection != "robust":
             raise Refusal(
-                'expected 0, the default, unless design.projection = "robust": other designs hold '
-                "no width",
+                'expected 0, the default, unless design.projection = "robust": the others do not '
+                "control the width",
                 ("minimum_member",),
                 ("projection",),
             )
@@ -139,7 +137,7 @@ class Design(Table):
             if size is not None and width < MEMBER_CELLS * size * (1.0 - 1e-9):
                 raise Refusal(
                     f'expected at least {MEMBER_CELLS} cells of arm "{arm.name}", '
-                    f"{MEMBER_CELLS * size:.4g} [m]; a wider member or finer cells",
+                    f"{MEMBER_CELLS * size:.4g} [m]; choose a wider member or finer cells",
                     *keys,
                 )
             if 3.0 * width > arm.height * (1.0 + 1e-9):
@@ -160,10 +158,9 @@ class Design(Table):
         for i, share in shares.items():
             if share + (1.0 - share) * self.minimum > limit:
                 raise Refusal(
-                    f"expected so little that volume_fraction = {limit} can be met: with "
-                    f"design.minimum = {self.minimum} between them the solid ends of "
-                    f"share {share:.4g} exceed it; shorten passive (0 keeps none) or raise "
-                    "the volume",
+                    f"expected a length with which volume_fraction = {limit} can be met: the solid "
+                    f"ends are {share:.4g} of the volume, with design.minimum = {self.minimum} "
+                    "between them; shorten passive (0: no solid ends) or raise the volume fraction",
                     ("arms", i, "passive"),
                     ("arms", i, "length"),
                     ("arms", i, "cells"),

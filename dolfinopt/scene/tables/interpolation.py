@@ -24,6 +24,6 @@ class Interpolation(Table):
         default=1e-6,
         ge=1e-12,
         lt=1,
-        description="stiffness and mass of void relative to solid; its square but for "
-        '"two-material" [-]',
+        description="stiffness and density of void relative to solid; laws other than "
+        '"two-material" use its square [-]',
     )

@@ -24,34 +24,41 @@ class Motion(Table):
 
     path: Path2D = Field(
         default="arc",
-        description="of the end-effector: arc, line or table of points; or a table of joint "
+        description="path of the end-effector (arc, line, table of points), or a table of joint "
         "coordinates [-]",
     )
     radius: Length = Field(
-        default=1.0, description="radius of the semicircle about the origin, of an arc [m]"
+        default=1.0, description="radius of the arc, a semicircle about the origin [m]"
     )
     flattening: float = Field(
-        default=1.0, ge=0, le=1, description="factor of an arc's y; 0 is the straight line [-]"
+        default=1.0,
+        ge=0,
+        le=1,
+        description="factor on the y coordinate of the arc; 0 gives a straight line [-]",
     )
     start: tuple[Position, Position] = Field(
-        default=(-1.0, 0.0), description="where a line begins [m]"
+        default=(-1.0, 0.0), description="start point of the line [m]"
     )
-    end: tuple[Position, Position] = Field(default=(1.0, 0.0), description="where a line ends [m]")
+    end: tuple[Position, Position] = Field(
+        default=(1.0, 0.0), description="end point of the line [m]"
+    )
     file: FileName | None = Field(
         default=None,
-        description="table (CSV) of points or joints, from the scene's folder or the working "
-        "directory [-]",
+        description="table (CSV) of points or joint coordinates; relative to the scene's folder "
+        "or the working directory [-]",
     )
     law: TimeLaw = Field(
         default="quintic",
-        description="time law along the path; of a table with times from stop to stop [-]",
+        description="time law along the path; for a table with times, of every move between two "
+        "stops [-]",
     )
     acceleration_share: float = Field(
         default=0.25,
         ge=1e-3,
         le=0.5,
-        description='share of the time in which "trapezoidal" and "s-curve" accelerate, and as '
-        "long in which they brake, unless their last limit tells [-]",
+        description='fraction of the duration in which "trapezoidal" and "s-curve" accelerate, '
+        "and the same in which they brake; unused if the last of their limits "
+        "(max_acceleration, max_jerk) is given [-]",
     )
     max_speed: PathLimit | None = Field(
         default=None, description="limit of the speed along the path [m/s]"
@@ -60,17 +67,17 @@ class Motion(Table):
         default=None, description="limit of the acceleration along the path [m/s2]"
     )
     max_jerk: PathLimit | None = Field(
-        default=None, description='limit of the jerk along the path; not of "trapezoidal" [m/s3]'
+        default=None, description='limit of the jerk along the path; not with "trapezoidal" [m/s3]'
     )
     duration: Duration = Field(
         default=1.9,
-        description="time from start to end of the path; unless stated the last t of a table, or "
-        "what the limits need [s]",
+        description="time from start to end of the path; where a table has times or limits are "
+        "given, the default is the last time or the shortest possible [s]",
     )
     horizon: Duration = Field(
         default=3.0,
-        description="simulated time, the duration or more; at rest after duration; unless stated "
-        "the duration where that is longer than the default [s]",
+        description="simulated time, at least the duration, after which the machine stays at "
+        "rest; the default is the duration if that is longer [s]",
     )
     base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
     base_position: Position = Field(
@@ -80,13 +87,13 @@ class Motion(Table):
         default=0.5,
         ge=-1e3,
         le=1e3,
-        description="position of the cart over the desired x of the end-effector; with one arm, a "
-        "fixed base or a table of joints there is no choice [-]",
+        description="cart's position over the end-effector's desired x; not with one arm, a "
+        "fixed base or a table of joint coordinates [-]",
     )
     joint_height: Position = Field(default=-0.5, description="y of the shoulder joint [m]")
     elbow: Literal[-1, 1] = Field(
         default=-1,
-        description="sign of the elbow angle beta; with one arm, of its cosine with +x [-]",
+        description="sign of the elbow angle beta; with one arm, of the cosine of its angle [-]",
     )
     gravity: tuple[Acceleration, Acceleration] = Field(
         default=(0.0, 0.0), description="gravitational acceleration in x and y [m/s2]"
@@ -123,8 +130,8 @@ class Motion(Table):
         share = type(self).model_fields["acceleration_share"].default
         if profile and getattr(self, last) is not None and self.acceleration_share != share:
             raise Refusal(
-                f"expected {shown(share)}, the default, with motion.{last}, which tells how long "
-                "the law accelerates",
+                f"expected {shown(share)}, the default, with motion.{last}, which determines "
+                "how long the law accelerates",
                 ("acceleration_share",),
                 (last,),
             )
@@ -148,7 +155,7 @@ class Motion(Table):
             )
         if self.cart_follow != type(self).model_fields["cart_follow"].default:
             raise Refusal(
-                "expected 0.5, the default, with one arm: its angle and the path leave the cart "
-                "no choice",
+                "expected 0.5, the default, with one arm: the path determines the position "
+                "of the cart",
                 ("motion", "cart_follow"),
             )

@@ -25,48 +25,60 @@ class Objective(Table):
 
     kind: ObjectiveKind = Field(
         default="esl",
-        description="compliance of load cases or over the horizon, deviation, static "
-        "compliance, or first eigenfrequency [-]",
+        description='minimised response, "esl" being the compliance of the load cases; or '
+        "eigenfrequency, maximised [-]",
     )
     load_cases: int = Field(
         default=30,
         ge=1,
-        description="equal intervals of the horizon; each gives its worst instant [-]",
+        description="number of load cases: the worst instant of each of so many equal intervals "
+        "of the horizon [-]",
     )
     worst: WorstBy = Field(
-        default="compliance", description="what makes an instant the worst of its interval [-]"
+        default="compliance",
+        description="quantity that decides which instant of an interval is the worst [-]",
     )
-    gradient: GradientKind = Field(default="esl", description="with the loads frozen, or exact [-]")
+    gradient: GradientKind = Field(
+        default="esl",
+        description='"esl": equivalent static loads held constant; "exact": of the whole '
+        "simulation [-]",
+    )
     exponent: float = Field(
         default=20.0,
         ge=2,
         le=200,
-        description="p of p-means: deviation over time, squared periods over modes, worst "
-        "scenario or robust design [-]",
+        description="exponent p of the p-means: deviation over time, squared periods over "
+        "modes, worst scenario, robust designs [-]",
     )
     scenarios: Combination = Field(
-        default="sum", description="of the scenarios: weighted sum, or smooth worst case [-]"
+        default="sum", description="how scenarios are combined: weighted sum, or smooth maximum [-]"
     )
     loads: tuple[Load, ...] = Field(
         default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        description="static load cases (F_x N, F_y N, moment N m) at each arm's outboard "
+        description="static load cases [F_x N, F_y N, moment N m] at each arm's outboard "
         "interface [-]",
     )
     attached: Attached = Field(
-        default="rigid-body", description="what an arm carries while it vibrates [-]"
+        default="rigid-body",
+        description="model of what an arm carries, for its eigenfrequencies [-]",
     )
     elbow_angle: float | None = Field(
         default=None,
         ge=-100,
         le=100,
-        description="of every joint behind an arm while it vibrates; default: mid-path [rad]",
+        description="angle of every joint outboard of an arm, for its eigenfrequencies; "
+        "default: that at the middle of the path [rad]",
     )
     modes: int = Field(
-        default=3, ge=1, le=50, description="lowest modes in the p-mean of the eigenfrequency [-]"
+        default=3,
+        ge=1,
+        le=50,
+        description="number of lowest modes in the p-mean of the eigenfrequency [-]",
     )
     follow: bool = Field(
         default=False,
-        description="follow the initial design's first mode by MAC instead of the p-mean [-]",
+        description="track the initial design's first mode by its MAC value in place of the "
+        "p-mean [-]",
     )
 
     @field_validator("loads")
@@ -95,7 +107,7 @@ class Objective(Table):
             if scene.scenarios:
                 raise Refusal(
                     'expected "esl", "compliance" or "deviation" with [[scenarios]]: the others '
-                    "know no motion",
+                    "do not simulate the motion",
                     ("objective", "kind"),
                     ("scenarios", 0, "changes"),
                 )
@@ -135,7 +147,7 @@ class Objective(Table):
             if scene.arms[i].solid_ends == 0.0:
                 raise Refusal(
                     'expected more than 0 with objective.attached = "none": without a mass at its '
-                    "end the optimiser would cut an arm off",
+                    "end the optimiser would remove the end of an arm",
                     ("arms", i, "passive"),
                     ("objective", "attached"),
                 )

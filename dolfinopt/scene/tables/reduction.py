@@ -19,25 +19,24 @@ class Reduction(Table):
     """Model reduction of every arm."""
 
     method: ReductionMethod = Field(
-        default="craig-bampton", description="how the basis is made [-]"
+        default="craig-bampton", description="method of model reduction [-]"
     )
     coordinates: Coordinates = Field(
         default=4,
-        description='elastic coordinates q of each arm; "auto": the fewest that meet '
-        "reduction.tolerance [-]",
+        description='number of elastic coordinates q of each arm; "auto": the smallest number '
+        "that meets reduction.tolerance [-]",
     )
     tolerance: float = Field(
         default=1e-3,
         ge=1e-6,
         le=0.5,
-        description='with "auto": relative error that too few coordinates may make, energy norm '
-        "[-]",
+        description='with "auto": allowed relative error of the reduction, energy norm [-]',
     )
     shifts: tuple[Frequency, ...] = Field(
-        default=(0.0,), description='where "krylov" matches moments [Hz]'
+        default=(0.0,), description='frequencies at which "krylov" matches moments [Hz]'
     )
     band: tuple[Frequency, Frequency] = Field(
-        default=(0.0, 50.0), description='from where to where "balanced" weights responses [Hz]'
+        default=(0.0, 50.0), description='frequency band whose responses "balanced" weights [Hz]'
     )
 
     @field_validator("shifts")

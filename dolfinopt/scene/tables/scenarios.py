@@ -9,12 +9,15 @@ from dolfinopt.scene.tables.base import Refusal, Table
 
 
 class Scenario(Table):
-    """Another use of the same design, which the objective counts in."""
+    """A scenario: another use of the same design, part of the objective."""
 
     changes: tuple[str, ...] = Field(
-        description='what differs, as "key=value" of motion, payload, damping or material [-]'
+        description='changes to the scene as "key=value", of motion, payload, damping or '
+        "material [-]"
     )
-    weight: float = Field(default=1.0, ge=1e-9, le=1e9, description="of its objective [-]")
+    weight: float = Field(
+        default=1.0, ge=1e-9, le=1e9, description="weight in the sum of the scenarios [-]"
+    )
 
     @field_validator("changes")
     @classmethod
@@ -27,5 +30,5 @@ class Scenario(Table):
                     f"expected keys of motion, payload, damping or material, found {shown(key)}"
                 )
             if key == "material.poisson_ratio":
-                raise Refusal("expected no material.poisson_ratio: it changes the arms' basis")
+                raise Refusal("expected no material.poisson_ratio: the reduced basis depends on it")
         return changes

@@ -28,9 +28,9 @@ class Simulation(Table):
     rho_inf: float = Field(
         default=0.8, ge=0, le=1, description="spectral radius at infinity of generalised-alpha [-]"
     )
-    stages: int = Field(default=4, ge=2, le=5, description="stages of a Radau IIA step [-]")
+    stages: int = Field(default=4, ge=2, le=5, description="stages of the Radau IIA method [-]")
     sample: float = Field(
-        default=1e-3, ge=1e-9, le=1e5, description="interval of the output instants [s]"
+        default=1e-3, ge=1e-9, le=1e5, description="sampling interval of the output [s]"
     )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
