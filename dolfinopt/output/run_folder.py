@@ -6,7 +6,7 @@ The summary is written last: a folder that holds one is complete.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,8 @@ from dolfinopt.output.files import (
 )
 from dolfinopt.output.summary import summarise
 from dolfinopt.parallel import Partition, together
-from dolfinopt.profiling import Profile
+from dolfinopt.profiling import Counts, Profile
+from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.contents import named_files, with_relative_paths
@@ -39,9 +40,18 @@ Draw = Callable[[list[ArmView]], None]
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """One design in one scene, simulated; the trajectory is the root's, None elsewhere.
+    """One design in one scene, simulated, and how it was found.
 
-    `choice` is what `reduction.coordinates = "auto"` came to.
+    Attributes:
+        scene, partition, arms, x_phys: the design.
+        evaluation, trajectory: what came of it; the trajectory is the root's, None elsewhere.
+        profile: this rank's.
+        choice: what `reduction.coordinates = "auto"` came to.
+        counts: this rank's, where not all of the profile's belong to the run.
+        crisp: evaluation of the design cut at one half.
+        iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
+        limits: the constraints; by default those of `evaluation` and `x_phys`.
+        initial_deviation: (n, 2) m, of the initial design, kept for the picture.
     """
 
     scene: Scene
@@ -52,6 +62,14 @@ class Simulated:
     trajectory: Trajectory | None
     profile: Profile
     choice: OrderSelection | None = None
+    counts: Counts | None = None
+    crisp: Evaluation | None = None
+    iterations: int = 0
+    converged: bool = True
+    stop_reason: str = "simulated"
+    kkt: float | None = None
+    limits: Sequence[Limit] | None = None
+    initial_deviation: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -79,21 +97,27 @@ def write_simulation(
         paraview: write design.vtu and design.xdmf, too.
         pictures: called with the arms' views before the summary is written, on the root.
     """
-    s, begun = simulated, time.perf_counter() - wall
-    views = gather_views(s.scene, s.partition, s.arms, s.x_phys)
-    summary = summarise(
-        s.scene,
-        s.partition,
-        s.arms,
-        s.x_phys,
-        s.evaluation,
-        s.profile,
-        wall=wall,
-        choice=s.choice,
-        trajectory=s.trajectory,
-    )
-    with together(s.partition.world):
-        return _write(folder, views, s.trajectory, None, summary, paraview, pictures, begun)
+    begun = time.perf_counter() - wall
+    one = simulated
+    views = gather_views(one.scene, one.partition, one.arms, one.x_phys)
+    summary = summarise(one, wall)
+    with together(one.partition.world):
+        if one.trajectory is None:
+            return None
+        write_design(folder, views)
+        if paraview:
+            write_fields(folder, views)
+        write_trajectory(folder, one.trajectory, one.initial_deviation)
+        if pictures is not None:
+            since = time.perf_counter()
+            pictures(views)
+            del summary["seconds"]["total"]  # stands last
+            summary["seconds"]["pictures"] = time.perf_counter() - since
+        summary["seconds"]["total"] = time.perf_counter() - begun
+        summary["files"] = {name: row[key] for name, row, key in named_files(summary["scene"])}
+        summary["scene"] = with_relative_paths(summary["scene"], folder)
+        write_summary(folder, summary)
+        return Written(views, summary)
 
 
 def write_result(
@@ -111,59 +135,24 @@ def write_result(
         scene: that was optimised.
         folder: exists; history and checkpoint are there already.
         result: what `optimize` returned.
-        wall: seconds that it took up to now; the summary's total also counts what follows.
-        paraview: write design.vtu and design.xdmf, too.
-        pictures: called with the arms' views before the summary is written, on the root.
+        wall, paraview, pictures: as for `write_simulation`.
     """
-    begun = time.perf_counter() - wall
-    views = gather_views(scene, result.partition, result.arms, result.x_phys)
-    summary = summarise(
+    simulated = Simulated(
         scene,
         result.partition,
         result.arms,
         result.x_phys,
         result.evaluation,
+        result.trajectory,
         result.profile,
-        wall=wall,
+        choice=result.choice,
         counts=result.counts,
         crisp=result.crisp,
-        choice=result.choice,
         iterations=result.iterations,
         converged=result.converged,
         stop_reason=result.stop_reason,
         kkt=result.kkt if np.isfinite(result.kkt) else None,
         limits=result.limits,
-        trajectory=result.trajectory,
+        initial_deviation=result.initial_deviation,
     )
-    initial = result.initial_deviation
-    with together(result.partition.world):
-        return _write(folder, views, result.trajectory, initial, summary, paraview, pictures, begun)
-
-
-def _write(
-    folder: Path,
-    views: list[ArmView],
-    trajectory: Trajectory | None,
-    initial: np.ndarray | None,
-    summary: dict[str, Any],
-    paraview: bool,
-    pictures: Draw | None = None,
-    begun: float = 0.0,
-) -> Written | None:
-    if trajectory is None:
-        return None
-    write_design(folder, views)
-    if paraview:
-        write_fields(folder, views)
-    write_trajectory(folder, trajectory, initial)
-    if pictures is not None:
-        since = time.perf_counter()
-        pictures(views)
-        del summary["seconds"]["total"]  # stands last
-        summary["seconds"]["pictures"] = time.perf_counter() - since
-    summary["seconds"]["total"] = time.perf_counter() - begun
-    named = named_files(summary["scene"])
-    summary["files"] = {name: row[key] for name, row, key in named}
-    summary["scene"] = with_relative_paths(summary["scene"], folder)
-    write_summary(folder, summary)
-    return Written(views, summary)
+    return write_simulation(folder, simulated, wall, paraview=paraview, pictures=pictures)

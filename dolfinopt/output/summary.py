@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -18,13 +18,16 @@ from dolfinopt.mesh import compat
 from dolfinopt.output.files import drive_units, trajectory_units, versions
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.constraints import Limit, limits_of, summary_of
+from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.plausibility import implausible
 from dolfinopt.units import HISTORY, SUMMARY
+
+if TYPE_CHECKING:
+    from dolfinopt.output.run_folder import Simulated
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -35,112 +38,139 @@ SMALL_TURN = 0.2  # rad
 FILTER_CELLS = 2.0
 
 
-def summarise(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
-    evaluation: Evaluation,
-    profile: Profile,
-    *,
-    wall: float,
-    counts: Counts | None = None,
-    crisp: Evaluation | None = None,
-    choice: OrderSelection | None = None,
-    iterations: int = 0,
-    converged: bool = True,
-    stop_reason: str = "simulated",
-    kkt: float | None = None,
-    limits: Sequence[Limit] | None = None,
-    trajectory: Trajectory | None = None,
-) -> dict[str, Any]:
+def summarise(run: Simulated, wall: float) -> dict[str, Any]:
     """Return the content of summary.json on the root, an empty dict elsewhere (collective).
 
     Args:
-        scene, partition, arms, x_phys, evaluation: of the design the summary is about.
-        profile: this rank's.
+        run: the design, what came of it and how it was found.
         wall: seconds since the command began, s.
-        counts: this rank's, where not all of the profile's belong to the run.
-        crisp: evaluation of the design cut at one half.
-        choice: what `reduction.coordinates = "auto"` came to.
-        iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
-        limits: the constraints; by default those of `evaluation` and `x_phys`.
-        trajectory: of the design, on the root.
     """
+    scene, partition = run.scene, run.partition
+    cost = _cost(run, wall)  # without what follows
+    traits = _gather_traits(run)
     with together(partition.world):
-        mine = {k: _traits(scene, k, a, x_phys[k]) for k, a in arms.items()}
-    every = gather_arms(partition, mine)
-    volumes, sides, sizes, notes, greys = (
-        {k: one[j] for k, one in every.items()} for j in range(5)
-    )
-    widths = _widths(partition, arms, x_phys)
-    seconds = _slowest(partition.world, profile.seconds)
-    own = (counts or profile.counts) if partition.is_root else Counts()
-    counted = partition.world.gather(own, root=0)
-    memory = partition.world.gather(
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0
-    )
-    errors = _frequency_errors(partition, arms, x_phys, profile)
-    with together(partition.world):
-        if counted is None or memory is None:
+        if partition.world.rank != 0:
             return {}
-        if limits is None:
-            limits = limits_of(scene, evaluation, _limited_fractions(scene, volumes, sizes))
         return {
             "name": scene.name,
-            "objective": evaluation.objective,
-            "compliance": evaluation.compliance,
-            "max_deviation": evaluation.max_deviation,
-            "max_deviation_time": evaluation.max_deviation_time,
-            **({} if trajectory is None else _machine(scene, trajectory)),
-            "grayness": float(np.average([greys[k] for k in sizes], weights=list(sizes.values()))),
-            "volume_fraction": {
-                arm.name: volumes[owner]
-                for arm, owner in zip(scene.arms, scene.owners, strict=True)
-                if owner is not None
-            },
-            **_by_arm(scene, "minimum_member_measured", {k: w[0] for k, w in widths.items()}),
-            **_by_arm(scene, "minimum_gap_measured", {k: w[1] for k, w in widths.items()}),
-            "first_frequency": {
-                arm.name: value
-                for arm, value in zip(scene.arms, evaluation.first_frequencies, strict=True)
-                if np.isfinite(value)
-            },
-            "first_frequency_error": {
-                arm.name: errors[owner]
-                for arm, owner in zip(scene.arms, scene.owners, strict=True)
-                if owner in errors
-            },
-            "loaded_frequency": dict(
-                zip(_flexible_names(scene), evaluation.loaded_frequencies, strict=False)
-            ),
-            "constraints": summary_of(limits),
-            "scenarios": [
-                {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
-                for one, motion in zip(scene.scenarios, evaluation.scenarios, strict=True)
-            ],
-            **({} if crisp is None else {"crisp": _figures(crisp)}),
-            "simulation_error_estimate": evaluation.error,
-            "reduction": _reduction(scene, choice),
-            "warnings": [
-                *implausible(scene),
-                *(note for mesh_notes in notes.values() for note in mesh_notes),
-                *_warnings(scene, evaluation),
-                *_too_few(scene, choice),
-                *(filter_warnings(scene, sides) if iterations else ()),
-            ],
-            "iterations": iterations,
-            "converged": converged,
-            "stop_reason": stop_reason,
-            "kkt": kkt,
-            "seconds": {**seconds, "total": wall},
-            "counts": asdict(sum(counted, Counts())),
-            "peak_memory_mb": max(memory),
-            "ranks": partition.world.size,
-            "units": _units(scene, trajectory),
+            **_figures(run.evaluation),
+            "max_deviation_time": run.evaluation.max_deviation_time,
+            **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            **_of_designs(scene, run.evaluation, traits),
+            **_of_responses(run, traits),
+            "simulation_error_estimate": run.evaluation.error,
+            "reduction": _reduction(scene, run.choice),
+            "warnings": _all_warnings(run, traits),
+            "iterations": run.iterations,
+            "converged": run.converged,
+            "stop_reason": run.stop_reason,
+            "kkt": run.kkt,
+            **cost,
+            "units": _units(scene, run.trajectory),
             "versions": versions(),
             "scene": scene.to_dict(),
         }
+
+
+@dataclass(frozen=True)
+class _Traits:
+    """What is known of one design beside its motion.
+
+    Attributes:
+        volume_fraction, grayness: of the physical densities.
+        cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3.
+        notes: of the mesh.
+        widths: of member and gap of the design cut at one half, m.
+        error: `frequency_excess`, None where it is not reduced.
+    """
+
+    volume_fraction: float
+    grayness: float
+    cell_size: float
+    volume: float
+    notes: tuple[str, ...]
+    widths: tuple[float | None, float | None] = (None, None)
+    error: float | None = None
+
+
+def _gather_traits(run: Simulated) -> dict[int, _Traits]:
+    """Return the traits of every design, on the root (collective)."""
+    partition, arms, x_phys = run.partition, run.arms, run.x_phys
+    with together(partition.world):
+        mine = {k: _traits(run.scene, k, arm, x_phys[k]) for k, arm in arms.items()}
+    every = gather_arms(partition, mine)
+    widths = _widths(partition, arms, x_phys)
+    errors = _frequency_errors(partition, arms, x_phys, run.profile)
+    with together(partition.world):
+        return {k: replace(one, widths=widths[k], error=errors.get(k)) for k, one in every.items()}
+
+
+def _of_designs(
+    scene: Scene, evaluation: Evaluation, traits: Mapping[int, _Traits]
+) -> dict[str, Any]:
+    """Return what the designs are like, and the frequencies of the arms, by the arm's name."""
+    volumes = [one.volume for one in traits.values()]
+    grays = [one.grayness for one in traits.values()]
+    by_arm = {
+        arm.name: traits[owner]
+        for arm, owner in zip(scene.arms, scene.owners, strict=True)
+        if owner is not None
+    }
+    first = zip(scene.arms, evaluation.first_frequencies, strict=True)
+    flexible = [arm.name for arm in scene.arms if arm.flexible]
+    loaded = zip(flexible, evaluation.loaded_frequencies, strict=False)
+    return {
+        "grayness": float(np.average(grays, weights=volumes)),
+        "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
+        "minimum_member_measured": {name: one.widths[0] for name, one in by_arm.items()},
+        "minimum_gap_measured": {name: one.widths[1] for name, one in by_arm.items()},
+        "first_frequency": {arm.name: value for arm, value in first if np.isfinite(value)},
+        "first_frequency_error": {
+            name: one.error for name, one in by_arm.items() if one.error is not None
+        },
+        "loaded_frequency": dict(loaded),
+    }
+
+
+def _of_responses(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]:
+    """Return the constraints by name, and the figures of scenarios and of the crisp design."""
+    scene, limits = run.scene, run.limits
+    if limits is None:
+        limits = limits_of(scene, run.evaluation, _limited_fractions(scene, traits))
+    return {
+        "constraints": summary_of(limits),
+        "scenarios": [
+            {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
+            for one, motion in zip(scene.scenarios, run.evaluation.scenarios, strict=True)
+        ],
+        **({} if run.crisp is None else {"crisp": _figures(run.crisp)}),
+    }
+
+
+def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
+    sizes = {k: one.cell_size for k, one in traits.items()}
+    return [
+        *implausible(run.scene),
+        *(note for one in traits.values() for note in one.notes),
+        *_warnings(run.scene, run.evaluation),
+        *_too_few(run.scene, run.choice),
+        *(filter_warnings(run.scene, sizes) if run.iterations else ()),
+    ]
+
+
+def _cost(run: Simulated, wall: float) -> dict[str, Any]:
+    """Return seconds by phase, counts, memory and ranks, on the root (collective)."""
+    world = run.partition.world
+    seconds = _slowest(world, run.profile.seconds)
+    own = (run.counts or run.profile.counts) if run.partition.is_root else Counts()
+    counted = world.gather(own, root=0)
+    memory = world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
+    return {
+        "seconds": {**seconds, "total": wall},
+        "counts": asdict(sum(counted or (), Counts())),
+        "peak_memory_mb": max(memory or [0.0]),
+        "ranks": world.size,
+    }
 
 
 def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
@@ -168,14 +198,13 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     return units
 
 
-def _limited_fractions(
-    scene: Scene, volumes: Mapping[int, float], sizes: Mapping[int, float]
-) -> list[float]:
+def _limited_fractions(scene: Scene, traits: Mapping[int, _Traits]) -> list[float]:
     """Return the volume fractions that have a limit: every design's, or that of all together."""
+    fractions = {k: one.volume_fraction for k, one in traits.items()}
     if not scene.design.shared_volume:
-        return [volumes[k] for k in scene.cell_counts]
-    weights = [sizes[k] for k in sizes]
-    return [float(np.average([volumes[k] for k in sizes], weights=weights))]
+        return [fractions[k] for k in scene.cell_counts]
+    volumes = [one.volume for one in traits.values()]
+    return [float(np.average([*fractions.values()], weights=volumes))]
 
 
 def _frequency_errors(
@@ -213,20 +242,14 @@ def _widths(
         return {k: thinnest(whole[k], cut[k]) for k in whole}
 
 
-def _by_arm(scene: Scene, name: str, values: Mapping[int, Any]) -> dict[str, dict[str, Any]]:
-    """Return a value of every arm that has a design, by the arm's name."""
-    pairs = zip(scene.arms, scene.owners, strict=True)
-    return {name: {arm.name: values[k] for arm, k in pairs if k is not None}}
-
-
-def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> tuple[Any, ...]:
-    """Return volume fraction, size of a cell, volume, notes and grayness (collective there)."""
-    return (
+def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
+    """Return what needs the design's own cells alone (collective on its ranks)."""
+    return _Traits(
         arm.volume_fraction(x_phys),
+        arm.grayness(x_phys),
         _cell_size(scene, index, arm),
         _volume(scene, index, arm),
-        arm.mesh.notes,
-        arm.grayness(x_phys),
+        tuple(arm.mesh.notes),
     )
 
 
@@ -305,10 +328,6 @@ def _volume(scene: Scene, index: int, arm: Arm) -> float:
     """Return the volume of all arms with one design, m3."""
     area = arm.mesh.comm.allreduce(arm.mesh.area.sum())
     return float(len(arm.places) * scene.arms[index].thickness * area)
-
-
-def _flexible_names(scene: Scene) -> list[str]:
-    return [arm.name for arm in scene.arms if arm.flexible]
 
 
 def _figures(evaluation: Motion) -> dict[str, float]:

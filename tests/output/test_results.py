@@ -70,10 +70,23 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
 
     monkeypatch.setattr(results, "write_trajectory", fail)
     one = simulated(result)
+    with pytest.raises(OSError, match="disk full"):
+        write_simulation(shared_tmp_path, one, 1.0)
+    assert not (shared_tmp_path / "summary.json").exists()
+
+
+def test_summary_of_a_simulation_and_an_optimisation_agree(result, shared_tmp_path):
+    """Of one design: the same keys in the same order, and motions to the scene's tolerance."""
+    scene = do.load_scene(SCENE, SMALL)
+    written = [write_result(scene, shared_tmp_path, result, 1.0, paraview=False)]
+    written.append(write_simulation(shared_tmp_path, simulated(result), 1.0, paraview=False))
     if WORLD.rank == 0:
-        with pytest.raises(OSError, match="disk full"):
-            results._write(shared_tmp_path, [], one.trajectory, None, {}, False)
-        assert not (shared_tmp_path / "summary.json").exists()
+        one, other = (dict(found.summary) for found in written)
+        assert list(one) == list(other)
+        assert one["volume_fraction"] == other["volume_fraction"]
+        # The optimisation's steps are those of the design before; energies take twice the error.
+        error = 4.0 * scene.simulation.tolerance
+        assert one["compliance"] == pytest.approx(other["compliance"], rel=error)
 
 
 def test_views_of_arms_without_a_current_design():
