@@ -20,8 +20,8 @@ from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.output import checkpoint
 from dolfinopt.output.files import write_arrays, write_text
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study.sampling import Samples, respond
 from dolfinopt.study.store import Case, run_cases
+from dolfinopt.study.uncertainty import sample_cases
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 COARSE = ("arms.cells=[12,3]", "design.filter_radius=0.2", "optimizer.max_iterations=2")
@@ -194,9 +194,8 @@ def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
     scene = load_scene(paper_scene(), COARSE)
     outcomes = run_cases([Case(scene)], tmp_path, SELF, shown=False)
     assert outcomes.computed == 1 and not outcomes.failures
-    samples = Samples(scene, ("payload.mass",), np.array([[5.0], [7.0]]))
-    _, computed = respond(samples, [("initial", None)], tmp_path, SELF, shown=False)
-    assert computed == 3
+    samples = sample_cases(scene, [(), ("payload.mass=5.0",), ("payload.mass=7.0",)], "", None)
+    assert run_cases(samples, tmp_path, SELF, shown=False).computed == 3
     assert capsys.readouterr().err.count("continuing without") == 2
 
 
@@ -206,18 +205,17 @@ def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(("name", "value"), [("NUMERICS", -1), ("__version__", "0.0.0")])
 def test_results_of_another_program_are_computed_anew(name, value, tmp_path, monkeypatch):
     scene = load_scene(paper_scene(), COARSE)
-    samples = Samples(scene, ("payload.mass",), np.array([[5.0]]))
 
     def computed():
-        cases = run_cases([Case(scene)], tmp_path, SELF, shown=False).computed
-        return cases, respond(samples, [("initial", None)], tmp_path, SELF, shown=False)[1]
+        samples = sample_cases(scene, [(), ("payload.mass=5.0",)], "", None)
+        return run_cases([Case(scene), *samples], tmp_path, SELF, shown=False).computed
 
-    assert computed() == (1, 2)
-    assert computed() == (0, 0)
+    assert computed() == 3
+    assert computed() == 0
     with monkeypatch.context() as other:
         other.setattr(f"dolfinopt.version.{name}", value)
-        assert computed() == (1, 2)
+        assert computed() == 3
         checkpoint.begin(tmp_path, scene)
     with pytest.raises(InputError, match="another version of dolfinopt wrote this checkpoint"):
         checkpoint.check(tmp_path, scene)
-    assert computed() == (0, 0)  # those of this program are still there
+    assert computed() == 0  # those of this program are still there

@@ -35,10 +35,10 @@ from dolfinopt.parallel import (
 from dolfinopt.responses import eigenfrequency, evaluation, motion, static, tip_deflection
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study import sampling
 from dolfinopt.study import store as cases
 from dolfinopt.study import studies as study
 from dolfinopt.study.store import Case, run_cases
+from dolfinopt.study.uncertainty import sample_cases
 
 COMM = MPI.COMM_WORLD
 LONE = min(1, COMM.size - 1)  # the rank that fails; with two arms it has one of them
@@ -453,19 +453,17 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
 
 def test_samples(monkeypatch, shared_tmp_path):
     scene = load_scene(paper_scene(), COARSE)
-    samples = sampling.Samples(scene, ("payload.mass",), np.linspace(4.0, 6.0, 60)[:, None])
-    fail_on(monkeypatch, LONE, sampling, "_do")
-    with pytest.raises(Unusual, match=r"^_do$"):
-        sampling.respond(samples, [("initial", None)], shared_tmp_path, COMM, shown=False)
+    samples = [(), *((f"payload.mass={mass}",) for mass in np.linspace(4.0, 6.0, 60))]
+    fail_on(monkeypatch, LONE, cases, "_sample")
+    with pytest.raises(Unusual, match=r"^_sample$"):
+        run_cases(sample_cases(scene, samples, "", None), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
 
 
 def test_tables(monkeypatch, shared_tmp_path):
-    from dolfinopt.study import sweep as sweeps
-
     scene = load_scene(paper_scene(), COARSE)
-    fail_on(monkeypatch, LONE, sweeps._Sweep, "report")
-    with pytest.raises(Unusual, match=r"^report$"):
+    fail_on(monkeypatch, LONE, study, "tabulated")
+    with pytest.raises(Unusual, match=r"^tabulated$"):
         study.study(scene, None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
 

@@ -63,16 +63,16 @@ def uncertainty(
     interrupted goes on.
     """
     world, loaded = load(scene, overrides)
-    from dolfinopt.study.uncertainty import Plan, random_name, study_random
+    from dolfinopt.study.uncertainty import Sampling, random_name, study_random
 
     folder = folder_of(scene, out)
-    plan = Plan(samples, seed, sampler, indices)
+    sampling = Sampling(samples, seed, sampler, indices)
     carry_out(
         world,
         folder,
         random_name(random),
         asked_of(world, loaded, designs) | {"distributions": sorted(random)},
-        partial(study_random, loaded, random, designs, folder, world, plan),
+        partial(study_random, loaded, random, designs, folder, world, sampling),
         overwrite=overwrite,
         plots=plots,
     )

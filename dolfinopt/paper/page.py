@@ -322,7 +322,7 @@ def _player(plan: Plan, outcomes: Outcomes) -> dict[str, Any] | None:
     The page is complete without its script, which only moves the picture.
     """
     from dolfinopt.plots.animation import round_magnification
-    from dolfinopt.study.store import simulate_scenarios
+    from dolfinopt.study.simulate import simulate_scenarios
 
     optimum = outcomes[plan.optimum]
     if optimum.failure:

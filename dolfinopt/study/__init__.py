@@ -1,6 +1,6 @@
 """Studies: many optimisations and simulations of variants of a scene, and tables of them.
 
-`variants` changes scenes, `sweep` and `presets` plan what to compute, `store` keeps the results by
-what they compute, `tasks` shares the work out over ranks; `studies` is where it all begins.
-`uncertainty` does the same for random values, with `sampling` and `statistics`.
+Plans of labelled cases (`plans`, `sweep`, `presets`, `uncertainty`) -> results kept by what they
+compute (`store`; `simulate` is what one rank does, `tasks` shares the work out) -> one data frame
+-> tables and figures (`tables`, `figures`). `variants` changes scenes; `studies` is the beginning.
 """

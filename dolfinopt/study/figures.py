@@ -27,15 +27,12 @@ from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import tables as findings
 from dolfinopt.study.tables import (
-    BarFigure,
     DesignFigure,
-    HistogramFigure,
+    FrameFigure,
     LineFigure,
     MatrixFigure,
     Panel,
-    ScatterFigure,
     Study,
-    TornadoFigure,
     joined,
 )
 
@@ -70,8 +67,8 @@ def common_looks(figures: Iterable[findings.Figure]) -> Looks:
     for figure in figures:
         if isinstance(figure, LineFigure):
             groups.append([line.label for row in figure.rows for p in row for line in p.lines])
-        elif isinstance(figure, HistogramFigure):
-            groups.append([panels[0].title for panels in figure.rows])
+        elif isinstance(figure, FrameFigure) and figure.kind in ("histogram", "scatter"):
+            groups.append(list(figure.frame["design"].unique()))
     return looks(groups)
 
 
@@ -82,19 +79,34 @@ def draw(figure: findings.Figure, styles: Looks | None = None) -> Figure:
         figure: what.
         styles: of curves and designs by name, see `common_looks`; default: of this figure alone.
     """
+    styles = styles or common_looks([figure])
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
     if isinstance(figure, MatrixFigure):
         return matrix_figure(figure)
-    if isinstance(figure, TornadoFigure):
-        return tornado_figure(figure)
-    if isinstance(figure, HistogramFigure):
-        return histogram_figure(figure, styles)
-    if isinstance(figure, BarFigure):
-        return bar_figure(figure)
-    if isinstance(figure, ScatterFigure):
-        return scatter_figure(figure, styles)
+    if isinstance(figure, FrameFigure):
+        return FRAMES[figure.kind](figure, styles)
     return design_figure(figure)
+
+
+def _grid(
+    title: str, shape: tuple[int, int], panel: tuple[float, float], **options: Any
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with its title, and axes (rows, columns), inches each."""
+    (rows, columns), (width, height) = shape, panel
+    drawn = new_figure(width * columns + 0.6, height * rows + 0.6)
+    drawn.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
+    return drawn, drawn.subplots(rows, columns, squeeze=False, **options)
+
+
+def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> None:
+    """Write what axes show; formulas are text."""
+    axes.set_title(title, loc="left", fontsize=10, parse_math=False)
+    axes.set_xlabel(x_label, parse_math=False)
+    axes.set_ylabel(y_label, parse_math=False)
+
+
+# -- curves ----------------------------------------------------------------------------------
 
 
 def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
@@ -105,8 +117,8 @@ def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     """
     rows, columns = len(figure.rows), max(map(len, figure.rows))
     styles = styles or common_looks([figure])
-    drawn = new_figure((4.4 if columns > 1 else 6.5) * columns + 3.0, (PANEL + 0.4) * rows + 0.4)
-    grid = drawn.subplots(rows, columns, squeeze=False)
+    width = (4.4 if columns > 1 else 6.5) + 2.4 / columns  # with the names beside them
+    drawn, grid = _grid(figure.title, (rows, columns), (width, PANEL + 0.4))
     for row, panels in zip(grid, figure.rows, strict=True):
         for axes in row[len(panels) :]:
             axes.set_visible(False)
@@ -115,7 +127,6 @@ def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     _share_axes(grid, figure.rows)
     for row, panels in zip(grid, figure.rows, strict=True):
         _name_curves(row, panels)
-    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12, parse_math=False)
     return drawn
 
 
@@ -209,19 +220,19 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if any(len(line.x) > FEW for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
-    axes.set_xlabel(panel.x_label, parse_math=False)
-    axes.set_ylabel(panel.y_label, parse_math=False)
-    axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
+    _label(axes, panel.title, panel.x_label, panel.y_label)
     axes.grid(True, alpha=0.3)
+
+
+# -- tables ----------------------------------------------------------------------------------
 
 
 def matrix_figure(figure: MatrixFigure) -> Figure:
     """Return heat maps with their numbers."""
     count = len(figure.labels)
     side = max(3.6, 0.62 * count + 1.6)
-    drawn = new_figure(side * len(figure.panels) + 0.6, side + 0.5)
-    for axes, (title, values) in zip(drawn.subplots(1, len(figure.panels), squeeze=False)[0],
-                                     figure.panels, strict=True):  # fmt: skip
+    drawn, grid = _grid(figure.title, (1, len(figure.panels)), (side, side))
+    for axes, (title, values) in zip(grid[0], figure.panels, strict=True):
         image = axes.imshow(values, cmap="RdBu_r", vmin=-LOSS, vmax=LOSS)
         for (i, j), value in np.ndenumerate(values):
             dark = abs(value) > 0.6 * LOSS
@@ -229,11 +240,8 @@ def matrix_figure(figure: MatrixFigure) -> Figure:
                       fontsize=9 if count <= CROWD else 7)  # fmt: skip
         axes.set_xticks(range(count), figure.labels)
         axes.set_yticks(range(count), figure.labels)
-        axes.set_xlabel(figure.column_label, parse_math=False)
-        axes.set_ylabel(figure.row_label, parse_math=False)
-        axes.set_title(title, loc="left", fontsize=10)
+        _label(axes, title, figure.column_label, figure.row_label)
         drawn.colorbar(image, ax=axes, shrink=0.8, extend=_beyond(values))
-    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
     return drawn
 
 
@@ -243,28 +251,117 @@ def _beyond(values: np.ndarray) -> Literal["neither", "min", "max", "both"]:
     return "both" if low and high else "min" if low else "max" if high else "neither"
 
 
-def tornado_figure(figure: TornadoFigure) -> Figure:
-    """Return bars from the lowest to the highest value, the most telling key on top."""
-    drawn = new_figure(9.0, sum(1.1 + 0.45 * len(bars) for _, bars in figure.panels) + 0.4)
-    heights = [1.0 + 0.5 * len(bars) for _, bars in figure.panels]
-    grid = drawn.subplots(len(figure.panels), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for axes, (title, bars) in zip(grid, figure.panels, strict=True):
+def tornado_figure(figure: FrameFigure, styles: Looks) -> Figure:
+    """Return bars from the lowest to the highest value, the most telling key on top.
+
+    Columns: design, quantity, key, and the changes at both ends.
+    """
+    panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
+    count = max(len(bars) for _, bars in panels)
+    drawn, grid = _grid(figure.title, (len(panels), 1), (8.4, 1.1 + 0.45 * count))
+    for axes, ((design, quantity), bars) in zip(grid[:, 0], panels, strict=True):
         place = np.arange(len(bars))
-        for k, (colour, label) in enumerate(
-            ((PALETTE[0], "at the first value"), (PALETTE[1], "at the last value"))
-        ):
-            # The second is narrower: both may point the same way.
-            width = (0.7, 0.4)[k]
-            axes.barh(place, [bar[1 + k] for bar in bars], width, color=colour, label=label)
-        axes.set_yticks(place, [bar[0] for bar in bars])
+        # The second is narrower: both may point the same way.
+        for label, width, colour in zip(bars.columns[-2:], (0.7, 0.4), PALETTE):
+            axes.barh(place, bars[label], width, color=colour, label=label.removesuffix(" [%]"))
+        axes.set_yticks(place, bars["key"])
         axes.invert_yaxis()
         axes.axvline(0.0, color="black", linewidth=0.8)
-        axes.set_xlabel("change [%]")
-        axes.set_title(title, loc="left", fontsize=10, parse_math=False)
+        _label(axes, f"{design}: {quantity}", "change [%]")
         axes.grid(True, axis="x", alpha=0.3)
-    grid[0].legend(frameon=False, fontsize=9, loc="best")
-    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+    grid[0, 0].legend(frameon=False, fontsize=9, loc="best")
     return drawn
+
+
+def bar_figure(figure: FrameFigure, styles: Looks) -> Figure:
+    """Return groups of bars with their intervals.
+
+    Columns: design, quantity, input, and for each group its value and both ends of its interval.
+    """
+    panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
+    inputs = list(figure.frame["input"].unique())
+    place, columns = np.arange(len(inputs)), figure.frame["quantity"].nunique()
+    shape = len(panels) // columns, columns
+    drawn, grid = _grid(figure.title, shape, (1.5 + 1.1 * max(3, len(inputs)), 3.3), sharey=True)
+    for axes, ((design, quantity), bars) in zip(grid.flat, panels, strict=True):
+        for k, colour, shift in ((3, PALETTE[0], -0.2), (6, PALETTE[1], 0.2)):
+            value, low, high = bars.iloc[:, k : k + 3].to_numpy(dtype=float).T
+            ends = np.maximum([value - low, high - value], 0.0)
+            label = str(bars.columns[k]).partition(" [")[0]
+            axes.bar(place + shift, value, 0.36, yerr=ends, capsize=3, label=label, color=colour,
+                     alpha=0.8)  # fmt: skip
+        # A key in two lines takes half the width.
+        names = [label.replace(".", ".\n", 1) for label in inputs]
+        axes.set_xticks(place, names, fontsize=8, parse_math=False)
+        _label(axes, f"{design}: {quantity}", "", "share of the variance [-]")
+        axes.grid(True, axis="y", alpha=0.3)
+    grid[0, 0].legend(frameon=False, fontsize=9)
+    return drawn
+
+
+# -- samples ---------------------------------------------------------------------------------
+
+
+def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
+    """Return histograms, the share of the samples below as a curve, and the nominal values.
+
+    Columns: design, sample (number 0 is the nominal one), and the quantities.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    designs = list(figure.frame.groupby("design", sort=False))
+    quantities = list(figure.frame.columns[2:])
+    title = f"{figure.title}; dashed: nominal"
+    drawn, grid = _grid(title, (len(designs), len(quantities)), (5.2, 3.2))
+    for row, (design, own) in zip(grid, designs, strict=True):
+        for axes, what in zip(row, quantities, strict=True):
+            values = own.loc[own["sample"] > 0, what].to_numpy()
+            axes.hist(values, bins="fd", color=styles[design]["color"], alpha=0.55)
+            axes.axvline(own[what].iloc[0], color="black", linestyle="--", linewidth=1.2)
+            _label(axes, design, what, "samples [-]")
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+            share = axes.twinx()
+            share.step(np.sort(values), np.arange(1, len(values) + 1) / len(values), where="post",
+                       color=GREY, linewidth=1.4)  # fmt: skip
+            share.set_ylim(0.0, 1.0)
+            share.set_ylabel("share of samples below [-]", color=GREY)
+    return drawn
+
+
+def scatter_figure(figure: FrameFigure, styles: Looks) -> Figure:
+    """Return points, a row a quantity and a column an input.
+
+    Columns: design, the inputs, and two quantities.
+    """
+    from matplotlib.ticker import EngFormatter
+
+    inputs, quantities = figure.frame.columns[1:-2], figure.frame.columns[-2:]
+    rows = [
+        (design, what, own)
+        for design, own in figure.frame.groupby("design", sort=False)
+        for what in quantities
+    ]
+    shape = len(rows), len(inputs)
+    drawn, grid = _grid(figure.title, shape, (3.2, 2.5), sharex="col", sharey="row")
+    for row, (design, what, own) in zip(grid, rows, strict=True):
+        for axes, name in zip(row, inputs, strict=True):
+            axes.plot(own[name], own[what], ".", color=styles[design]["color"], alpha=0.35,
+                      markersize=3)  # fmt: skip
+            axes.grid(True, alpha=0.3)
+            if own[name].abs().max() >= 1e4:  # 70 G rather than a power of ten in a corner
+                axes.xaxis.set_major_formatter(EngFormatter())
+        row[0].set_ylabel(f"{design}\n{what}", fontsize=9, parse_math=False)
+    for axes, name in zip(grid[-1], inputs, strict=True):
+        axes.set_xlabel(name, fontsize=9, parse_math=False)
+    return drawn
+
+
+FRAMES = {
+    "tornado": tornado_figure,
+    "bars": bar_figure,
+    "histogram": histogram_figure,
+    "scatter": scatter_figure,
+}
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -321,82 +418,3 @@ def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
     partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
     arms = build_arms(scene, partition, Profile())
     return designed(gather_views(scene, partition, arms, read_design(path, partition, arms)))
-
-
-# -- random values ---------------------------------------------------------------------------
-
-
-def histogram_figure(figure: HistogramFigure, styles: Looks | None = None) -> Figure:
-    """Return histograms, the share of the samples below as a curve, and the nominal values."""
-    from matplotlib.ticker import MaxNLocator
-
-    rows, columns = len(figure.rows), max(map(len, figure.rows))
-    styles = styles or common_looks([figure])
-    drawn = new_figure(5.2 * columns, 3.2 * rows + 0.5)
-    grid = drawn.subplots(rows, columns, squeeze=False)
-    for row, panels in zip(grid, figure.rows, strict=True):
-        for axes, panel in zip(row, panels):
-            colour = styles[panels[0].title]["color"]
-            axes.hist(panel.values, bins="fd", color=colour, alpha=0.55)
-            axes.axvline(panel.nominal, color="black", linestyle="--", linewidth=1.2)
-            axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
-            axes.set_xlabel(panel.x_label, parse_math=False)
-            axes.set_ylabel("samples [-]")
-            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-            share = axes.twinx()
-            ordered = np.sort(panel.values)
-            share.step(ordered, np.arange(1, len(ordered) + 1) / len(ordered), where="post",
-                       color=GREY, linewidth=1.4)  # fmt: skip
-            share.set_ylim(0.0, 1.0)
-            share.set_ylabel("share of samples below [-]", color=GREY)
-    drawn.suptitle(f"{figure.title}; dashed: nominal", x=0.01, ha="left", fontsize=12)
-    return drawn
-
-
-def bar_figure(figure: BarFigure) -> Figure:
-    """Return groups of bars with their intervals."""
-    rows, columns = len(figure.rows), max(map(len, figure.rows))
-    place = np.arange(len(figure.labels))
-    drawn = new_figure((1.5 + 1.1 * max(3, len(place))) * columns + 0.6, 3.2 * rows + 0.8)
-    grid = drawn.subplots(rows, columns, squeeze=False, sharey=True)
-    for row, panels in zip(grid, figure.rows, strict=True):
-        for axes, panel in zip(row, panels):
-            width = 0.8 / len(panel.groups)
-            for k, (label, bars) in enumerate(panel.groups):
-                value, low, high = bars.T
-                x = place + (k - 0.5 * (len(panel.groups) - 1)) * width
-                ends = np.maximum([value - low, high - value], 0.0)
-                axes.bar(x, value, 0.9 * width, yerr=ends, capsize=3, label=label,
-                         color=PALETTE[k % len(PALETTE)], alpha=0.8)  # fmt: skip
-            # A key in two lines takes half the width.
-            names = [label.replace(".", ".\n", 1) for label in figure.labels]
-            axes.set_xticks(place, names, fontsize=8, parse_math=False)
-            axes.set_title(panel.title, loc="left", fontsize=10, parse_math=False)
-            axes.set_ylabel(panel.y_label)
-            axes.grid(True, axis="y", alpha=0.3)
-    grid[0, 0].legend(frameon=False, fontsize=9)
-    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
-    return drawn
-
-
-def scatter_figure(figure: ScatterFigure, styles: Looks | None = None) -> Figure:
-    """Return points, a row a quantity and a column an input."""
-    from matplotlib.ticker import EngFormatter
-
-    rows, columns = len(figure.rows), len(figure.columns)
-    names = [label.partition(": ")[0] for label, _ in figure.rows]
-    styles = styles if styles and set(names) <= set(styles) else looks([names])
-    drawn = new_figure(3.2 * columns + 0.8, 2.5 * rows + 0.5)
-    grid = drawn.subplots(rows, columns, squeeze=False, sharex="col", sharey="row")
-    for i, (row, (y_label, y)) in enumerate(zip(grid, figure.rows, strict=True)):
-        for axes, (x_label, x) in zip(row, figure.columns):
-            axes.plot(x, y, ".", color=styles[names[i]]["color"], alpha=0.35, markersize=3)
-            axes.grid(True, alpha=0.3)
-            if np.abs(x).max() >= 1e4:  # 70 G rather than a power of ten in a corner
-                axes.xaxis.set_major_formatter(EngFormatter())
-            if axes is row[0]:
-                axes.set_ylabel(y_label.replace(": ", "\n", 1), fontsize=9, parse_math=False)
-            if i == rows - 1:
-                axes.set_xlabel(x_label, fontsize=9, parse_math=False)
-    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
-    return drawn

@@ -1,11 +1,13 @@
-"""What every study is made of: cases to do, and tables and figures to make of them."""
+"""What every study is made of: cases with labels, and tables and figures of their results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
@@ -13,47 +15,77 @@ from dolfinopt.study.store import Case, Outcome, Outcomes
 from dolfinopt.study.tables import DesignFigure, Figure, Line, Panel, Table
 
 Item = TypeVar("Item")
-Take = Callable[[Outcome], float]
-QUANTITIES: tuple[tuple[str, Take], ...] = (
-    ("compliance [N m]", lambda outcome: outcome.compliance),
-    ("maximal deviation [mm]", lambda outcome: 1e3 * outcome.max_deviation),
-)
-
 Report = tuple[list[Table], list[Figure]]
+Design = Case | Path | None  # optimised by a case, of a file, or the initial one
+COMPLIANCE, DEVIATION = QUANTITIES = ("compliance [N m]", "maximal deviation [mm]")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Cases to do, and what to make of them."""
+    """Cases to do, and what to make of them; pickled from the root to all ranks.
+
+    Attributes:
+        name: of the study's files.
+        rows: labels by column and the case of each; cases that these need may be left out.
+        report: returns tables and figures of the frame of all rows, see `tabulated`.
+    """
 
     name: str
+    rows: Sequence[tuple[Mapping[str, Any], Case]]
+    report: Callable[[pd.DataFrame], Report]
 
-    @property
-    def cases(self) -> list[Case]:
-        """All of them; what they depend on may be left out."""
-        raise NotImplementedError
 
-    def report(self, outcomes: Outcomes) -> Report:
-        """Return tables and figures."""
-        raise NotImplementedError
+def tabulated(plan: Plan, outcomes: Outcomes) -> pd.DataFrame:
+    """Return a row a case: the plan's labels, the results with units, and the outcome itself."""
+    rows = []
+    for labels, case in plan.rows:
+        o = outcomes[case]
+        results = {
+            "label": case.label,
+            COMPLIANCE: o.compliance,
+            DEVIATION: 1e3 * o.max_deviation,
+            "at [s]": o.max_deviation_time,
+            "grayness [-]": o.grayness,
+            "iterations": o.iterations,
+            "seconds": o.seconds,
+            "ended by": ended(o),
+            "failure": o.failure,
+            "outcome": o,
+        }
+        rows.append({**labels, **results})
+    return pd.DataFrame(rows)
+
+
+def by_design(
+    frame: pd.DataFrame, index: Sequence[str], results: Sequence[str] = QUANTITIES
+) -> pd.DataFrame:
+    """Return the columns `index`, and each design's `results` in columns beside one another.
+
+    Args:
+        frame: with a column "design"; all designs have the same rows, in one order.
+        index: columns of what was varied.
+        results: columns.
+    """
+    parts = {name: part.reset_index() for name, part in frame.groupby("design", sort=False)}
+    wide = next(iter(parts.values()))[[*index]].copy()
+    for name, part in parts.items():
+        for what in results:
+            wide[f"{name}: {what}"] = part[what]
+    return wide
 
 
 # -- designs ---------------------------------------------------------------------------------
 
 
-def given_designs(
-    scene: Scene, designs: Sequence[Path]
-) -> tuple[tuple[str, Case | Path | None], ...]:
-    """Return label and design of the files, or else of the initial and the optimised design."""
+def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
+    """Return the files' designs by label, or else the initial and the optimised one."""
     _check_designs(scene, designs)
     if designs:
         names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
         plain = len(set(names)) == len(names)
-        return tuple((n if plain else str(p), p) for n, p in zip(names, designs, strict=True))
-    return (
-        ("initial design", None),
-        ("optimised design", Case(scene, "optimize", label="optimised design")),
-    )
+        return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
+    optimised = Case(scene, "optimize", label="optimised design")
+    return {"initial design": None, optimised.label: optimised}
 
 
 def _check_designs(scene: Scene, designs: Sequence[Path]) -> None:
@@ -76,10 +108,11 @@ def _check_designs(scene: Scene, designs: Sequence[Path]) -> None:
         read_design(path, partition, arms)
 
 
-# -- tables and figures ----------------------------------------------------------------------
+# -- figures ---------------------------------------------------------------------------------
 
 
 def ended(outcome: Outcome) -> str:
+    """Return why an optimisation stopped, or what failed."""
     if outcome.failure:
         return f"failed: {outcome.failure}"
     return "" if outcome.case.action != "optimize" else outcome.stop_reason
@@ -98,18 +131,12 @@ def deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel, 
 
 
 def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
-    return DesignFigure(
-        name,
-        title,
-        tuple(
-            (
-                f"{o.case.label}: {o.compliance:.4g} N m, {1e3 * o.max_deviation:.4g} mm",
-                o.case.scene,
-                o.design,
-            )
-            for o in found
-        ),
-    )
+    """Return the designs beside one another, each with its results."""
+    labels = [
+        f"{o.case.label}: {o.compliance:.4g} N m, {1e3 * o.max_deviation:.4g} mm" for o in found
+    ]
+    designs = [(label, o.case.scene, o.design) for label, o in zip(labels, found, strict=True)]
+    return DesignFigure(name, title, tuple(designs))
 
 
 def magnitudes(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,16 +15,18 @@ import pandas as pd
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.plans import (
+    COMPLIANCE,
+    DEVIATION,
     QUANTITIES,
+    Design,
     Plan,
     Report,
-    Take,
+    by_design,
     design_figure,
     deviation_panels,
-    ended,
     given_designs,
 )
-from dolfinopt.study.store import Case, Outcome, Outcomes
+from dolfinopt.study.store import Case, Outcome
 from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table
 from dolfinopt.study.variants import (
     METHODS,
@@ -37,229 +41,180 @@ SWEPT = (4, 6, 8, 12, 16, 24, 48)  # coordinates of "coordinates"
 OPTIMISED = (4, 12, 48)  # coordinates of "reduction"
 COMPARED = (4, 12)
 MOTION = "made for the loads of the motion"
+Rows = list[tuple[Mapping[str, Any], Case]]
+
+
+def _good(frame: pd.DataFrame) -> list[Outcome]:
+    return list(frame.loc[frame["failure"] == "", "outcome"])
 
 
 # -- objectives ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Objectives(Plan):
-    initial: Case
-    optimised: tuple[Case, ...]
-
-    @property
-    def cases(self) -> list[Case]:
-        return [self.initial, *self.optimised]
-
-    def report(self, outcomes: Outcomes) -> Report:
-        found = [outcomes[case] for case in self.cases]
-        frame = pd.DataFrame(
-            {
-                "objective": o.case.label,
-                "compliance [N m]": o.compliance,
-                "maximal deviation [mm]": 1e3 * o.max_deviation,
-                "at [s]": o.max_deviation_time,
-                "grayness [-]": o.grayness,
-                "iterations": o.iterations,
-                "seconds": o.seconds,
-                "ended by": ended(o),
-            }
-            for o in found
-        )
-        title = "Designs optimised for every objective, simulated in the scene."
-        table = Table("", title, frame)
-        good = [o for o in found if not o.failure]
-        moved = [o for o in good if o.case.scene.objective.simulated and o.case != self.initial]
-        others = [o for o in good if o not in moved]
-        panels = [
-            *deviation_panels("initial, static, eigenfrequency", others),
-            *deviation_panels(MOTION, moved),
-        ]
-        figures: list[Figure] = [
-            LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
-            design_figure("designs", "Designs by objective", good),
-        ]
-        return [table], figures
-
-
 def objective_plan(scene: Scene) -> Plan:
-    optimised = []
+    """Plan a design for every objective that the scene allows."""
+    rows: Rows = [({}, Case(scene, label="initial design"))]
     for label, settings in OBJECTIVES:
         free = ["objective.worst=compliance"] if "worst=deviation" not in settings else []
         try:
             other = changed(scene, *free, *(f"objective.{setting}" for setting in settings))
         except InputError:  # the scene excludes it, as passive ends do "nothing attached"
             continue
-        optimised.append(Case(other, "optimize", label=label))
-    return _Objectives("objective", Case(scene, label="initial design"), tuple(optimised))
+        rows.append(({}, Case(other, "optimize", label=label)))
+    return Plan("objective", rows, _objectives)
+
+
+def _objectives(frame: pd.DataFrame) -> Report:
+    columns = ["label", *QUANTITIES, "at [s]", "grayness [-]", "iterations", "seconds", "ended by"]
+    title = "Designs optimised for every objective, simulated in the scene."
+    table = Table("", title, frame[columns].rename(columns={"label": "objective"}))
+    good = _good(frame)
+    moved = [o for o in good if o.case.action == "optimize" and o.case.scene.objective.simulated]
+    others = [o for o in good if o not in moved]
+    panels = [
+        *deviation_panels("initial, static, eigenfrequency", others),
+        *deviation_panels(MOTION, moved),
+    ]
+    return [table], [
+        LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
+        design_figure("designs", "Designs by objective", good),
+    ]
+
+
+# -- coordinates -----------------------------------------------------------------------------
+
+
+def coordinates_plan(
+    scene: Scene, name: str, designs: Sequence[Path], counts: Sequence[int] | None
+) -> Plan:
+    """Plan given designs, simulated with every method and number of coordinates."""
+    given = given_designs(scene, designs)
+    rows = _reduced_rows("given", given, reductions(scene, counts, SWEPT), "simulate", "")
+    part = "" if name == "coordinates" else "coordinates"
+    return Plan(name, rows, partial(_coordinates, name=part))
+
+
+def _reduced_rows(
+    role: str, given: Mapping[str, Design], scenes: Sequence[Scene], action: Any, words: str
+) -> Rows:
+    """Return every design with every reduction."""
+    return [
+        (
+            {"role": role, "design": label, **_reduction(scene)},
+            Case(scene, action, design, f"{label}, {words}{reduction_name(scene)}"),
+        )
+        for label, design in given.items()
+        for scene in scenes
+    ]
+
+
+def _reduction(scene: Scene) -> dict[str, Any]:
+    return {"method": scene.reduction.method, "coordinates": scene.reduction.coordinates}
+
+
+def _coordinates(frame: pd.DataFrame, name: str) -> Report:
+    title = "Given designs against the number of elastic coordinates of each arm."
+    table = Table(name, title, by_design(frame, ["method", "coordinates"]))
+    rows = []
+    for label, design in frame.groupby("design", sort=False):
+        methods = list(design.groupby("method", sort=False))
+        panels = []
+        for what in QUANTITIES:
+            lines = [
+                Line(str(method), part["coordinates"].to_numpy(), part[what].to_numpy())
+                for method, part in methods
+            ]
+            x_label = "elastic coordinates of each arm [-]"
+            panels.append(Panel(str(label), x_label, what, tuple(lines), x_log2=True))
+        rows.append(tuple(panels))
+    figures: list[Figure] = [LineFigure(name, title, tuple(rows))]
+    # The last design's deviation with the fewest and the most coordinates.
+    found = []
+    for _, part in [one for one in methods if one[0] in METHODS[:2]]:
+        for outcome in dict.fromkeys(part["outcome"].iloc[[0, -1]]):
+            case = replace(outcome.case, label=reduction_name(outcome.case.scene))
+            found.append(replace(outcome, case=case))
+    found = [outcome for outcome in found if not outcome.failure]
+    if panels := deviation_panels(str(label), found):
+        figures.append(LineFigure("deviation", "Deviation of the end-effector", tuple(panels)))
+    return [table], figures
 
 
 # -- reductions ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Coordinates(Plan):
-    """Given designs, simulated with every method and number of coordinates."""
-
-    designs: tuple[tuple[str, Case | Path | None], ...]
-    scenes: tuple[Scene, ...]
-
-    def case(self, label: str, design: Case | Path | None, scene: Scene) -> Case:
-        return Case(scene, "simulate", design, f"{label}, {reduction_name(scene)}")
-
-    @property
-    def cases(self) -> list[Case]:
-        return [self.case(*one, scene) for one in self.designs for scene in self.scenes]
-
-    def report(self, outcomes: Outcomes) -> Report:
-        rows = []
-        for scene in self.scenes:
-            row: dict[str, object] = {
-                "method": scene.reduction.method,
-                "coordinates": scene.reduction.coordinates,
-            }
-            for label, design in self.designs:
-                outcome = outcomes[self.case(label, design, scene)]
-                row |= {f"{label}: {what}": take(outcome) for what, take in QUANTITIES}
-            rows.append(row)
-        name = "" if self.name == "coordinates" else "coordinates"
-        title = "Given designs against the number of elastic coordinates of each arm."
-        table = Table(name, title, pd.DataFrame(rows))
-        figure = LineFigure("coordinates" if name else "", title, self._panels(outcomes))
-        return [table], [figure, *self._deviations(outcomes)]
-
-    def _panels(self, outcomes: Outcomes) -> tuple[tuple[Panel, ...], ...]:
-        def panel(label: str, design: Case | Path | None, y_label: str, take: Take) -> Panel:
-            lines = []
-            for method in METHODS:
-                mine = [scene for scene in self.scenes if scene.reduction.method == method]
-                x = np.array([scene.reduction.coordinates for scene in mine])
-                y = [take(outcomes[self.case(label, design, scene)]) for scene in mine]
-                if mine:
-                    lines.append(Line(method, x, np.array(y)))
-            return Panel(
-                label, "elastic coordinates of each arm [-]", y_label, tuple(lines), x_log2=True
-            )
-
-        return tuple(
-            tuple(panel(*one, y_label, take) for y_label, take in QUANTITIES)
-            for one in self.designs
-        )
-
-    def _deviations(self, outcomes: Outcomes) -> list[Figure]:
-        """Return the last design's deviation with the fewest and the most coordinates."""
-        label, design = self.designs[-1]
-        found = []
-        for method in METHODS[:2]:
-            mine = [scene for scene in self.scenes if scene.reduction.method == method]
-            for scene in dict.fromkeys([*mine[:1], *mine[-1:]]):
-                outcome = outcomes[self.case(label, design, scene)]
-                if not outcome.failure:
-                    found.append(replace(outcome, case=Case(scene, label=reduction_name(scene))))
-        panels = deviation_panels(label, found)
-        title = "Deviation of the end-effector"
-        return [LineFigure("deviation", title, tuple(panels))] if panels else []
+def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
+    """Plan designs optimised with every reduction, simulated with the reference; and the sweep."""
+    reference = reference_scene(scene)
+    optimised = [
+        Case(one, "optimize", label=reduction_name(one))
+        for one in reductions(scene, counts, OPTIMISED)
+    ]
+    rows: Rows = []
+    for case in optimised:
+        label = f"{case.label} in {reduction_name(reference)}"
+        rows.append(({"role": "own", **_reduction(case.scene)}, case))
+        rows.append(({"role": "again", **_reduction(case.scene)},
+                     Case(reference, "simulate", case, label)))  # fmt: skip
+    rows += coordinates_plan(scene, "reduction", (), None).rows
+    compared = reductions(scene, None, COMPARED)
+    rows += _reduced_rows("compared", given_designs(scene, ()), compared, "compare", "basis of ")
+    return Plan("reduction", rows, partial(_reductions, called=reduction_name(reference)))
 
 
-def coordinates_plan(
-    scene: Scene, name: str, designs: Sequence[Path], counts: Sequence[int] | None
-) -> _Coordinates:
-    scenes = reductions(scene, counts, SWEPT)
-    return _Coordinates(name, given_designs(scene, designs), tuple(scenes))
+def _reductions(frame: pd.DataFrame, called: str) -> Report:
+    parts = {role: part.reset_index() for role, part in frame.groupby("role")}
+    own, again = parts["own"], parts["again"]
+    tables, figures = _coordinates(parts["given"], "coordinates")
+    tables = [_reduction_table(own, again, called), *tables, _bases(parts["compared"], called)]
+    title = f"Designs optimised with every reduction, simulated with {called}"
+    pairs = zip(own["outcome"], again["outcome"], strict=True)
+    moved = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
+    if panels := deviation_panels("", moved):
+        figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
+        figures.append(design_figure("designs", title, moved))
+    if good := _good(own):
+        figures.append(_convergence(good))
+    return tables, figures
 
 
-@dataclass(frozen=True)
-class _Reductions(Plan):
-    """Designs optimised with every reduction, simulated with the reference; and the sweep."""
+def _reduction_table(own: pd.DataFrame, again: pd.DataFrame, called: str) -> Table:
+    """Return the designs' results in their own model and in the reference."""
+    ended = own["ended by"].where((own["failure"] != "") | (again["failure"] == ""),
+                                  again["ended by"])  # fmt: skip
+    frame = pd.DataFrame(
+        {
+            "method": own["method"],
+            "coordinates": own["coordinates"],
+            "compliance, own model [N m]": own[COMPLIANCE],
+            f"compliance, {called} [N m]": again[COMPLIANCE],
+            "own model off by [%]": 100.0 * (own[COMPLIANCE] / again[COMPLIANCE] - 1.0),
+            f"maximal deviation, {called} [mm]": again[DEVIATION],
+            "grayness [-]": own["grayness [-]"],
+            "iterations": own["iterations"],
+            "seconds": own["seconds"],
+            "ended by": ended,
+        }
+    )
+    title = f"Designs optimised with every reduction, simulated with {called} as well."
+    return Table("", title, frame)
 
-    scenes: tuple[Scene, ...]
-    reference: Scene
-    sweep: _Coordinates
-    compared: tuple[Scene, ...]
 
-    def optimised(self, scene: Scene) -> Case:
-        return Case(scene, "optimize", label=reduction_name(scene))
-
-    def again(self, scene: Scene) -> Case:
-        label = f"{reduction_name(scene)} in {reduction_name(self.reference)}"
-        return Case(self.reference, "simulate", self.optimised(scene), label)
-
-    def comparison(self, label: str, design: Case | Path | None, scene: Scene) -> Case:
-        return Case(scene, "compare", design, f"{label}, basis of {reduction_name(scene)}")
-
-    @property
-    def cases(self) -> list[Case]:
-        return [
-            *(self.again(scene) for scene in self.scenes),
-            *self.sweep.cases,
-            *(self.comparison(*one, s) for one in self.sweep.designs for s in self.compared),
-        ]
-
-    def report(self, outcomes: Outcomes) -> Report:
-        tables, figures = self.sweep.report(outcomes)
-        tables = [self._main(outcomes), *tables, self._bases(outcomes)]
-        pairs = [(outcomes[self.optimised(s)], outcomes[self.again(s)]) for s in self.scenes]
-        own = [a for a, _ in pairs if not a.failure]
-        model = reduction_name(self.reference)
-        title = f"Designs optimised with every reduction, simulated with {model}"
-        moved = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
-        if panels := deviation_panels("", moved):
-            figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
-            figures.append(design_figure("designs", title, moved))
-        if own:
-            figures.append(_convergence(own))
-        return tables, figures
-
-    def _main(self, outcomes: Outcomes) -> Table:
-        called = reduction_name(self.reference)
-        rows = []
-        for scene in self.scenes:
-            own, again = outcomes[self.optimised(scene)], outcomes[self.again(scene)]
-            rows.append(
-                {
-                    "method": scene.reduction.method,
-                    "coordinates": scene.reduction.coordinates,
-                    "compliance, own model [N m]": own.compliance,
-                    f"compliance, {called} [N m]": again.compliance,
-                    "own model off by [%]": 100.0 * (own.compliance / again.compliance - 1.0),
-                    f"maximal deviation, {called} [mm]": 1e3 * again.max_deviation,
-                    "grayness [-]": own.grayness,
-                    "iterations": own.iterations,
-                    "seconds": own.seconds,
-                    "ended by": ended(own if own.failure or not again.failure else again),
-                }
-            )
-        title = f"Designs optimised with every reduction, simulated with {called} as well."
-        return Table("", title, pd.DataFrame(rows))
-
-    def _bases(self, outcomes: Outcomes) -> Table:
-        """Return what the bases miss of the reference's."""
-        columns = ["design", "arm", "method", "coordinates"]
-        columns += [f"frequency {k} off by [%]" for k in (1, 2, 3)]
-        columns += [f"MAC {k} [-]" for k in (1, 2, 3)]
-        columns += ["largest angle [deg]", "tip compliance lost, F_y [%]", "moment [%]"]
-        rows = []
-        for label, design in self.sweep.designs:
-            for scene in self.compared:
-                for b in outcomes[self.comparison(label, design, scene)].bases:
-                    frequency, mac = (_three(values) for values in (b.frequency, b.mac))
-                    rows.append(
-                        (
-                            label,
-                            b.arm,
-                            scene.reduction.method,
-                            scene.reduction.coordinates,
-                            *(_percent(value) for value in frequency),
-                            *(round(value, 6) for value in mac),
-                            round(math.degrees(max(b.angle)), 4),
-                            _percent(b.compliance[1]),
-                            _percent(b.compliance[2]),
-                        )
-                    )
-        title = (
-            f"What the bases miss of {reduction_name(self.reference)}: first natural modes and tip."
-        )
-        return Table("bases", title, pd.DataFrame(rows, columns=columns))
+def _bases(compared: pd.DataFrame, called: str) -> Table:
+    """Return what the bases miss of the reference's."""
+    rows = []
+    for _, row in compared.iterrows():
+        for b in row["outcome"].bases:
+            frequency, mac = ([*v, math.nan, math.nan, math.nan][:3] for v in (b.frequency, b.mac))
+            known = {"design": row["design"], "arm": b.arm, "method": row["method"]}
+            known["coordinates"] = row["coordinates"]
+            known |= {f"frequency {k} off by [%]": _percent(v) for k, v in enumerate(frequency, 1)}
+            known |= {f"MAC {k} [-]": round(value, 6) for k, value in enumerate(mac, 1)}
+            known["largest angle [deg]"] = round(math.degrees(max(b.angle)), 4)
+            known["tip compliance lost, F_y [%]"] = _percent(b.compliance[1])
+            rows.append(known | {"moment [%]": _percent(b.compliance[2])})
+    title = f"What the bases miss of {called}: first natural modes and tip."
+    return Table("bases", title, pd.DataFrame(rows))
 
 
 def _percent(share: float) -> float:
@@ -267,32 +222,25 @@ def _percent(share: float) -> float:
     return round(100.0 * share, 4) + 0.0
 
 
-def _three(values: Sequence[float]) -> list[float]:
-    return [*values, math.nan, math.nan, math.nan][:3]
-
-
 def _convergence(found: Sequence[Outcome]) -> LineFigure:
     """Return objective and grayness against the iteration."""
-    objective, grayness = [], []
-    for outcome in found:
-        rows = outcome.history()
-        x = np.array([row.iteration for row in rows])
-        objective.append(Line(outcome.case.label, x, np.array([row.objective for row in rows])))
-        grayness.append(Line(outcome.case.label, x, np.array([row.grayness for row in rows])))
+    histories = [(outcome.case.label, outcome.history()) for outcome in found]
+
+    def lines(quantity: str) -> tuple[Line, ...]:
+        return tuple(
+            Line(
+                label,
+                np.array([row.iteration for row in rows]),
+                np.array([getattr(row, quantity) for row in rows]),
+            )
+            for label, rows in histories
+        )
+
     unit = {"compliance": "N m s", "deviation": "m", "eigenfrequency": "s2"}
     label = f"objective [{unit.get(found[0].case.scene.objective.kind, 'N m')}]"
+    title = "as the own model sees it"
     panels = (
-        (Panel("as the own model sees it", "iteration [-]", label, tuple(objective), y_log=True),),
-        (Panel("", "iteration [-]", "grayness [-]", tuple(grayness)),),
+        (Panel(title, "iteration [-]", label, lines("objective"), y_log=True),),
+        (Panel("", "iteration [-]", "grayness [-]", lines("grayness")),),
     )
     return LineFigure("convergence", "Convergence", panels)
-
-
-def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
-    return _Reductions(
-        "reduction",
-        tuple(reductions(scene, counts, OPTIMISED)),
-        reference_scene(scene),
-        coordinates_plan(scene, "reduction", (), None),
-        tuple(reductions(scene, None, COMPARED)),
-    )

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -199,8 +199,7 @@ def saltelli_points(count: int, dimensions: int, sampler: Sampler, seed: int) ->
 # -- statistics ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """A value and its confidence interval; an end that the samples do not tell is nan."""
 
     value: float
@@ -208,26 +207,12 @@ class Estimate:
     high: float
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """What the values of a sample say; intervals as for independent samples.
+def statistics(values: np.ndarray) -> dict[str, Estimate]:
+    """Return mean, standard deviation and `QUANTILES` of values (n,), n >= 2, by name.
 
-    Attributes:
-        mean, deviation: the latter with n - 1.
-        quantiles: at `QUANTILES`.
-    """
-
-    mean: Estimate
-    deviation: Estimate
-    quantiles: tuple[Estimate, ...]
-
-
-def statistics(values: np.ndarray) -> Statistics:
-    """Return mean, standard deviation and quantiles of values (n,), n >= 2.
-
-    Standard errors s / sqrt(n) and sqrt(m4 - s^4 (n - 3) / (n - 1)) / (2 s sqrt(n)) with the fourth
-    central moment m4; quantiles lie between order statistics. Even samples (`unit_points`) do
-    better than these intervals say.
+    The deviation has n - 1. Intervals are as for independent samples: standard errors s / sqrt(n)
+    and sqrt(m4 - s^4 (n - 3) / (n - 1)) / (2 s sqrt(n)) with the fourth central moment m4;
+    quantiles lie between order statistics. Even samples (`unit_points`) do better than these say.
     """
     n = len(values)
     wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
@@ -235,11 +220,11 @@ def statistics(values: np.ndarray) -> Statistics:
     of_mean = s / math.sqrt(n)
     m4 = float(np.mean((values - mean) ** 4))
     of_s = math.sqrt(max(m4 - s**4 * (n - 3) / (n - 1), 0.0) / n) / (2.0 * s) if s > 0.0 else 0.0
-    return Statistics(
-        Estimate(mean, mean - wide * of_mean, mean + wide * of_mean),
-        Estimate(s, s - wide * of_s, s + wide * of_s),
-        tuple(quantile(values, share) for share in QUANTILES),
-    )
+    return {
+        "mean": Estimate(mean, mean - wide * of_mean, mean + wide * of_mean),
+        "standard deviation": Estimate(s, s - wide * of_s, s + wide * of_s),
+        **{f"{100.0 * share:g} % quantile": quantile(values, share) for share in QUANTILES},
+    }
 
 
 def quantile(values: np.ndarray, share: float) -> Estimate:

@@ -1,4 +1,4 @@
-"""Cached and resumable cases, spread over the ranks: optimisations, simulations, comparisons.
+"""Cached and resumable cases, spread over the ranks: what all studies compute.
 
 A case is known by what it computes: a hash of the scene's content, of the design and of the program
 that computes, never a name, a path or a date. Its results are the usual files in DIR/cases/<key>/;
@@ -17,11 +17,11 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
@@ -32,27 +32,21 @@ from dolfinopt.disk import make_folder
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.scene.contents import file_digest, program, with_digests
 from dolfinopt.scene.load import Scene
+from dolfinopt.study import variants
 from dolfinopt.study.progress import Progress
 from dolfinopt.study.tasks import do_tasks
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.arms.arm import Arm
-    from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.run_folder import Simulated
-    from dolfinopt.parallel import Partition
-    from dolfinopt.profiling import Profile
-    from dolfinopt.responses.evaluation import Evaluation
+    from dolfinopt.study.simulate import BasisFigures
 
-Action = Literal["optimize", "simulate", "compare"]
+Action = Literal["optimize", "simulate", "compare", "sample"]
 
 CASES = "cases"  # folder of all cases
 SUMMARY, FAILURE, BATCH = "summary.json", "failure.json", "batch.json"
-# Craig-Bampton with this many coordinates stands for the unreduced arm.
-REFERENCE_METHOD, REFERENCE = "craig-bampton", 48
-MODES = 3  # natural modes that "compare" looks at
 # Scenes that differ in nothing but these tables have the same arms: they are meshed, assembled
 # and factorised once.
 SCENARIO = (
@@ -81,23 +75,37 @@ class Case:
     Attributes:
         scene: complete; its name does not matter.
         action: "optimize" finds a design, "simulate" moves a given one, "compare" says what its
-            reduced basis misses of `REFERENCE` Craig-Bampton coordinates.
-        design: of the last two: that of an optimising case, of a file, or None, the initial one.
+            reduced basis misses of `variants.REFERENCE` Craig-Bampton coordinates, "sample" moves
+            it at several samples of the scene's values, one after the other.
+        design: given; that of an optimising case, of a file, or None, the initial one.
         label: what progress and messages call it.
+        samples: what each sample changes, "key.path=value" each.
+        first: number of the first sample, for messages.
     """
 
     scene: Scene
     action: Action = "simulate"
     design: Case | Path | None = None
     label: str = field(default="", compare=False)
+    samples: tuple[tuple[str, ...], ...] = ()
+    first: int = field(default=0, compare=False)
 
     @cached_property
     def key(self) -> str:
         """Sixteen hexadecimal digits that stand for everything the case computes."""
         parts: list[Any] = [program(), self.action, scene_content(self.scene), self.design_key]
         if self.action == "compare":
-            parts += [REFERENCE_METHOD, REFERENCE, MODES]
-        return _digest(parts)
+            from dolfinopt.study.simulate import MODES
+
+            parts += [variants.REFERENCE_METHOD, variants.REFERENCE, MODES]
+        return _digest([*parts, self.samples])
+
+    @property
+    def title(self) -> str:
+        """Its label, with the numbers of its samples."""
+        if not self.samples:
+            return self.label
+        return f"{self.label}, samples {self.first} to {self.first + len(self.samples) - 1}"
 
     @cached_property
     def design_key(self) -> str:
@@ -108,7 +116,12 @@ class Case:
 
     @cached_property
     def arms_key(self) -> str:
-        """Equal where the same arms with the same design are simulated or compared."""
+        """Equal where the same arms with the same design are simulated or compared.
+
+        Optimisations and samples share nothing.
+        """
+        if self.action in ("optimize", "sample"):
+            return self.key
         content = scene_content(self.scene)
         kept = {table: value for table, value in content.items() if table not in SCENARIO}
         return _digest([self.action, kept, self.design_key])
@@ -137,26 +150,7 @@ class Case:
         return hash(self.key)
 
 
-@dataclass(frozen=True)
-class BasisFigures:
-    """What one arm's basis misses, see `reduction.BasisErrors`; first `MODES` modes.
-
-    Attributes:
-        arm: its name.
-        frequency: relative excess of the natural frequencies.
-        mac: modal assurance criterion of the modes that belong to them.
-        compliance: relative loss under unit loads at the outboard interface, F_x, F_y, moment.
-        angle: rad, between the reference's modes and the basis.
-    """
-
-    arm: str
-    frequency: tuple[float, ...]
-    mac: tuple[float, ...]
-    compliance: tuple[float, ...]
-    angle: tuple[float, ...]
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Outcome:
     """What came out of a case, read back from its folder. What it does not have is nan.
 
@@ -167,10 +161,11 @@ class Outcome:
         compliance: of the load cases, N m.
         max_deviation, max_deviation_time: m, s.
         grayness: over all arms.
-        volume_fraction: mean of the arms.
         iterations, stop_reason: of an optimisation.
         seconds: that it took.
         bases: of a comparison, one an arm with a design of its own.
+        samples: compliance, max_deviation and max_deviation_time (n,) of samples.
+        messages: of the samples that failed, by number.
     """
 
     case: Case
@@ -181,11 +176,23 @@ class Outcome:
     max_deviation: float = math.nan
     max_deviation_time: float = math.nan
     grayness: float = math.nan
-    volume_fraction: float = math.nan
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
     bases: tuple[BasisFigures, ...] = ()
+    samples: Mapping[str, np.ndarray] = field(default_factory=dict)
+    messages: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def failures(self) -> list[str]:
+        """What failed, a line each."""
+        if not self.messages:
+            return [f"{self.case.title}: {self.failure}"] if self.failure else []
+        return [
+            f"{self.case.label}, sample {number} "
+            f"({', '.join(self.case.samples[number - self.case.first])}): {message}"
+            for number, message in self.messages.items()
+        ]
 
     @property
     def design(self) -> Path:
@@ -210,7 +217,7 @@ class Outcomes:
 
     Attributes:
         by_case: in the order asked for.
-        computed: how many were not there before.
+        computed: how many were not there before; every sample counts.
     """
 
     by_case: Mapping[Case, Outcome]
@@ -255,8 +262,10 @@ class _Batch:
         """Rough measure of the time it takes; the reduced equations' cost grows with q^2."""
         first = self.cases[0]
         steps = first.scene.optimizer.max_iterations if first.action == "optimize" else 1
+        if first.action == "sample":  # all alike: those of one design stay together
+            return 1.0
         coordinates = first.scene.reduction.coordinates
-        size = 1.0 + ((REFERENCE if coordinates == "auto" else coordinates) / 10.0) ** 2
+        size = 1.0 + ((variants.REFERENCE if coordinates == "auto" else coordinates) / 10.0) ** 2
         return steps * size * len(self.cases)
 
 
@@ -267,17 +276,35 @@ class _Place:
     Attributes:
         folder: of all cases.
         run: what tells this run's failures from those of earlier ones.
+        nominal: the design in its nominal scene that samples of this rank last set out from.
     """
 
     folder: Path
     run: str
+    nominal: dict[str, Simulated | ConvergenceError] = field(default_factory=dict, compare=False)
 
     def __getitem__(self, case: Case) -> Path:
         return self.folder / case.key
 
     def failure(self, case: Case) -> str:
         """Return why the case failed in this run, "" if it did not."""
-        return _failure(self[case], self.run)
+        return str(self.failure_data(case).get("message", ""))
+
+    def failure_data(self, case: Case) -> dict[str, Any]:
+        """Return what the case left when it failed in this run, nothing if it did not."""
+        try:
+            data = json.loads((self[case] / FAILURE).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return data if data.get("run") == self.run else {}
+
+    def fail(self, case: Case, message: str, **more: Any) -> None:
+        """Keep why a case failed."""
+        from dolfinopt.output.files import write_text
+
+        make_folder(self[case])
+        data = {"run": self.run, "message": message, **more}
+        write_text(self[case] / FAILURE, json.dumps(data) + "\n")
 
     def has(self, case: Case) -> bool:
         """Tell whether the case is done, or has failed in this run."""
@@ -286,7 +313,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Job:
-    """What one rank does in one go: an optimisation, or one design in many scenes."""
+    """What one rank does in one go: an optimisation, one design in many scenes, or its samples."""
 
     batches: tuple[_Batch, ...]
     place: _Place
@@ -327,14 +354,17 @@ class _Job:
             if reason := self.place.failure(given):
                 for case in missing:
                     label = given.label or given.key
-                    _fail(self.place[case], self.place.run, f"{label}: {reason}")
-                    progress.tell(case.label, text="its design is missing", finished=1)
+                    self.place.fail(case, f"{label}: {reason}")
+                    progress.tell(case.title, text="its design is missing", finished=1)
                 return
             given = self.place[given] / "design.npz"
         if self.first.action == "optimize":
             for case in missing:
                 make_folder(self.place[case])
-                _optimise(case, self.place[case], self.place.run, progress)
+                _optimise(case, self.place, progress)
+        elif self.first.action == "sample":
+            for case in missing:
+                _sample(case, given, self.place, progress)
         else:
             batches = [one for one in self.batches if not set(missing).isdisjoint(one.cases)]
             _examine(batches, missing, given, self.place, progress)
@@ -370,11 +400,12 @@ def run_cases(
 
     done, found = on_root(world, look)
     batches = [_Batch(tuple(wanted[i] for i in batch)) for batch in found]
-    missing = len(done) - sum(done)
-    do_tasks(_jobs(batches, place, world.size), place.folder, world, missing, shown=shown)
+    missing = [case for case, there in zip(wanted, done, strict=True) if not there]
+    jobs = _jobs(batches, place, world)
+    do_tasks(jobs, place.folder, world, len(missing), shown=shown)
     with together(world):
         outcomes = {case: _read(case, place) for case in wanted}
-    return Outcomes(outcomes, missing)
+    return Outcomes(outcomes, sum(max(1, len(case.samples)) for case in missing))
 
 
 def _with_dependencies(cases: Iterable[Case]) -> list[Case]:
@@ -421,29 +452,31 @@ def _read_batch(folder: Path) -> tuple[str, ...]:
         return ()
 
 
-def _jobs(batches: Iterable[_Batch], place: _Place, ranks: int) -> list[_Job]:
+def _jobs(batches: Iterable[_Batch], place: _Place, world: MPI.Comm) -> list[_Job]:
     """Return the jobs, optimisations first, as others wait for them, and longest first.
 
     Batches of the same arms and design are one job, so that these are built once, unless that
-    leaves a rank without.
+    leaves a rank without. Every rank begins with other samples: with several designs each rank
+    reduces those it needs.
     """
     groups: dict[str, list[_Batch]] = {}
     for batch in batches:
-        first = batch.cases[0]
-        name = first.key if first.action == "optimize" else first.arms_key
-        groups.setdefault(name, []).append(batch)
+        groups.setdefault(batch.cases[0].arms_key, []).append(batch)
     jobs = []
     for group in groups.values():
-        parts = ranks if len(groups) < ranks else 1
+        parts = world.size if len(groups) < world.size else 1
         cuts = np.linspace(0, len(group), min(parts, len(group)) + 1).astype(int)
         jobs += [_Job(tuple(group[a:b]), place) for a, b in pairwise(cuts)]
-    return sorted(jobs, key=lambda job: (job.first.action != "optimize", -job.cost))
+    jobs.sort(key=lambda job: (job.first.action != "optimize", -job.cost))
+    samples = [job for job in jobs if job.first.action == "sample"]
+    begin = len(samples) * world.rank // world.size
+    return [job for job in jobs if job not in samples] + samples[begin:] + samples[:begin]
 
 
 # -- what is done ----------------------------------------------------------------------------
 
 
-def _optimise(case: Case, folder: Path, run: str, progress: Progress) -> None:
+def _optimise(case: Case, place: _Place, progress: Progress) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
     from mpi4py import MPI
 
@@ -452,7 +485,7 @@ def _optimise(case: Case, folder: Path, run: str, progress: Progress) -> None:
     from dolfinopt.output.run import optimize
     from dolfinopt.output.run_folder import write_result
 
-    begun = time.perf_counter()
+    begun, folder = time.perf_counter(), place[case]
     scene = _unnamed(case)
     limit = scene.optimizer.max_iterations
     resume, earlier = True, 0.0
@@ -471,7 +504,7 @@ def _optimise(case: Case, folder: Path, run: str, progress: Progress) -> None:
     try:
         result = optimize(scene, folder, resume=resume, world=MPI.COMM_SELF, report=report)
     except ConvergenceError as error:
-        _fail(folder, run, str(error))
+        place.fail(case, str(error))
         progress.tell(case.label, text=f"failed: {error}", finished=1)
         return
     wall = earlier + time.perf_counter() - begun
@@ -490,15 +523,13 @@ def _examine(
 ) -> None:
     """Simulate or compare one design in many scenes; write what is missing."""
     from dolfinopt.output.run_folder import write_simulation
+    from dolfinopt.study.simulate import compare, simulate_scenarios
 
     cases = [case for batch in batches for case in batch.cases]
     progress.tell(missing[0].label, text="...")
     scenes = [_unnamed(case) for case in cases]
-    results: Iterator[Simulated | tuple[BasisFigures, ...] | ConvergenceError]
-    if cases[0].action == "simulate":
-        results = simulate_scenarios(scenes, design)
-    else:
-        results = compare(scenes, design)
+    examine: Any = simulate_scenarios if cases[0].action == "simulate" else compare
+    results = examine(scenes, design)
     begun = time.perf_counter()
     for case, scene, found in zip(cases, scenes, results, strict=True):
         if case not in missing:  # it is there already, and shares the steps of those that are not
@@ -506,10 +537,10 @@ def _examine(
         folder, wall = place[case], time.perf_counter() - begun
         make_folder(folder)
         if isinstance(found, ConvergenceError):
-            _fail(folder, place.run, str(found))
+            place.fail(case, str(found))
             text = f"failed: {found}"
         elif isinstance(found, tuple):
-            _write_comparison(folder, scene, found, wall)
+            _write_table(folder, scene, wall, {"bases": [vars(one) for one in found]})
             text = "compared"
         else:
             write_simulation(folder, found, wall, paraview=False)
@@ -518,120 +549,44 @@ def _examine(
         begun = time.perf_counter()
 
 
-def simulate_scenarios(
-    scenes: Sequence[Scene], design: Path | None
-) -> Iterator[Simulated | ConvergenceError]:
-    """Simulate one design in many scenes, on this rank alone.
+def _sample(case: Case, design: Path | None, place: _Place, progress: Progress) -> None:
+    """Simulate one design at samples of its scene's values."""
+    from dolfinopt.responses.motion import worst_instants
+    from dolfinopt.study.simulate import (
+        scales_bodies,
+        simulate_samples,
+        simulate_scenarios,
+        with_sample,
+    )
 
-    Arms are meshed, assembled and factorised once; neighbours with the same `reduction` share it
-    and are simulated in one batch, whose time and counts the first of them bears.
-
-    Args:
-        scenes: that differ in `SCENARIO` alone; neighbours also in what `Case.batch_key` allows.
-        design: design.npz, or None, the initial one.
-
-    Returns:
-        In the scenes' order; of one that fails its error.
-
-    Raises:
-        InputError: the design does not fit the arms.
-    """
-    from dolfinopt.output.run_folder import Simulated
-    from dolfinopt.profiling import Profile
-    from dolfinopt.responses.evaluation import evaluate_batch
-    from dolfinopt.responses.order_selection import choose_coordinates
-
-    profile = Profile()
-    partition, arms, x_phys = _posed(scenes[0], design, profile)
-    for batch in _neighbours(scenes):
-        arms = {k: arm.under(batch[0]) for k, arm in arms.items()}
-        every: Sequence[tuple[Evaluation, Trajectory | None] | ConvergenceError]
-        choice = None
-        try:
-            choice = choose_coordinates(batch[0], partition, arms, x_phys, profile)
-            every = evaluate_batch(batch, partition, arms, x_phys, profile)
-        except ConvergenceError as error:
-            every = [error]
-        for scene, found in zip(batch, every, strict=True):
-            if isinstance(found, ConvergenceError):
-                yield found
-            else:
-                yield Simulated(scene, partition, arms, x_phys, *found, profile, choice)
-            _clear(profile)
-
-
-def _neighbours(scenes: Sequence[Scene]) -> Iterator[list[Scene]]:
-    """Yield neighbours with one basis; where it is chosen, "auto", each scene alone."""
-    for reduction, group in groupby(scenes, key=lambda scene: scene.reduction):
-        if reduction.coordinates == "auto":
-            yield from ([scene] for scene in group)
+    begun = time.perf_counter()
+    progress.tell(case.title, text="...")
+    scenes = [with_sample(case.scene, one, k) for k, one in enumerate(case.samples, case.first)]
+    scaled = scales_bodies(change.partition("=")[0] for one in case.samples for change in one)
+    nominal = Case(case.scene, "simulate", design).key
+    if scaled and nominal not in place.nominal:
+        place.nominal.clear()
+        (place.nominal[nominal],) = simulate_scenarios([case.scene], design)
+    rows, messages = [], {}
+    found = simulate_samples(place.nominal.get(nominal), scenes, design, scaled)
+    for number, trajectory in enumerate(found, case.first):
+        if isinstance(trajectory, ConvergenceError):
+            messages[number] = str(trajectory)
+            rows.append((math.nan, math.nan, math.nan))
         else:
-            yield list(group)
-
-
-def compare(
-    scenes: Sequence[Scene], design: Path | None
-) -> Iterator[tuple[BasisFigures, ...] | ConvergenceError]:
-    """Compare one design's bases with `REFERENCE` Craig-Bampton coordinates, on this rank alone.
-
-    Args:
-        scenes: that differ in `SCENARIO` alone; their reduction counts.
-        design: design.npz, or None, the initial one.
-
-    Raises:
-        InputError: the design does not fit the arms.
-    """
-    from dolfinopt.profiling import Profile
-    from dolfinopt.reduction import METHODS, Options, basis_errors
-    from dolfinopt.responses.order_selection import choose_coordinates
-
-    profile = Profile()
-    partition, arms, x_phys = _posed(scenes[0], design, profile)
-    richer = {}
-    for k, arm in arms.items():
-        arm.set_design(x_phys[k])
-        most = min(REFERENCE, arm.elastic.num_dofs)
-        richer[k] = METHODS[REFERENCE_METHOD].reduce(arm.elastic, Options(most), None)
-    for scene in scenes:
-        figures = []
-        try:
-            arms = {k: arm.under(scene) for k, arm in arms.items()}
-            choose_coordinates(scene, partition, arms, x_phys, profile)
-            for k, arm in arms.items():
-                arm.reduce(x_phys[k])
-                assert arm.basis is not None
-                errors = basis_errors(arm.elastic, arm.basis, richer[k], MODES)
-                values = (errors.frequency, errors.mac, errors.compliance, errors.angle)
-                figures.append(BasisFigures(scene.arms[k].name, *(tuple(v) for v in values)))
-        except ConvergenceError as error:
-            yield error
-        else:
-            yield tuple(figures)
-
-
-def _posed(
-    scene: Scene, design: Path | None, profile: Profile
-) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
-    """Build the arms on this rank; return them with the physical densities of the design."""
-    from mpi4py import MPI
-
-    from dolfinopt.arms.arm import build_arms
-    from dolfinopt.output.files import read_design
-    from dolfinopt.parallel import partition_arms
-
-    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = build_arms(scene, partition, profile)
-    if design is not None:
-        return partition, arms, read_design(design, partition, arms)
-    return partition, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
-
-
-def _clear(profile: Profile) -> None:
-    """Begin the account of the next scene; its profile is known to the arms."""
-    from dolfinopt.profiling import Counts
-
-    profile.seconds.clear()
-    profile.counts = Counts()
+            worst = worst_instants(trajectory, trajectory.scene.objective.load_cases)
+            compliance = float(trajectory.compliance[worst].sum())
+            rows.append((compliance, *trajectory.max_deviation))
+        progress.tell(case.title, len(rows), len(scenes))
+    wall = time.perf_counter() - begun
+    names = ("compliance", "max_deviation", "max_deviation_time")
+    samples = {name: list(values) for name, values in zip(names, zip(*rows), strict=True)}
+    if messages:
+        place.fail(case, f"{len(messages)} samples", samples=samples, messages=messages)
+    else:
+        make_folder(place[case])
+        _write_table(place[case], case.scene, wall, {"samples": samples})
+    progress.tell(case.title, text=f"{1e3 * wall / len(scenes):.0f} ms each", finished=1)
 
 
 def _unnamed(case: Case) -> Scene:
@@ -646,19 +601,12 @@ def _figures(compliance: float, deviation: float) -> str:
 # -- files -----------------------------------------------------------------------------------
 
 
-def _write_comparison(
-    folder: Path, scene: Scene, figures: Sequence[BasisFigures], wall: float
-) -> None:
+def _write_table(folder: Path, scene: Scene, wall: float, results: Mapping[str, Any]) -> None:
+    """Write the summary of a case that has no other files."""
     from dolfinopt.output.files import versions, write_summary
 
-    summary = {
-        "name": scene.name,
-        "bases": [vars(one) for one in figures],
-        "seconds": {"total": wall},
-        "versions": versions(),
-        "scene": scene.to_dict(),
-    }
-    write_summary(folder, summary)
+    more = {"seconds": {"total": wall}, "versions": versions(), "scene": scene.to_dict()}
+    write_summary(folder, {"name": scene.name, **results, **more})
 
 
 def _is_done(folder: Path) -> bool:
@@ -672,45 +620,26 @@ def _is_done(folder: Path) -> bool:
     return True
 
 
-def _fail(folder: Path, run: str, message: str) -> None:
-    from dolfinopt.output.files import write_text
-
-    make_folder(folder)
-    write_text(folder / FAILURE, json.dumps({"run": run, "message": message}) + "\n")
-
-
-def _failure(folder: Path, run: str) -> str:
-    """Return why the case failed in this run, "" if it did not."""
-    try:
-        data = json.loads((folder / FAILURE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return ""
-    return str(data["message"]) if data.get("run") == run else ""
-
-
 def _read(case: Case, place: _Place) -> Outcome:
     """Read a case back."""
     folder = place[case]
-    if message := place.failure(case):
-        return Outcome(case, folder, failure=message)
+    if failed := place.failure_data(case):
+        messages = {int(number): text for number, text in failed.get("messages", {}).items()}
+        samples = _arrays(failed.get("samples", {}))
+        return Outcome(case, folder, failed["message"], samples=samples, messages=messages)
     data = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
     seconds = data["seconds"]["total"]
+    if case.action == "sample":
+        return Outcome(case, folder, seconds=seconds, samples=_arrays(data["samples"]))
     if case.action == "compare":
-        fields = ("frequency", "mac", "compliance", "angle")
-        bases = tuple(
-            BasisFigures(one["arm"], *(tuple(one[key]) for key in fields)) for one in data["bases"]
-        )
+        from dolfinopt.study.simulate import BasisFigures
+
+        bases = tuple(BasisFigures(**one) for one in data["bases"])
         return Outcome(case, folder, seconds=seconds, bases=bases)
-    return Outcome(
-        case,
-        folder,
-        objective=data["objective"],
-        compliance=data["compliance"],
-        max_deviation=data["max_deviation"],
-        max_deviation_time=data["max_deviation_time"],
-        grayness=data["grayness"],
-        volume_fraction=float(np.mean(list(data["volume_fraction"].values()))),
-        iterations=data["iterations"],
-        stop_reason=data["stop_reason"],
-        seconds=seconds,
-    )
+    names = ("objective", "compliance", "max_deviation", "max_deviation_time", "grayness",
+             "iterations", "stop_reason")  # fmt: skip
+    return Outcome(case, folder, seconds=seconds, **{name: data[name] for name in names})
+
+
+def _arrays(samples: Mapping[str, Sequence[float]]) -> dict[str, np.ndarray]:
+    return {name: np.array(values, dtype=float) for name, values in samples.items()}

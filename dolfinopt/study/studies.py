@@ -1,7 +1,7 @@
 """Studies of a scene: objectives, reductions, and sweeps over any numeric value.
 
-A study plans cases (see `cases`), has them done, and puts tables and figures together from what
-they left; a second study of the same takes what is there.
+A study plans cases, has those done that its folder does not hold yet, and makes tables and figures
+of the data frame of all results.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.plans import Plan
+from dolfinopt.study.plans import Plan, tabulated
 from dolfinopt.study.presets import coordinates_plan, objective_plan, reduction_plan
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.sweep import sweep_plan
@@ -54,15 +54,29 @@ def study(
     Raises:
         InputError: something asked for is not possible; nothing was computed.
     """
+    from dolfinopt.parallel import on_root
+
+    plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize)
+    return carry_out(plan, folder, world, shown=shown)
+
+
+def carry_out(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) -> Study:
+    """Do what is planned (collective); the result is complete on the root.
+
+    Args:
+        plan: the same on all ranks.
+        folder: DIR, where the cases are kept.
+        world: all ranks.
+        shown: draw progress.
+    """
     from dolfinopt.output.folders import prepare_folder
     from dolfinopt.parallel import on_root, together
 
-    plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize)
     on_root(world, prepare_folder, folder)
-    outcomes = run_cases(plan.cases, folder, world, shown=shown)
+    outcomes = run_cases([case for _, case in plan.rows], folder, world, shown=shown)
     with together(world):
-        tables, figures = plan.report(outcomes)
-    failures = tuple(f"{o.case.label}: {o.failure}" for o in outcomes.failures)
+        tables, figures = plan.report(tabulated(plan, outcomes))
+    failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
     return Study(plan.name, tuple(tables), tuple(figures), failures, outcomes.computed)
 
 
@@ -80,7 +94,7 @@ def _plan(
         if keys.count(key) > 1:
             raise InputError(f"--vary {key} twice; give all its values in one")
     if preset in ("objective", "reduction", "coordinates"):
-        return _fixed_plan(scene, preset, asked, designs, reoptimize)
+        return _preset_plan(scene, preset, asked, designs, reoptimize)
     if preset is None and not asked:
         raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
     if preset is not None:
@@ -98,7 +112,7 @@ def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
     return file_name(*([preset] if preset else []), *(key for key in keys if key != own))
 
 
-def _fixed_plan(
+def _preset_plan(
     scene: Scene,
     preset: Preset,
     asked: Sequence[Vary],
@@ -106,27 +120,18 @@ def _fixed_plan(
     reoptimize: bool,
 ) -> Plan:
     """Plan a preset that has its own variants."""
+    command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
     for one in asked:
         if preset == "objective" or one.key != COORDINATES:
             only = "none" if preset == "objective" else f"only {COORDINATES}"
-            raise InputError(f"--vary {one.text}: expected {only} with {_command(preset)}")
-    if preset in ("objective", "reduction") and designs:
-        raise InputError(f"--design: expected none with {_command(preset)}, which makes its own")
+            raise InputError(f"--vary {one.text}: expected {only} with {command}")
+    if preset != "coordinates" and designs:
+        raise InputError(f"--design: expected none with {command}, which makes its own")
     if reoptimize:
-        raise InputError(f"--reoptimize: not with {_command(preset)}; see compare reductions")
+        raise InputError(f"--reoptimize: not with {command}; see compare reductions")
     if preset == "objective":
         return objective_plan(scene)
-    counts = [_whole(value, asked[0]) for value in asked[0].values] if asked else None
+    counts = asked[0].whole_numbers if asked else None
     if preset == "coordinates":
         return coordinates_plan(scene, preset, designs, counts)
     return reduction_plan(scene, counts)
-
-
-def _command(preset: Preset) -> str:
-    return f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
-
-
-def _whole(value: str, vary: Vary) -> int:
-    if float(value) % 1.0:
-        raise InputError(f"--vary {vary.text}: expected whole numbers, found {value}")
-    return int(float(value))

@@ -7,7 +7,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -26,11 +26,13 @@ class Table:
         name: of its file, "" for the study's main table.
         title: a sentence.
         frame: columns with units; nan is left empty in files.
+        long: too long to be read, for a CSV file alone.
     """
 
     name: str
     title: str
     frame: pd.DataFrame
+    long: bool = False
 
     def markdown(self) -> str:
         """Return the table in Markdown, four digits a number."""
@@ -130,76 +132,23 @@ class MatrixFigure:
     panels: tuple[tuple[str, np.ndarray], ...]
 
 
-@dataclass(frozen=True)
-class TornadoFigure:
-    """How far each key, alone, moves a figure.
+@dataclass(frozen=True, eq=False)
+class FrameFigure:
+    """A figure of a data frame.
 
     Attributes:
-        panels: title, and for every bar its label and the relative changes at both ends.
+        name, title: of its file, and above it.
+        kind: which picture; see `figures.FRAMES` for the columns that each needs.
+        frame: what is drawn.
     """
 
     name: str
     title: str
-    panels: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...]
+    kind: Literal["tornado", "bars", "histogram", "scatter"]
+    frame: pd.DataFrame
 
 
-@dataclass(frozen=True, eq=False)
-class Histogram:
-    """How values (n,) of one design scatter, and the nominal one."""
-
-    title: str
-    x_label: str
-    values: np.ndarray
-    nominal: float
-
-
-@dataclass(frozen=True)
-class HistogramFigure:
-    """Histograms in rows, with the share of the values below."""
-
-    name: str
-    title: str
-    rows: tuple[tuple[Histogram, ...], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Bars:
-    """Groups of bars: a label, and value, lower and upper end (n, 3) of each."""
-
-    title: str
-    y_label: str
-    groups: tuple[tuple[str, np.ndarray], ...]
-
-
-@dataclass(frozen=True)
-class BarFigure:
-    """Panels of bars in rows; `labels` (n,) below all of them."""
-
-    name: str
-    title: str
-    labels: tuple[str, ...]
-    rows: tuple[tuple[Bars, ...], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class ScatterFigure:
-    """Points: every row's values (n,) by every column's."""
-
-    name: str
-    title: str
-    columns: tuple[tuple[str, np.ndarray], ...]
-    rows: tuple[tuple[str, np.ndarray], ...]
-
-
-Figure = (
-    LineFigure
-    | DesignFigure
-    | MatrixFigure
-    | TornadoFigure
-    | HistogramFigure
-    | BarFigure
-    | ScatterFigure
-)
+Figure = LineFigure | DesignFigure | MatrixFigure | FrameFigure
 
 
 @dataclass(frozen=True)
@@ -212,7 +161,6 @@ class Study:
         figures: to draw.
         failures: one line each.
         computed: cases that were not there before.
-        data: tables too long to be read, for CSV files alone.
     """
 
     name: str
@@ -220,21 +168,17 @@ class Study:
     figures: tuple[Figure, ...]
     failures: tuple[str, ...]
     computed: int
-    data: tuple[Table, ...] = ()
 
     def markdown(self) -> str:
-        """Return all tables."""
-        return "\n".join(table.markdown() for table in self.tables)
+        """Return all tables but the long ones."""
+        return "\n".join(table.markdown() for table in self.tables if not table.long)
 
 
 def write_study(study: Study, folder: Path) -> list[Path]:
     """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
     from dolfinopt.output.files import write_text
 
-    texts = {
-        f"{joined(study.name, table.name)}.csv": table.csv()
-        for table in (*study.tables, *study.data)
-    }
+    texts = {f"{joined(study.name, table.name)}.csv": table.csv() for table in study.tables}
     for figure in study.figures:
         if isinstance(figure, LineFigure):
             texts[f"{joined(study.name, figure.name)}_curves.csv"] = figure.csv()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -16,16 +17,13 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.tables.base import without_none
-from dolfinopt.study.plans import given_designs
-from dolfinopt.study.sampling import Responses, Samples, posed, respond
+from dolfinopt.study.plans import QUANTITIES, Design, Plan, Report, by_design, given_designs
+from dolfinopt.study.simulate import scales_bodies, with_sample
 from dolfinopt.study.statistics import (
     CONFIDENCE,
-    QUANTILES,
     Distribution,
-    Estimate,
     Indices,
     Sampler,
-    Statistics,
     draw,
     parse_distribution,
     polynomial_indices,
@@ -34,20 +32,10 @@ from dolfinopt.study.statistics import (
     statistics,
     unit_points,
 )
-from dolfinopt.study.store import Case, run_cases
-from dolfinopt.study.tables import (
-    BarFigure,
-    Bars,
-    Cell,
-    Figure,
-    Histogram,
-    HistogramFigure,
-    ScatterFigure,
-    Study,
-    Table,
-    file_name,
-)
-from dolfinopt.study.variants import Vary, changed
+from dolfinopt.study.store import Case
+from dolfinopt.study.studies import carry_out
+from dolfinopt.study.tables import Figure, FrameFigure, Study, Table, file_name
+from dolfinopt.study.variants import axis_of, changed
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -57,15 +45,13 @@ NAME = "uncertainty"
 TABLES = ("motion", "payload", "damping", "material", "arms", "interpolation")
 SIZES = ("length", "height", "mesh_size", "passive")
 LEAST = 10  # samples: fewer tell nothing of the scatter
-QUANTITIES: tuple[tuple[str, Callable[[Responses], np.ndarray]], ...] = (
-    ("compliance [N m]", lambda found: found.compliance),
-    ("maximal deviation [mm]", lambda found: 1e3 * found.max_deviation),
-)
+CHUNK = 25  # samples that an interruption may cost
+REDUCED = 5  # of those that are meshed and reduced anew, which take longer
 INTERVAL = f"{100.0 * CONFIDENCE:g} %"
 
 
 @dataclass(frozen=True)
-class Plan:
+class Sampling:
     """How samples are drawn and what is made of them.
 
     Attributes:
@@ -84,15 +70,16 @@ class Plan:
 
 @dataclass(frozen=True)
 class Input:
-    """A scene value and its distribution within what the key allows."""
+    """A scene value, what the scene says of it, and its distribution within the key's range."""
 
     key: str
+    nominal: object
     distribution: Distribution
 
     @property
     def axis(self) -> str:
         """Key with its unit."""
-        return Vary(self.key, (), "").axis
+        return axis_of(self.key)
 
 
 def study_random(
@@ -101,7 +88,7 @@ def study_random(
     designs: Sequence[Path],
     folder: Path,
     world: MPI.Comm,
-    plan: Plan = Plan(),
+    sampling: Sampling = Sampling(),
     *,
     shown: bool = True,
 ) -> Study:
@@ -113,28 +100,16 @@ def study_random(
         designs: design.npz files in place of the initial and the optimised design.
         folder: DIR, where simulations are kept.
         world: all ranks.
-        plan: how many samples, and how they are drawn.
+        sampling: how many samples, and how they are drawn.
         shown: draw progress.
 
     Raises:
         InputError: something asked for is not possible.
     """
-    from dolfinopt.output.folders import prepare_folder
     from dolfinopt.parallel import on_root
 
-    asked: _Asked = on_root(world, _ask, scene, tuple(random), tuple(designs), plan)
-    on_root(world, prepare_folder, folder)
-    cases = [design for _, design in asked.designs if isinstance(design, Case)]
-    made = run_cases(cases, folder, world, shown=shown)
-    if made.failures:
-        failures = tuple(f"{o.case.label}: {o.failure}" for o in made.failures)
-        return Study(random_name(random), (), (), failures, made.computed)
-    paths = [
-        (label, made[design].design if isinstance(design, Case) else design)
-        for label, design in asked.designs
-    ]
-    found, computed = respond(asked.samples, paths, folder, world, shown=shown)
-    return on_root(world, _report, random_name(random), asked, found, made.computed + computed)
+    plan = on_root(world, _plan, scene, tuple(random), tuple(designs), sampling)
+    return carry_out(plan, folder, world, shown=shown)
 
 
 def random_name(random: Sequence[str]) -> str:
@@ -145,41 +120,58 @@ def random_name(random: Sequence[str]) -> str:
 # -- what is asked ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """What is to be simulated."""
-
-    plan: Plan
-    inputs: tuple[Input, ...]
-    samples: Samples
-    designs: tuple[tuple[str, Case | Path | None], ...]
-
-
-def _ask(scene: Scene, random: Sequence[str], designs: tuple[Path, ...], plan: Plan) -> _Asked:
+def _plan(
+    scene: Scene, random: Sequence[str], designs: tuple[Path, ...], sampling: Sampling
+) -> Plan:
     """Check what is asked and draw the samples (root only)."""
-    if plan.samples < LEAST:
-        raise InputError(f"--samples {plan.samples}: expected at least {LEAST}")
-    if plan.seed < 0:
-        raise InputError(f"--seed {plan.seed}: expected an integer >= 0")
+    if sampling.samples < LEAST:
+        raise InputError(f"--samples {sampling.samples}: expected at least {LEAST}")
+    if sampling.seed < 0:
+        raise InputError(f"--seed {sampling.seed}: expected an integer >= 0")
     nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
     inputs = tuple(parse_input(nominal, text) for text in random)
     keys = [one.key for one in inputs]
     for key in keys:
         if keys.count(key) > 1:
             raise InputError(f"--random {key} twice; a value has one distribution")
-    values = draw([one.distribution for one in inputs], _points(plan, len(inputs)))
-    samples = Samples(nominal, tuple(keys), values)
+    values = draw([one.distribution for one in inputs], _points(sampling, len(inputs)))
+    samples = sample_texts(keys, values)
     for column in values.T:  # what is refused is so at the ends, mostly
         for index in (int(np.argmin(column)), int(np.argmax(column))):
-            posed(samples, 1 + index)
-    return _Asked(plan, inputs, samples, given_designs(scene, designs))
+            with_sample(nominal, samples[1 + index], 1 + index)
+    given = given_designs(scene, designs)
+    cases = [one for label, design in given.items()
+             for one in sample_cases(nominal, samples, label, design)]  # fmt: skip
+    report = partial(_report, inputs=inputs, values=values, sampling=sampling)
+    return Plan(random_name(random), [({"design": case.label}, case) for case in cases], report)
 
 
-def _points(plan: Plan, dimensions: int) -> np.ndarray:
-    if plan.indices == "saltelli" and dimensions > 1:
-        half = -(-plan.samples // 2)
-        return saltelli_points(half, dimensions, plan.sampler, plan.seed)
-    return unit_points(plan.samples, dimensions, plan.sampler, plan.seed)
+def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
+    """Return what makes each sample of the scene, as "key=value": nothing, and values (n, d)."""
+    rows = [tuple(f"{key}={v!r}" for key, v in zip(keys, row)) for row in values.tolist()]
+    return [(), *rows]
+
+
+def sample_cases(
+    scene: Scene, samples: Sequence[tuple[str, ...]], label: str, design: Design
+) -> list[Case]:
+    """Return the cases of one design: an interruption costs one of them.
+
+    Further samples leave those that are complete as they are.
+    """
+    keys = {change.partition("=")[0] for one in samples for change in one}
+    size = CHUNK if scales_bodies(keys) else REDUCED
+    return [
+        Case(scene, "sample", design, label, tuple(samples[first : first + size]), first)
+        for first in range(0, len(samples), size)
+    ]
+
+
+def _points(sampling: Sampling, dimensions: int) -> np.ndarray:
+    if sampling.indices == "saltelli" and dimensions > 1:
+        half = -(-sampling.samples // 2)
+        return saltelli_points(half, dimensions, sampling.sampler, sampling.seed)
+    return unit_points(sampling.samples, dimensions, sampling.sampler, sampling.seed)
 
 
 def parse_input(scene: Scene, text: str) -> Input:
@@ -211,7 +203,7 @@ def parse_input(scene: Scene, text: str) -> Input:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
         low, high = _range(key)
         try:
-            return Input(key, distribution.within(low, high))
+            return Input(key, nominal_value(scene, key), distribution.within(low, high))
         except InputError as error:
             raise InputError(f"{error}; {key} is {allowed_words(_field(key))}") from None
     except InputError as error:
@@ -256,166 +248,116 @@ def _range(key: str) -> tuple[float, float]:
 # -- what comes out --------------------------------------------------------------------------
 
 
-def _report(name: str, asked: _Asked, found: Sequence[Responses], computed: int) -> Study:
-    """Return tables and figures (root only)."""
-    labels = [label for label, _ in asked.designs]
-    columns = list(zip(labels, found, strict=True))
-    failures = [
-        f"{label}, sample {index} ({', '.join(asked.samples.changes(index))}): {message}"
-        for label, responses in columns
-        for index, message in responses.failures.items()
-    ]
-    tables = [_input_table(asked)]
+def _report(
+    frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray, sampling: Sampling
+) -> Report:
+    """Return tables and figures of the samples' values (n, d), and a table of all samples."""
+    tables = [_input_table(inputs)]
+    if any(o.failure and not o.messages for o in frame["outcome"]):  # a design is missing
+        return tables, []
+    samples = _samples(frame, inputs, values)
     figures: list[Figure] = []
-    if not failures:
-        used = _statistics_count(asked)
-        tables.append(_statistics_table(columns, used))
-        figures.append(_histograms(columns, used))
-        if len(asked.inputs) > 1:
-            indices = [
-                [_indices(asked, take(responses)[1:]) for _, take in QUANTITIES]
-                for responses in found
-            ]
-            tables.append(_indices_table(asked, labels, indices))
-            figures.append(_index_bars(asked, labels, indices))
-        figures.append(_scatter(asked, columns, used))
-    data = (_sample_table(asked, columns),)
-    return Study(name, tuple(tables), tuple(figures), tuple(failures), computed, data)
-
-
-def _statistics_count(asked: _Asked) -> int:
-    """Return how many samples are independent draws: Saltelli's mixed ones are none."""
-    count = len(asked.samples.values)
-    if asked.plan.indices == "saltelli" and len(asked.inputs) > 1:
-        return 2 * count // (len(asked.inputs) + 2)
-    return count
-
-
-def _indices(asked: _Asked, values: np.ndarray) -> Indices:
-    if asked.plan.indices == "saltelli":
-        return saltelli_indices(values, len(asked.inputs), asked.plan.seed)
-    distributions = [one.distribution for one in asked.inputs]
-    return polynomial_indices(asked.samples.values, values, distributions)
-
-
-def _input_table(asked: _Asked) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for one in asked.inputs:
-        nominal = nominal_value(asked.samples.scene, one.key)
-        law = one.distribution
-        rows.append(
-            (
-                one.axis,
-                law.text,
-                nominal if isinstance(nominal, float) else math.nan,
-                law.mean,
-                law.deviation,
-                round(100.0 * law.cut_off, 6),
-            )
+    if not (frame["failure"] != "").any():
+        # Saltelli's mixed samples are no draws of their own.
+        several = len(inputs) > 1
+        mixed = sampling.indices == "saltelli" and several
+        used = 2 * len(values) // (len(inputs) + 2) if mixed else len(values)
+        drawn = samples[samples["sample"] <= used]
+        tables.append(_statistics_table(drawn, used))
+        title = f"Designs under {used} samples of the random values"
+        figures.append(
+            FrameFigure("", title, "histogram", drawn[["design", "sample", *QUANTITIES]])
         )
-    columns = ["input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"]
+        if several:
+            tables.append(_indices_table(samples, inputs, sampling))
+            title = f"Sobol' indices with {INTERVAL} confidence intervals"
+            figures.append(FrameFigure("indices", title, "bars", tables[-1].frame))
+        columns = ["design", *(one.axis for one in inputs), *QUANTITIES]
+        title = "Samples by each random value"
+        points = drawn.loc[drawn["sample"] > 0, columns]
+        figures.append(FrameFigure("scatter", title, "scatter", points))
+    index = ["sample", *(one.axis for one in inputs)]
+    wide = by_design(samples[samples["sample"] > 0], index, (*QUANTITIES, "at [s]"))
+    tables.append(Table("", "All samples.", wide, long=True))
+    return tables, figures
+
+
+def _samples(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> pd.DataFrame:
+    """Return a row a design and sample, number 0 with the nominal values: inputs and results."""
+    nominal = [one.nominal if isinstance(one.nominal, float) else math.nan for one in inputs]
+    columns = [one.axis for one in inputs]
+    known = pd.DataFrame(np.vstack([nominal, values]), columns=columns)
+    known.insert(0, "sample", np.arange(len(known)))
+    parts = []
+    for design, own in frame.groupby("design", sort=False):
+        found = pd.concat([pd.DataFrame(o.samples) for o in own["outcome"]], ignore_index=True)
+        results = {
+            QUANTITIES[0]: found["compliance"],
+            QUANTITIES[1]: 1e3 * found["max_deviation"],
+            "at [s]": found["max_deviation_time"],
+        }
+        parts.append(known.assign(design=design, **results))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _input_table(inputs: Sequence[Input]) -> Table:
+    rows = [
+        {
+            "input": one.axis,
+            "distribution": one.distribution.text,
+            "nominal": one.nominal if isinstance(one.nominal, float) else math.nan,
+            "mean": one.distribution.mean,
+            "standard deviation": one.distribution.deviation,
+            "cut off [%]": round(100.0 * one.distribution.cut_off, 6),
+        }
+        for one in inputs
+    ]
     title = "Random values, independent of one another, cut off where the key's range ends."
-    return Table("inputs", title, pd.DataFrame(rows, columns=columns))
+    return Table("inputs", title, pd.DataFrame(rows))
 
 
-def _statistics_table(columns: Sequence[tuple[str, Responses]], used: int) -> Table:
+def _statistics_table(samples: pd.DataFrame, used: int) -> Table:
     """Return all statistics, designs beside one another."""
-    names = ["mean", "standard deviation"]
-    names += [f"{100.0 * share:g} % quantile" for share in QUANTILES]
-    header = ["quantity", "statistic"]
-    for label, _ in columns:
-        header += [label, f"{label}: from", f"{label}: to"]
-    rows: list[tuple[Cell, ...]] = []
-    for what, take in QUANTITIES:
-        nominal: list[Cell] = [what, "nominal"]
-        several: list[Statistics] = []
-        for _, found in columns:
-            values = take(found)
-            nominal += [float(values[0]), math.nan, math.nan]
-            several.append(statistics(values[1 : 1 + used]))
-        rows.append(tuple(nominal))
-        for i, name in enumerate(names):
-            row: list[Cell] = [what, name]
-            for one in several:
-                row += _cells([one.mean, one.deviation, *one.quantiles][i])
-            rows.append(tuple(row))
+    parts = []
+    for what in QUANTITIES:
+        columns: dict[str, dict[str, float]] = {}
+        for design, own in samples.groupby("design", sort=False):
+            values = own[what].to_numpy()
+            found = {"nominal": (values[0], math.nan, math.nan), **statistics(values[1:])}
+            for k, end in enumerate(("", ": from", ": to")):
+                columns[f"{design}{end}"] = {name: one[k] for name, one in found.items()}
+        part = pd.DataFrame(columns).rename_axis("statistic").reset_index()
+        part.insert(0, "quantity", what)
+        parts.append(part)
     title = (
         f"Designs under {used} samples, with {INTERVAL} confidence intervals as for independent "
         "samples."
     )
-    return Table("statistics", title, pd.DataFrame(rows, columns=header))
+    return Table("statistics", title, pd.concat(parts, ignore_index=True))
 
 
-def _cells(one: Estimate) -> list[Cell]:
-    return [one.value, one.low, one.high]
-
-
-def _indices_table(
-    asked: _Asked, labels: Sequence[str], indices: Sequence[Sequence[Indices]]
-) -> Table:
-    fitted = asked.plan.indices == "polynomial"
-    header = ["design", "quantity", "input", "first order [-]", "from", "to", "total [-]"]
-    header += ["total from", "total to"]
-    header += ["degree [-]", "unexplained [-]"] if fitted else []
-    rows: list[tuple[Cell, ...]] = []
-    for label, by_quantity in zip(labels, indices, strict=True):
-        for (what, _), one in zip(QUANTITIES, by_quantity, strict=True):
-            for k, known in enumerate(asked.inputs):
-                row: list[Cell] = [label, what.partition(" [")[0], known.key]
-                row += [*_cells(one.first[k]), *_cells(one.total[k])]
-                row += [one.degree, one.unexplained] if fitted else []
-                rows.append(tuple(row))
+def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input], sampling: Sampling) -> Table:
+    """Return the Sobol' indices of all inputs, a row an input."""
+    fitted = sampling.indices == "polynomial"
+    names = ("first order [-]", "from", "to", "total [-]", "total from", "total to")
+    rows = []
+    for design, own in samples[samples["sample"] > 0].groupby("design", sort=False):
+        for what in QUANTITIES:
+            one = _indices(own, what, inputs, sampling)
+            for known, first, total in zip(inputs, one.first, one.total, strict=True):
+                row: dict[str, Any] = {"design": design, "quantity": what.partition(" [")[0]}
+                row |= {"input": known.key, **dict(zip(names, (*first, *total), strict=True))}
+                if fitted:
+                    row |= {"degree [-]": one.degree, "unexplained [-]": one.unexplained}
+                rows.append(row)
     how = "of a polynomial fitted to the samples" if fitted else "by Saltelli's scheme"
     title = f"Sobol' indices, shares of the variance, {how}, with {INTERVAL} confidence intervals."
-    return Table("indices", title, pd.DataFrame(rows, columns=header))
+    return Table("indices", title, pd.DataFrame(rows))
 
 
-def _sample_table(asked: _Asked, columns: Sequence[tuple[str, Responses]]) -> Table:
-    """Return a row a sample."""
-    frame = pd.DataFrame(asked.samples.values, columns=[one.axis for one in asked.inputs])
-    frame.insert(0, "sample", np.arange(1, 1 + len(frame)))
-    for label, found in columns:
-        for what, take in QUANTITIES:
-            frame[f"{label}: {what}"] = take(found)[1:]
-        frame[f"{label}: at [s]"] = found.max_deviation_time[1:]
-    return Table("", "All samples.", frame)
-
-
-def _histograms(columns: Sequence[tuple[str, Responses]], used: int) -> HistogramFigure:
-    rows = tuple(
-        tuple(
-            Histogram(label, what, take(found)[1 : 1 + used], float(take(found)[0]))
-            for what, take in QUANTITIES
-        )
-        for label, found in columns
-    )
-    return HistogramFigure("", f"Designs under {used} samples of the random values", rows)
-
-
-def _index_bars(
-    asked: _Asked, labels: Sequence[str], indices: Sequence[Sequence[Indices]]
-) -> BarFigure:
-    rows = []
-    for label, by_quantity in zip(labels, indices, strict=True):
-        panels = []
-        for (what, _), one in zip(QUANTITIES, by_quantity, strict=True):
-            groups = tuple(
-                (name, np.array([_cells(estimate) for estimate in estimates], dtype=float))
-                for name, estimates in (("first order", one.first), ("total", one.total))
-            )
-            title = f"{label}: {what.partition(' [')[0]}"
-            panels.append(Bars(title, "share of the variance [-]", tuple(groups)))
-        rows.append(tuple(panels))
-    keys = tuple(one.key for one in asked.inputs)
-    title = f"Sobol' indices with {INTERVAL} confidence intervals"
-    return BarFigure("indices", title, keys, tuple(rows))
-
-
-def _scatter(asked: _Asked, columns: Sequence[tuple[str, Responses]], used: int) -> ScatterFigure:
-    axes = tuple((one.axis, asked.samples.values[:used, k]) for k, one in enumerate(asked.inputs))
-    rows = tuple(
-        (f"{label}: {what}", take(found)[1 : 1 + used])
-        for label, found in columns
-        for what, take in QUANTITIES
-    )
-    return ScatterFigure("scatter", "Samples by each random value", axes, rows)
+def _indices(own: pd.DataFrame, what: str, inputs: Sequence[Input], sampling: Sampling) -> Indices:
+    values = own[what].to_numpy()
+    if sampling.indices == "saltelli":
+        return saltelli_indices(values, len(inputs), sampling.seed)
+    samples = own[[one.axis for one in inputs]].to_numpy()
+    return polynomial_indices(samples, values, [one.distribution for one in inputs])

@@ -11,7 +11,6 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
-from dolfinopt.study.store import REFERENCE, REFERENCE_METHOD
 
 # Label, and the settings that make it.
 OBJECTIVES = (
@@ -27,6 +26,8 @@ OBJECTIVES = (
     ("eigenfrequency, point masses attached", ("kind=eigenfrequency", "attached=point-mass")),
     ("eigenfrequency, nothing attached", ("kind=eigenfrequency", "attached=none")),
 )
+# Craig-Bampton with this many coordinates stands for the unreduced arm.
+REFERENCE_METHOD, REFERENCE = "craig-bampton", 48
 COORDINATES = "reduction.coordinates"
 METHODS = ("craig-bampton", "modal", "krylov", "balanced")
 # The Gramian's responses span few directions; more coordinates have nothing to describe.
@@ -56,15 +57,32 @@ class Vary:
         return [float(value) for value in self.values]
 
     @property
+    def whole_numbers(self) -> list[int]:
+        """The values, each once, as whole numbers.
+
+        Raises:
+            InputError: one is none.
+        """
+        for value, number in zip(self.values, self.numbers, strict=True):
+            if number % 1.0:
+                raise InputError(f"--vary {self.text}: expected whole numbers, found {value}")
+        return list(dict.fromkeys(map(int, self.numbers)))
+
+    @property
     def axis(self) -> str:
         """Key with its unit, for axes and columns."""
-        name = re.sub(r"^(arms)\.[^.]+\.(?=[^.]+$)", r"\1.", self.key)
-        units = {
-            info.key: match[1]
-            for info in describe_keys()
-            if (match := re.search(r"\[([^\]]*)\]$", info.description))
-        }
-        return f"{self.key} [{units.get(name, '-')}]"
+        return axis_of(self.key)
+
+
+def axis_of(key: str) -> str:
+    """Return a key with its unit, "[-]" where it has none."""
+    name = re.sub(r"^(arms)\.[^.]+\.(?=[^.]+$)", r"\1.", key)
+    units = {
+        info.key: match[1]
+        for info in describe_keys()
+        if (match := re.search(r"\[([^\]]*)\]$", info.description))
+    }
+    return f"{key} [{units.get(name, '-')}]"
 
 
 def parse_vary(text: str) -> Vary:

@@ -174,7 +174,7 @@ def test_arm_picture_is_to_scale():
 
 def test_animation_follows_the_mechanism():
     """Frames of the SVG end where the trajectory's end-effector is."""
-    from dolfinopt.study.store import simulate_scenarios
+    from dolfinopt.study.simulate import simulate_scenarios
 
     simulated = next(iter(simulate_scenarios([tiny_plan().scene], None)))
     trajectory = simulated.trajectory

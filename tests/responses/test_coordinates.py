@@ -18,7 +18,7 @@ from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import gather_arms
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.responses.order_selection import OrderSelection, estimated_error
-from dolfinopt.study.store import compare, simulate_scenarios
+from dolfinopt.study.simulate import compare, simulate_scenarios
 
 WORLD = MPI.COMM_WORLD
 AUTO = 'reduction.coordinates="auto"'

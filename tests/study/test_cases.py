@@ -15,7 +15,8 @@ from dolfinopt.optimization import loop as optimization
 from dolfinopt.output import checkpoint, run
 from dolfinopt.responses import evaluation
 from dolfinopt.study import store as cases
-from dolfinopt.study.store import Case, run_cases, scene_content, simulate_scenarios
+from dolfinopt.study.simulate import simulate_scenarios
+from dolfinopt.study.store import Case, run_cases, scene_content
 
 ROOT = Path(__file__).parents[2]
 SCENE = ROOT / "demos" / "two_arm.toml"

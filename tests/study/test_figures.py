@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.text import Text
 
@@ -10,11 +11,11 @@ from dolfinopt.plots.style import BLUE, ORANGE, look, look_numbers, spread
 from dolfinopt.study.figures import (
     column_figure,
     common_looks,
+    draw,
     line_figure,
     matrix_figure,
-    tornado_figure,
 )
-from dolfinopt.study.tables import Line, LineFigure, MatrixFigure, Panel, TornadoFigure
+from dolfinopt.study.tables import FrameFigure, Line, LineFigure, MatrixFigure, Panel
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -164,6 +165,8 @@ def test_matrix_and_tornado_figures():
     texts = [text.get_text() for text in drawn.axes[0].texts]
     assert texts == ["0.00", "1.50", "-2.00", "0.00"]
     assert drawn.axes[0].get_ylabel() == "made for [kg]"
-    drawn = tornado_figure(TornadoFigure("", "T", (("panel", (("mass", -3.0, 4.0),)),)))
+    columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
+    frame = pd.DataFrame([("one", "compliance", "mass", -3.0, 4.0)], columns=columns)
+    drawn = draw(FrameFigure("", "T", "tornado", frame))
     assert [patch.get_width() for patch in drawn.axes[0].patches] == [-3.0, 4.0]
     assert drawn.axes[0].get_xlabel() == "change [%]"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,34 +10,43 @@ from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.study import sampling
-from dolfinopt.study.sampling import Samples, posed, respond
+from dolfinopt.study import simulate, uncertainty
+from dolfinopt.study.simulate import scales_bodies, with_sample
+from dolfinopt.study.store import run_cases
+from dolfinopt.study.uncertainty import sample_cases, sample_texts
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 SMALL = ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
 FINE = ("simulation.tolerance=1e-6", "motion.horizon=2.2")
-INITIAL = [("initial", None)]
 CHUNK = 6
 
 
 @pytest.fixture(autouse=True)
 def _small_chunks(monkeypatch):
-    monkeypatch.setattr(sampling, "CHUNK", CHUNK)
+    monkeypatch.setattr(uncertainty, "CHUNK", CHUNK)
 
 
 def scene(*overrides):
     return do.load_scene(SCENE, [*SMALL, *overrides])
 
 
-def payloads(count, *overrides):
-    """Return samples of the payload's mass."""
-    values = 6.0 + 0.3 * np.sin(np.arange(count, dtype=float))
-    return Samples(scene(*overrides), ("payload.mass",), values[:, None])
+def masses(count):
+    return 6.0 + 0.3 * np.sin(np.arange(count, dtype=float))
 
 
-def arrays(found):
-    return np.stack([found.compliance, found.max_deviation, found.max_deviation_time])
+def payloads(count, *overrides, design=None):
+    """Return cases of samples of the payload's mass."""
+    samples = sample_texts(["payload.mass"], masses(count)[:, None])
+    return sample_cases(scene(*overrides), samples, "it", design)
+
+
+def respond(cases, folder, comm=WORLD):
+    """Return what came of all samples (3, 1 + n), how many were computed, and all messages."""
+    outcomes = run_cases(cases, folder, comm, shown=False)
+    found = [outcomes[case] for case in cases]
+    arrays = np.concatenate([np.stack([*one.samples.values()]) for one in found], axis=1)
+    return arrays, outcomes.computed, {k: v for o in found for k, v in o.messages.items()}
 
 
 @pytest.mark.parametrize(
@@ -56,10 +64,11 @@ def arrays(found):
 def test_samples_are_scenes_by_themselves(changes, scaling, shared_tmp_path):
     """Whether bodies are scaled or reduced anew: as `evaluate` has it, arms built for it alone."""
     base = scene(*FINE)
-    samples = Samples(base, tuple(changes), np.array([list(changes.values())]))
-    assert samples.scaling == scaling
-    [found], computed = respond(samples, INITIAL, shared_tmp_path, WORLD, shown=False)
-    assert computed == 2 and not found.failures
+    samples = sample_texts([*changes], np.array([[*changes.values()]]))
+    assert scales_bodies(changes) == scaling
+    cases = sample_cases(base, samples, "", None)
+    found, computed, failures = respond(cases, shared_tmp_path)
+    assert computed == 2 and not failures
     figures = []
     for texts in ((), (f"{key}={value}" for key, value in changes.items())):
         other = scene(*FINE, *texts)
@@ -69,78 +78,74 @@ def test_samples_are_scenes_by_themselves(changes, scaling, shared_tmp_path):
         expected, _ = do.evaluate(other, partition, arms, x, do.Profile())
         figures.append((expected.compliance, expected.max_deviation, expected.max_deviation_time))
     # Both are right to the tolerance in the coordinates; some of it is lost in their squares.
-    np.testing.assert_allclose(arrays(found).T, figures, rtol=1e-5)
+    np.testing.assert_allclose(found.T, figures, rtol=1e-5)
     assert np.abs(figures[1][0] / figures[0][0] - 1.0) > 1e-4  # it does matter
 
 
 def test_what_is_known_is_not_done_again(shared_tmp_path):
     """Further samples are added to complete chunks, whose bits stay."""
     count = 2 * CHUNK - 1  # and the scene itself: two chunks
-    [first], computed = respond(payloads(count), INITIAL, shared_tmp_path, WORLD, shown=False)
-    assert computed == 2 * CHUNK and len(first.compliance) == 2 * CHUNK
-    [again], computed = respond(payloads(count), INITIAL, shared_tmp_path, WORLD, shown=False)
+    first, computed, _ = respond(payloads(count), shared_tmp_path)
+    assert computed == 2 * CHUNK and first.shape == (3, 2 * CHUNK)
+    again, computed, _ = respond(payloads(count), shared_tmp_path)
     assert computed == 0
-    np.testing.assert_array_equal(arrays(first), arrays(again))
-    [more], computed = respond(payloads(count + 3), INITIAL, shared_tmp_path, WORLD, shown=False)
+    np.testing.assert_array_equal(first, again)
+    more, computed, _ = respond(payloads(count + 3), shared_tmp_path)
     assert computed == 3
-    np.testing.assert_array_equal(arrays(first), arrays(more)[:, : 2 * CHUNK])
+    np.testing.assert_array_equal(first, more[:, : 2 * CHUNK])
     # Another name is the same scene; another value is not, nor is another design.
-    named = replace(payloads(count), scene=scene('name="other"'))
-    assert respond(named, INITIAL, shared_tmp_path, WORLD, shown=False)[1] == 0
-    few = payloads(CHUNK - 1)
-    other = replace(few, scene=scene("motion.flattening=0.9"))
-    assert respond(other, INITIAL, shared_tmp_path, WORLD, shown=False)[1] == CHUNK
-    designs = [("full", _full(shared_tmp_path))]
-    assert respond(few, designs, shared_tmp_path, WORLD, shown=False)[1] == CHUNK
+    assert respond(payloads(count, 'name="other"'), shared_tmp_path)[1] == 0
+    few = CHUNK - 1
+    assert respond(payloads(few, "motion.flattening=0.9"), shared_tmp_path)[1] == CHUNK
+    assert respond(payloads(few, design=_full(shared_tmp_path)), shared_tmp_path)[1] == CHUNK
 
 
 def test_damaged_chunks_are_done_again(shared_tmp_path):
-    [first], _ = respond(payloads(CHUNK + 1), INITIAL, shared_tmp_path, WORLD, shown=False)
+    first, *_ = respond(payloads(CHUNK + 1), shared_tmp_path)
     WORLD.barrier()  # all have read them
     if WORLD.rank == 0:
-        files = sorted((shared_tmp_path / "samples").glob("*.npz"))
+        files = sorted((shared_tmp_path / "cases").glob("*/summary.json"))
         assert len(files) == 2
         files[0].write_bytes(files[0].read_bytes()[:100])
         files[1].write_bytes(b"")
     WORLD.barrier()
-    [again], computed = respond(payloads(CHUNK + 1), INITIAL, shared_tmp_path, WORLD, shown=False)
+    again, computed, _ = respond(payloads(CHUNK + 1), shared_tmp_path)
     assert computed == CHUNK + 2
-    np.testing.assert_array_equal(arrays(first), arrays(again))
+    np.testing.assert_array_equal(first, again)
 
 
 @pytest.mark.serial
 def test_an_interruption_costs_a_chunk(tmp_path, monkeypatch):
     """Ctrl-C in the third chunk: two are kept, and the end is the same."""
     count = 3 * CHUNK - 1
-    honest, calls = sampling._response, []
+    honest, calls = simulate.simulate_batch, []
 
-    def interrupted(trajectory):
+    def interrupted(scenes, *others):
         calls.append(1)
-        if len(calls) == 2 * CHUNK + 5:
+        if len(calls) == 3:
             raise KeyboardInterrupt
-        return honest(trajectory)
+        return honest(scenes, *others)
 
-    monkeypatch.setattr(sampling, "_response", interrupted)
+    monkeypatch.setattr(simulate, "simulate_batch", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        respond(payloads(count), INITIAL, tmp_path / "a", SELF, shown=False)
-    [found], computed = respond(payloads(count), INITIAL, tmp_path / "a", SELF, shown=False)
+        respond(payloads(count), tmp_path / "a", SELF)
+    found, computed, _ = respond(payloads(count), tmp_path / "a", SELF)
     assert computed == CHUNK
-    [expected], computed = respond(payloads(count), INITIAL, tmp_path / "b", SELF, shown=False)
+    expected, computed, _ = respond(payloads(count), tmp_path / "b", SELF)
     assert computed == 3 * CHUNK
-    np.testing.assert_array_equal(arrays(found), arrays(expected))
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
 def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
     """The same bits, whoever does a chunk, of two designs."""
-    samples = payloads(2 * CHUNK)
-    designs = [*INITIAL, ("full", _full(shared_tmp_path))]
-    alone, _ = respond(samples, designs, tmp_path / "alone", SELF, shown=False)
-    together, computed = respond(samples, designs, shared_tmp_path / "all", WORLD, shown=False)
-    assert computed == 2 * (2 * CHUNK + 1)
-    for one, other in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(arrays(one), arrays(other))
-    assert not np.array_equal(arrays(alone[0]), arrays(alone[1]))
+    count = 2 * CHUNK + 1
+    cases = payloads(count - 1) + payloads(count - 1, design=_full(shared_tmp_path))
+    alone, *_ = respond(cases, tmp_path / "alone", SELF)
+    together, computed, _ = respond(cases, shared_tmp_path / "all")
+    assert computed == 2 * count
+    np.testing.assert_array_equal(alone, together)
+    assert (alone[0, :count] != alone[0, count:]).all()
 
 
 def _full(folder):
@@ -157,7 +162,7 @@ def _full(folder):
 
 @pytest.mark.serial
 def test_failures_are_told_and_tried_again(tmp_path, monkeypatch):
-    honest = sampling.simulate_batch
+    honest = simulate.simulate_batch
 
     def failing(scenes, *others):
         return [
@@ -165,22 +170,20 @@ def test_failures_are_told_and_tried_again(tmp_path, monkeypatch):
             for scene, one in zip(scenes, honest(scenes, *others), strict=True)
         ]
 
-    samples = payloads(CHUNK - 1)
-    heavy = np.flatnonzero(samples.values[:, 0] > 6.25) + 1
+    cases = payloads(CHUNK - 1)
+    heavy = np.flatnonzero(masses(CHUNK - 1) > 6.25) + 1
     assert 0 < len(heavy) < CHUNK - 1
     with monkeypatch.context() as patch:
-        patch.setattr(sampling, "simulate_batch", failing)
-        [found], _ = respond(samples, INITIAL, tmp_path, SELF, shown=False)
-    assert list(found.failures) == list(heavy)
-    assert set(found.failures.values()) == {"too heavy"}
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.compliance)), heavy)
-    [found], computed = respond(samples, INITIAL, tmp_path, SELF, shown=False)
-    assert computed == CHUNK and not found.failures and np.isfinite(arrays(found)).all()
+        patch.setattr(simulate, "simulate_batch", failing)
+        found, _, failures = respond(cases, tmp_path, SELF)
+    assert list(failures) == list(heavy) and {*failures.values()} == {"too heavy"}
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found[0])), heavy)
+    found, computed, failures = respond(cases, tmp_path, SELF)
+    assert computed == CHUNK and not failures and np.isfinite(found).all()
 
 
 def test_a_sample_out_of_reach_is_one_line():
-    samples = Samples(scene(), ("motion.radius",), np.array([[1.0], [5.0]]))
-    assert posed(samples, 0) == samples.scene
+    assert with_sample(scene(), (), 0) == scene()
     with pytest.raises(InputError, match=r"--random, sample 2 \(motion.radius=5.0\)") as caught:
-        posed(samples, 2)
+        with_sample(scene(), ("motion.radius=5.0",), 2)
     assert "\n" not in str(caught.value)

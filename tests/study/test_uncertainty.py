@@ -14,8 +14,7 @@ import dolfinopt as do
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.study.figures import draw
-from dolfinopt.study.tables import BarFigure, HistogramFigure, ScatterFigure
-from dolfinopt.study.uncertainty import Plan, nominal_value, parse_input, study_random
+from dolfinopt.study.uncertainty import Sampling, nominal_value, parse_input, study_random
 
 WORLD = MPI.COMM_WORLD
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
@@ -187,9 +186,9 @@ def given(tmp_path_factory):
     return WORLD.bcast(path, root=0)
 
 
-def study(given, folder, *random, base=None, **plan):
+def study(given, folder, *random, base=None, **options):
     base = scene() if base is None else base
-    return study_random(base, random, [given], folder, WORLD, Plan(**plan), shown=False)
+    return study_random(base, random, [given], folder, WORLD, Sampling(**options), shown=False)
 
 
 def test_small_scatter_is_linear(folder, given):
@@ -230,7 +229,7 @@ def test_both_ways_to_the_indices(folder, given):
     fitted = study(given, folder / "i", MASS, YOUNG, samples=32)
     direct = study(given, folder / "i", MASS, YOUNG, samples=32, indices="saltelli", seed=3)
     assert direct.computed == 1 + 16 * (2 + 2)
-    assert len(cells_of(direct.data[0])) == 64
+    assert len(tables_of(direct)[""].frame) == 64
     ours, theirs = (cells_of(tables_of(done)["indices"]) for done in (fitted, direct))
     assert len(ours) == len(theirs) == 4
     for one, other in zip(ours, theirs, strict=True):
@@ -240,14 +239,13 @@ def test_both_ways_to_the_indices(folder, given):
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
             assert abs(value - middle) < 2.0 * half and half < 0.8
     # Mixed samples are no draws of their own: statistics rest on 32.
-    figure = direct.figures[0]
-    assert isinstance(figure, HistogramFigure) and len(figure.rows[0][0].values) == 32
+    assert sorted(direct.figures[0].frame["sample"]) == list(range(33))
 
 
 def test_one_input_has_no_indices(folder, given):
     done = study(given, folder, MASS, samples=20, sampler="latin-hypercube", indices="saltelli")
     assert done.computed == 21
-    assert list(tables_of(done)) == ["inputs", "statistics"]
+    assert list(tables_of(done)) == ["inputs", "statistics", ""]
     assert [figure.name for figure in done.figures] == ["", "scatter"]
 
 
@@ -260,12 +258,12 @@ def test_scenarios_are_left_out(folder, given):
 
 @pytest.mark.serial
 def test_failures_end_with_status_1(folder, given, monkeypatch):
-    from dolfinopt.study import sampling
+    from dolfinopt.study import simulate
 
     def failing(scenes, *_):
         return [ConvergenceError("no luck")] * len(scenes)
 
-    monkeypatch.setattr(sampling, "simulate_batch", failing)
+    monkeypatch.setattr(simulate, "simulate_batch", failing)
     with pytest.raises(ConvergenceError, match=r"solid, sample 0 \(\): no luck \(and 10 more\)"):
         run(SCENE, "--random", MASS, "--samples", 10, "--design", given, *SETTINGS,
             "--out", folder / "f")  # fmt: skip
@@ -279,10 +277,8 @@ def test_failures_end_with_status_1(folder, given, monkeypatch):
 @pytest.mark.serial
 def test_pictures_show_the_samples(folder, given):
     done = study(given, folder / "i", MASS, YOUNG, samples=32)
-    values = np.array([row[3:5] for row in cells_of(done.data[0])], dtype=float)
+    values = tables_of(done)[""].frame.to_numpy()[:, 3:5]
     histogram, bars, scatter = done.figures
-    assert isinstance(histogram, HistogramFigure)
-    assert isinstance(bars, BarFigure) and isinstance(scatter, ScatterFigure)
     drawn = draw(histogram)
     for j, axes in enumerate(drawn.axes[:2]):
         assert sum(patch.get_height() for patch in axes.patches) == 32
