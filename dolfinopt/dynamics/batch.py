@@ -16,11 +16,11 @@ import numpy as np
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.batch_system import BatchModes, BatchSystem, batch_of, related
-from dolfinopt.dynamics.collocation import radau_iia, stages_of, step_beginnings
+from dolfinopt.dynamics.collocation import Stages
 from dolfinopt.dynamics.elastic_system import ElasticSystem, static_equilibrium
-from dolfinopt.dynamics.error_estimate import estimated_errors
-from dolfinopt.dynamics.newton import Tuning, newton
+from dolfinopt.dynamics.newton import Iterate, Tuning, newton
 from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.system import State
 from dolfinopt.dynamics.time_grid import (
     even_steps,
     first_num_steps,
@@ -239,46 +239,13 @@ def _on_grid(
     tolerance: float,
     tuning: Tuning,
 ) -> list[Solution | None]:
-    """Return every system's solution on its grid, None where Newton's method fails.
+    """Return every system's solution on its grid, see `radau.on_grids`, from rest (R, N)."""
 
-    Args:
-        modes: of R systems.
-        time_grids: (R, n + 1), s.
-        stages: number of them.
-        rest: (R, N) coordinates that they start from.
-        guesses: of each.
-        tolerance, tuning: of Newton's method.
-    """
-    method = radau_iia(stages)
-    steps = stages_of(modes, method, time_grids)
-    size = modes.system.num_coordinates
-    a = np.stack([_guess(guess, grid, method.c, size) for guess, grid in zip(guesses, time_grids)])
+    def solve(steps: Stages, state: State, first: np.ndarray) -> Iterate:
+        return newton(steps, state, first, tolerance, tuning)
+
     state = (rest, np.zeros_like(rest))
-    iterate = newton(steps, state, modes.to_modes(a).reshape(-1, *a.shape[2:]), tolerance, tuning)
-    chosen = np.flatnonzero(iterate.converged)
-    out: list[Solution | None] = [None] * len(a)
-    if len(chosen) == 0:
-        return out
-    z = iterate.a.reshape(a.shape)[chosen].reshape(-1, *a.shape[2:])
-    steps, state = steps.chosen(chosen), (rest[chosen], np.zeros_like(rest[chosen]))
-    begin = step_beginnings(steps, state, z)
-    rate, grids = iterate.rate[chosen], time_grids[chosen]
-    errors = estimated_errors(steps, grids, begin, z, tuning.limits, rate)
-    q, qd = (modes.from_modes(x).reshape(len(chosen), -1, size) for x in begin)
-    a = modes.from_modes(z).reshape(len(chosen), *a.shape[1:])
-    for k, i in enumerate(chosen):
-        spent = int(iterate.iterations[i])
-        out[i] = Solution(grids[k], method.c, q[k], qd[k], a[k], float(errors[k]), spent)
-    return out
-
-
-def _guess(
-    guess: Solution | None, time_grid: np.ndarray, nodes: np.ndarray, size: int
-) -> np.ndarray:
-    """Return accelerations (n, s, N) from a solution, its horizon stretched to this one."""
-    if guess is None:
-        return np.zeros((len(time_grid) - 1, len(nodes), size))
-    return guess.accelerations(time_grid, nodes, stretched=True)
+    return radau.on_grids(modes, time_grids, state, guesses, stages, solve, tuning.limits)
 
 
 def _common_time_grids(systems: Sequence[ElasticSystem], steps: Sequence[int]) -> np.ndarray:

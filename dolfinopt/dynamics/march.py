@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Stages, step_ends
-from dolfinopt.dynamics.newton import ONE_RUN, Tuning, newton
+from dolfinopt.dynamics.newton import ONE_RUN, Iterate, Tuning, newton
 from dolfinopt.dynamics.newton_matrix import limits_for
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
@@ -35,13 +35,14 @@ class March:
 
     def run(
         self, stages: Stages, state: State, guess: np.ndarray, tuning: Tuning = ONE_RUN
-    ) -> tuple[np.ndarray, int]:
-        """Return the accelerations (n, s, N) of one run and the Newton iterations spent.
+    ) -> Iterate:
+        """Return where Newton's method ends for one run; its iterations are those of all windows.
 
         Raises:
             ConvergenceError: Newton fails in a single step, or spends more than `MAX_SWEEPS`.
         """
-        return self._run(stages, state, guess, tuning, True)
+        a, spent = self._run(stages, state, guess, tuning, True)
+        return Iterate(a, np.ones(1, dtype=bool), np.zeros(1), np.array([spent]))
 
     def _run(
         self, stages: Stages, state: State, guess: np.ndarray, tuning: Tuning, simplified: bool

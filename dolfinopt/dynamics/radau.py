@@ -13,16 +13,23 @@ blocks (`newton_matrix`).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.dynamics.collocation import Collocation, radau_iia, stages_of, step_ends
+from dolfinopt.dynamics.collocation import (
+    Collocation,
+    Stages,
+    radau_iia,
+    stages_of,
+    step_beginnings,
+)
 from dolfinopt.dynamics.error_estimate import estimated_errors
 from dolfinopt.dynamics.march import REMEDY, March
-from dolfinopt.dynamics.newton import ONE_RUN, ROUNDING
+from dolfinopt.dynamics.newton import ONE_RUN, ROUNDING, Iterate
 from dolfinopt.dynamics.solution import Solution
-from dolfinopt.dynamics.system import Preconditioner, System
+from dolfinopt.dynamics.system import Preconditioner, State, System
 from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.profiling import Profile
@@ -144,7 +151,6 @@ def on_grid(
     return _on_grid(system.preconditioner(), time_grid, tolerance, stages, guess)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # Newton's trial steps may lead anywhere
 def _on_grid(
     preconditioner: Preconditioner,
     time_grid: np.ndarray,
@@ -153,17 +159,76 @@ def _on_grid(
     guess: Solution | None,
     progress: SlowWork | None = None,
 ) -> Solution:
-    method = radau_iia(stages)
-    state = preconditioner.system.initial_state()
-    steps = stages_of(preconditioner, method, time_grid)
-    first = _first_guess(preconditioner, method, time_grid, guess)
     march = March(tolerance, len(time_grid) - 1, progress or SlowWork("simulation"))
-    a, spent = march.run(steps, state, first, ONE_RUN)
-    q, qd = step_ends(steps, state, a)
-    begin = (q[:-1], qd[:-1])
-    error = float(estimated_errors(steps, time_grid, begin, a, ONE_RUN.limits)[0])
-    q, qd, a = (preconditioner.from_modes(x) for x in (*begin, a))
-    return Solution(time_grid, method.c, q, qd, a, error, spent, march.windows)
+
+    def newton(steps: Stages, state: State, first: np.ndarray) -> Iterate:
+        return march.run(steps, state, first, ONE_RUN)
+
+    state = preconditioner.system.initial_state()
+    (found,) = on_grids(preconditioner, time_grid[None], state, [guess], stages, newton)
+    assert found is not None  # `march` has raised
+    return replace(found, windows=march.windows)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # Newton's trial steps may lead anywhere
+def on_grids(
+    preconditioner: Preconditioner,
+    time_grids: np.ndarray,
+    state: State,
+    guesses: Sequence[Solution | None],
+    stages: int,
+    newton: Callable[[Stages, State, np.ndarray], Iterate],
+    limits: tuple[float, ...] | None = None,
+) -> list[Solution | None]:
+    """Return every run's solution on its time grid, None where Newton's method fails.
+
+    Args:
+        preconditioner: of R runs.
+        time_grids: (R, n + 1) ends of the steps, s.
+        state: (R, N) q, qd that they begin with, in the preconditioner's coordinates.
+        guesses: of each run, or None.
+        stages: number of them.
+        newton: returns where it ends from stages, state and the first guess (R n, s, N).
+        limits: of slow coordinates of the error estimate, which then believes the contraction seen.
+    """
+    method, size = radau_iia(stages), preconditioner.system.num_coordinates
+    steps = stages_of(preconditioner, method, time_grids)
+    pairs = zip(guesses, time_grids, strict=True)
+    first = np.stack([_first_guess(preconditioner, method, grid, guess) for guess, grid in pairs])
+    shape = first.shape
+    iterate = newton(steps, state, first.reshape(-1, *shape[2:]))
+    found: list[Solution | None] = [None] * len(time_grids)
+    chosen = np.flatnonzero(iterate.converged)
+    if len(chosen) == 0:
+        return found
+    z = iterate.a.reshape(shape)[chosen].reshape(-1, *shape[2:])
+    steps, state = steps.chosen(chosen), (state[0][chosen], state[1][chosen])
+    begin, grids = step_beginnings(steps, state, z), time_grids[chosen]
+    rate = None if limits is None else iterate.rate[chosen]
+    errors = estimated_errors(steps, grids, begin, z, limits or ONE_RUN.limits, rate)
+    q, qd = (preconditioner.from_modes(x).reshape(len(chosen), -1, size) for x in begin)
+    a = preconditioner.from_modes(z).reshape(len(chosen), *shape[1:])
+    for k, i in enumerate(chosen):
+        spent = int(iterate.iterations[i])
+        found[i] = Solution(grids[k], method.c, q[k], qd[k], a[k], float(errors[k]), spent)
+    return found
+
+
+def _first_guess(
+    preconditioner: Preconditioner,
+    method: Collocation,
+    time_grid: np.ndarray,
+    guess: Solution | None,
+) -> np.ndarray:
+    """Return accelerations (n, s, N) to begin Newton with: those of `guess`, or zero."""
+    size = preconditioner.system.num_coordinates
+    shape = (len(time_grid) - 1, len(method.c), size)
+    if guess is None or guess.a.shape[2] != size:
+        return np.zeros(shape)
+    a = guess.accelerations(time_grid, method.c)
+    if a is guess.a:
+        return preconditioner.to_modes(a)
+    return preconditioner.to_modes(a.reshape(-1, size)).reshape(shape)  # one product for all
 
 
 # -- grids -----------------------------------------------------------------------------------
@@ -199,22 +264,3 @@ def _first_time_grid(system: System, tolerance: float, stages: int) -> np.ndarra
     growth = (known / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
     growth = max(growth, 0.6) if growth < FIRST_GROWTH else 1.0
     return even_steps(system, int(np.ceil(first_num_steps(system) * growth)))
-
-
-def _first_guess(
-    preconditioner: Preconditioner,
-    method: Collocation,
-    time_grid: np.ndarray,
-    guess: Solution | None,
-) -> np.ndarray:
-    """Return accelerations (n, s, N) to begin Newton with: those of `guess`, or zero."""
-    size = preconditioner.system.num_coordinates
-    shape = (len(time_grid) - 1, len(method.c), size)
-    if guess is None or guess.a.shape[2] != size:
-        return np.zeros(shape)
-    a = guess.accelerations(time_grid, method.c)
-    return (
-        preconditioner.to_modes(a.reshape(-1, size)).reshape(shape)
-        if a is not guess.a
-        else preconditioner.to_modes(a)
-    )

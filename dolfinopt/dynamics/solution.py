@@ -48,19 +48,16 @@ class Solution:
             value += self.qd[step]
         return value
 
-    def accelerations(
-        self, time_grid: np.ndarray, nodes: np.ndarray, *, stretched: bool = False
-    ) -> np.ndarray:
+    def accelerations(self, time_grid: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return qdd (m, s, N) at the nodes (s,) of the steps of another grid (m + 1,), s.
 
-        Args:
-            stretched: whether the horizon of this solution is stretched to that of the grid.
+        The horizon of this solution is stretched to that of the grid.
         """
         if np.array_equal(self.time_grid, time_grid) and np.array_equal(self.nodes, nodes):
             return self.a
         times = time_grid[:-1, None] + np.diff(time_grid)[:, None] * nodes
-        factor = self.time_grid[-1] / time_grid[-1] if stretched else 1.0
-        return self.sample(times.ravel() * factor, 2).reshape(*times.shape, -1)
+        stretch = self.time_grid[-1] / time_grid[-1]
+        return self.sample(times.ravel() * stretch, 2).reshape(*times.shape, -1)
 
 
 def lagrange_integrals(
