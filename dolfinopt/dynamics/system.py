@@ -2,10 +2,14 @@
 
 An integrator sees a system of N coordinates through its residual r(t, q, q', q'') = 0 alone. What
 a mechanism of elastic bodies makes of it stands in `elastic_system`; another system is another
-file with another implementation. A constraint g(q, t) = 0 is a row of the residual, its multiplier
-the second derivative of a coordinate that nothing else depends on: collocation then fulfils it at
-every stage (Hairer, Lubich & Roche 1989, doi:10.1007/BFb0093947). Such rows ask for the exact
-Newton matrix, that of a system without a preconditioner.
+file with another implementation.
+
+Coordinates may be free rigid ones (m, rad) beside elastic ones: control forces that depend on them
+are part of the residual. A constraint g(q, t) = 0 is a row of the residual, its multiplier the
+second derivative of a coordinate that nothing else depends on: collocation then fulfils it at every
+stage, positions with order 2 s - 1, velocities s, multipliers s - 1 (Hairer, Lubich & Roche 1989,
+doi:10.1007/BFb0093947). Neither is definite: such a system has no preconditioner (`Unchanged`), and
+all its coordinates are treated densely, with pivots. tests/dynamics/test_system.py has examples.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ import numpy as np
 
 State = tuple[np.ndarray, np.ndarray]  # q, qd
 
-# An arm that nearly rests beside the others is measured against this share of theirs.
+# A group that nearly rests beside the others is measured against this share of theirs: rounding
+# and Newton's leftover of the large ones is no error of the small one.
 LEAST_SHARE = 1e-3
 
 
@@ -116,7 +121,9 @@ class System(Protocol):
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return the largest norm of q (..., n, N) over n instants, (..., groups).
 
-        A group is what is measured by itself: errors are relative to its own size.
+        A group is what is measured by itself: errors are relative to its own size, or to
+        `LEAST_SHARE` of the largest group's. Groups of other units (m, rad, energy^(1/2)) are
+        weighted so that they compare; a multiplier's coordinate belongs to none.
         """
 
     def slowest_frequency(self) -> float:
