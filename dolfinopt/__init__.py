@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
     from dolfinopt.optimization.result import Result
-    from dolfinopt.output.files import gather_views
     from dolfinopt.output.run import optimize
+    from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import abort_together, gather_arms, partition_arms
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
@@ -52,7 +52,7 @@ _HOME = {
     "Evaluation": "responses.evaluation",
     "evaluate": "responses.evaluation",
     "gradient": "responses.evaluation",
-    "gather_views": "output.files",
+    "gather_views": "output.views",
     "gather_arms": "parallel",
     "Profile": "profiling",
     "Model": "model",

@@ -1,16 +1,16 @@
-"""Writing to disk: whole or not at all, and in one line when it cannot be done."""
+"""Files on disk: written whole or not at all, and one line when it cannot be done."""
 
 from __future__ import annotations
 
 import errno
 import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-from dolfinopt.errors import OutputError
+from dolfinopt.errors import InputError, OutputError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -82,3 +82,23 @@ def append_text(path: Path, text: str) -> None:
             with suppress(OSError):
                 os.truncate(path, size)
             raise
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write an .npz atomically."""
+    import numpy as np
+
+    write_atomically(path, lambda stream: np.savez(stream, **arrays))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically."""
+    write_atomically(path, lambda stream: stream.write(text.encode()))
+
+
+def open_input(path: Path) -> IO[bytes]:
+    """Open a file that the user has named; raise InputError where it cannot be read."""
+    try:
+        return open(path, "rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None

@@ -29,20 +29,15 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body
+from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.motion import check_motion
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.output.files import (
-    ArmView,
-    canonical_order,
-    designed,
-    gather_views,
-    read_design,
-    write_arrays,
-)
+from dolfinopt.output.design import read_design
 from dolfinopt.output.run import optimize
+from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient

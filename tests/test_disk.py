@@ -14,11 +14,10 @@ from mpi4py import MPI
 
 from dolfinopt import disk, locks
 from dolfinopt.data import paper_scene
-from dolfinopt.disk import append_text, make_folder, write_atomically
+from dolfinopt.disk import append_text, make_folder, write_arrays, write_atomically, write_text
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.output import checkpoint
-from dolfinopt.output.files import write_arrays, write_text
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study.store import Case, run_cases
 from dolfinopt.study.uncertainty import sample_cases

@@ -22,7 +22,7 @@ from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.mesh import compat
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.output import checkpoint, files, run, summary
+from dolfinopt.output import checkpoint, design, history, run, summary, views
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import (
@@ -300,7 +300,7 @@ OPTIMISATIONS = {
     "chain": (LONE, arm.Arm, "chain", 1),
     "threshold": (LONE, arm.Arm, "preserving_threshold", 0),
     "history": (0, run, "HistoryWriter", 0),
-    "history row": (0, files.HistoryWriter, "append", 1),
+    "history row": (0, history.HistoryWriter, "append", 1),
     "checkpoint begun": (0, checkpoint, "write_arrays", 0),
     "checkpoint": (0, checkpoint, "write_arrays", 1),
     "checkpoint modes": (LONE, checkpoint, "_rows", 0),
@@ -338,7 +338,7 @@ def test_resuming(monkeypatch, shared_tmp_path):
 
 WRITING = {
     "views": (LONE, arm.Arm, "volume_fraction"),
-    "bars": (0, files, "_views"),
+    "bars": (0, views, "_views"),
     "design": (0, results, "write_design"),
     "trajectory": (0, results, "write_trajectory"),
     "summary": (0, summary, "versions"),
@@ -369,21 +369,21 @@ def test_optimised_designs_are_written(monkeypatch, shared_tmp_path):
 
 def test_gradients_are_written(monkeypatch, shared_tmp_path):
     model = Model()
-    fail_on(monkeypatch, 0, files, "write_arrays")
+    fail_on(monkeypatch, 0, design, "write_arrays")
     with pytest.raises(Unusual):
-        files.write_gradient(shared_tmp_path / "gradient.npz", *model.place, model.x, 1.0)
+        design.write_gradient(shared_tmp_path / "gradient.npz", *model.place, model.x, 1.0)
     COMM.Barrier()
 
 
 def test_designs_are_read(monkeypatch, shared_tmp_path):
     model = Model()
-    files_ = do.gather_views(*model.place, model.x)
+    found = do.gather_views(*model.place, model.x)
     if COMM.rank == 0:
-        files.write_design(shared_tmp_path, files_)
+        design.write_design(shared_tmp_path, found)
     COMM.Barrier()
-    fail_on(monkeypatch, LONE, files, "_fit")
+    fail_on(monkeypatch, LONE, design, "_fit")
     with pytest.raises(Unusual):
-        files.read_design(shared_tmp_path / "design.npz", model.partition, model.arms)
+        design.read_design(shared_tmp_path / "design.npz", model.partition, model.arms)
     COMM.Barrier()
 
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from dolfinopt.bench import mesh, peers, reduction, solvers, time, tolerance, whole
 from dolfinopt.bench.common import Diagram, Goal, Plan, Tell, measured, write_diagram
-from dolfinopt.output.files import write_text
+from dolfinopt.disk import write_text
 from dolfinopt.study.tables import Table
 
 QUICKLY = ("arms.cells=[100,6]",)

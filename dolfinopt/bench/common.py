@@ -20,8 +20,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.arms.arm import Arm, build_arms, chain_of
+from dolfinopt.disk import write_text
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.output.files import write_text
 from dolfinopt.output.run import optimize
 from dolfinopt.parallel import partition_arms
 from dolfinopt.plots.style import save

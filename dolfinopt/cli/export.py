@@ -42,9 +42,9 @@ def export(
     """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
+    from dolfinopt.disk import write_arrays, write_text
     from dolfinopt.exchange.sid import sid_arrays, sid_text
     from dolfinopt.multibody.mbdyn import fem_text
-    from dolfinopt.output.files import write_arrays, write_text
     from dolfinopt.parallel import gather_arms
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.order_selection import choose_coordinates

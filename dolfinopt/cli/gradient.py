@@ -58,7 +58,7 @@ def gradient(
         overrides = (*overrides, f'objective.gradient="{kind}"')
     world, loaded = load(scene, overrides)
     from dolfinopt.optimization.gradient_check import check_exact
-    from dolfinopt.output.files import write_gradient
+    from dolfinopt.output.design import write_gradient
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes

@@ -20,7 +20,7 @@ from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
     from dolfinopt.optimization.result import Result
-    from dolfinopt.output.files import ArmView
+    from dolfinopt.output.views import ArmView
     from dolfinopt.scene.load import Scene
 
 

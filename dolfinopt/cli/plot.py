@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 def plot(folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""
     world = start()
-    from dolfinopt.output.files import gather_views, read_history, read_initial_deviation
+    from dolfinopt.output.history import read_history
+    from dolfinopt.output.trajectory import read_initial_deviation
+    from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate

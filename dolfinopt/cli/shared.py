@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.optimization.history import HistoryRow
-    from dolfinopt.output.files import ArmView
+    from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.responses.order_selection import OrderSelection
     from dolfinopt.scene.load import Scene
@@ -121,7 +121,7 @@ def design_of(
 ) -> tuple[Partition, dict[int, Arm], dict[int, Any]]:
     """Build the arms and return them with the physical densities of a file or the initial ones."""
     from dolfinopt.arms.arm import build_arms
-    from dolfinopt.output.files import read_design
+    from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
 
     partition = partition_arms(world, scene.cell_counts)
@@ -142,7 +142,7 @@ def draw(
     animation: bool = False,
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
-    from dolfinopt.output.files import designed
+    from dolfinopt.output.views import designed
     from dolfinopt.plots.curves import draw_deviation, draw_history
     from dolfinopt.plots.design import draw_design
     from dolfinopt.plots.machine import draw_machine

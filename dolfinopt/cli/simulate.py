@@ -21,7 +21,7 @@ from dolfinopt.cli.shared import claim, conclude, design_of, draw, elapsed, load
 if TYPE_CHECKING:
     pass
 
-    from dolfinopt.output.files import ArmView
+    from dolfinopt.output.views import ArmView
 
 
 @click.command()

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
-from dolfinopt.output.files import write_arrays
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection

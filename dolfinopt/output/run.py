@@ -14,7 +14,7 @@ from dolfinopt.optimization.loop import Report
 from dolfinopt.optimization.memory import Memory
 from dolfinopt.optimization.result import Result
 from dolfinopt.output import checkpoint
-from dolfinopt.output.files import HistoryWriter
+from dolfinopt.output.history import HistoryWriter
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene

@@ -15,15 +15,11 @@ import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.result import Result
-from dolfinopt.output.files import (
-    ArmView,
-    gather_views,
-    write_design,
-    write_fields,
-    write_summary,
-    write_trajectory,
-)
-from dolfinopt.output.summary import summarise
+from dolfinopt.output.design import write_design
+from dolfinopt.output.fields import write_fields
+from dolfinopt.output.summary import summarise, write_summary
+from dolfinopt.output.trajectory import write_trajectory
+from dolfinopt.output.views import ArmView, gather_views
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import platform
 import resource
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,9 +16,10 @@ from mpi4py import MPI
 from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.vibration import frequency_excess
 from dolfinopt.density.members import thinnest
+from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.mesh import compat
-from dolfinopt.output.files import drive_units, trajectory_units, versions
+from dolfinopt.output.trajectory import drive_units, trajectory_units
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import limits_of, summary_of
@@ -25,6 +29,7 @@ from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.plausibility import implausible
 from dolfinopt.units import HISTORY, SUMMARY
+from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.output.run_folder import Simulated
@@ -345,3 +350,25 @@ def _slowest(world: MPI.Comm, seconds: Mapping[str, float]) -> dict[str, float]:
         for phase, value in one.items():
             slowest[phase] = max(slowest.get(phase, 0.0), value)
     return slowest
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write summary.json."""
+    write_text(folder / "summary.json", json.dumps(summary, indent=2, sort_keys=False) + "\n")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of everything a result depends on."""
+    import scipy
+    from petsc4py import PETSc
+    from slepc4py import SLEPc
+
+    return {
+        "dolfinopt": __version__,
+        "dolfinx": compat.dolfinx_version(),
+        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "slepc": ".".join(map(str, SLEPc.Sys.getVersion())),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }

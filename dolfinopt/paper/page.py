@@ -32,7 +32,7 @@ from dolfinopt.study.tables import DesignFigure, LineFigure, as_text
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.output.files import ArmView
+    from dolfinopt.output.views import ArmView
     from dolfinopt.scene.load import Scene
     from dolfinopt.study.store import Case, Outcomes
 
@@ -67,7 +67,7 @@ def write_reproduction(
         folder: exists.
         plots: False leaves out pictures and page.
     """
-    from dolfinopt.output.files import write_text
+    from dolfinopt.disk import write_text
     from dolfinopt.plots.style import save
     from dolfinopt.study.figures import column_figure, common_looks, draw
 
@@ -231,7 +231,8 @@ def _overridden(scene: Scene) -> list[str]:
 
 def _gallery(cases: Iterable[Case], outcomes: Outcomes) -> list[dict[str, Any]]:
     """Return the designs, all to one scale; those without a result are left out."""
-    from dolfinopt.output.files import designed, read_views
+    from dolfinopt.output.design import read_views
+    from dolfinopt.output.views import designed
 
     items = []
     for case in dict.fromkeys(cases):

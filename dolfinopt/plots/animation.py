@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.disk import write_atomically
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.output.files import ArmView, write_atomically
+from dolfinopt.output.views import ArmView
 from dolfinopt.plots.shapes import CART, CELLS, base_corners, chain, deformed_cells, filled, thin
 from dolfinopt.plots.style import DENSITY, GREY, ORANGE, PathLike, round_number, ticks
 

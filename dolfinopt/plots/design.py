@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from dolfinopt.output.files import ArmView, write_atomically
+from dolfinopt.disk import write_atomically
+from dolfinopt.output.views import ArmView
 from dolfinopt.plots.shapes import outline, volume_fraction
 from dolfinopt.plots.style import COLOURS, DENSITY, GREY, PathLike, new_figure, ticks
 

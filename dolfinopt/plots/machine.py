@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.output.files import ArmView
+from dolfinopt.output.views import ArmView
 from dolfinopt.plots.shapes import (
     CELLS,
     base_corners,

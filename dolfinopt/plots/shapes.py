@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.output.files import ArmView
+from dolfinopt.output.views import ArmView
 from dolfinopt.plots.style import COLOURS
 
 CELLS = 3000  # of all arms in a frame; finer ones would be hardly larger than a pixel

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.output.files import write_atomically
+from dolfinopt.disk import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

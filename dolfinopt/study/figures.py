@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dolfinopt.output.files import designed, gather_views, read_design
+from dolfinopt.output.design import read_views
+from dolfinopt.output.views import designed
 from dolfinopt.plots.style import (
     COLOURS,
     DENSITY,
@@ -23,8 +24,6 @@ from dolfinopt.plots.style import (
     save,
     spans_decade,
 )
-from dolfinopt.profiling import Profile
-from dolfinopt.scene.load import Scene
 from dolfinopt.study import tables as findings
 from dolfinopt.study.tables import (
     DesignFigure,
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.output.files import ArmView
+    from dolfinopt.output.views import ArmView
 
 FEW = 40  # points a line that get markers
 NARROW = 5.4  # inches, of a column
@@ -369,7 +368,7 @@ FRAMES = {
 
 def design_figure(figure: DesignFigure) -> Figure:
     """Return the designs below each other, arms side by side, to one scale."""
-    views = [_views(scene, path) for _, scene, path in figure.designs]
+    views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
     columns = max(map(len, views))
     tall = max(np.ptp(v.corners[..., 1]) / np.ptp(v.corners[..., 0]) for row in views for v in row)
     wide = 6.0
@@ -406,15 +405,3 @@ def _draw_arm(axes: Axes, view: ArmView) -> Any:
     axes.xaxis.set_visible(False)
     axes.set_yticks([])
     return cells
-
-
-def _views(scene: Scene, path: Path) -> Sequence[ArmView]:
-    """Return the arms of a design file, on this rank alone."""
-    from mpi4py import MPI
-
-    from dolfinopt.arms.arm import build_arms
-    from dolfinopt.parallel import partition_arms
-
-    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = build_arms(scene, partition, Profile())
-    return designed(gather_views(scene, partition, arms, read_design(path, partition, arms)))

@@ -95,7 +95,7 @@ def _check_designs(scene: Scene, designs: Sequence[Path]) -> None:
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import build_arms
-    from dolfinopt.output.files import read_design
+    from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
     from dolfinopt.profiling import Profile
 

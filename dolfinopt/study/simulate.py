@@ -207,7 +207,7 @@ def _posed(
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import build_arms
-    from dolfinopt.output.files import read_design
+    from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
 
     partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)

@@ -206,7 +206,7 @@ class Outcome:
 
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""
-        from dolfinopt.output.files import read_history
+        from dolfinopt.output.history import read_history
 
         return read_history(self.folder / "history.csv")
 
@@ -300,7 +300,7 @@ class _Place:
 
     def fail(self, case: Case, message: str, **more: Any) -> None:
         """Keep why a case failed."""
-        from dolfinopt.output.files import write_text
+        from dolfinopt.disk import write_text
 
         make_folder(self[case])
         data = {"run": self.run, "message": message, **more}
@@ -425,7 +425,7 @@ def _batches(
 
     Those that an earlier run had begun together stay so if all of them are wanted again.
     """
-    from dolfinopt.output.files import write_text
+    from dolfinopt.disk import write_text
 
     known = {case.key: case for case in wanted}
     groups: dict[tuple[str, ...] | str, list[Case]] = {}
@@ -481,7 +481,7 @@ def _optimise(case: Case, place: _Place, progress: Progress) -> None:
     from mpi4py import MPI
 
     from dolfinopt.output import checkpoint
-    from dolfinopt.output.files import read_history
+    from dolfinopt.output.history import read_history
     from dolfinopt.output.run import optimize
     from dolfinopt.output.run_folder import write_result
 
@@ -603,7 +603,7 @@ def _figures(compliance: float, deviation: float) -> str:
 
 def _write_table(folder: Path, scene: Scene, wall: float, results: Mapping[str, Any]) -> None:
     """Write the summary of a case that has no other files."""
-    from dolfinopt.output.files import versions, write_summary
+    from dolfinopt.output.summary import versions, write_summary
 
     more = {"seconds": {"total": wall}, "versions": versions(), "scene": scene.to_dict()}
     write_summary(folder, {"name": scene.name, **results, **more})

@@ -176,7 +176,7 @@ class Study:
 
 def write_study(study: Study, folder: Path) -> list[Path]:
     """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
-    from dolfinopt.output.files import write_text
+    from dolfinopt.disk import write_text
 
     texts = {f"{joined(study.name, table.name)}.csv": table.csv() for table in study.tables}
     for figure in study.figures:

@@ -17,7 +17,9 @@ from dolfinopt.arms.vibration import frequency_excess
 from dolfinopt.cli import commands
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.optimization.optimality import kkt_residual
-from dolfinopt.output.files import ArmView, read_history, write_fields
+from dolfinopt.output.fields import write_fields
+from dolfinopt.output.history import read_history
+from dolfinopt.output.views import ArmView
 from dolfinopt.parallel import Partition, on_root, sum_over_arms
 from dolfinopt.responses import scenarios
 from dolfinopt.responses.constraints import Limit, distinct, violated, worst_limits

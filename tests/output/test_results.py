@@ -8,8 +8,8 @@ from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.output import run_folder as results
-from dolfinopt.output.files import gather_views
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
+from dolfinopt.output.views import gather_views
 
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD

@@ -10,7 +10,7 @@ from browser import browser, open_browser
 from mpi4py import MPI
 from test_paper import tiny_plan
 
-from dolfinopt.output.files import ArmView
+from dolfinopt.output.views import ArmView
 from dolfinopt.paper import page as report
 from dolfinopt.paper import reproduction as paper
 from dolfinopt.paper.statements import check_paper, failed_checks

@@ -16,7 +16,7 @@ from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.output.files import ArmView
+from dolfinopt.output.views import ArmView
 from dolfinopt.plots import animation, curves, design, machine, shapes, style
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -502,7 +502,7 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
 def test_real_arms_join():
     from dolfinopt.arms.arm import build_arms
     from dolfinopt.dynamics.simulation import build_mechanism
-    from dolfinopt.output.files import gather_views
+    from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import gather_arms, partition_arms
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import load_scene

@@ -1,0 +1,159 @@
+"""design.npz and gradient.npz: values of the cells by centroid, and reading a design back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.disk import open_input, write_arrays
+from dolfinopt.errors import InputError
+from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
+from dolfinopt.parallel import Partition, gather_cells, on_root, together
+from dolfinopt.responses.response import objective_of
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+
+def write_design(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.npz: centroids and physical densities of every arm."""
+    arrays = {}
+    for view in designed(views):
+        arrays[f"{view.name}/centroid"] = view.centroid
+        arrays[f"{view.name}/density"] = view.density
+    arrays["units"] = np.array(["centroid: m", "density: -"])
+    write_arrays(folder / "design.npz", arrays)
+
+
+def write_gradient(
+    path: Path,
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    by_cell: Mapping[int, np.ndarray],
+    objective: float,
+) -> None:
+    """Write the gradient with respect to the physical densities (collective).
+
+    Of a shared design once, under the name of the arm it belongs to.
+    """
+    centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
+    gathered = gather_cells(partition, by_cell)
+    with together(partition.world):
+        if partition.world.rank != 0:
+            return
+        arrays: dict[str, Any] = {"objective": objective}
+        for index, centroid in centroids.items():
+            order, name = canonical_order(centroid), scene.arms[index].name
+            arrays[f"{name}/centroid"] = centroid[order]
+            arrays[f"{name}/gradient"] = gathered[index][order]
+        unit = objective_of(scene).unit  # per physical density, which has none
+        arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
+        write_arrays(path, arrays)
+
+
+def read_views(scene: Scene, path: Path) -> list[ArmView]:
+    """Return the arms of a design file, on this rank alone.
+
+    Raises:
+        InputError: the file cannot be read, or does not fit the scene's arms.
+    """
+    from mpi4py import MPI
+
+    from dolfinopt.arms.arm import build_arms
+    from dolfinopt.parallel import partition_arms
+    from dolfinopt.profiling import Profile
+
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, partition, Profile())
+    return gather_views(scene, partition, arms, read_design(path, partition, arms))
+
+
+def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
+    """Return the physical densities of a design.npz on this rank's cells (collective).
+
+    Cells take the value of the nearest centroid in the file.
+
+    Raises:
+        InputError: the file is missing, damaged, or made for other arms.
+    """
+    arrays = on_root(partition.world, _load_design, path)
+    with together(partition.world):
+        return {index: _fit(path, arm, arrays) for index, arm in arms.items()}
+
+
+def _load_design(path: Path) -> dict[str, np.ndarray]:
+    with open_input(path) as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as data:
+                return {key: data[key] for key in data.files}
+        except (ValueError, OSError, EOFError, KeyError, _zip_error()):
+            raise InputError(
+                f"{path}: --design is no readable .npz file; give a design.npz that dolfinopt wrote"
+            ) from None
+
+
+def _zip_error() -> type[Exception]:
+    from zipfile import BadZipFile
+
+    return BadZipFile
+
+
+def _fit(path: Path, arm: Arm, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the file's densities on the arm's cells by nearest centroid."""
+    from scipy.spatial import cKDTree
+
+    name = arm.mesh.name
+    keys = (f"{name}/centroid", f"{name}/density")
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        found = sorted({key.split("/")[0] for key in arrays if "/" in key})
+        raise InputError(
+            f"{path}: missing key {missing[0]!r} for arm {name!r}; the file holds "
+            f"{', '.join(map(repr, found)) or 'nothing'}; give a design made for these arms"
+        )
+    centroid, density = (np.asarray(arrays[key]) for key in keys)
+    if centroid.ndim != 2 or centroid.shape[1] < 2 or density.shape != centroid.shape[:1]:
+        raise InputError(
+            f"{path}: {keys[1]} has shape {density.shape} beside centroids of shape "
+            f"{centroid.shape}; expected (n,) and (n, 2)"
+        )
+    try:
+        centroid, density = centroid.astype(float)[:, :2], density.astype(float)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: {keys[1]} holds {density.dtype}, not numbers") from None
+    if len(density) == 0 or not np.isfinite(centroid).all():
+        raise InputError(f"{path}: {keys[0]} is empty or not finite; give a complete design")
+    outside = ~((density >= 0.0) & (density <= 1.0))  # catches NaN
+    if outside.any():
+        raise InputError(
+            f"{path}: {keys[1]} = {density[outside][0]:g} at cell {np.flatnonzero(outside)[0]}: "
+            "physical densities lie in [0, 1]"
+        )
+    return density[_nearest(path, arm, centroid, cKDTree)]
+
+
+def _nearest(path: Path, arm: Arm, centroid: np.ndarray, tree: Any) -> np.ndarray:
+    """Return the nearest design point of each cell; both must cover the same region."""
+    cells = arm.mesh.centroid
+    comm = arm.mesh.comm
+    low = np.min(comm.allgather(cells.min(axis=0)), axis=0)
+    high = np.max(comm.allgather(cells.max(axis=0)), axis=0)
+    size = np.sqrt(comm.allreduce(arm.mesh.area.max(), op=max))
+    points = tree(centroid)
+    spacing = points.query(centroid, k=2)[0][:, 1].max() if len(centroid) > 1 else np.inf
+    reach = 2.0 * (size + min(spacing, np.ptp(centroid, axis=0).max()))
+    edge = np.concatenate([centroid.min(axis=0) - low, centroid.max(axis=0) - high])
+    distance, place = points.query(cells)
+    if np.abs(edge).max() > reach or distance.max() > reach:
+        a, b = centroid.min(axis=0), centroid.max(axis=0)
+        raise InputError(
+            f"{path}: the design of arm {arm.mesh.name!r} covers x {a[0]:.4g}..{b[0]:.4g} m, "
+            f"y {a[1]:.4g}..{b[1]:.4g} m, its mesh x {low[0]:.4g}..{high[0]:.4g} m, "
+            f"y {low[1]:.4g}..{high[1]:.4g} m; give a design made for these arms"
+        )
+    return place

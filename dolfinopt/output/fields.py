@@ -1,0 +1,137 @@
+"""design.vtu and design.xdmf: density and arm by cell, for ParaView."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dolfinopt.disk import write_atomically
+from dolfinopt.output.views import ArmView, designed
+
+VTK_TRIANGLE, VTK_QUAD = 5, 9
+XDMF_CELLS = {3: 4, 4: 5}  # its numbers of triangles and quadrilaterals, by corners
+
+
+def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.vtu and design.xdmf: density and arm by cell, see `_Sheet`.
+
+    One grid, because few programs read collections. ParaView and PyVista read both, meshio the
+    former: it takes no XDMF with the instant without which PyVista takes none.
+    """
+    sheet = _sheet(views)
+    _write_vtu(folder / "design.vtu", sheet)
+    _write_xdmf(folder / "design.xdmf", sheet)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """All designed arms as one grid, one below the other, in m.
+
+    Attributes:
+        points: (n_points, 3).
+        cells: (n_cells, 3 or 4) points around each cell, an array an arm.
+        density: (all cells,).
+        arm: (all cells,) number of the arm, from 0 in the scene's order.
+    """
+
+    points: np.ndarray
+    cells: list[np.ndarray]
+    density: np.ndarray
+    arm: np.ndarray
+
+
+def _sheet(views: Sequence[ArmView]) -> _Sheet:
+    points, cells, arm = [], [], []
+    offset, count = 0.0, 0
+    for index, view in enumerate(views):
+        if view.designed:
+            own, corners = _merge_corners(view.corners)
+            points.append(np.column_stack([own[:, 0], own[:, 1] + offset, np.zeros(len(own))]))
+            cells.append(corners + count)
+            arm.append(np.full(len(corners), index))
+            offset -= 2.0 * np.ptp(own[:, 1])
+            count += len(own)
+    density = np.concatenate([view.density for view in designed(views)])
+    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm))
+
+
+def _write_vtu(path: Path, sheet: _Sheet) -> None:
+    from xml.etree import ElementTree as Xml
+
+    root = Xml.Element("VTKFile", type="UnstructuredGrid", version="0.1")
+    piece = Xml.SubElement(Xml.SubElement(root, "UnstructuredGrid"), "Piece")
+    piece.set("NumberOfPoints", str(len(sheet.points)))
+    piece.set("NumberOfCells", str(len(sheet.density)))
+
+    def add(parent: Any, name: str, values: np.ndarray) -> None:
+        whole = values.dtype.kind == "i"
+        item = Xml.SubElement(parent, "DataArray", Name=name, format="ascii")
+        item.set("type", "Int64" if whole else "Float64")
+        if values.ndim == 2:
+            item.set("NumberOfComponents", str(values.shape[1]))
+        item.text = _text_of(values, "%d" if whole else "%.10g")
+
+    corners = np.concatenate([np.full(len(part), part.shape[1]) for part in sheet.cells])
+    add(Xml.SubElement(piece, "Points"), "Points", sheet.points)
+    cells = Xml.SubElement(piece, "Cells")
+    add(cells, "connectivity", np.concatenate([part.ravel() for part in sheet.cells]))
+    add(cells, "offsets", np.cumsum(corners))
+    add(cells, "types", np.where(corners == 4, VTK_QUAD, VTK_TRIANGLE))
+    data = Xml.SubElement(piece, "CellData", Scalars="density")
+    add(data, "density", sheet.density)
+    add(data, "arm", sheet.arm)
+    write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
+
+
+def _write_xdmf(path: Path, sheet: _Sheet) -> None:
+    from xml.etree import ElementTree as Xml
+
+    root = Xml.Element("Xdmf", Version="3.0")
+    grid = Xml.SubElement(Xml.SubElement(root, "Domain"), "Grid", Name="arms", GridType="Uniform")
+    Xml.SubElement(grid, "Time", Value="0")
+    topology = Xml.SubElement(grid, "Topology")
+    topology.set("NumberOfElements", str(len(sheet.density)))
+    shapes = {part.shape[1] for part in sheet.cells}
+    if len(shapes) == 1:
+        topology.set("TopologyType", "Quadrilateral" if shapes == {4} else "Triangle")
+        _data_item(topology, np.vstack(sheet.cells), "Int")
+    else:
+        topology.set("TopologyType", "Mixed")
+        parts = [np.insert(part, 0, XDMF_CELLS[part.shape[1]], axis=1) for part in sheet.cells]
+        _data_item(topology, np.concatenate([part.ravel() for part in parts]), "Int")
+    geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
+    _data_item(geometry, sheet.points, "Float")
+    for name, values, kind in (("density", sheet.density, "Float"), ("arm", sheet.arm, "Int")):
+        attribute = Xml.SubElement(grid, "Attribute", Name=name, Center="Cell")
+        attribute.set("AttributeType", "Scalar")
+        _data_item(attribute, values, kind)
+    write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
+
+
+def _data_item(parent: Any, values: np.ndarray, number_type: str) -> None:
+    from xml.etree import ElementTree as Xml
+
+    item = Xml.SubElement(parent, "DataItem", Format="XML", NumberType=number_type)
+    item.set("Dimensions", " ".join(map(str, values.shape)))
+    if number_type == "Float":
+        item.set("Precision", "8")
+    item.text = _text_of(values, "%d" if number_type == "Int" else "%.10g")
+
+
+def _text_of(values: np.ndarray, form: str) -> str:
+    """Return numbers as text, a line a row."""
+    rows = values if values.ndim == 2 else values[:, None]
+    line = " ".join([form] * rows.shape[1]) + "\n"
+    return "\n" + line * len(rows) % tuple(rows.ravel().tolist())
+
+
+def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 2) and cells (n_cells, corners) of cells that share their corners."""
+    flat = corners.reshape(-1, 2)
+    rounded = np.round(flat / (1e-9 * np.ptp(flat, axis=0).max()))
+    _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    return flat[kept], place.reshape(corners.shape[:2])

@@ -1,0 +1,136 @@
+"""Whole arms on the root: what pictures, ParaView and design files need of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.arms.arm import fixed_body
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.parallel import Partition, gather_cells, together
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+
+@dataclass(frozen=True, eq=False)
+class ArmView:
+    """One whole arm on the root, cells in the order of their centroids.
+
+    Attributes:
+        name: the arm's.
+        corners: (n_cells, 3 or 4, 2) m, around each cell.
+        centroid: (n_cells, 2) m.
+        density: (n_cells,) physical densities.
+        modes: (n_cells, 3 or 4, 2, q) the reduced basis at the corners; q = 0 if not reduced.
+        designed: False for arms without a design: rigid ones and those from a file.
+        length: from joint axis to joint axis, m; None if not known.
+    """
+
+    name: str
+    corners: np.ndarray
+    centroid: np.ndarray
+    density: np.ndarray
+    modes: np.ndarray
+    designed: bool = True
+    length: float | None = None
+
+
+def gather_views(
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+) -> list[ArmView]:
+    """Collect every arm on the root (collective); empty list elsewhere."""
+
+    def collect(values: Any) -> dict[int, np.ndarray]:
+        with together(partition.world):
+            mine = {index: values(index, arm) for index, arm in arms.items()}
+        return gather_cells(partition, mine)
+
+    def modes(index: int, arm: Arm) -> np.ndarray:
+        cells = arm.substructure.operators.cells
+        if arm.basis is None:
+            return np.zeros((*cells.shape, 2, 0))
+        return arm.basis.V[cells]
+
+    def points(index: int, arm: Arm) -> np.ndarray:
+        operators = arm.substructure.operators  # also of arms that no design was set for
+        return operators.points[operators.cells]
+
+    corners = collect(points)
+    centroids = collect(lambda _, arm: arm.mesh.centroid)
+    densities = collect(lambda index, _: x_phys[index])
+    shapes = collect(modes)
+    with together(partition.world):
+        if partition.world.rank == 0:
+            return _views(scene, corners, centroids, densities, shapes)
+        return []
+
+
+def _views(
+    scene: Scene,
+    corners: Mapping[int, np.ndarray],
+    centroids: Mapping[int, np.ndarray],
+    densities: Mapping[int, np.ndarray],
+    shapes: Mapping[int, np.ndarray],
+) -> list[ArmView]:
+    """Return the views of all arms in the chain, given those with a design (root only)."""
+    views = []
+    for index, owner in enumerate(scene.owners):
+        name = scene.arms[index].name
+        if owner is None:
+            views.append(_bar_view(name, scene.arms[index].height, fixed_body(scene, index)))
+            continue
+        order = canonical_order(centroids[owner])
+        # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
+        around = [0, 1, 3, 2] if corners[owner].shape[1] == 4 else [0, 1, 2]
+        views.append(
+            ArmView(
+                name,
+                corners[owner][order][:, around],
+                centroids[owner][order],
+                densities[owner][order],
+                shapes[owner][order][:, around],
+                length=scene.arms[index].length,
+            )
+        )
+    return views
+
+
+def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
+    """Return a body whose shape is not known as a bar from joint to joint.
+
+    Between them it bends like a beam without loads: cubic polynomials that fit the outboard
+    interface's displacement and rotation.
+    """
+    length = float(np.hypot(*body.outboard_point))
+    axis = np.array([*body.outboard_point]) / length
+    across = np.array([-axis[1], axis[0]])
+    s = np.linspace(0.0, 1.0, 21)
+    station = np.stack([s[:-1], s[1:], s[1:], s[:-1]], axis=1)  # (n_cells, 4)
+    side = 0.5 * height * np.array([-1.0, -1.0, 1.0, 1.0])
+    corners = length * station[..., None] * axis + side[:, None] * across
+    u, v = axis @ body.outboard[:2], across @ body.outboard[:2]
+    bend, turn = 3.0 * station**2 - 2.0 * station**3, length * (station**3 - station**2)
+    slope = (6.0 * station - 6.0 * station**2) / length, 3.0 * station**2 - 2.0 * station
+    deflection = bend[..., None] * v + turn[..., None] * body.outboard[2]
+    rotation = slope[0][..., None] * v + slope[1][..., None] * body.outboard[2]
+    along = station[..., None] * u - side[:, None] * rotation
+    modes = along[:, :, None] * axis[:, None] + deflection[:, :, None] * across[:, None]
+    density = np.ones(len(corners))
+    return ArmView(name, corners, corners.mean(axis=1), density, modes, False, length)
+
+
+def canonical_order(points: np.ndarray) -> np.ndarray:
+    """Sort points by x, then y, as equal to 1e-9 of their extent: the same on any partition."""
+    size = np.ptp(points, axis=0).max() or 1.0
+    rounded = np.round(points / (1e-9 * size))
+    return np.lexsort((rounded[:, 1], rounded[:, 0]))
+
+
+def designed(views: Sequence[ArmView]) -> list[ArmView]:
+    """Return the arms that have a design."""
+    return [view for view in views if view.designed]
