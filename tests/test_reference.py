@@ -260,8 +260,8 @@ def test_esl_gradient_does_not_depend_on_how_many_cases_there_are():
     for k, arm in run.arms.items():
         q = run.q_e[k][run.cases.indices]
         assert len(q) == 30 > q.shape[1]
-        whole = esl_gradient(arm, q.T @ q)
-        one_by_one = sum(esl_gradient(arm, np.outer(case, case)) for case in q)
+        whole = esl_gradient(arm.current, q.T @ q)
+        one_by_one = sum(esl_gradient(arm.current, np.outer(case, case)) for case in q)
         assert (whole < 0.0).all()  # more material is always stiffer
         # Directions of Q below 1e-14 of the largest are left out.
         assert np.abs(whole - one_by_one).max() < 1e-11 * np.abs(whole).max()

@@ -296,8 +296,8 @@ def test_coordinates_are_chosen(owner, name, monkeypatch):
 
 
 OPTIMISATIONS = {
-    "realise": (LONE, arm.Arm, "realise", 0),
-    "chain": (LONE, arm.Arm, "chain", 1),
+    "densities": (LONE, arm.Arm, "physical_designs", 0),
+    "gradient by x": (LONE, arm.Arm, "backward", 1),
     "threshold": (LONE, arm.Arm, "preserving_threshold", 0),
     "history": (0, run, "HistoryWriter", 0),
     "history row": (0, history.HistoryWriter, "append", 1),
@@ -387,7 +387,7 @@ def test_designs_are_read(monkeypatch, shared_tmp_path):
     COMM.Barrier()
 
 
-@pytest.mark.parametrize("name", ["physical", "chain"])
+@pytest.mark.parametrize("name", ["physical", "backward"])
 def test_taylor_test(name, monkeypatch):
     model = Model()
     fail_on(monkeypatch, LONE, arm.Arm, name)

@@ -37,8 +37,8 @@ CLIPPED = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Realised:
-    """One design that design variables stand for.
+class PhysicalDesign:
+    """One design that design variables stand for, and the way back to them.
 
     Attributes:
         x_phys: (n_cells,) physical densities.
@@ -100,11 +100,11 @@ class Arm:
         """Return the physical densities of design variables x: filtered, passive cells solid."""
         return self.filtered(x).x_phys
 
-    def filtered(self, x: np.ndarray) -> Realised:
+    def filtered(self, x: np.ndarray) -> PhysicalDesign:
         """Return the design of design variables x without projection.
 
         Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
-        what is cut off there has no derivative, and `chain` knows.
+        what is cut off there has no derivative, and `backward` knows.
         """
         x = np.where(self.mesh.passive, 1.0, x)
         with self.profile.phase("filter"):
@@ -115,20 +115,22 @@ class Arm:
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
             clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
         x_phys = np.where(self.mesh.passive, 1.0, np.clip(x_filtered, 0.0, 1.0))
-        return Realised(x_phys, None, clipped)
+        return PhysicalDesign(x_phys, None, clipped)
 
     def uniform(self, density: float) -> np.ndarray:
         """Return the physical densities of the same design variable in every cell."""
         return self.physical(np.full(self.mesh.num_cells, density))
 
-    def realise(self, x: np.ndarray, sharpness: float, threshold: float) -> tuple[Realised, ...]:
+    def physical_designs(
+        self, x: np.ndarray, beta: float, threshold: float
+    ) -> tuple[PhysicalDesign, ...]:
         """Return the designs that x stands for.
 
         One; or eroded, dilated and nominal with the robust projection, the nominal one last.
 
         Args:
             x: (n_cells,) design variables.
-            sharpness: beta of the scene's projection.
+            beta: sharpness of the scene's projection.
             threshold: its eta.
         """
         filtered = self.filtered(x)
@@ -139,38 +141,38 @@ class Arm:
         if kind == "robust":
             eroded, nominal, dilated = robust_thresholds(self.scene.design.erosion)
             thresholds = (eroded, dilated, nominal)
-        projected = [project(filtered.x_phys, sharpness, eta) for eta in thresholds]
+        projected = [project(filtered.x_phys, beta, eta) for eta in thresholds]
         return tuple(
-            Realised(np.where(self.mesh.passive, 1.0, p.value), p, filtered.clipped)
+            PhysicalDesign(np.where(self.mesh.passive, 1.0, p.value), p, filtered.clipped)
             for p in projected
         )
 
-    def preserving_threshold(self, x: np.ndarray, sharpness: float) -> float:
+    def preserving_threshold(self, x: np.ndarray, beta: float) -> float:
         """Return the projection's threshold that keeps the volume of x (collective on the arm).
 
         Within `THRESHOLDS`: where all that is left between void and solid is nearly void, the
         volume alone would choose a threshold among the void cells.
         """
         area = self._active(self.mesh.area)
-        eta = preserving_threshold(self.physical(x), area, sharpness, self.mesh.comm)
+        eta = preserving_threshold(self.physical(x), area, beta, self.mesh.comm)
         return float(np.clip(eta, *THRESHOLDS))
 
-    def chain(self, slope: np.ndarray, realised: Realised | None = None) -> np.ndarray:
+    def backward(self, gradient: np.ndarray, design: PhysicalDesign | None = None) -> np.ndarray:
         """Return the derivative with respect to x from that with respect to x_phys.
 
         Args:
-            slope: (n_cells,).
-            realised: what `realise` or `filtered` made of x; None: neither projected nor clipped.
+            gradient: (n_cells,).
+            design: of `physical_designs` or `filtered`; None: neither projected nor clipped.
         """
-        if realised is not None and realised.projected is not None:
-            slope = realised.projected.backward(self._active(slope))
-        if realised is not None and realised.clipped is not None:
-            slope = np.where(realised.clipped, 0.0, slope)
+        if design is not None and design.projected is not None:
+            gradient = design.projected.backward(self._active(gradient))
+        if design is not None and design.clipped is not None:
+            gradient = np.where(design.clipped, 0.0, gradient)
         with self.profile.phase("filter"):
-            slope = self.filter.backward(self._active(slope))
+            gradient = self.filter.backward(self._active(gradient))
             if self.symmetry is not None:
-                slope = self.symmetry.backward(slope)
-            return self._active(slope)
+                gradient = self.symmetry.backward(gradient)
+            return self._active(gradient)
 
     def _active(self, values: np.ndarray) -> np.ndarray:
         return np.where(self.mesh.passive, 0.0, values)
@@ -198,7 +200,7 @@ class Arm:
             self.solid.young_modulus * material.stiffness, self.solid.density * material.mass
         )
         self._state = DesignState(
-            x_phys, material, elastic, self.scene, self.coordinates, self.initial
+            x_phys, material, elastic, self.solid, self.scene, self.coordinates, self.initial
         )
         return self._state
 

@@ -10,9 +10,11 @@ from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, loaded_modes
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.reduction import METHODS, Basis, Options
 from dolfinopt.scene import load as scenes
+from dolfinopt.scene.schema import Material
 
 
 @dataclass(eq=False)
@@ -40,6 +42,7 @@ class DesignState:
         x_phys: (n_cells,) physical densities of the owned cells, read only.
         material: their interpolated stiffness and mass.
         elastic: stiffness, mass and constraint modes.
+        solid: the material where x_phys is 1.
         scene: says how to reduce, and the damping.
         num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
     """
@@ -49,18 +52,34 @@ class DesignState:
         x_phys: np.ndarray,
         material: Interpolated,
         elastic: ElasticArm,
+        solid: Material,
         scene: scenes.Scene,
         num_modes: int | None,
         initial: InitialVectors,
     ):
         self.x_phys = x_phys.copy()
         self.x_phys.setflags(write=False)
-        self.material, self.elastic = material, elastic
+        self.material, self.elastic, self.solid = material, elastic, solid
         self.scene, self.num_modes = scene, num_modes
         self._initial = initial
         self._basis: Basis | None = None
         self._body: ShapeIntegrals | None = None
         self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
+
+    @property
+    def mesh(self) -> ArmMesh:
+        """The arm's mesh."""
+        return self.elastic.mesh
+
+    @property
+    def young_slope(self) -> np.ndarray:
+        """Derivative of Young's modulus by x_phys (n_cells,), Pa."""
+        return self.solid.young_modulus * self.material.stiffness_slope
+
+    @property
+    def density_slope(self) -> np.ndarray:
+        """Derivative of the mass density by x_phys (n_cells,), kg/m3."""
+        return self.solid.density * self.material.mass_slope
 
     @property
     def reduction_options(self) -> Options:
@@ -121,7 +140,9 @@ class DesignState:
         self, scene: scenes.Scene, num_modes: int | None, initial: InitialVectors
     ) -> DesignState:
         """Return the same design in another scene of the same arm, with what stays the same."""
-        other = DesignState(self.x_phys, self.material, self.elastic, scene, num_modes, initial)
+        other = DesignState(
+            self.x_phys, self.material, self.elastic, self.solid, scene, num_modes, initial
+        )
         if self.num_modes == num_modes and same_basis(self.scene, scene):
             other._basis = self._basis
             if self.scene.damping == scene.damping:

@@ -34,18 +34,18 @@ class RigidIntegrals:
             self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia
         )
 
-    def turned(self, angle: float) -> RigidIntegrals:
+    def rotated(self, angle: float) -> RigidIntegrals:
         """Return the same in a frame from which this one is turned by `angle`, rad."""
         return RigidIntegrals(self.mass, self.moment * np.exp(1j * angle), self.inertia)
 
-    def moved(self, lever: complex) -> RigidIntegrals:
+    def shifted(self, lever: complex) -> RigidIntegrals:
         """Return the same about a point from which this frame's origin lies at `lever`, m."""
         first = self.moment + self.mass * lever
         second = self.inertia + 2.0 * (np.conj(lever) * self.moment).real
         return RigidIntegrals(self.mass, first, second + self.mass * abs(lever) ** 2)
 
     def matrix(self) -> np.ndarray:
-        """Return the inertia (3, 3) felt by displacements (u_x, u_y, theta) of the origin."""
+        """Return the inertia (3, 3) under displacements (u_x, u_y, theta) of the origin."""
         m, c = self.mass, self.moment
         return np.array(
             [[m, 0.0, -c.imag], [0.0, m, c.real], [-c.imag, c.real, self.inertia]], dtype=float
@@ -68,14 +68,14 @@ class Chain:
 
     Attributes:
         bodies: of every arm, in its own frame.
-        reach: (arms,) outboard point of every arm, complex, m.
+        outboard_points: (arms,) of every arm, complex, m.
         angles: (arms,) joint angle inboard of every arm, rad; the first one has no effect.
         payload: at the last outboard point.
         kind: "rigid-body", "point-mass" or "none", see `carried`.
     """
 
     bodies: Sequence[RigidIntegrals]
-    reach: Sequence[complex]
+    outboard_points: Sequence[complex]
     angles: Sequence[float]
     payload: RigidIntegrals
     kind: str
@@ -88,7 +88,7 @@ class Chain:
         load = self.payload
         loads = [load]
         for k in reversed(range(1, len(self.bodies))):
-            load = (self.bodies[k] + load.moved(self.reach[k])).turned(self.angles[k])
+            load = (self.bodies[k] + load.shifted(self.outboard_points[k])).rotated(self.angles[k])
             loads.append(load)
         return [self._kept(load) for load in reversed(loads)]
 
@@ -97,33 +97,34 @@ class Chain:
             return load
         return RigidIntegrals(load.mass if self.kind == "point-mass" else 0.0, 0j, 0.0)
 
-    def body_slopes(self, by_carried: Sequence[np.ndarray]) -> list[RigidIntegrals]:
-        """Return the slopes by every body's integrals from those by `carried` matrices (3, 3).
+    def cotangents(self, by_carried: Sequence[np.ndarray]) -> list[RigidIntegrals]:
+        """Return the derivatives by every body's integrals from those by `carried` matrices (3, 3).
 
-        The transpose of `carried`: outwards, what an arm carries is felt by all arms before it.
+        The transpose of `carried`: outwards, as every arm is part of what those before it carry.
         """
-        slope = RigidIntegrals(0.0, 0j, 0.0)
-        slopes = [slope]
+        cotangent = RigidIntegrals(0.0, 0j, 0.0)
+        found = [cotangent]
         for k in range(1, len(self.bodies)):
-            slope = slope + self._kept(_matrix_slopes(by_carried[k - 1]))
-            slope = slope.turned(-self.angles[k])
-            slopes.append(slope)
-            slope = _moved_slopes(slope, self.reach[k])
-        return slopes
+            cotangent = cotangent + self._kept(_of_matrix(by_carried[k - 1]))
+            cotangent = cotangent.rotated(-self.angles[k])
+            found.append(cotangent)
+            cotangent = _of_shifted(cotangent, self.outboard_points[k])
+        return found
 
 
-def _matrix_slopes(by_matrix: np.ndarray) -> RigidIntegrals:
-    """Return slopes by mass, moment and inertia from those by `RigidIntegrals.matrix`."""
+def _of_matrix(by_matrix: np.ndarray) -> RigidIntegrals:
+    """Return derivatives by mass, moment, inertia from those by `RigidIntegrals.matrix`."""
     g = by_matrix + by_matrix.T
     return RigidIntegrals(
         float(by_matrix[0, 0] + by_matrix[1, 1]), complex(g[1, 2], -g[0, 2]), float(by_matrix[2, 2])
     )
 
 
-def _moved_slopes(slope: RigidIntegrals, lever: complex) -> RigidIntegrals:
-    """Return the slopes by a body's integrals from those by its `moved` ones."""
-    mass = slope.mass + (np.conj(slope.moment) * lever).real + slope.inertia * abs(lever) ** 2
-    return RigidIntegrals(float(mass), slope.moment + 2.0 * slope.inertia * lever, slope.inertia)
+def _of_shifted(by_shifted: RigidIntegrals, lever: complex) -> RigidIntegrals:
+    """Return derivatives by a body's integrals from those by its `shifted` ones."""
+    moment, inertia = by_shifted.moment, by_shifted.inertia
+    mass = by_shifted.mass + (np.conj(moment) * lever).real + inertia * abs(lever) ** 2
+    return RigidIntegrals(float(mass), moment + 2.0 * inertia * lever, inertia)
 
 
 # -- how far off a reduced model is ------------------------------------------------------------
@@ -162,8 +163,7 @@ class LoadedModes:
         values: (k,) squared angular frequencies, rad2/s2, ascending.
         field: (n_nodes, 2, k) nodal values, orthonormal in mass and carried mass together.
         outboard: (3, k) displacements of the outboard interface.
-        start: (owned rows, k) from which the next design's search sets out; the followed mode
-            comes first.
+        start: (owned rows, k) initial guess for the next design; the followed mode comes first.
         followed: index of the mode most like the first column of the start.
     """
 

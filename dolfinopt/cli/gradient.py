@@ -104,7 +104,7 @@ def _check_gradient(
             remainders = "".join(f"{r:12.2e}" for r in row.remainders)
             slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
             click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
-        if scene.objective.simulated:
+        if scene.objective.needs("motion"):
             click.echo(
                 f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
                 f"{test.ratio:.3f} times as long"

@@ -11,7 +11,7 @@ from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm, Realised
+    from dolfinopt.arms.arm import Arm, PhysicalDesign
 
 # Steepness from which on the move limit falls with its square root: up to it the projection's
 # slope, about beta / 2, moves x_phys by no more than twice what x moves.
@@ -44,11 +44,14 @@ class Continuation:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
         return self.scene.optimizer.move * min(1.0, (GENTLE / self.beta) ** 0.5)
 
-    def realise(self, x: Mapping[int, np.ndarray]) -> dict[int, tuple[Realised, ...]]:
+    def physical_designs(
+        self, x: Mapping[int, np.ndarray]
+    ) -> dict[int, tuple[PhysicalDesign, ...]]:
         """Return the designs that x stands for, the nominal one last (collective)."""
         with together(self.partition.world):
             return {
-                k: arm.realise(x[k], self.beta, self.thresholds[k]) for k, arm in self.arms.items()
+                k: arm.physical_designs(x[k], self.beta, self.thresholds[k])
+                for k, arm in self.arms.items()
             }
 
     def advance(self, x: Mapping[int, np.ndarray]) -> None:

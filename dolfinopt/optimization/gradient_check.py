@@ -151,7 +151,7 @@ def _by_x(
     partition: Partition, arms: Mapping[int, Arm], slopes: Cells, x: Cells
 ) -> dict[int, np.ndarray]:
     with together(partition.world):
-        return {k: arm.chain(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
+        return {k: arm.backward(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
 
 
 def _dot(partition: Partition, a: Cells, b: Cells) -> float:

@@ -4,43 +4,36 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.solution import Solution
-from dolfinopt.errors import ConvergenceError
-from dolfinopt.optimization.continuation import Continuation
-from dolfinopt.optimization.convergence import ending, stop_reason
+from dolfinopt.optimization.assessment import assess, initial_selection
+from dolfinopt.optimization.convergence import Ending, ending, stop_reason
+from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.optimality import kkt_residual
+from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.optimization.result import Result
-from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.constraints import Limit, limits_of, violated, worst_limits
-from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
-from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
+from dolfinopt.responses.constraints import violated
+from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
-from dolfinopt.responses.scenarios import worst_of
+from dolfinopt.responses.volume_fraction import cell_volumes
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm, Realised
+    from dolfinopt.arms.arm import Arm
 
-# Checkpoints are written when this much time has passed: a kill costs no more than that, and
-# writing (some ms) stays below a percent of the run.
+# A checkpoint is written when this much time has passed: a kill costs no more than that, and
+# writing stays below a percent of the run.
 CHECKPOINT_INTERVAL = 2.0  # s
-
-# "auto" chooses coordinates for the initial design, so many times better than asked for: those of
-# an optimised one err 1.7 to 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
-RESERVE = 3.0
 
 Report = Callable[[HistoryRow], None]
 
@@ -82,125 +75,78 @@ def run(
     Raises:
         ConvergenceError: a simulation failed.
     """
-    return _Run(scene, partition, arms, profile, recorder, report).go(memory)
-
-
-@dataclass(frozen=True, eq=False)
-class _Gradients:
-    """Gradients by this rank's design variables: objective (n,), constraints (k, n)."""
-
-    objective: np.ndarray
-    constraints: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """The problem at the current design, as MMA takes it: values f (m,) and gradients by x."""
-
-    df0dx: np.ndarray
-    f: np.ndarray
-    dfdx: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Evaluated:
-    """One realised design, what it does, and its gradients."""
-
-    realised: Mapping[int, Realised]
-    evaluation: Evaluation
-    gradients: _Gradients
-
-    @property
-    def x_phys(self) -> dict[int, np.ndarray]:
-        """Physical densities of this rank's arms."""
-        return {k: one.x_phys for k, one in self.realised.items()}
+    return _Run(Evaluator(scene, partition, arms, profile), recorder, report).go(memory)
 
 
 class _Run:
-    """One optimisation under way."""
+    """One optimisation under way.
+
+    Attributes:
+        x, state: this rank's design variables (n,), and what MMA remembers.
+        problem: at x.
+        nominal: the nominal one of the designs that x stands for.
+        history: rows so far (root only).
+        iteration, change: updates made, and the largest change of a variable in the last one.
+        kkt, grayness: residual and grayness of x; the latter is known on the root.
+        finished: why the iterations have ended, "" while they go on.
+        selection: of the coordinates, where the scene leaves it to "auto".
+        initial_deviation: (n_times, 2) of the initial design, m (root only).
+    """
+
+    problem: Problem
+    nominal: EvaluatedDesign
 
     def __init__(
-        self,
-        scene: Scene,
-        partition: Partition,
-        arms: Mapping[int, Arm],
-        profile: Profile,
-        recorder: Recorder | None,
-        report: Report | None,
-    ):
-        self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
-        self.recorder = recorder
-        self.report = report
-        self.moves = needs(scene, "motion")  # else only the result is simulated
-        self.variables = Variables(scene, partition, arms)
-        self.continuation = Continuation(scene, partition, arms)
-        self.x = np.maximum(np.full(self.variables.size, scene.design.initial), self.variables.xmin)
+        self, evaluator: Evaluator, recorder: Recorder | None, report: Report | None
+    ) -> None:
+        self.evaluator, self.recorder, self.report = evaluator, recorder, report
+        self.scene, self.profile = evaluator.scene, evaluator.profile
+        self.partition, self.arms = evaluator.partition, evaluator.arms
+        self.variables, self.continuation = evaluator.variables, evaluator.continuation
+        self.x = np.maximum(
+            np.full(self.variables.size, self.scene.design.initial), self.variables.xmin
+        )
         self.state = initial_state(self.x)
-        self.solutions: tuple[Solution, ...] = ()
-        # Where the current design's evaluation set out: kept, so that it can be repeated.
-        self.start: tuple[Solution, ...] = ()
-        self.modes: dict[int, list[np.ndarray]] = {}
-        self.trajectory: Trajectory | None = None
-        self.initial_deviation = np.empty((0, 2))
         self.history: list[HistoryRow] = []
-        self.iteration = 0
-        self.change = 0.0
-        self.kkt = np.nan  # residual of the current design
-        self.limits: tuple[Limit, ...] = ()
-        self.grayness = 0.0  # of the nominal design; known on the root
-        self.finished = ""
-        self.choice: OrderSelection | None = None
-        self.earlier = 0.0  # seconds spent before a resume
+        self.iteration, self.change = 0, 0.0
+        self.kkt, self.grayness = np.nan, 0.0
+        self.finished: Ending = ""
+        self.selection: OrderSelection | None = None
+        self.initial_deviation = np.empty((0, 2))
+        self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
     def go(self, memory: Memory | None) -> Result:
         """Iterate until the design converges or the iterations are spent."""
+        self._begin(memory)
+        self._evaluate()
+        if memory is None:
+            self._record()
+        while not self._finished():
+            self._update(self.problem)
+            self._evaluate()
+            self._record()
+            self._checkpoint()
+        self._checkpoint(force=True)
+        return self._result()
+
+    def _begin(self, memory: Memory | None) -> None:
+        """Go on from `memory`, or choose the coordinates for the initial design (collective)."""
         if memory is not None:
             self._restore(memory)
-        elif self.moves:
-            x = self.continuation.realise(self.variables.split(self.x))
-            self.choice = self._choose({k: one[-1].x_phys for k, one in x.items()}, RESERVE)
+        elif needs(self.scene, "motion"):
+            initial = densities(self.evaluator.physical_designs(self.x)[-1])
+            self.selection = initial_selection(self.evaluator, initial)
         if self.recorder is not None:
             self.recorder.begin(self.history)
-        designs = self._evaluate()
-        problem = self._problem(designs)
-        if memory is None:
-            self._record(designs, problem)
-        while not self._finished():
-            self._update(problem)
-            designs = self._evaluate()
-            problem = self._problem(designs)
-            self._record(designs, problem)
-            self._checkpoint(force=False)
-        self._checkpoint(force=True)
-        counts = replace(self.profile.counts)
-        evaluation, crisp = self._assess(designs)
-        converged = self.finished == "converged"
-        return Result(
-            partition=self.partition,
-            arms=self.arms,
-            x_phys=designs[-1].x_phys,
-            evaluation=evaluation,
-            crisp=crisp,
-            trajectory=self.trajectory,
-            initial_deviation=self.initial_deviation,
-            history=self.history,
-            iterations=self.iteration,
-            converged=converged,
-            stop_reason=stop_reason(
-                self.scene,
-                self.finished,
-                self.change,
-                self.kkt,
-                violated(self.limits),
-                self.grayness,
-            ),
-            kkt=self.kkt,
-            limits=self.limits,
-            profile=self.profile,
-            counts=counts,
-            choice=self.choice,
-        )
+
+    def _evaluate(self) -> None:
+        """Evaluate x: filter, reduce, simulate, measure, differentiate (collective)."""
+        designs = self.evaluator.evaluate(self.x)
+        self.nominal, self.problem = designs[-1], problem_of(self.scene, designs)
+        trajectory = self.evaluator.trajectory
+        if trajectory is not None and len(self.initial_deviation) == 0:
+            self.initial_deviation = trajectory.deviation
 
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
@@ -209,97 +155,13 @@ class _Run:
             self.iteration,
             self.change,
             self.kkt,
-            violated(self.limits),
+            violated(self.problem.limits),
             self.continuation.complete,
         )
         return bool(self.finished)
 
-    def _evaluate(self) -> list[_Evaluated]:
-        """Evaluate the design that x stands for, or all of them; the nominal one last."""
-        self.start = self.solutions
-        self.modes = {k: arm.initial_vectors for k, arm in self.arms.items()}
-        realised = self.continuation.realise(self.variables.split(self.x))
-        several = self.scene.design.projection == "robust"
-        designs = []
-        for variant in range(3 if several else 1):
-            mine = {k: one[variant] for k, one in realised.items()}
-            evaluation, trajectory = self._evaluate_one({k: r.x_phys for k, r in mine.items()})
-            if trajectory is not None:
-                self.solutions = trajectory.solutions
-            self.trajectory = trajectory
-            # Taken now, with this design's factorisation at hand.
-            designs.append(_Evaluated(mine, evaluation, self._gradients(mine)))
-        if self.trajectory is not None and len(self.initial_deviation) == 0:
-            self.initial_deviation = self.trajectory.deviation
-        return designs
-
-    def _choose(self, x_phys: Mapping[int, np.ndarray], reserve: float) -> OrderSelection | None:
-        return choose_coordinates(
-            self.scene, self.partition, self.arms, x_phys, self.profile, reserve=reserve
-        )
-
-    def _evaluate_one(
-        self, x_phys: Mapping[int, np.ndarray], simulated: bool = False
-    ) -> tuple[Evaluation, Trajectory | None]:
-        return evaluate(
-            self.scene,
-            self.partition,
-            self.arms,
-            x_phys,
-            self.profile,
-            self.solutions,
-            simulated=simulated,
-        )
-
-    def _gradients(self, realised: Mapping[int, Realised]) -> _Gradients:
-        """Return the gradients by x of the design evaluated last (collective)."""
-        place = self.scene, self.partition, self.arms
-        analysed = *place, self.trajectory, self.profile
-        rows = [gradient(*analysed), *constraint_gradients(*analysed)]
-        with together(self.partition.world):
-            objective, *limits = (self.variables.by_x(row, realised) for row in rows)
-            return _Gradients(objective, np.array(limits).reshape(len(limits), self.variables.size))
-
-    def _objective(self, designs: Sequence[_Evaluated]) -> tuple[float, list[float]]:
-        """Return the objective of all designs together, and its derivatives by theirs."""
-        values = [one.evaluation.objective for one in designs]
-        return worst_of(values, self.scene.objective.exponent)
-
-    def _problem(self, designs: Sequence[_Evaluated]) -> _Problem:
-        """Return the problem at the current design (collective); keep its limits."""
-        _, weights = self._objective(designs)
-        gradients = [one.gradients for one in designs]
-        realised = [one.realised for one in designs]
-        width = self.scene.design.minimum_member
-        volume, by_volume = self.variables.limited_volume(realised, width)
-        fractions = (1.0 + volume) * self.scene.design.volume_fraction
-        self.limits = worst_limits(
-            [limits_of(self.scene, one.evaluation, fractions.tolist()) for one in designs]
-        )
-        constraints = [value for one in designs for value in one.evaluation.constraints]
-        return _Problem(
-            np.sum([w * s.objective for w, s in zip(weights, gradients, strict=True)], axis=0),
-            np.append(volume, constraints),
-            np.vstack([by_volume, *(one.constraints for one in gradients)]),
-        )
-
-    def _residual(self, problem: _Problem) -> float:
-        """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
-        variables = self.variables
-        with self.profile.phase("kkt residual"):
-            return kkt_residual(
-                self.x,
-                variables.xmin,
-                variables.xmax,
-                problem.df0dx,
-                problem.f,
-                problem.dfdx,
-                variables.slices,
-                partial(sum_over_arms, self.partition),
-            )[0]
-
-    def _update(self, problem: _Problem) -> None:
-        """Make one MMA step."""
+    def _update(self, problem: Problem) -> None:
+        """Make one MMA step, and one of the continuation (collective)."""
         with self.profile.phase("mma"):
             x, self.state = mma_step(
                 self.x,
@@ -319,67 +181,78 @@ class _Run:
         self.iteration += 1
         self.continuation.advance(self.variables.split(self.x))
 
-    def _assess(self, designs: Sequence[_Evaluated]) -> tuple[Evaluation, Evaluation | None]:
-        """Evaluate what the iterations left out: motions not simulated, and the crisp design."""
-        x_phys, evaluation, crisp = designs[-1].x_phys, designs[-1].evaluation, None
-        self._assess_choice(x_phys)
-        # A followed mode is known by those before it: the initial and the crisp design's are not.
-        starts = {k: arm.initial_vectors for k, arm in self.arms.items()}
-        if not self.moves:
-            with together(self.partition.world):
-                initial = {k: a.uniform(self.scene.design.initial) for k, a in self.arms.items()}
-            _, trajectory = self._evaluate_one(initial, simulated=True)
-            if trajectory is not None:
-                self.initial_deviation = trajectory.deviation
-        if self.scene.design.projection:
-            cut = {k: np.where(x > 0.5, 1.0, 0.0) for k, x in x_phys.items()}
-            crisp, _ = self._evaluate_one(cut, simulated=True)
-        if crisp is not None or not self.moves:
-            for k, arm in self.arms.items():
-                arm.initial_vectors = starts[k]
-            evaluation, self.trajectory = self._evaluate_one(x_phys, simulated=True)
-        return evaluation, crisp
+    def _result(self) -> Result:
+        """Assess the final design (collective)."""
+        counts = replace(self.profile.counts)
+        final = assess(self.evaluator, self.nominal.x_phys, self.nominal.evaluation, self.selection)
+        if final.initial is not None:
+            self.initial_deviation = final.initial.deviation
+        limits = self.problem.limits
+        return Result(
+            partition=self.partition,
+            arms=self.arms,
+            x_phys=self.nominal.x_phys,
+            evaluation=final.evaluation,
+            crisp=final.crisp,
+            trajectory=self.evaluator.trajectory,
+            initial_deviation=self.initial_deviation,
+            history=self.history,
+            iterations=self.iteration,
+            converged=self.finished == "converged",
+            stop_reason=stop_reason(
+                self.scene, self.finished, self.change, self.kkt, violated(limits), self.grayness
+            ),
+            kkt=self.kkt,
+            limits=limits,
+            profile=self.profile,
+            counts=counts,
+            choice=final.selection,
+        )
 
-    def _assess_choice(self, x_phys: Mapping[int, np.ndarray]) -> None:
-        """Estimate anew what the chosen coordinates miss; choose where nothing moved so far."""
-        if not self.moves:
-            self.choice = self._choose(x_phys, 1.0)
-        elif self.choice is not None:
-            place = self.scene, self.partition, self.arms
-            try:
-                error = estimated_error(*place, x_phys, self.choice.coordinates, self.profile)
-            except ConvergenceError:  # of the richer motion; the design is not lost for it
-                error = np.inf
-            self.choice = replace(self.choice, error=error)
+    # -- history -----------------------------------------------------------------------------
 
-    def _record(self, designs: Sequence[_Evaluated], problem: _Problem) -> None:
-        """Add a row to the history; collective, kept on the root."""
-        self.kkt = self._residual(problem)
-        nominal = designs[-1]
+    def _record(self) -> None:
+        """Measure x and add a row to the history; collective, kept on the root."""
+        with self.profile.phase("kkt residual"):
+            self.kkt = self._residual()
         parts = {}
-        for k, volume in self.variables.volume.items():
-            x = nominal.x_phys[k]
+        x_phys = self.nominal.x_phys
+        meshes = {k: arm.mesh for k, arm in self.arms.items()}
+        for k, volume in cell_volumes(self.scene, meshes).items():
+            x = x_phys[k]
             parts[k] = np.array([volume.sum(), volume @ x, volume @ (4.0 * x * (1.0 - x))])
         total, volume, grey = sum_over_arms(self.partition, parts)
         with together(self.partition.world):
             if self.partition.world.rank == 0:
-                self._add_row(designs, float(volume / total), float(grey / total))
+                self.grayness = float(grey / total)
+                self._add_row(float(volume / total))
 
-    def _add_row(
-        self, designs: Sequence[_Evaluated], volume_fraction: float, grayness: float
-    ) -> None:
+    def _residual(self) -> float:
+        """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
+        variables, problem = self.variables, self.problem
+        return kkt_residual(
+            self.x,
+            variables.xmin,
+            variables.xmax,
+            problem.df0dx,
+            problem.f,
+            problem.dfdx,
+            variables.slices,
+            partial(sum_over_arms, self.partition),
+        )[0]
+
+    def _add_row(self, volume_fraction: float) -> None:
         """Make the history's next row, write and report it (root only)."""
-        self.grayness = grayness
         row = HistoryRow(
             iteration=self.iteration,
-            objective=self._objective(designs)[0],
-            max_deviation=designs[-1].evaluation.max_deviation,
-            grayness=grayness,
+            objective=self.problem.f0,
+            max_deviation=self.nominal.evaluation.max_deviation,
+            grayness=self.grayness,
             volume_fraction=volume_fraction,
             change=self.change,
-            seconds=self.earlier + time.perf_counter() - self.begun,
+            seconds=self.seconds_before + time.perf_counter() - self.begun,
             kkt=self.kkt,
-            constraints={one.name: one.value for one in self.limits},
+            constraints={one.name: one.value for one in self.problem.limits},
         )
         self.history.append(row)
         if self.recorder is not None:
@@ -389,7 +262,7 @@ class _Run:
 
     # -- memory ------------------------------------------------------------------------------
 
-    def _checkpoint(self, force: bool) -> None:
+    def _checkpoint(self, force: bool = False) -> None:
         """Save when due (collective: the root looks at the clock)."""
         if self.recorder is None:
             return
@@ -406,30 +279,23 @@ class _Run:
         return Memory(
             iteration=self.iteration,
             cells=self.variables.split(np.column_stack(columns)),
-            modes=self.modes,
+            modes=self.evaluator.initial_vectors,
             multipliers=state.multipliers,
-            solutions=self.start,
+            solutions=self.evaluator.initial_solutions,
             history=self.history,
             initial_deviation=self.initial_deviation,
             finished=self.finished,
             beta=self.continuation.beta,
             thresholds=self.continuation.thresholds,
-            choice=self.choice,
+            choice=self.selection,
         )
 
     def _restore(self, memory: Memory) -> None:
         columns = self.variables.join(memory.cells).reshape(-1, 5)
-        self.x = columns[:, 0].copy()
-        self.state = MMAState(
-            iteration=memory.iteration,
-            x_old1=columns[:, 1].copy(),
-            x_old2=columns[:, 2].copy(),
-            low=columns[:, 3].copy(),
-            upp=columns[:, 4].copy(),
-            multipliers=memory.multipliers,
-        )
-        self.solutions = memory.solutions
-        self.choice = memory.choice
+        self.x, x_old1, x_old2, low, upp = (column.copy() for column in columns.T)
+        self.state = MMAState(memory.iteration, x_old1, x_old2, low, upp, memory.multipliers)
+        self.evaluator.solutions = memory.solutions
+        self.selection = memory.choice
         for k, arm in self.arms.items():
             if memory.choice is not None:
                 arm.set_order(memory.choice.coordinates)
@@ -439,7 +305,6 @@ class _Run:
         self.iteration = memory.iteration
         self.continuation.beta = memory.beta
         self.continuation.thresholds = dict(memory.thresholds)
-        self.change = memory.history[-1].change
-        self.kkt = memory.history[-1].kkt
-        self.grayness = memory.history[-1].grayness
-        self.earlier = memory.history[-1].seconds
+        last = memory.history[-1]
+        self.change, self.kkt, self.grayness = last.change, last.kkt, last.grayness
+        self.seconds_before = last.seconds

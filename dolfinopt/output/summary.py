@@ -62,7 +62,7 @@ def summarise(run: Simulated, wall: float) -> dict[str, Any]:
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
             **_of_designs(scene, run.evaluation, traits),
-            **_of_responses(run, traits),
+            **_of_responses(run),
             "simulation_error_estimate": run.evaluation.error,
             "reduction": _reduction(scene, run.choice),
             "warnings": _all_warnings(run, traits),
@@ -137,11 +137,11 @@ def _of_designs(
     }
 
 
-def _of_responses(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]:
+def _of_responses(run: Simulated) -> dict[str, Any]:
     """Return the constraints by name, and the figures of scenarios and of the crisp design."""
     scene, limits = run.scene, run.limits
     if limits is None:
-        limits = limits_of(scene, run.evaluation, _limited_fractions(scene, traits))
+        limits = limits_of(scene, run.evaluation)
     return {
         "constraints": summary_of(limits),
         "scenarios": [
@@ -201,15 +201,6 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)
     return units
-
-
-def _limited_fractions(scene: Scene, traits: Mapping[int, _Traits]) -> list[float]:
-    """Return the volume fractions that have a limit: every design's, or that of all together."""
-    fractions = {k: one.volume_fraction for k, one in traits.items()}
-    if not scene.design.shared_volume:
-        return [fractions[k] for k in scene.cell_counts]
-    volumes = [one.volume for one in traits.values()]
-    return [float(np.average([*fractions.values()], weights=volumes))]
 
 
 def _frequency_errors(

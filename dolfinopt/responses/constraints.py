@@ -12,7 +12,7 @@ from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.constraints import Constraints
 
 # Relative violation up to which a constraint counts as met: MMA meets an active one to a fraction
-# of its last change.
+# of its last change, which optimizer.tolerance leaves at 1e-3.
 EXCESS = 1e-3
 
 
@@ -21,7 +21,7 @@ class Limit:
     """One constraint and what a design makes of it.
 
     Attributes:
-        quantity: "volume_fraction", or the name of a response.
+        quantity: name of the response.
         arm: whose; "" of all together.
         value, limit: in `unit`.
         unit: of both.
@@ -80,35 +80,20 @@ def distinct(value: float, limit: float) -> tuple[str, str]:
     return texts
 
 
-def limits_of(
-    scene: Scene, evaluation: Evaluation, volume_fractions: Sequence[float]
-) -> tuple[Limit, ...]:
+def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
     """Return every constraint of the scene and its value.
 
     Args:
         scene: with the limits.
         evaluation: of the design.
-        volume_fractions: of every designed arm, or of all together with `design.shared_volume`.
     """
-    designed = [scene.arms[owner].name for owner in scene.cell_counts]
-    names = [""] if scene.design.shared_volume else designed
-    limit = scene.design.volume_fraction
-    limits = [
-        Limit("volume_fraction", name, float(value), limit, "-")
-        for name, value in zip(names, volume_fractions, strict=True)
-    ]
+    limits = []
     # The objective's values come first: it may be the response of a limit, too.
     for bound, found in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
         response = bound.response
+        unit = response.limit_unit or response.unit
         limits += [
-            Limit(
-                response.name,
-                arm,
-                float(value),
-                bound.limit,
-                response.limit_unit or response.unit,
-                response.lower,
-            )
+            Limit(response.name, arm, float(value), bound.limit, unit, response.lower)
             for arm, value in zip(found.arms, found.values, strict=True)
         ]
     return tuple(limits)
@@ -118,8 +103,7 @@ def constraint_label(name: str) -> str:
     """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
     for quantity in ("volume_fraction", *Constraints.model_fields):
         if name.startswith(quantity):
-            response = None if quantity == "volume_fraction" else find(quantity)
-            unit = "-" if response is None else response.limit_unit or response.unit
+            unit = find(quantity).limit_unit or find(quantity).unit
             arm = name[len(quantity) + 1 :]
             return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
     return name
@@ -128,13 +112,13 @@ def constraint_label(name: str) -> str:
 def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
     """Return each constraint as the worst of several variants of a design has it.
 
-    The volume is that of the last variant, the nominal one.
+    Or as the last variant, the nominal one, where the response says so.
     """
     worst = []
     for limit, *others in zip(*reversed(variants), strict=True):
         values = [limit.value, *(one.value for one in others)]
         extreme = min(values) if limit.least else max(values)
-        kept = limit.value if limit.quantity == "volume_fraction" else extreme
+        kept = limit.value if find(limit.quantity).of_nominal else extreme
         worst.append(replace(limit, value=kept))
     return tuple(worst)
 

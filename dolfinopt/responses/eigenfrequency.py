@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 
-from dolfinopt.arms.arm import Arm, fixed_body
+from dolfinopt.arms.arm import fixed_body
+from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.parallel import on_root, together
@@ -16,13 +16,14 @@ from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
-    Need,
     Response,
     by_owner,
     on_all_ranks,
     register,
 )
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.responses import NEEDS
 
 NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
@@ -49,7 +50,7 @@ class Eigenfrequency(Response):
     name, label, unit = "eigenfrequency", "squared longest periods", "s2"
     limit_unit = "Hz"
     lower = True
-    needs: ClassVar[frozenset[Need]] = frozenset({"mass", "eigenproblem"})
+    needs = NEEDS[name]
     stands_for = "first frequency"
 
     @property
@@ -59,12 +60,12 @@ class Eigenfrequency(Response):
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return squared period and first frequency of every flexible arm (collective)."""
-        scene, partition, arms = analysis.scene, analysis.partition, analysis.arms
+        scene, partition, designs = analysis.scene, analysis.partition, analysis.designs
         chain = _chain(analysis)
         with together(partition.world):
             mine = {
                 place: (squared_period(one, self.options.exponent, self.follow)[0], one.frequency)
-                for place, one in _modes(arms, chain).items()
+                for place, one in _modes(_by_place(scene, designs), chain).items()
             }
         found = on_all_ranks(partition, mine)
         periods, frequencies = zip(*found.values(), strict=True)
@@ -76,27 +77,27 @@ class Eigenfrequency(Response):
 
         What an arm carries depends on the designs outboard of it.
         """
-        scene, partition, arms = analysis.scene, analysis.partition, analysis.arms
+        scene, partition, designs = analysis.scene, analysis.partition, analysis.designs
         chain = _chain(analysis)
         with together(partition.world):
-            modes = _modes(arms, chain)
+            by_place = _by_place(scene, designs)
+            modes = _modes(by_place, chain)
             own = {}
-            for owner in arms:
-                for place in arms[owner].places:
-                    _, by_values = squared_period(modes[place], self.options.exponent, self.follow)
-                    own[place] = period_gradient(arms[owner], modes[place], by_values)
+            for place, one in modes.items():
+                _, by_values = squared_period(one, self.options.exponent, self.follow)
+                own[place] = period_gradient(by_place[place], one, by_values)
         by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
         zero = [np.zeros((3, 3))] * len(scene.arms)
         with together(partition.world):
             for place, matrix in by_carried.items():
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
-                by_body = by_owner(scene, chain.body_slopes(carried))
+                by_body = by_owner(scene, chain.cotangents(carried))
                 row = {
-                    k: np.zeros(arm.mesh.num_cells)  # it is not outboard of this place
+                    k: np.zeros_like(state.x_phys)  # it is not outboard of this place
                     if by_body[k] == NOTHING
-                    else rigid_gradient(arm, by_body[k])
-                    for k, arm in arms.items()
+                    else rigid_gradient(state, by_body[k])
+                    for k, state in designs.items()
                 }
                 owner = scene.owners[place]
                 if owner in row:
@@ -104,32 +105,28 @@ class Eigenfrequency(Response):
                 rows.append(row)
         return rows
 
-    def constraint(self, smooth: np.ndarray, limit: float) -> np.ndarray:
-        """Return T^2 f^2 - 1 of squared periods and the least frequency."""
-        return smooth * limit**2 - 1.0
-
-    def constraint_gradient(self, gradient: np.ndarray, limit: float) -> np.ndarray:
-        """Return its gradient from the squared period's."""
-        return limit**2 * gradient
+    def smooth_limits(self, analysis: Analysis, limit: float) -> float:
+        """Return the squared period of the least frequency, s2."""
+        return 1.0 / limit**2
 
 
 def _chain(analysis: Analysis) -> Chain:
     """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
     scene, partition = analysis.scene, analysis.partition
     with together(partition.world):
-        mine = {k: rigid_integrals(arm.elastic) for k, arm in analysis.arms.items()}
+        mine = {k: rigid_integrals(one.elastic) for k, one in analysis.designs.items()}
     owned = on_all_ranks(partition, mine)
 
     def freeze() -> Chain:
-        bodies, reach = [], []
+        bodies, outboard_points = [], []
         for place, owner in enumerate(scene.owners):
             if owner is not None:
                 bodies.append(owned[owner])
-                reach.append(complex(scene.arms[place].length, 0.0))
+                outboard_points.append(complex(scene.arms[place].length, 0.0))
             else:
                 body = fixed_body(scene, place)
                 bodies.append(RigidIntegrals(body.mass, complex(*body.moment), body.inertia))
-                reach.append(complex(*body.outboard_point))
+                outboard_points.append(complex(*body.outboard_point))
         angle = scene.objective.elbow_angle
         if angle is None:
             middle = np.array([0.5 * scene.motion.duration])
@@ -137,19 +134,21 @@ def _chain(analysis: Analysis) -> Chain:
         else:
             angles = [angle] * len(bodies)
         load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.inertia)
-        return Chain(bodies, reach, angles, load, scene.objective.attached)
+        return Chain(bodies, outboard_points, angles, load, scene.objective.attached)
 
     return on_root(partition.world, freeze)
 
 
-def _modes(arms: Mapping[int, Arm], chain: Chain) -> dict[int, LoadedModes]:
-    """Return the loaded modes of every arm of the chain that has one of this rank's designs.
-
-    Within `together`.
-    """
-    carried = chain.carried()
+def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, DesignState]:
+    """Return the design of every arm of the chain that has one of this rank's."""
     return {
-        place: arms[owner].loaded_modes(place, carried[place])
-        for owner in arms
-        for place in arms[owner].places
+        place: designs[owner]
+        for place, owner in enumerate(scene.owners)
+        if owner is not None and owner in designs
     }
+
+
+def _modes(designs: Mapping[int, DesignState], chain: Chain) -> dict[int, LoadedModes]:
+    """Return the loaded modes of arms by their place in the chain; within `together`."""
+    carried = chain.carried()
+    return {place: one.loaded_modes(place, carried[place]) for place, one in designs.items()}

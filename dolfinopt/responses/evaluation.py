@@ -22,7 +22,10 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.motion import motion_objective, worst_instants
 from dolfinopt.responses.response import (
     Analysis,
+    CellGradient,
     Measured,
+    Response,
+    asked_of,
     constraints_of,
     needs,
     objective_of,
@@ -68,8 +71,8 @@ class Evaluation(Motion):
 
     Attributes:
         objective: sum of its response's values, of all scenarios if there are any.
-        constraints: (k,) of the scene's [constraints], relative, kept where <= 0.
-        responses: the objective's values, then those of every constraint.
+        constraints: (k,) of everything that the scene limits, relative, kept where <= 0.
+        responses: the objective's values, then those of every constraint, see `constraints_of`.
     """
 
     constraints: tuple[float, ...] = ()
@@ -129,7 +132,8 @@ def evaluate(
         if isinstance(found, ConvergenceError):
             raise found
         motion = found
-    return _measured(Analysis(scene, partition, arms, trajectory, profile), motion), trajectory
+    analysis = _analysis(scene, partition, arms, trajectory, profile)
+    return _measured(analysis, motion), trajectory
 
 
 def evaluate_batch(
@@ -167,14 +171,26 @@ def evaluate_batch(
             if isinstance(motion, ConvergenceError):
                 raise motion
             under = arms
-            if constraints_of(scene) or "motion" not in objective_of(scene).needs:
+            if any(one.needs and "motion" not in one.needs for one in asked_of(scene)):
                 with together(partition.world):
                     under = {k: arm.under(scene) for k, arm in arms.items()}
-            analysis = Analysis(scene, partition, under, trajectory, profile)
+            analysis = _analysis(scene, partition, under, trajectory, profile)
             found.append((_measured(analysis, motion), trajectory))
         except ConvergenceError as error:
             found.append(error)
     return found
+
+
+def _analysis(
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    trajectory: Trajectory | None,
+    profile: Profile,
+) -> Analysis:
+    """Return what the scene's responses are computed from: the designs that the arms have."""
+    designs = {k: arm.current for k, arm in arms.items()}
+    return Analysis(scene, partition, designs, trajectory, profile)
 
 
 def _check_densities(partition: Partition, arms: Mapping[int, Arm], x_phys: Cells) -> None:
@@ -197,7 +213,8 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     constraints: list[float] = []
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
-        constraints += bound.response.constraint(np.array(found.smooth), bound.limit).tolist()
+        limits = bound.response.smooth_limits(analysis, bound.limit)
+        constraints += (np.array(found.smooth) / limits - 1.0).tolist()
         measured.append(found)
     return Evaluation(
         **vars(replace(motion, objective=measured[0].total)),
@@ -221,10 +238,31 @@ def gradient(
         trajectory: what `evaluate` returned.
         profile: of this rank.
     """
-    rows = objective_of(scene).gradients(Analysis(scene, partition, arms, trajectory, profile))
+    rows = objective_of(scene).gradients(_analysis(scene, partition, arms, trajectory, profile))
     if len(rows) == 1:
         return rows[0]
-    return {k: np.sum([row[k] for row in rows], axis=0) for k in arms}
+    return {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in arms}
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintGradient:
+    """One entry of `Evaluation.constraints`, smooth value / limit - 1, differentiated.
+
+    Attributes:
+        response: whose value it is.
+        smooth: derivative of the smooth value by the physical densities (n_cells,) of every arm
+            that it depends on.
+        limit: in the unit of the smooth value.
+    """
+
+    response: Response
+    smooth: CellGradient
+    limit: float
+
+    @property
+    def cells(self) -> CellGradient:
+        """Derivative of the constraint by the physical densities of every arm."""
+        return {k: g / self.limit for k, g in self.smooth.items()}
 
 
 def constraint_gradients(
@@ -233,21 +271,23 @@ def constraint_gradients(
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None = None,
     profile: Profile | None = None,
-) -> list[dict[int, np.ndarray]]:
-    """Return the gradients of `Evaluation.constraints` by the physical densities (collective).
+) -> list[ConstraintGradient]:
+    """Return the gradients of `Evaluation.constraints` (collective).
 
     Args:
         scene, partition, arms, trajectory, profile: as for `gradient`; the last two are for
             constraints of the motion alone.
     """
-    analysis = Analysis(scene, partition, arms, trajectory, profile or Profile())
-    rows = []
+    analysis = _analysis(scene, partition, arms, trajectory, profile or Profile())
+    found = []
     for bound in constraints_of(scene):
-        for row in bound.response.gradients(analysis):
-            rows.append(
-                {k: bound.response.constraint_gradient(g, bound.limit) for k, g in row.items()}
-            )
-    return rows
+        rows = bound.response.gradients(analysis)
+        limits = np.broadcast_to(bound.response.smooth_limits(analysis, bound.limit), len(rows))
+        found += [
+            ConstraintGradient(bound.response, row, float(limit))
+            for row, limit in zip(rows, limits, strict=True)
+        ]
+    return found
 
 
 # -- the motion ------------------------------------------------------------------------------

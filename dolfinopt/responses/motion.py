@@ -17,7 +17,6 @@ from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
-    Need,
     Response,
     by_owner,
     find,
@@ -25,6 +24,7 @@ from dolfinopt.responses.response import (
 from dolfinopt.responses.scenarios import combined, cotangents_of_scene, factors
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
 from dolfinopt.scene.load import WorstBy
+from dolfinopt.scene.tables.responses import MOTION, Need
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def all_samples(trajectory: Trajectory) -> LoadCases:
 class MotionResponse(Response):
     """A response of the motion: one value of the machine, of all scenarios together."""
 
-    needs: ClassVar[frozenset[Need]] = frozenset({"motion", "mass"})
+    needs: ClassVar[frozenset[Need]] = MOTION
 
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
         """Return the instants that make it up; by default all samples."""
@@ -146,7 +146,7 @@ class MotionResponse(Response):
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient by the physical densities, see `objective.gradient` (collective)."""
-        scene, partition, arms = analysis.scene, analysis.partition, analysis.arms
+        scene, partition, designs = analysis.scene, analysis.partition, analysis.designs
         profile, trajectory = analysis.profile, analysis.trajectory
 
         def moments() -> dict[int, np.ndarray]:
@@ -162,10 +162,10 @@ class MotionResponse(Response):
         if self.options.gradient == "esl":
             A = on_root(partition.world, moments)
             with together(partition.world):
-                return [{k: esl_gradient(arm, A[k]) for k, arm in arms.items()}]
+                return [{k: esl_gradient(one, A[k]) for k, one in designs.items()}]
         by_body = on_root(partition.world, cotangents)
         with together(partition.world):
-            return [{k: exact_gradient(arm, by_body[k]) for k, arm in arms.items()}]
+            return [{k: exact_gradient(one, by_body[k]) for k, one in designs.items()}]
 
 
 class ComplianceResponse(MotionResponse):

@@ -1,9 +1,10 @@
 """What a response is, and where it is found: one file each, named like its word in the scene.
 
-Objective and constraints of a scene are responses: `objective.kind = "deviation"` and every key of
-[constraints] name one. To add one, write `responses/NAME.py` with a subclass of `Response` under
-`@register`, and add NAME to the literal of `objective.kind` in scene/tables/objective.py or to the
-keys in scene/tables/constraints.py.
+Objective and constraints of a scene are responses: `objective.kind = "deviation"`, every key of
+[constraints] and `design.volume_fraction` name one. To add one, write `responses/NAME.py` with a
+subclass of `Response` under `@register`; add NAME to the literal of `objective.kind` in
+scene/tables/objective.py or to the keys in scene/tables/constraints.py, and what it needs to
+scene/tables/responses.py.
 """
 
 from __future__ import annotations
@@ -12,40 +13,42 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
+from dolfinopt.parallel import Partition, gather_arms
+
 if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
+    from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.parallel import Partition
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
     from dolfinopt.scene.tables.objective import Objective
+    from dolfinopt.scene.tables.responses import Need
 
 T = TypeVar("T")
 R = TypeVar("R", bound="type[Response]")
 
-Need = Literal["motion", "mass", "eigenproblem"]
-CellGradient = dict[int, np.ndarray]  # (n_cells,) of every arm of this rank
+# (n_cells,) by the arms of this rank; an arm without an entry has no influence.
+CellGradient = dict[int, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What responses are computed from: the arms with one design set, and its motion.
+    """What responses are computed from: the designs of the arms, and their motion.
 
     Attributes:
         scene: says what is asked.
         partition: which ranks do which arm.
-        arms: this rank's.
+        designs: of this rank's arms.
         trajectory: on the root, where a response needs a motion; None elsewhere.
         profile: of this rank.
     """
 
     scene: Scene
     partition: Partition
-    arms: Mapping[int, Arm]
+    designs: Mapping[int, DesignState]
     trajectory: Trajectory | None
     profile: Profile
 
@@ -81,8 +84,9 @@ class Response(ABC):
         unit: of the smooth values and the objective.
         limit_unit: of the true values and of a limit; "" where it is `unit`.
         lower: whether a limit is a lower one.
-        needs: what must be known beside stiffness and design: a simulated motion, the mass matrix,
-            an eigenproblem.
+        of_nominal: whether a limit holds for the nominal one of robust designs alone.
+        needs: what must be known beside the densities: the stiffness matrix, the mass matrix, a
+            simulated motion, an eigenproblem.
         stands_for: what the true values are, where they are another quantity than the objective.
         options: the scene's [objective], which has the options of all responses.
     """
@@ -92,6 +96,7 @@ class Response(ABC):
     unit: ClassVar[str]
     limit_unit: ClassVar[str] = ""
     lower: ClassVar[bool] = False
+    of_nominal: ClassVar[bool] = False
     needs: ClassVar[frozenset[Need]] = frozenset()
     stands_for: ClassVar[str] = ""
 
@@ -106,18 +111,17 @@ class Response(ABC):
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of every smooth value by the physical densities (collective)."""
 
-    def constraint(self, smooth: np.ndarray, limit: float) -> np.ndarray:
-        """Return the constraints, relative and kept where <= 0, from smooth values."""
-        return smooth / limit - 1.0
-
-    def constraint_gradient(self, gradient: np.ndarray, limit: float) -> np.ndarray:
-        """Return the gradient of a constraint from that of its smooth value."""
-        return gradient / limit
+    def smooth_limits(self, analysis: Analysis, limit: float) -> np.ndarray | float:
+        """Return the limit of every smooth value, in their unit (collective)."""
+        return limit
 
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """A response and its limit, in the response's `limit_unit`."""
+    """A response and its limit, in the response's `limit_unit`.
+
+    As the optimiser sees it: smooth value / smooth limit - 1 <= 0.
+    """
 
     response: Response
     limit: float
@@ -145,15 +149,20 @@ def objective_of(scene: Scene) -> Response:
 
 
 def constraints_of(scene: Scene) -> list[Constraint]:
-    """Return what the scene limits beside the volume, in the order of its keys."""
-    limits = {key: limit for key, limit in vars(scene.constraints).items() if limit is not None}
+    """Return what the scene limits: the volume, then [constraints] in the order of its keys."""
+    limits = {"volume_fraction": scene.design.volume_fraction}
+    limits |= {key: limit for key, limit in vars(scene.constraints).items() if limit is not None}
     return [Constraint(find(key)(scene.objective), limit) for key, limit in limits.items()]
+
+
+def asked_of(scene: Scene) -> list[Response]:
+    """Return the objective and what is limited."""
+    return [objective_of(scene), *(one.response for one in constraints_of(scene))]
 
 
 def needs(scene: Scene, what: Need) -> bool:
     """Return whether the objective or a constraint of the scene needs that."""
-    asked = [objective_of(scene), *(one.response for one in constraints_of(scene))]
-    return any(what in one.needs for one in asked)
+    return any(what in one.needs for one in asked_of(scene))
 
 
 def by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:
@@ -180,6 +189,4 @@ def occurrences(scene: Scene) -> dict[int, int]:
 
 def on_all_ranks(partition: Partition, mine: Mapping[int, T]) -> dict[int, T]:
     """Return one object an arm on all ranks, in the arms' order (collective)."""
-    from dolfinopt.parallel import gather_arms
-
     return partition.world.bcast(gather_arms(partition, mine), root=0)

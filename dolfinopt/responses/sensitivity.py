@@ -1,26 +1,22 @@
-"""Gradients of the objective with respect to the physical densities."""
+"""Gradients of one arm's functions by its physical densities, over this rank's cells."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, mass_partners, rigid_body
 from dolfinopt.reduction import METHODS, frame_fields
 from dolfinopt.responses.statics import StaticResponse
 
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
-
-
-# Directions of A below this share of its largest are rounding.
+# Directions of A below this share of its largest are the rounding of its sums.
 RANK_TOLERANCE = 1e-14
 
 
-def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
+def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
     """Return the derivative by x_phys of one arm with the equivalent static loads frozen.
 
     dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
@@ -28,24 +24,23 @@ def esl_gradient(arm: Arm, A: np.ndarray) -> np.ndarray:
     Source: Seifried, Moghadasi & Held (2015), eq. (11), doi:10.1016/j.piutam.2015.01.018.
 
     Args:
-        arm: with the design reduced.
+        state: of the arm.
         A: (q, q) see `motion.MotionResponse.load_case_moments`.
 
     Returns:
         (n_cells,) over this rank's cells.
     """
-    state = arm.current
-    with arm.profile.phase("gradient"):
+    with state.elastic.profile.phase("gradient"):
         left, values, right = np.linalg.svd(A)
         keep = values > RANK_TOLERANCE * values[0]
         V = state.basis.V
         energies = state.elastic.cell_stiffness_products(
             V @ (left[:, keep] * values[keep]), V @ right[keep].T
         )
-        return -arm.solid.young_modulus * state.material.stiffness_slope * energies
+        return -state.young_slope * energies
 
 
-def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
+def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray:
     """Return the derivative by x_phys of one arm of a function of its floating body.
 
     Every integral is a product u . M v or u . K v of modes and rigid motions, so its derivative
@@ -53,59 +48,59 @@ def exact_gradient(arm: Arm, slopes: ShapeIntegrals) -> np.ndarray:
     `Method.adjoint`. Exact for the discrete model.
 
     Args:
-        arm: with the design reduced.
-        slopes: of the function by the body's constants; those of D go to K.
+        state: of the arm.
+        cotangents: the function's derivatives by the body's integrals; those by D join K's.
 
     Returns:
         (n_cells,) over this rank's cells.
     """
-    state = arm.current
-    with arm.profile.phase("gradient"):
+    with state.elastic.profile.phase("gradient"):
         elastic, basis = state.elastic, state.basis
         V = basis.V
-        damping = arm.scene.damping.stiffness_proportional
-        by_K = slopes.K + damping * slopes.D
-        partners = mass_partners(elastic.points, V, slopes)
+        damping = state.scene.damping.stiffness_proportional
+        by_K = cotangents.K + damping * cotangents.D
+        partners = mass_partners(elastic.points, V, cotangents)
         by_V = elastic.mass_times(partners.by_modes)
         by_V += elastic.stiffness_times(V @ (by_K + by_K.T))
         interior, outboard = elastic.restrict(by_V)
-        method = METHODS[arm.scene.reduction.method]
+        method = METHODS[state.scene.reduction.method]
         assert method.adjoint is not None  # the scene refuses the others
         fields = method.adjoint(
-            elastic, basis, state.reduction_options, interior, outboard + slopes.outboard
+            elastic, basis, state.reduction_options, interior, outboard + cotangents.outboard
         )
         energies = elastic.cell_stiffness_products(V @ by_K.T - fields.stiffness, V)
         partners.left[:, :, 1:-1] += fields.mass
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        slope = arm.solid.young_modulus * state.material.stiffness_slope * energies
-        return slope + arm.solid.density * state.material.mass_slope * masses
+        return state.young_slope * energies + state.density_slope * masses
 
 
-def static_gradient(arm: Arm, response: StaticResponse) -> np.ndarray:
+def static_gradient(state: DesignState, response: StaticResponse) -> np.ndarray:
     """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads."""
-    return _static_slope(arm, response.tip, response.tip)
+    return _static_gradient(state, response.tip, response.tip)
 
 
-def deflection_gradient(arm: Arm, response: StaticResponse, exponent: float) -> np.ndarray:
+def deflection_gradient(
+    state: DesignState, response: StaticResponse, exponent: float
+) -> np.ndarray:
     """Return d deflection / dx_phys (n_cells,), by one adjoint load a case."""
-    by_tip = response.deflection_slope(exponent)
-    adjoint = np.linalg.solve(arm.elastic.constraint_modes().stiffness, by_tip)
-    return _static_slope(arm, adjoint, response.tip)
+    by_tip = response.deflection_gradient(exponent)
+    adjoint = np.linalg.solve(state.elastic.constraint_modes().stiffness, by_tip)
+    return _static_gradient(state, adjoint, response.tip)
 
 
-def _static_slope(arm: Arm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _static_gradient(state: DesignState, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard displacements (3, k)."""
-    with arm.profile.phase("gradient"):
-        field = arm.elastic.constraint_modes().field
-        energies = arm.elastic.cell_stiffness_products(field @ left, field @ right)
-        return -arm.solid.young_modulus * arm.material.stiffness_slope * energies
+    with state.elastic.profile.phase("gradient"):
+        field = state.elastic.constraint_modes().field
+        energies = state.elastic.cell_stiffness_products(field @ left, field @ right)
+        return -state.young_slope * energies
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodGradient:
-    """Slopes of one arm's squared period.
+    """Derivatives of one arm's squared period.
 
     Attributes:
         cells: (n_cells,) by its own physical densities, what it carries held.
@@ -116,26 +111,28 @@ class PeriodGradient:
     carried: np.ndarray
 
 
-def period_gradient(arm: Arm, modes: LoadedModes, by_values: np.ndarray) -> PeriodGradient:
+def period_gradient(
+    state: DesignState, modes: LoadedModes, by_values: np.ndarray
+) -> PeriodGradient:
     """Differentiate a function of the eigenvalues, given its derivative by them (k,).
 
     d lambda = phi' (dK - lambda dM) phi, phi of unit mass.
     """
-    with arm.profile.phase("gradient"):
+    with state.elastic.profile.phase("gradient"):
         weighted = modes.field * by_values
-        energies = arm.elastic.cell_stiffness_products(weighted, modes.field)
-        masses = arm.elastic.cell_mass_products(weighted * modes.values, modes.field)
-        cells = arm.solid.young_modulus * arm.material.stiffness_slope * energies
-        cells -= arm.solid.density * arm.material.mass_slope * masses
+        energies = state.elastic.cell_stiffness_products(weighted, modes.field)
+        masses = state.elastic.cell_mass_products(weighted * modes.values, modes.field)
+        cells = state.young_slope * energies
+        cells -= state.density_slope * masses
         carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
         return PeriodGradient(cells, carried)
 
 
-def rigid_gradient(arm: Arm, by_rigid: RigidIntegrals) -> np.ndarray:
+def rigid_gradient(state: DesignState, by_rigid: RigidIntegrals) -> np.ndarray:
     """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,)."""
     moment = np.array([by_rigid.moment.real, by_rigid.moment.imag])
-    points = arm.elastic.points
+    points = state.elastic.points
     by = rigid_body(by_rigid.mass, moment, by_rigid.inertia, np.zeros(2))
     partners = mass_partners(points, np.empty((*points.shape, 0)), by)
-    masses = arm.elastic.cell_mass_products(partners.left, partners.right)
-    return arm.solid.density * arm.material.mass_slope * masses
+    masses = state.elastic.cell_mass_products(partners.left, partners.right)
+    return state.density_slope * masses

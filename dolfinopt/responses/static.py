@@ -16,6 +16,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import static_gradient
 from dolfinopt.responses.statics import static_response
+from dolfinopt.scene.tables.responses import NEEDS
 
 
 @register
@@ -23,14 +24,15 @@ class StaticCompliance(Response):
     """Compliance of every design under `objective.loads`, times the arms that have it, N m."""
 
     name, label, unit = "static", "compliance under static loads", "N m"
+    needs = NEEDS[name]
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the compliance of every design (collective)."""
         scene, uses, loads = analysis.scene, occurrences(analysis.scene), self._loads
         with together(analysis.partition.world):
             mine = {
-                k: uses[k] * static_response(arm.elastic, loads).compliance
-                for k, arm in analysis.arms.items()
+                k: uses[k] * static_response(state.elastic, loads).compliance
+                for k, state in analysis.designs.items()
             }
         found = on_all_ranks(analysis.partition, mine)
         values = tuple(found.values())
@@ -38,14 +40,14 @@ class StaticCompliance(Response):
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of every design's compliance (collective)."""
-        uses, arms = occurrences(analysis.scene), analysis.arms
+        uses, designs = occurrences(analysis.scene), analysis.designs
         rows = []
         with together(analysis.partition.world):
             for owner in analysis.scene.cell_counts:
-                row: CellGradient = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
-                if owner in arms:
-                    response = static_response(arms[owner].elastic, self._loads)
-                    row[owner] = static_gradient(arms[owner], response) * uses[owner]
+                row: CellGradient = {k: np.zeros_like(one.x_phys) for k, one in designs.items()}
+                if owner in designs:
+                    response = static_response(designs[owner].elastic, self._loads)
+                    row[owner] = static_gradient(designs[owner], response) * uses[owner]
                 rows.append(row)
         return rows
 

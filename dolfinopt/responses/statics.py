@@ -36,7 +36,7 @@ class StaticResponse:
         """Return (sum_k |u_k|^p)^(1/p) of the outboard point, m: at least the largest |u_k|."""
         return p_norm_of_lengths(self.tip[:2].T, exponent)[0]
 
-    def deflection_slope(self, exponent: float) -> np.ndarray:
+    def deflection_gradient(self, exponent: float) -> np.ndarray:
         """Return the derivative (3, k) of `deflection` by the displacements."""
         _, by_displacement = p_norm_of_lengths(self.tip[:2].T, exponent)
         return np.vstack([by_displacement.T, np.zeros(self.tip.shape[1])])
@@ -49,7 +49,7 @@ def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
     the mass matrix nor a reduced model is needed.
 
     Args:
-        arm: with its design set.
+        arm: of the design.
         loads: (k, 3) F_x, F_y (N) and moment (N m) of every case.
     """
     columns = np.array(loads, dtype=float).T

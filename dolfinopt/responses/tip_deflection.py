@@ -15,6 +15,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import deflection_gradient
 from dolfinopt.responses.statics import static_response
+from dolfinopt.scene.tables.responses import NEEDS
 
 
 @register
@@ -22,13 +23,14 @@ class TipDeflection(Response):
     """Largest displacement of the outboard point under `objective.loads`, by its p-norm, m."""
 
     name, label, unit = "tip_deflection", "static deflection", "m"
+    needs = NEEDS[name]
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the deflection of every design (collective)."""
         mine = {}
         with together(analysis.partition.world):
-            for k, arm in analysis.arms.items():
-                response = static_response(arm.elastic, self._loads)
+            for k, state in analysis.designs.items():
+                response = static_response(state.elastic, self._loads)
                 mine[k] = response.deflection(self.options.exponent), response.largest
         found = on_all_ranks(analysis.partition, mine)
         smooth, largest = zip(*found.values(), strict=True)
@@ -37,13 +39,15 @@ class TipDeflection(Response):
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of every design's deflection (collective)."""
-        arms, rows = analysis.arms, []
+        designs, rows = analysis.designs, []
         for owner in analysis.scene.cell_counts:
-            row = {k: np.zeros(arm.mesh.num_cells) for k, arm in arms.items()}
+            row = {k: np.zeros_like(one.x_phys) for k, one in designs.items()}
             with together(analysis.partition.world):
-                if owner in arms:
-                    response = static_response(arms[owner].elastic, self._loads)
-                    row[owner] = deflection_gradient(arms[owner], response, self.options.exponent)
+                if owner in designs:
+                    response = static_response(designs[owner].elastic, self._loads)
+                    row[owner] = deflection_gradient(
+                        designs[owner], response, self.options.exponent
+                    )
             rows.append(row)
         return rows
 

@@ -72,7 +72,7 @@ def _sizes(scene: Scene) -> list[str]:
 def _motion(scene: Scene) -> list[str]:
     found = []
     damping, motion = scene.damping.stiffness_proportional, scene.motion
-    if scene.objective.simulated and damping > motion.duration:
+    if scene.objective.needs("motion") and damping > motion.duration:
         found.append(
             f"damping.stiffness_proportional = {damping:g} s: deflections relax in that time, "
             f"longer than motion.duration = {motion.duration:g} s, so that the arms hardly "

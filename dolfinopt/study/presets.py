@@ -69,7 +69,9 @@ def _objectives(frame: pd.DataFrame) -> Report:
     title = "Designs optimised for every objective, simulated in the scene."
     table = Table("", title, frame[columns].rename(columns={"label": "objective"}))
     good = _good(frame)
-    moved = [o for o in good if o.case.action == "optimize" and o.case.scene.objective.simulated]
+    moved = [
+        o for o in good if o.case.action == "optimize" and o.case.scene.objective.needs("motion")
+    ]
     others = [o for o in good if o not in moved]
     panels = [
         *deviation_panels("initial, static, eigenfrequency", others),

@@ -136,7 +136,7 @@ class Case:
         if scene.reduction.method == "balanced":  # the Gramian knows the damping
             free.remove("damping")
         kept = {table: value for table, value in content.items() if table not in free}
-        motion_alone = scene.objective.simulated and not any(vars(scene.constraints).values())
+        motion_alone = scene.objective.needs("motion") and not any(vars(scene.constraints).values())
         if motion_alone and scene.reduction.method in SCALABLE:
             for row in (kept["material"], *kept["arms"]):
                 for key in SCALING:

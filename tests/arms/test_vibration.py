@@ -22,7 +22,6 @@ from dolfinopt.arms.vibration import (
     rigid_integrals,
 )
 from dolfinopt.responses.eigenfrequency import squared_period
-from dolfinopt.responses.evaluation import constraint_gradients
 from dolfinopt.responses.sensitivity import period_gradient
 
 Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
@@ -72,7 +71,7 @@ def direct_inertia(chain: Chain, clouds: list[tuple[np.ndarray, np.ndarray]], k:
         turn *= np.exp(1j * chain.angles[j])
         masses.append(clouds[j][0])
         places.append(origin + turn * clouds[j][1])
-        origin += turn * chain.reach[j]
+        origin += turn * chain.outboard_points[j]
     m = np.concatenate([*masses, [chain.payload.mass]])
     z = np.concatenate([*places, [origin]])
     velocity = np.zeros((len(m), 2, 3))
@@ -89,7 +88,9 @@ def test_carried(arms: int, kind: str) -> None:
     """Against point masses placed at the chain's random angles, to rounding."""
     rng = np.random.default_rng(arms)
     chain, clouds = chain_of_points(rng, arms)
-    carried = Chain(chain.bodies, chain.reach, chain.angles, chain.payload, kind).carried()
+    carried = Chain(
+        chain.bodies, chain.outboard_points, chain.angles, chain.payload, kind
+    ).carried()
     assert len(carried) == arms
     for k, load in enumerate(carried):
         expected = direct_inertia(chain, clouds, k)
@@ -102,18 +103,18 @@ def test_carried(arms: int, kind: str) -> None:
 
 @pytest.mark.parametrize("arms", [1, 2, 3, 4])
 @pytest.mark.parametrize("kind", ["rigid-body", "point-mass", "none"])
-def test_body_slopes_are_the_transpose(arms: int, kind: str) -> None:
+def test_cotangents_are_the_transpose(arms: int, kind: str) -> None:
     """<W, carried(bodies)> is linear in the bodies, and <slopes(W), bodies> the same number."""
     rng = np.random.default_rng(arms)
     (chain, _), (other, _) = chain_of_points(rng, arms), chain_of_points(rng, arms)
     weights = list(rng.normal(size=(arms, 3, 3)))
 
     def product(bodies: list[RigidIntegrals]) -> float:
-        moved = Chain(bodies, chain.reach, chain.angles, chain.payload, kind).carried()
+        moved = Chain(bodies, chain.outboard_points, chain.angles, chain.payload, kind).carried()
         return sum(np.sum(w * load.matrix()) for w, load in zip(weights, moved, strict=True))
 
-    one = Chain(chain.bodies, chain.reach, chain.angles, chain.payload, kind)
-    slopes = one.body_slopes(weights)
+    one = Chain(chain.bodies, chain.outboard_points, chain.angles, chain.payload, kind)
+    slopes = one.cotangents(weights)
     found = sum(
         s.mass * d.mass + (np.conj(s.moment) * d.moment).real + s.inertia * d.inertia
         for s, d in zip(slopes, other.bodies, strict=True)
@@ -314,7 +315,7 @@ def slopes_at(
     x = design_of(arm, symmetric)
     found = modes(x)
     _, by_values = squared_period(found, exponent, follow)
-    return modes, period_gradient(arm, found, by_values).cells
+    return modes, period_gradient(arm.current, found, by_values).cells
 
 
 @pytest.mark.parametrize("exponent", [4.0, 20.0])
@@ -363,7 +364,7 @@ def test_following_a_mode_through_a_crossing() -> None:
     arm, seen = stubby(), []
 
     def carried(inertia: float) -> RigidIntegrals:
-        return RigidIntegrals(MASS, 0j, inertia).moved(-0.15 + 0j)
+        return RigidIntegrals(MASS, 0j, inertia).shifted(-0.15 + 0j)
 
     first = loaded_modes(arm.elastic, carried(0.5), 3, None)
     axial = int(np.argmax(np.abs(first.outboard[0]) / np.abs(first.outboard[1])))
@@ -423,7 +424,7 @@ def test_the_outboard_arm_weighs_on_the_inboard_one() -> None:
     """Without the coupling the gradient of arm 1's period by arm 2's mass would be missing."""
     built = build("objective.kind=eigenfrequency", "constraints.first_frequency=1.0")
     built.evaluate(built.fields(wave))
-    first, second = constraint_gradients(built.scene, built.partition, built.arms)
+    first, second = built.constraint_gradients()
     ones = built.fields(lambda k, x, y: np.full(len(x), float(k == 1)))
     others = built.fields(lambda k, x, y: np.full(len(x), float(k == 0)))
     assert built.dot(first, ones) > 0.0  # heavier outboard: longer period

@@ -307,10 +307,10 @@ def test_chain_through_what_is_clipped(shared_tmp_path):
 
     here = arm.filtered(x)
     assert COMM.allreduce(int(here.clipped.sum())) > 10
-    slope = COMM.allreduce(d @ arm.chain(2.0 * w * here.x_phys, here))
+    slope = COMM.allreduce(d @ arm.backward(2.0 * w * here.x_phys, here))
     remainders = [abs(value(h) - value(0.0) - h * slope) for h in (1e-3, 1e-4)]
     assert remainders[1] < 0.02 * remainders[0]  # of second order
-    wrong = COMM.allreduce(d @ arm.chain(2.0 * w * here.x_phys))
+    wrong = COMM.allreduce(d @ arm.backward(2.0 * w * here.x_phys))
     assert abs(wrong - slope) > 1e-3 * abs(slope)
 
 

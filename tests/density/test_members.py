@@ -13,8 +13,8 @@ import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.members import thinnest
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.optimization.continuation import Continuation
-from dolfinopt.optimization.variables import Variables
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.problem import problem_of
 from dolfinopt.output.summary import _widths, filter_warnings
 
 WORLD = MPI.COMM_WORLD
@@ -141,23 +141,16 @@ def test_which_design_carries_the_volume(width):
     scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}"))
     partition = do.partition_arms(WORLD, scene.cell_counts)
     arms = do.build_arms(scene, partition, do.Profile())
-    variables, continuation = (
-        Variables(scene, partition, arms),
-        Continuation(scene, partition, arms),
-    )
-    continuation.beta = 4.0
-    realised = continuation.realise(variables.split(np.linspace(0.1, 0.9, variables.size)))
-    designs = [{k: one[i] for k, one in realised.items()} for i in range(3)]
-    value, slopes = variables.limited_volume(designs, width)
-    _, dilated, nominal = (
-        variables.volume_constraints({k: one.x_phys for k, one in design.items()})
-        for design in designs
-    )
-    assert value == pytest.approx(nominal)
+    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    evaluator.continuation.beta = 4.0
+    designs = evaluator.evaluate(np.linspace(0.1, 0.9, evaluator.variables.size))
+    problem = problem_of(scene, designs)
+    _, dilated, nominal = (np.array(one.evaluation.constraints) for one in designs)
+    assert problem.f == pytest.approx(nominal)
     assert dilated > nominal
-    expected = variables.volume_gradients(designs[1 if width else 2])
+    expected = designs[1 if width else 2].constraints
     factor = (1.0 + nominal) / (1.0 + dilated) if width else np.ones(len(nominal))
-    np.testing.assert_allclose(slopes, expected * factor[:, None], rtol=1e-14)
+    np.testing.assert_allclose(problem.dfdx, expected * factor[:, None], rtol=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_chain_is_the_transpose_of_physical(shape):
     w = arm.mesh.area * np.sin(45.0 * centroid[:, 0] + 90.0 * centroid[:, 1])
     change = arm.physical(x + dx) - arm.physical(x)  # linear: no limit is met
     left, right, size = COMM.allreduce(
-        np.array([w @ change, arm.chain(w) @ dx, np.abs(w) @ np.abs(change)])
+        np.array([w @ change, arm.backward(w) @ dx, np.abs(w) @ np.abs(change)])
     )
     assert abs(left - right) < 1e-12 * size
     physical = arm.physical(x)

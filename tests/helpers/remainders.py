@@ -12,6 +12,7 @@ from mpi4py import MPI
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.parallel import Partition, sum_over_arms
+from dolfinopt.responses.evaluation import Evaluation, constraint_gradients
 from dolfinopt.scene.load import Scene
 
 SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
@@ -36,6 +37,12 @@ class Built:
         """Return the objective's gradient at the design evaluated last."""
         return do.gradient(self.scene, self.partition, self.arms, trajectory, self.profile)
 
+    def constraint_gradients(self, trajectory=None) -> list[dict[int, np.ndarray]]:
+        """Return the gradients of `beside_volume` at the design evaluated last."""
+        place = self.scene, self.partition, self.arms
+        rows = constraint_gradients(*place, trajectory, self.profile)
+        return [row.cells for row in rows if row.response.name != "volume_fraction"]
+
     def dot(self, a: Cells, b: Cells) -> float:
         """Return the product over all cells of all arms, on all ranks."""
         return float(sum_over_arms(self.partition, {k: np.array(a[k] @ b[k]) for k in self.arms}))
@@ -47,6 +54,11 @@ class Built:
             x, y = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
             out[k] = function(k, x, y)
         return out
+
+
+def beside_volume(evaluation: Evaluation) -> tuple[float, ...]:
+    """Return the values of [constraints], which follow the volume's."""
+    return evaluation.constraints[len(evaluation.responses[1].values) :]
 
 
 def build(*overrides: str, cells: tuple[int, int] = (24, 3)) -> Built:

@@ -233,7 +233,7 @@ def test_robust_designs_take_the_scene_s_exponent(monkeypatch):
         asked.append((len(values), exponent))
         return original(values, exponent)
 
-    monkeypatch.setattr("dolfinopt.optimization.loop.worst_of", noted)
+    monkeypatch.setattr("dolfinopt.optimization.problem.worst_of", noted)
     robust = ["design.projection=robust", "objective.exponent=7", "objective.kind=static"]
     do.optimize(scene(*robust, iterations=1))
     assert asked and set(asked) == {(3, 7.0)}

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from remainders import SCENE, Built, build, rates, uneven, wave
+from remainders import SCENE, Built, beside_volume, build, rates, uneven, wave
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import together
 from dolfinopt.responses import response as registry
-from dolfinopt.responses.evaluation import constraint_gradients
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.p_norm import p_norm, p_norm_of_lengths
 from dolfinopt.responses.response import (
@@ -29,6 +28,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.constraints import Constraints
+from dolfinopt.scene.tables.responses import NEEDS
 
 
 class Roughness(Response):
@@ -40,8 +40,8 @@ class Roughness(Response):
     def measure(self, analysis: Analysis) -> Measured:
         with together(analysis.partition.world):
             mine = {
-                k: float(arm.mesh.area @ (arm.current.x_phys - self.level) ** 2)
-                for k, arm in analysis.arms.items()
+                k: float(one.mesh.area @ (one.x_phys - self.level) ** 2)
+                for k, one in analysis.designs.items()
             }
         found = on_all_ranks(analysis.partition, mine)
         values = tuple(found.values())
@@ -52,8 +52,8 @@ class Roughness(Response):
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         return [
             {
-                k: 2.0 * arm.mesh.area * (arm.current.x_phys - self.level) * float(k == owner)
-                for k, arm in analysis.arms.items()
+                k: 2.0 * one.mesh.area * (one.x_phys - self.level) * float(k == owner)
+                for k, one in analysis.designs.items()
             }
             for owner in analysis.scene.cell_counts
         ]
@@ -164,19 +164,46 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert needs(built.scene, "motion")
     x, d = built.fields(wave), built.fields(uneven)
     _, trajectory = built.evaluate(x)
-    [row] = constraint_gradients(
-        built.scene, built.partition, built.arms, trajectory, built.profile
-    )
+    [row] = built.constraint_gradients(trajectory)
 
     def value(h: float) -> float:
         moved = {k: x[k] + h * d[k] for k in x}
-        return built.evaluate(moved)[0].constraints[0]
+        return beside_volume(built.evaluate(moved)[0])[0]
 
     evaluation, _ = built.evaluate(x)
     [own] = (one for one in evaluation.responses if one.response == name)
-    assert evaluation.constraints == (own.smooth[0] / 0.01 - 1.0,)
+    assert beside_volume(evaluation) == (own.smooth[0] / 0.01 - 1.0,)
     # Steps at which what is left of the time error, 1e-7, stays below the remainders.
     assert rates(value, built.dot(row, d), (4e-2, 1e-2)) == pytest.approx(2.0, abs=0.2)
+
+
+def test_deviation_is_limited_and_compliance_minimised() -> None:
+    """Through the registry alone: the limit, tighter than the free design is, is met."""
+    options = [*QUICK, "objective.kind=compliance", "objective.gradient=exact"]
+    scene = do.load_scene(SCENE, [*options, "optimizer.max_iterations=60"])
+    free, built = do.optimize(scene), build(*options)
+    measured = rebuilt(built, limited(built.scene, deviation=1.0)).evaluate(free.x_phys)[0]
+    limit = 0.99 * measured.values_of("deviation")[0]
+    kept = do.optimize(limited(scene, deviation=limit))
+    one = next(one for one in kept.limits if one.quantity == "deviation")
+    assert (one.arm, one.unit, one.met) == ("", "m", True)
+    assert kept.evaluation.objective > free.evaluation.objective
+
+
+def test_the_volume_is_minimised_under_a_limit() -> None:
+    """The volume is a response like the others: least material that is stiff enough."""
+    options = [*QUICK, "objective.kind=static", "optimizer.max_iterations=80"]
+    scene = do.load_scene(SCENE, [*options, "design.volume_fraction=0.9", "design.initial=0.8"])
+    built = build(*QUICK)
+    full = built.fields(lambda k, x, y: np.ones(len(x)))
+    solid = rebuilt(built, limited(built.scene, tip_deflection=1.0)).evaluate(full)[0]
+    limit = 2.0 * max(solid.tip_deflections)
+    result = do.optimize(minimised(limited(scene, tip_deflection=limit), "volume_fraction"))
+    # The p-norm of two load cases is at most 4 % above the larger one.
+    tips = [one for one in result.limits if one.quantity == "tip_deflection"]
+    assert all(one.met and one.value == pytest.approx(limit, rel=0.03) for one in tips)
+    fractions = [one.value for one in result.limits if one.quantity == "volume_fraction"]
+    assert max(fractions) < 0.7  # a beam's stiffness grows faster than its material
 
 
 def test_needs_are_stated_by_the_responses() -> None:
@@ -188,11 +215,14 @@ def test_needs_are_stated_by_the_responses() -> None:
     assert {kind for kind, one in asked.items() if "motion" in one} == {
         "esl", "compliance", "deviation"
     }  # fmt: skip
-    assert asked["eigenfrequency"] == {"mass", "eigenproblem"} == find("first_frequency").needs
-    assert asked["static"] == frozenset() == find("tip_deflection").needs
+    vibration = {"stiffness", "mass", "eigenproblem"}
+    assert asked["eigenfrequency"] == vibration == find("first_frequency").needs
+    assert asked["static"] == {"stiffness"} == find("tip_deflection").needs
+    assert find("volume_fraction").needs == frozenset()
+    assert {name: find(name).needs for name in NEEDS} == NEEDS
     built = build("constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6")
     names = [one.response.name for one in constraints_of(built.scene)]
-    assert names == ["first_frequency", "tip_deflection"]
+    assert names == ["volume_fraction", "first_frequency", "tip_deflection"]
     assert objective_of(built.scene).unit == "N m"
 
 

@@ -417,7 +417,7 @@ def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def no_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the slopes by the physical densities for those by the variables."""
-    monkeypatch.setattr("dolfinopt.arms.arm.Arm.chain", lambda arm, slope, _: arm._active(slope))
+    monkeypatch.setattr("dolfinopt.arms.arm.Arm.backward", lambda arm, slope, _: arm._active(slope))
 
 
 @pytest.mark.parametrize("fault", [no_modes, no_trajectory, no_start, no_filter])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from pydantic import Field, field_validator
 
+from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import Loc, Refusal, Table
+from dolfinopt.scene.tables.responses import NEEDS, Need
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -94,20 +96,22 @@ class Objective(Table):
             )
         return loads
 
-    @property
-    def simulated(self) -> bool:
-        """Whether the objective needs the motion."""
-        return self.kind in ("esl", "compliance", "deviation")
+    def needs(self, what: Need) -> bool:
+        """Return whether the objective needs that."""
+        return what in NEEDS[self.kind]
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
         self._check_attached(scene)
         self._check_load_cases(scene)
-        if not self.simulated:
+        if not self.needs("motion"):
             if scene.scenarios:
+                moving = [
+                    shown(kind) for kind in get_args(ObjectiveKind) if "motion" in NEEDS[kind]
+                ]
                 raise Refusal(
-                    'expected "esl", "compliance" or "deviation" with [[scenarios]]: the others '
-                    "do not simulate the motion",
+                    f"expected {', '.join(moving[:-1])} or {moving[-1]} with [[scenarios]]: the "
+                    "others do not simulate the motion",
                     ("objective", "kind"),
                     ("scenarios", 0, "changes"),
                 )

@@ -1,0 +1,102 @@
+"""From x to the designs that it stands for, what they do, and the gradients of that by x."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.optimization.continuation import Continuation
+from dolfinopt.optimization.problem import EvaluatedDesign
+from dolfinopt.optimization.variables import Variables
+from dolfinopt.parallel import Partition, together
+from dolfinopt.profiling import Profile
+from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm, PhysicalDesign
+
+
+class Evaluator:
+    """Evaluates one x after the other, each with the last one's motion as its initial guess.
+
+    Attributes:
+        scene, partition, arms, profile: of the run.
+        variables, continuation: how x makes designs.
+        trajectory: of the design evaluated last; None without a motion and off the root.
+        solutions: its motions; the next evaluation sets out from them.
+        initial_solutions, initial_vectors: from where that of the last x set out, so that it can
+            be repeated in the same bits.
+    """
+
+    def __init__(
+        self, scene: Scene, partition: Partition, arms: Mapping[int, Arm], profile: Profile
+    ):
+        self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
+        self.variables = Variables(scene, partition, arms)
+        self.continuation = Continuation(scene, partition, arms)
+        self.trajectory: Trajectory | None = None
+        self.solutions: tuple[Solution, ...] = ()
+        self.initial_solutions: tuple[Solution, ...] = ()
+        self.initial_vectors: dict[int, list[np.ndarray]] = {}
+
+    def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
+        """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
+
+        Collective; of this rank's arms.
+        """
+        designs = self.continuation.physical_designs(self.variables.split(x))
+        count = 3 if self.scene.design.projection == "robust" else 1
+        return [{k: one[variant] for k, one in designs.items()} for variant in range(count)]
+
+    def evaluate(self, x: np.ndarray) -> list[EvaluatedDesign]:
+        """Evaluate the designs that x stands for, the nominal one last (collective)."""
+        self.initial_solutions = self.solutions
+        self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
+        # Gradients at once, with the design's factorisation at hand.
+        return [
+            self._differentiated(design, self.evaluate_densities(densities(design)))
+            for design in self.physical_designs(x)
+        ]
+
+    def evaluate_densities(
+        self, x_phys: Mapping[int, np.ndarray], simulated: bool = False
+    ) -> Evaluation:
+        """Evaluate one design (collective); `simulated` even where no response needs a motion."""
+        evaluation, self.trajectory = evaluate(
+            self.scene,
+            self.partition,
+            self.arms,
+            x_phys,
+            self.profile,
+            self.solutions,
+            simulated=simulated,
+        )
+        return evaluation
+
+    def _differentiated(
+        self, design: Mapping[int, PhysicalDesign], evaluation: Evaluation
+    ) -> EvaluatedDesign:
+        """Add the gradients by x of the design evaluated last (collective)."""
+        if self.trajectory is not None:
+            self.solutions = self.trajectory.solutions
+        analysed = self.scene, self.partition, self.arms, self.trajectory, self.profile
+        objective, rows = gradient(*analysed), constraint_gradients(*analysed)
+        with together(self.partition.world):
+            by_x = [self.variables.by_x(row.smooth, design) / row.limit for row in rows]
+            return EvaluatedDesign(
+                design,
+                evaluation,
+                self.variables.by_x(objective, design),
+                np.array(by_x).reshape(len(rows), self.variables.size),
+                np.array([row.response.of_nominal for row in rows], dtype=bool),
+            )
+
+
+def densities(design: Mapping[int, PhysicalDesign]) -> dict[int, np.ndarray]:
+    """Return the physical densities of every arm."""
+    return {k: one.x_phys for k, one in design.items()}
