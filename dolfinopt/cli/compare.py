@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import click
 
-from dolfinopt.cli.options import overwrite_option, plots_option, scene_argument, set_option
-from dolfinopt.cli.shared import load
-from dolfinopt.cli.studies import asked_of, carry_out, folder_of, study_out_option
+from dolfinopt.cli.options import scene_argument
+from dolfinopt.cli.studies import StudyRun, study_options
 from dolfinopt.errors import InputError
 
 PRESETS = {"objectives": "objective", "reductions": "reduction"}
@@ -26,19 +24,8 @@ PRESETS = {"objectives": "objective", "reductions": "reduction"}
     metavar="N",
     help="of the reductions, any number of times; default: 4 and 12",
 )
-@study_out_option
-@overwrite_option
-@set_option
-@plots_option
-def compare(
-    scene: Path,
-    what: str,
-    coordinates: tuple[int, ...],
-    out: Path | None,
-    overwrite: bool,
-    overrides: tuple[str, ...],
-    plots: bool,
-) -> None:
+@study_options
+def compare(run: StudyRun, what: str, coordinates: tuple[int, ...]) -> None:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
@@ -46,12 +33,8 @@ def compare(
     """
     if coordinates and what == "objectives":
         raise InputError("--coordinates: expected only with compare SCENE reductions")
-    world, loaded = load(scene, overrides)
     from dolfinopt.study.studies import study
 
     preset: Any = PRESETS[what]
-    folder = folder_of(scene, out)
     vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
-    run = partial(study, loaded, preset, vary, [], folder, world)
-    question = asked_of(world, loaded, [])
-    carry_out(world, folder, preset, question, run, overwrite=overwrite, plots=plots)
+    run.carry_out(preset, [], partial(study, run.scene, preset, vary, []))

@@ -8,9 +8,8 @@ from typing import Any
 
 import click
 
-from dolfinopt.cli.options import overwrite_option, plots_option, scene_argument, set_option
-from dolfinopt.cli.shared import load
-from dolfinopt.cli.studies import asked_of, carry_out, designs_option, folder_of, study_out_option
+from dolfinopt.cli.options import scene_argument
+from dolfinopt.cli.studies import StudyRun, designs_option, study_options
 from dolfinopt.errors import InputError
 
 PRESETS = ("payload", "flattening", "coordinates")
@@ -27,20 +26,9 @@ PRESETS = ("payload", "flattening", "coordinates")
 )
 @designs_option
 @click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
-@study_out_option
-@overwrite_option
-@set_option
-@plots_option
+@study_options
 def sweep(
-    scene: Path,
-    preset: Any,
-    vary: tuple[str, ...],
-    designs: tuple[Path, ...],
-    reoptimize: bool,
-    out: Path | None,
-    overwrite: bool,
-    overrides: tuple[str, ...],
-    plots: bool,
+    run: StudyRun, preset: Any, vary: tuple[str, ...], designs: tuple[Path, ...], reoptimize: bool
 ) -> None:
     """Simulate designs of SCENE for a range of values: tables and curves of what they do.
 
@@ -53,17 +41,10 @@ def sweep(
             "sweep: name payload, flattening or coordinates, or what to --vary "
             "(see dolfinopt sweep --help)"
         )
-    world, loaded = load(scene, overrides)
     from dolfinopt.study.studies import study, sweep_name
 
-    folder = folder_of(scene, out)
-    run = partial(study, loaded, preset, vary, designs, folder, world, reoptimize=reoptimize)
-    carry_out(
-        world,
-        folder,
+    run.carry_out(
         sweep_name(preset, vary),
-        asked_of(world, loaded, designs),
-        run,
-        overwrite=overwrite,
-        plots=plots,
+        designs,
+        partial(study, run.scene, preset, vary, designs, reoptimize=reoptimize),
     )

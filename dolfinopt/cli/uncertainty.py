@@ -8,9 +8,8 @@ from typing import Any
 
 import click
 
-from dolfinopt.cli.options import overwrite_option, plots_option, scene_argument, set_option
-from dolfinopt.cli.shared import load
-from dolfinopt.cli.studies import asked_of, carry_out, designs_option, folder_of, study_out_option
+from dolfinopt.cli.options import scene_argument
+from dolfinopt.cli.studies import StudyRun, designs_option, study_options
 
 
 @click.command()
@@ -40,39 +39,20 @@ from dolfinopt.cli.studies import asked_of, carry_out, designs_option, folder_of
     help="Sobol' indices of a polynomial fitted to the samples, or of more simulations",
 )
 @designs_option
-@study_out_option
-@overwrite_option
-@set_option
-@plots_option
+@study_options
 def uncertainty(
-    scene: Path,
-    random: tuple[str, ...],
-    samples: int,
-    seed: int,
-    sampler: Any,
-    indices: Any,
-    designs: tuple[Path, ...],
-    out: Path | None,
-    overwrite: bool,
-    overrides: tuple[str, ...],
-    plots: bool,
+    run: StudyRun, random: tuple[str, ...], designs: tuple[Path, ...], **sampling: Any
 ) -> None:
     """Simulate designs of SCENE with random values: statistics and Sobol' indices.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
-    world, loaded = load(scene, overrides)
     from dolfinopt.study.uncertainty import Sampling, random_name, study_random
 
-    folder = folder_of(scene, out)
-    sampling = Sampling(samples, seed, sampler, indices)
-    carry_out(
-        world,
-        folder,
+    run.carry_out(
         random_name(random),
-        asked_of(world, loaded, designs) | {"distributions": sorted(random)},
-        partial(study_random, loaded, random, designs, folder, world, sampling),
-        overwrite=overwrite,
-        plots=plots,
+        designs,
+        partial(study_random, run.scene, random, designs, sampling=Sampling(**sampling)),
+        distributions=sorted(random),
     )

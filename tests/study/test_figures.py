@@ -1,11 +1,13 @@
 """Pictures of studies: what is drawn, and that it can be read."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.text import Text
+from pictures import TOLERANCE, difference
 
 from dolfinopt.plots.style import BLUE, ORANGE, look, look_numbers, spread
 from dolfinopt.study.figures import (
@@ -17,6 +19,7 @@ from dolfinopt.study.figures import (
 )
 from dolfinopt.study.tables import FrameFigure, Line, LineFigure, MatrixFigure, Panel
 
+PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
 
@@ -170,3 +173,23 @@ def test_matrix_and_tornado_figures():
     drawn = draw(FrameFigure("", "T", "tornado", frame))
     assert [patch.get_width() for patch in drawn.axes[0].patches] == [-3.0, 4.0]
     assert drawn.axes[0].get_xlabel() == "change [%]"
+
+
+def sweep_figure(factor=1.0):
+    """Return a sweep's figure: three designs, one of another magnitude, two quantities."""
+    mass = np.linspace(4.0, 8.0, 5)
+    designs = {"initial design": 0.5, "optimised design": 0.15, "made for it": 0.148 * factor}
+    rows = []
+    for names in (["initial design"], ["optimised design", "made for it"]):
+        panels = []
+        for what, power in (("compliance [N m]", 2.0), ("maximal deviation [mm]", 1.0)):
+            lines = (Line(name, mass, designs[name] * mass**power) for name in names)
+            panels.append(Panel("", "payload.mass [kg]", what, tuple(lines)))
+        rows.append(tuple(panels))
+    return line_figure(LineFigure("", "Designs by payload.mass [kg].", tuple(rows)))
+
+
+def test_sweep_looks_as_it_did(tmp_path):
+    """Curves, colours, dashes, markers and scales; a curve that is 5 % off is another picture."""
+    assert difference(PICTURE, sweep_figure(), tmp_path) == 0.0
+    assert difference(PICTURE, sweep_figure(1.05), tmp_path) > TOLERANCE

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mpi4py import MPI
+from studies import SCENE, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
@@ -16,7 +15,6 @@ from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import sample_cases, sample_texts
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 SMALL = ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
 FINE = ("simulation.tolerance=1e-6", "motion.horizon=2.2")
 CHUNK = 6
@@ -95,9 +93,9 @@ def test_what_is_known_is_not_done_again(shared_tmp_path):
     np.testing.assert_array_equal(first, more[:, : 2 * CHUNK])
     # Another name is the same scene; another value is not, nor is another design.
     assert respond(payloads(count, 'name="other"'), shared_tmp_path)[1] == 0
-    few = CHUNK - 1
+    few, full = CHUNK - 1, write_uniform(shared_tmp_path / "full.npz", (12, 3), 1.0)
     assert respond(payloads(few, "motion.flattening=0.9"), shared_tmp_path)[1] == CHUNK
-    assert respond(payloads(few, design=_full(shared_tmp_path)), shared_tmp_path)[1] == CHUNK
+    assert respond(payloads(few, design=full), shared_tmp_path)[1] == CHUNK
 
 
 def test_damaged_chunks_are_done_again(shared_tmp_path):
@@ -139,25 +137,13 @@ def test_an_interruption_costs_a_chunk(tmp_path, monkeypatch):
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
 def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
     """The same bits, whoever does a chunk, of two designs."""
-    count = 2 * CHUNK + 1
-    cases = payloads(count - 1) + payloads(count - 1, design=_full(shared_tmp_path))
+    count, full = 2 * CHUNK + 1, write_uniform(shared_tmp_path / "full.npz", (12, 3), 1.0)
+    cases = payloads(count - 1) + payloads(count - 1, design=full)
     alone, *_ = respond(cases, tmp_path / "alone", SELF)
     together, computed, _ = respond(cases, shared_tmp_path / "all")
     assert computed == 2 * count
     np.testing.assert_array_equal(alone, together)
     assert (alone[0, :count] != alone[0, count:]).all()
-
-
-def _full(folder):
-    """Write a design of solid arms."""
-    path = folder / "full.npz"
-    if WORLD.rank == 0:
-        x, y = np.meshgrid((np.arange(12) + 0.5) / 12.0, (np.arange(3) - 1) * 0.02)
-        centroid = np.stack([x.ravel(), y.ravel()], axis=1)
-        arms = {f"arm{k}/centroid": centroid for k in (1, 2)}
-        np.savez(path, **arms, **{f"arm{k}/density": np.ones(36) for k in (1, 2)})
-    WORLD.barrier()
-    return path
 
 
 @pytest.mark.serial

@@ -1,6 +1,5 @@
 """Studies: what is planned, the tables and pictures that come of it, and what is refused."""
 
-import csv
 import json
 import os
 import re
@@ -15,16 +14,15 @@ import numpy as np
 import pandas as pd
 import pytest
 from mpi4py import MPI
+from studies import SCENE, cells_of, column, rows_of, run_command, write_uniform
 
 import dolfinopt as do
-from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.study import presets, variants
 from dolfinopt.study import studies as study
 from dolfinopt.study.variants import parse_vary
 
 ROOT = Path(__file__).parents[2]
-SCENE = ROOT / "demos" / "two_arm.toml"
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 SMALL = ["arms.cells=[20,3]", "optimizer.max_iterations=3", "simulation.sample=0.01"]
 SETTINGS = [word for value in SMALL for word in ("--set", value)]
@@ -40,22 +38,7 @@ def scene(*overrides):
 
 
 def run(*arguments, command="sweep"):
-    """Run the command on all ranks."""
-    commands.main([command, *map(str, arguments)], standalone_mode=False, obj=WORLD)
-    WORLD.barrier()
-
-
-def rows_of(path):
-    with open(path, newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-def cells_of(table):
-    return list(table.frame.itertuples(index=False, name=None))
-
-
-def column(rows, name):
-    return np.array([float(row[name]) for row in rows])
+    run_command(command, *arguments)
 
 
 def is_drawn(path):
@@ -226,17 +209,7 @@ def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
 
 def test_grid_of_two(folder):
     vary = ["payload.mass=4,8", "damping.stiffness_proportional=1e-4,2e-4,4e-4"]
-    design = folder / "given.npz"
-    if WORLD.rank == 0:
-        x, y = np.linspace(0.05, 0.95, 10), np.linspace(-0.02, 0.02, 3)
-        centroid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        arms = ("arm1", "arm2")
-        np.savez(
-            design,
-            **{f"{arm}/centroid": centroid for arm in arms},
-            **{f"{arm}/density": np.full(30, 0.8) for arm in arms},
-        )
-    WORLD.barrier()
+    design = write_uniform(folder / "given.npz", (10, 3), 0.8)
     done = study.study(scene(), None, vary, [design], folder, WORLD, shown=False)
     [table], [figure] = done.tables, done.figures
     assert [row[:2] for row in cells_of(table)] == [

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
-
 import click
 import numpy as np
 import pytest
 from mpi4py import MPI
+from studies import SCENE, cells_of, column, rows_of, run_command, write_uniform
 
 import dolfinopt as do
-from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.study.figures import draw
 from dolfinopt.study.uncertainty import Sampling, nominal_value, parse_input, study_random
 
 WORLD = MPI.COMM_WORLD
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 SMALL = ["arms.cells=[12,3]", "optimizer.max_iterations=2", "simulation.sample=0.01",
          "simulation.tolerance=1e-2"]  # fmt: skip
 SETTINGS = [word for value in SMALL for word in ("--set", value)]
@@ -30,22 +26,7 @@ def scene(*overrides):
 
 
 def run(*arguments):
-    """Run the command on all ranks."""
-    commands.main(["uncertainty", *map(str, arguments)], standalone_mode=False, obj=WORLD)
-    WORLD.barrier()
-
-
-def rows_of(path):
-    with open(path, newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-def cells_of(table):
-    return list(table.frame.itertuples(index=False, name=None))
-
-
-def column(rows, name):
-    return np.array([float(row[name]) for row in rows])
+    run_command("uncertainty", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -176,14 +157,8 @@ def test_command(folder, capsys):
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
     """A design of solid arms in a file, which needs no optimisation."""
-    path = None
-    if WORLD.rank == 0:
-        path = tmp_path_factory.mktemp("design") / "solid.npz"
-        x, y = np.meshgrid((np.arange(12) + 0.5) / 12.0, (np.arange(3) - 1) * 0.02)
-        centroid = np.stack([x.ravel(), y.ravel()], axis=1)
-        arms = {f"arm{k}/centroid": centroid for k in (1, 2)}
-        np.savez(path, **arms, **{f"arm{k}/density": np.ones(36) for k in (1, 2)})
-    return WORLD.bcast(path, root=0)
+    path = tmp_path_factory.mktemp("design") / "solid.npz" if WORLD.rank == 0 else None
+    return write_uniform(WORLD.bcast(path, root=0), (12, 3), 1.0)
 
 
 def study(given, folder, *random, base=None, **options):

@@ -1,0 +1,55 @@
+"""Studies in tests: the command on all ranks, and what it wrote."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.cli import commands
+from dolfinopt.study.tables import Table
+
+SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
+
+
+def run_command(command: str, *arguments: Any) -> None:
+    """Run a command on all ranks."""
+    commands.main([command, *map(str, arguments)], standalone_mode=False, obj=MPI.COMM_WORLD)
+    MPI.COMM_WORLD.barrier()
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file by column."""
+    with open(path, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def cells_of(table: Table) -> list[tuple[Any, ...]]:
+    """Return the rows of a table."""
+    return list(table.frame.itertuples(index=False, name=None))
+
+
+def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
+    """Return a column of numbers."""
+    return np.array([float(row[name]) for row in rows])
+
+
+def write_uniform(path: Path, cells: tuple[int, int], density: float) -> Path:
+    """Write a design of the two arms with one density (collective); return its path.
+
+    Args:
+        path: design.npz.
+        cells: of arms 1 m long and 0.06 m high, along and across.
+        density: of all.
+    """
+    if MPI.COMM_WORLD.rank == 0:
+        along, across = ((np.arange(n) + 0.5) / n for n in cells)
+        x, y = np.meshgrid(along, 0.06 * (across - 0.5))
+        centroid = np.stack([x.ravel(), y.ravel()], axis=1)
+        arms = {f"arm{k}/centroid": centroid for k in (1, 2)}
+        np.savez(path, **arms, **{f"arm{k}/density": np.full(x.size, density) for k in (1, 2)})
+    MPI.COMM_WORLD.barrier()
+    return path
