@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt import Model, OptimizationResult
 
 WORLD = MPI.COMM_WORLD
 ROOT = WORLD.rank == 0
-SCENE = Path(__file__).parents[1] / "demos/two_arm.toml"
 SMALL = "arms.cells=[24,4]", "simulation.sample=0.01", "optimizer.max_iterations=2"
 
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    return Model(SCENE, *SMALL)
+    return Model(TWO_ARM, *SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +27,7 @@ def result(model: Model) -> OptimizationResult:
 
 def test_simulate_is_evaluate(model: Model) -> None:
     """The initial design by name, by default, and by the functions give the same bits."""
-    scene = do.load_scene(SCENE, SMALL)
+    scene = do.load_scene(TWO_ARM, SMALL)
     partition = do.partition_arms(WORLD, scene.cell_counts)
     arms = do.build_arms(scene, partition, profile := do.Profile())
     x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
@@ -114,7 +112,7 @@ def test_study_is_a_table(model: Model, result: OptimizationResult) -> None:
 
 
 def test_scenes_from_dictionaries_and_scenes() -> None:
-    data = do.load_scene(SCENE).to_tree() if ROOT else {}
+    data = do.load_scene(TWO_ARM).to_tree() if ROOT else {}
     model = Model(data, "payload.mass=4")
     assert model.scene.payload.mass == 4.0
     assert Model(model.scene, "payload.mass=5").scene.payload.mass == 5.0
@@ -140,4 +138,4 @@ def test_bad_arguments_are_refused(model: Model) -> None:
     with pytest.raises(do.InputError, match="density"):
         model.uniform(1.5)
     with pytest.raises(do.InputError, match=r"payload\.masse"):
-        Model(SCENE, "payload.masse=4")
+        Model(TWO_ARM, "payload.masse=4")

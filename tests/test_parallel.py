@@ -6,13 +6,13 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
@@ -220,7 +220,6 @@ def test_ranks_end_together(body, status, line):
 
 # -- PETSc's options -------------------------------------------------------------------------
 
-SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 VIEWED = {  # option, what the view shows by default and with the option
     "dolfinopt_stiffness_": (
         "ksp_view",
@@ -241,7 +240,7 @@ VIEWED = {  # option, what the view shows by default and with the option
 def views(folder, *options):
     """Return what PETSc shows of each solver of a simulation with these options."""
     given = [f"-{p}{one[0]} ascii:{folder}/{p}.txt" for p, one in VIEWED.items()]
-    scene = [SCENE, "--set", "arms.cells=[16,3]", "--out", folder / "out", "--no-plots"]
+    scene = [TWO_ARM, "--set", "arms.cells=[16,3]", "--out", folder / "out", "--no-plots"]
     run = subprocess.run(
         [sys.executable, "-m", "dolfinopt", "simulate", *map(str, scene)],
         env=os.environ | {"PETSC_OPTIONS": " ".join([*given, *options])},
@@ -290,7 +289,7 @@ def test_options_of_other_programs_change_nothing():
     for key, value in (("ksp_type", "cg"), ("pc_type", "jacobi"), ("eps_type", "arnoldi")):
         options[key] = value
     try:
-        scene = do.load_scene(SCENE, ("arms.cells=[16,3]",))
+        scene = do.load_scene(TWO_ARM, ("arms.cells=[16,3]",))
         partition = do.partition_arms(COMM, scene.cell_counts)
         for arm in do.build_arms(scene, partition, do.Profile()).values():
             arm.reduce(arm.uniform(0.5))

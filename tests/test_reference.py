@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.multibody.shape_integrals import first_frequency
@@ -20,7 +21,6 @@ from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.scene.load import load_scene
 
 COMM = MPI.COMM_WORLD
-TWO_ARM = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 REFERENCE = Path(__file__).parent / "reference"
 TWO_ARM_VALUES = json.loads((REFERENCE / "two_arm_200x12.json").read_text())
 METHODS = {"cms": "craig-bampton", "modal": "modal"}

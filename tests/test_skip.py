@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import build, wave
+from runs import TWO_ARM
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
@@ -34,7 +35,6 @@ from dolfinopt.multibody.tangent import linearise
 from dolfinopt.output import run_folder as results
 from dolfinopt.parallel import gather_arms
 
-SCENE = Path(__file__).parents[1] / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
 # Coarse in space and time: what is counted depends on neither.
 QUICK = (
@@ -60,7 +60,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     @cache
     def once(command: str, *overrides: str, design: Path | None = None) -> Path:
         made.append(root / str(len(made)))
-        line = [command, str(SCENE), "--no-plots", "--out", str(made[-1])]
+        line = [command, str(TWO_ARM), "--no-plots", "--out", str(made[-1])]
         line += ["--design", str(design)] if design else []
         for override in (*QUICK, f"optimizer.max_iterations={ITERATIONS}", *overrides):
             line += ["--set", override]
@@ -310,12 +310,12 @@ WORDS = {
     "help": ["--help"],
     "version": ["--version"],
     "help of a command": ["optimize", "--help"],
-    "unknown command": ["optimise", SCENE],
-    "unknown option": ["optimize", SCENE, "--nonsense"],
+    "unknown command": ["optimise", TWO_ARM],
+    "unknown option": ["optimize", TWO_ARM, "--nonsense"],
     "no scene": ["simulate"],
-    "unknown choice": ["gradient", SCENE, "--kind", "fast"],
-    "unknown key": ["optimize", SCENE, "--set", "payload.mas=1"],
-    "value out of range": ["simulate", SCENE, "--set", "payload.mass=-1"],
+    "unknown choice": ["gradient", TWO_ARM, "--kind", "fast"],
+    "unknown key": ["optimize", TWO_ARM, "--set", "payload.mas=1"],
+    "value out of range": ["simulate", TWO_ARM, "--set", "payload.mass=-1"],
     "no such file": ["simulate", "nowhere.toml"],
 }
 
@@ -346,7 +346,7 @@ def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
         "dolfinopt.study.studies",
         "dolfinopt.multibody.mbdyn",
     }
-    line = ["optimize", SCENE, "--no-plots", "--out", tmp_path / "out"]
+    line = ["optimize", TWO_ARM, "--no-plots", "--out", tmp_path / "out"]
     for override in (*QUICK, "optimizer.max_iterations=1"):
         line += ["--set", override]
     assert loaded(DRAW | others | {"dolfinx"}, MAIN, *line) == {"dolfinx"}

@@ -494,8 +494,11 @@ main()
 
 @pytest.mark.serial
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
-@pytest.mark.parametrize("kind", ["ConvergenceError", "ZeroDivisionError"])
-@pytest.mark.parametrize("place", COMMANDS)
+@pytest.mark.parametrize(
+    ("place", "kind"),
+    [(place, "ConvergenceError") for place in COMMANDS]
+    + [(place, "ZeroDivisionError") for place in ("mesh", "simulation")],
+)
 def test_commands(place, kind, tmp_path):
     """All ranks end by themselves, with one message: nobody has to be aborted."""
     module, name, rank, command = COMMANDS[place]

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
-
 
 def small_arm(*overrides: str) -> Arm:
-    scene = do.load_scene(SCENE, ("arms.cells=[16,3]", *overrides))
+    scene = do.load_scene(TWO_ARM, ("arms.cells=[16,3]", *overrides))
     return Arm(scene, 0, MPI.COMM_SELF, do.Profile())
 
 
@@ -52,7 +49,7 @@ def test_what_states_share() -> None:
     x = arm.uniform(0.5)
     body = arm.reduce(x)
     damped = arm.under(
-        do.load_scene(SCENE, ("arms.cells=[16,3]", "damping.stiffness_proportional=1e-3"))
+        do.load_scene(TWO_ARM, ("arms.cells=[16,3]", "damping.stiffness_proportional=1e-3"))
     )
     assert damped.basis is arm.basis
     assert np.allclose(damped.reduce(x).D, 5.0 * body.D, rtol=1e-12)

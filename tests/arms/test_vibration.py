@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 from mpi4py import MPI
-from remainders import SCENE, build, rates, tip, uneven, wave
+from remainders import build, rates, tip, uneven, wave
+from runs import TWO_ARM
 from scipy.optimize import brentq
 
 import dolfinopt as do
@@ -30,7 +31,7 @@ NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
 def arm_of(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
     """Return the first arm, solid, on its own ranks."""
-    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
     arm = Arm(scene, 0, comm, do.Profile())
     arm.set_design(np.ones(arm.mesh.num_cells))
     return arm

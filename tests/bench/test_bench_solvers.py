@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from remainders import SCENE
+from runs import TWO_ARM
 
 from dolfinopt.bench import solvers
 from dolfinopt.scene.load import load_scene
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.serial
 
 
 def test_solvers_are_timed_in_a_process_of_their_own() -> None:
-    scene = changed(load_scene(SCENE), "arms.cells=[12,2]")
+    scene = changed(load_scene(TWO_ARM), "arms.cells=[12,2]")
     rows = solvers._in_process(scene, 2, {"petsc, nd"})
     names = [row[0] for row in rows]
     assert solvers.OURS in names and "mumps, its own" in names

@@ -11,37 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import ROOT, TWO_ARM, overrides, run, shell
 
-from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
 from dolfinopt.output.folders import RUN_FILES
 
-ROOT = Path(__file__).parents[2]
-SCENE = ROOT / "demos" / "two_arm.toml"
-TINY = [
-    word
-    for value in ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
-    for word in ("--set", value)
-]
-SMALL = ["--set", "arms.cells=[40,4]", "--set", "simulation.sample=0.005"]
+TINY = overrides("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
+SMALL = overrides("arms.cells=[40,4]", "simulation.sample=0.005")
 WORLD = MPI.COMM_WORLD
-
-
-def run(*arguments: object) -> None:
-    """Run a command in this process, on all ranks."""
-    commands.main([str(a) for a in arguments], standalone_mode=False, obj=WORLD)
-
-
-def shell(*arguments: object, ranks: int = 0) -> subprocess.CompletedProcess:
-    """Run the command in a process of its own, or under mpirun."""
-    command = [sys.executable, "-m", "dolfinopt", *map(str, arguments)]
-    if ranks:
-        command = ["mpirun", "-n", str(ranks), *command]
-    # os.environ is as it was before this process began MPI, which would confuse another mpirun.
-    environment = dict(os.environ)
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, cwd="/", env=environment
-    )
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +26,7 @@ def optimised(tmp_path_factory):
     """A short optimisation's folder, with pictures."""
     path = tmp_path_factory.mktemp("run") if WORLD.rank == 0 else None
     folder = WORLD.bcast(path, root=0) / "out"
-    run("optimize", SCENE, *SMALL, "--set", "optimizer.max_iterations=3", "--out", folder)
+    run("optimize", TWO_ARM, *SMALL, "--set", "optimizer.max_iterations=3", "--out", folder)
     WORLD.barrier()
     return folder
 
@@ -159,7 +136,7 @@ def test_history_ends_in_the_summary(optimised):
 def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
     run(
         "simulate",
-        SCENE,
+        TWO_ARM,
         *SMALL,
         "--design",
         optimised / "design.npz",
@@ -180,7 +157,7 @@ def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
 
 def test_gradient_file(optimised, shared_tmp_path):
     out = shared_tmp_path / "deep" / "g.npz"
-    run("gradient", SCENE, *SMALL, "--kind", "esl", "--out", out)
+    run("gradient", TWO_ARM, *SMALL, "--kind", "esl", "--out", out)
     WORLD.barrier()
     with np.load(out) as data:
         assert set(data.files) == {
@@ -213,29 +190,26 @@ def test_a_project_can_be_moved(tmp_path):
     text = re.sub(r'mesh = ".*?"', 'mesh = "own.geo"', text)
     (there / "scene.toml").write_text(text)
     small = ["--set", "arms.mesh_size=0.02", "--set", "simulation.sample=0.005", "--no-plots"]
-    done = shell("optimize", there / "scene.toml", *small, "--out", there / "results" / "run",
-                 "--set", "optimizer.max_iterations=1")  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    run("optimize", there / "scene.toml", *small, "--out", there / "results" / "run",
+        "--set", "optimizer.max_iterations=1")  # fmt: skip
     for file in (there / "results" / "run" / "summary.json", there / "results/run/checkpoint.npz"):
         assert file.is_file()
     shutil.copytree(there, here)
     shutil.rmtree(there)
     resume = ["optimize", here / "scene.toml", *small, "--out", here / "results" / "run",
               "--resume", "--set", "optimizer.max_iterations=2"]  # fmt: skip
-    done = shell(*resume)
-    assert done.returncode == 0, done.stderr
+    run(*resume)
     assert len((here / "results" / "run" / "history.csv").read_text().splitlines()) == 4
     summary = json.loads((here / "results" / "run" / "summary.json").read_text())
     assert summary["scene"]["arms"][0]["mesh"] == "../../own.geo"
-    assert shell("plot", here / "results" / "run").returncode == 0
+    run("plot", here / "results" / "run")
     # The run's folder alone finds the mesh where it was.
     shutil.copytree(here / "results" / "run", tmp_path / "elsewhere" / "deep" / "run")
-    assert shell("plot", tmp_path / "elsewhere" / "deep" / "run").returncode == 0
+    run("plot", tmp_path / "elsewhere" / "deep" / "run")
     with open(here / "own.geo", "a") as stream:
         stream.write("// another\n")
-    done = shell(*resume)
-    assert done.returncode == 2
-    assert "the content of the file arms.0.mesh has changed" in done.stderr
+    with pytest.raises(InputError, match=r"content of the file arms\.0\.mesh has changed"):
+        run(*resume)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +222,7 @@ def test_a_project_can_be_moved(tmp_path):
 )
 def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
     def written(name, *more):
-        run("gradient", SCENE, *TINY, *more, "--out", shared_tmp_path / name)
+        run("gradient", TWO_ARM, *TINY, *more, "--out", shared_tmp_path / name)
         WORLD.barrier()
         with np.load(shared_tmp_path / name) as data:
             return data["arm1/gradient"]
@@ -264,10 +238,10 @@ def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
 # -- used folders ----------------------------------------------------------------------------
 
 USED = {
-    "optimize": ["optimize", SCENE, "--set", "optimizer.max_iterations=1", "--no-plots"],
-    "simulate": ["simulate", SCENE, "--no-plots"],
-    "export": ["export", SCENE],
-    "gradient": ["gradient", SCENE],
+    "optimize": ["optimize", TWO_ARM, "--set", "optimizer.max_iterations=1", "--no-plots"],
+    "simulate": ["simulate", TWO_ARM, "--no-plots"],
+    "export": ["export", TWO_ARM],
+    "gradient": ["gradient", TWO_ARM],
 }
 
 
@@ -310,7 +284,7 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
     from dolfinopt.optimization import loop as optimization
 
     folder = shared_tmp_path / "o"
-    line = ["optimize", SCENE, *TINY, "--no-plots", "--out", folder, "--set"]
+    line = ["optimize", TWO_ARM, *TINY, "--no-plots", "--out", folder, "--set"]
     run(*line, "optimizer.max_iterations=1")
     WORLD.barrier()
     if WORLD.rank == 0:
@@ -334,8 +308,8 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
 
 def bad(tmp: Path) -> list[tuple[str, list[object], list[str]]]:
     """Return (name, arguments, words of the message) of commands that must be refused."""
-    opt = ["optimize", SCENE, *SMALL, "--set", "optimizer.max_iterations=1", "--out", tmp / "o"]
-    sim = ["simulate", SCENE, *SMALL, "--out", tmp / "o"]
+    opt = ["optimize", TWO_ARM, *SMALL, "--set", "optimizer.max_iterations=1", "--out", tmp / "o"]
+    sim = ["simulate", TWO_ARM, *SMALL, "--out", tmp / "o"]
     return [
         ("unknown key", [*opt, "--set", "payload.mas=1"], ["payload.mas", "payload.mass"]),
         ("negative", [*opt, "--set", "arms.length=-1"], ["arms.0.length", "-1", ">= 1e-06"]),
@@ -349,11 +323,11 @@ def bad(tmp: Path) -> list[tuple[str, list[object], list[str]]]:
         ("unwritable", [*opt[:-1], "/proc/nowhere/o"], ["/proc/nowhere/o", "--out"]),
         ("no checkpoint", [*opt, "--resume"], ["checkpoint.npz", "--resume"]),
         ("no design", [*sim, "--design", tmp / "no.npz"], ["no.npz"]),
-        ("no design file", [*sim, "--design", SCENE], [str(SCENE), ".npz"]),
+        ("no design file", [*sim, "--design", TWO_ARM], [str(TWO_ARM), ".npz"]),
         ("no run", ["plot", tmp], ["summary.json"]),
-        ("gradient to folder", ["gradient", SCENE, "--out", tmp], [str(tmp), "--out"]),
+        ("gradient to folder", ["gradient", TWO_ARM, "--out", tmp], [str(tmp), "--out"]),
         ("no such option", [*opt, "--nonsense"], ["--nonsense"]),
-        ("no such command", ["optimise", SCENE], ["optimise"]),
+        ("no such command", ["optimise", TWO_ARM], ["optimise"]),
     ]
 
 
@@ -396,7 +370,7 @@ def test_design_that_does_not_fit(optimised, shared_tmp_path, change, words):
         np.savez(path, **arrays)
     WORLD.barrier()
     with pytest.raises(InputError) as caught:
-        run("simulate", SCENE, *SMALL, "--design", path, "--out", shared_tmp_path / "o")
+        run("simulate", TWO_ARM, *SMALL, "--design", path, "--out", shared_tmp_path / "o")
     for word in [str(path), *words]:
         assert word in str(caught.value)
     assert not (shared_tmp_path / "o").exists()
@@ -406,7 +380,7 @@ def test_resume_of_another_scene(optimised):
     with pytest.raises(InputError, match=r"payload\.mass = 6\.0 there, 7\.0 here"):
         run(
             "optimize",
-            SCENE,
+            TWO_ARM,
             *SMALL,
             "--set",
             "payload.mass=7",
@@ -420,7 +394,9 @@ def test_resume_of_another_scene(optimised):
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_exit_status_and_streams(shared_tmp_path, ranks):
     """Status 2 and one line on standard error, from the process itself and through mpirun."""
-    done = shell("optimize", SCENE, "--set", "payload.mas=1", "--out", shared_tmp_path, ranks=ranks)
+    done = shell(
+        "optimize", TWO_ARM, "--set", "payload.mas=1", "--out", shared_tmp_path, ranks=ranks
+    )
     assert done.returncode == 2
     ours = [line for line in done.stderr.splitlines() if "payload.mas" in line]
     assert len(ours) == 1 and ours[0].startswith("dolfinopt: ")
@@ -444,8 +420,8 @@ def test_help_is_printed_once(words, ranks):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["optimise", SCENE], ["optimise", "did you mean optimize?", "(see dolfinopt --help)"]),
-        (["optimize", SCENE, "--ot", "x"], ["--ot", "(see dolfinopt optimize --help)"]),
+        (["optimise", TWO_ARM], ["optimise", "did you mean optimize?", "(see dolfinopt --help)"]),
+        (["optimize", TWO_ARM, "--ot", "x"], ["--ot", "(see dolfinopt optimize --help)"]),
         (["gradient"], ["SCENE", "(see dolfinopt gradient --help)"]),
     ],
 )
@@ -464,7 +440,7 @@ def test_without_petsc_one_line_says_how_to_get_it(tmp_path):
         sys.modules["petsc4py"] = None  # as if it were not installed
         from dolfinopt.cli import main
         main()"""
-    line = [sys.executable, "-c", code, "simulate", str(SCENE), "--out", str(tmp_path / "o")]
+    line = [sys.executable, "-c", code, "simulate", str(TWO_ARM), "--out", str(tmp_path / "o")]
     done = subprocess.run(line, capture_output=True, text=True, env=dict(os.environ), timeout=60)
     assert done.returncode == 1 and done.stdout == ""
     [line] = done.stderr.splitlines()

@@ -4,14 +4,12 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import jsonschema
 import pytest
-from mpi4py import MPI
+from runs import ROOT, run
 
 import dolfinopt
-from dolfinopt.cli import commands
 from dolfinopt.cli.init import TEMPLATES
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
@@ -26,12 +24,7 @@ else:
     import tomli as tomllib
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
-ROOT = Path(__file__).parents[2]
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
-
-
-def run(*words: object) -> None:
-    commands.main([str(w) for w in words], standalone_mode=False, obj=MPI.COMM_WORLD)
 
 
 def errors(data: object) -> list[str]:

@@ -167,6 +167,7 @@ def test_unknown_law():
 # -- in a scene ------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("law", sorted(LAWS))
 def test_every_law_optimises(law):
     overrides = [f"interpolation.law={law}", "arms.cells=[30, 4]", "optimizer.max_iterations=4"]
@@ -187,6 +188,7 @@ def demo() -> ModuleType:
     return module
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_local_modes_of_a_frame_with_void(shared_tmp_path: Path) -> None:
     """Classic SIMP's lowest modes live in the windows; the other laws' are the frame's."""
     spectra = demo().main(shared_tmp_path, (40, 6), (1e-3, 1e-2, 0.0))

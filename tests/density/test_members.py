@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
@@ -18,7 +18,6 @@ from dolfinopt.optimization.problem import problem_of
 from dolfinopt.output.summary import _widths, filter_warnings
 
 WORLD = MPI.COMM_WORLD
-SCENE = str(Path(__file__).parents[2] / "demos/two_arm.toml")
 CELL = 0.005  # m
 
 
@@ -86,7 +85,7 @@ def test_the_radius_of_a_width(erosion):
     Filtered on 4000 cells along a line; the strip in the middle, or at an open edge.
     """
     data = {"projection": "robust", "minimum_member": 0.05, "erosion": erosion}
-    design = do.load_scene(SCENE, (f"design={toml(data)}", "arms.height=0.2")).design
+    design = do.load_scene(TWO_ARM, (f"design={toml(data)}", "arms.height=0.2")).design
     cell = 1.0 / 4000.0
     mesh = structured_arm(MPI.COMM_SELF, "a", 1.0, 0.002, (4000, 1))
     order = np.argsort(mesh.centroid[:, 0])
@@ -124,7 +123,9 @@ ROBUST = [
 def test_members_of_a_robust_design_are_as_wide_as_asked():
     """To one cell; members along the edges, too, which a mirroring filter would halve."""
     width, cell = 0.012, 0.06 / 18
-    scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}", "design.erosion=0.25"))
+    scene = do.load_scene(
+        TWO_ARM, (*ROBUST, f"design.minimum_member={width}", "design.erosion=0.25")
+    )
     result = do.optimize(scene)
     widths = _widths(result.partition, result.arms, result.x_phys)
     volume = WORLD.bcast(result.history[-1].volume_fraction if WORLD.rank == 0 else None, root=0)
@@ -138,7 +139,7 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
 @pytest.mark.parametrize("width", [0.012, 0.0])
 def test_which_design_carries_the_volume(width):
     """With a width the dilated one, scaled so that the nominal one meets its limit; else that."""
-    scene = do.load_scene(SCENE, (*ROBUST, f"design.minimum_member={width}"))
+    scene = do.load_scene(TWO_ARM, (*ROBUST, f"design.minimum_member={width}"))
     partition = do.partition_arms(WORLD, scene.cell_counts)
     arms = do.build_arms(scene, partition, do.Profile())
     evaluator = Evaluator(scene, partition, arms, do.Profile())
@@ -174,12 +175,12 @@ def test_which_design_carries_the_volume(width):
 )
 def test_widths_that_cannot_be(overrides, reason):
     with pytest.raises(do.InputError, match=reason):
-        do.load_scene(SCENE, overrides)
+        do.load_scene(TWO_ARM, overrides)
 
 
 @pytest.mark.parametrize(("radius", "count"), [(0.0075, 1), (0.01, 0), (0.0, 1)])
 def test_a_filter_of_less_than_two_cells_warns(radius, count):
-    scene = do.load_scene(SCENE, (f"design.filter_radius={radius}",))
+    scene = do.load_scene(TWO_ARM, (f"design.filter_radius={radius}",))
     found = filter_warnings(scene, {0: 0.005, 1: 0.005})
     assert len(found) == count
     assert all("set design.filter_radius = 0.01 or more" in text for text in found)

@@ -15,7 +15,8 @@ import scipy.linalg
 import scipy.sparse
 from mpi4py import MPI
 from petsc4py import PETSc
-from remainders import SCENE, Built, rates, uneven, wave
+from remainders import Built, rates, uneven, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -45,7 +46,7 @@ EXTENDED = pytest.mark.skipif(
 
 def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
     """Build the two-arm scene on few cells."""
-    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
     profile = do.Profile()
     partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
     return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
@@ -53,7 +54,7 @@ def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
 
 def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3), comm: MPI.Comm | None = None) -> Arm:
     """Build the first arm of that scene."""
-    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
     return Arm(scene, 0, comm or MPI.COMM_SELF, do.Profile())
 
 
@@ -491,10 +492,10 @@ def test_undamped_energy_does_not_drift() -> None:
 @pytest.mark.serial
 @pytest.mark.slow
 def test_tolerances() -> None:
-    """From 1e-2 to 1e-12, against a solution of 1e-12."""
+    """From 1e-2 to 1e-9, against a solution of 1e-11."""
     overrides = ["simulation.stages=5", "motion.horizon=2.0", "simulation.sample=0.01"]
-    best = moved(*overrides, "simulation.tolerance=1e-12", field=wave)
-    for tolerance in (1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10):
+    best = moved(*overrides, "simulation.tolerance=1e-11", field=wave)
+    for tolerance in (1e-2, 1e-4, 1e-6, 1e-9):
         solution = radau.integrate(
             best.problem, tolerance, 3 if tolerance > 1e-7 else 5, do.Profile()
         )
@@ -520,7 +521,7 @@ def test_singular_arms_are_named() -> None:
 def test_designs_of_modal_truncation_with_many_coordinates() -> None:
     """Void tips that four modes do not see, undamped: arms that fold over are solved, and right."""
     scene = do.load_scene(
-        SCENE,
+        TWO_ARM,
         [
             "arms.cells=[48,6]",
             "reduction.method=modal",
@@ -625,7 +626,7 @@ def test_large_deflections_are_warned_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A tenth of an arm's length: in summary.json and on standard error, arm by arm."""
-    scene = ["simulate", str(SCENE), "--set", "arms.cells=[12,2]", "--no-plots", "--out"]
+    scene = ["simulate", str(TWO_ARM), "--set", "arms.cells=[12,2]", "--no-plots", "--out"]
     heavy = ["--set", "payload.mass=40", "--set", "arms.arm2.young_modulus=1e12"]
     for name, more in (("small", []), ("large", heavy)):
         commands.main(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -15,7 +15,6 @@ from dolfinopt.parallel import Partition, sum_over_arms
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients
 from dolfinopt.scene.load import Scene
 
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 Cells = Mapping[int, np.ndarray]
 
 
@@ -63,7 +62,7 @@ def beside_volume(evaluation: Evaluation) -> tuple[float, ...]:
 
 def build(*overrides: str, cells: tuple[int, int] = (24, 3)) -> Built:
     """Build the two-arm scene on few cells (collective)."""
-    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
     profile = do.Profile()
     partition = do.partition_arms(MPI.COMM_WORLD, scene.cell_counts)
     return Built(scene, partition, do.build_arms(scene, partition, profile), profile)

@@ -6,10 +6,10 @@ import math
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.errors import InputError
@@ -19,8 +19,6 @@ from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm, load_scene
 
-ROOT = Path(__file__).parents[2]
-SCENE = ROOT / "demos" / "two_arm.toml"
 COMM = MPI.COMM_WORLD
 
 
@@ -29,7 +27,7 @@ COMM = MPI.COMM_WORLD
     ["arms.cells=[100000,100000]", ["arms.mesh=meshes/arm_bores.geo", "arms.mesh_size=1e-6"]],
 )
 def test_what_exceeds_the_memory_is_refused(override):
-    scene = load_scene(SCENE, [override] if isinstance(override, str) else override)
+    scene = load_scene(TWO_ARM, [override] if isinstance(override, str) else override)
     for attempt in (
         lambda: check_budget(COMM, scene),
         lambda: build_arms(scene, partition_arms(COMM, scene.cell_counts), Profile()),
@@ -47,7 +45,7 @@ def test_what_exceeds_the_memory_is_refused(override):
 def test_estimate_is_what_was_measured(monkeypatch, free, fits):
     """2.28 GB beyond the libraries for two arms of 1600 x 96 cells on one rank."""
     monkeypatch.setattr(budget, "free_memory", lambda: free + budget.PROCESS * (COMM.size - 1))
-    scene = load_scene(SCENE, ["arms.cells=[1600,96]"])
+    scene = load_scene(TWO_ARM, ["arms.cells=[1600,96]"])
     if fits:
         check_budget(COMM, scene)
         return
@@ -92,7 +90,7 @@ def test_free_memory(tmp_path):
 
 @pytest.mark.serial
 def test_command_ends_before_it_writes(tmp_path):
-    words = [sys.executable, "-m", "dolfinopt", "optimize", SCENE, "--out", tmp_path / "out"]
+    words = [sys.executable, "-m", "dolfinopt", "optimize", TWO_ARM, "--out", tmp_path / "out"]
     words += ["--set", "arms.cells=[100000,100000]"]
     run = subprocess.run(list(map(str, words)), capture_output=True, text=True)
     assert run.returncode == 2 and not (tmp_path / "out").exists()

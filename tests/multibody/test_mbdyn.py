@@ -2,11 +2,11 @@
 
 import os
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
@@ -29,7 +29,6 @@ from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.02  # m
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 # Gmsh places points to 2e-12 of the length; sums over some hundred nodes lose less.
 PLACING = 1e-10
 
@@ -262,7 +261,7 @@ SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]
 
 
 def export(folder, *arguments, world=COMM):
-    command = ["export", SCENE, *SMALL, *arguments, "--out", folder]
+    command = ["export", TWO_ARM, *SMALL, *arguments, "--out", folder]
     commands.main([str(word) for word in command], standalone_mode=False, obj=world)
     world.barrier()
 

@@ -1,20 +1,16 @@
 """What a run says at its end: converged or not, feasible or not, in which units."""
 
 import json
-import os
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM, overrides, run, shell
 from scipy.integrate import trapezoid
 
 import dolfinopt as do
 from dolfinopt.arms.vibration import frequency_excess
-from dolfinopt.cli import commands
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.output.fields import write_fields
@@ -25,15 +21,13 @@ from dolfinopt.responses import scenarios
 from dolfinopt.responses.constraints import Limit, distinct, violated, worst_limits
 
 WORLD = MPI.COMM_WORLD
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 QUICK = ["arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9"]
 QUICK += ["simulation.tolerance=1e-2"]
-ENVIRONMENT = dict(os.environ)
 
 
-def scene(*overrides, iterations):
-    settings = [*QUICK, f"optimizer.max_iterations={iterations}", *overrides]
-    return do.load_scene(SCENE, settings)
+def scene(*changes, iterations):
+    settings = [*QUICK, f"optimizer.max_iterations={iterations}", *changes]
+    return do.load_scene(TWO_ARM, settings)
 
 
 # -- Karush-Kuhn-Tucker residual -------------------------------------------------------------
@@ -153,11 +147,9 @@ def test_a_large_residual_is_no_convergence():
 def test_an_infeasible_end_has_status_1_and_one_line(bound, words, shared_tmp_path):
     """The files are there all the same, and name the constraint."""
     folder = shared_tmp_path / "out"
-    line = ["optimize", str(SCENE), "--no-plots", "--out", str(folder)]
-    for override in [*QUICK, "optimizer.max_iterations=2", "objective.kind=static", bound]:
-        line += ["--set", override]
+    asked = overrides(*QUICK, "optimizer.max_iterations=2", "objective.kind=static", bound)
     with pytest.raises(do.ConvergenceError) as caught:
-        commands.main(line, standalone_mode=False, obj=WORLD)
+        run("optimize", TWO_ARM, *asked, "--no-plots", "--out", folder)
     message = str(caught.value)
     assert "\n" not in message and "%" not in message
     for word in words:
@@ -178,12 +170,9 @@ def test_an_infeasible_end_has_status_1_and_one_line(bound, words, shared_tmp_pa
 @pytest.mark.parametrize("bound", ["1e-9", "1.0"])
 def test_exit_status_of_an_optimisation(bound, tmp_path):
     """0: finished, feasible, though the iterations ran out; 1: not feasible."""
-    line = [sys.executable, "-m", "dolfinopt", "optimize", str(SCENE), "--no-plots"]
-    line += ["--out", str(tmp_path / "out")]
     bound = f"constraints.tip_deflection={bound}"
-    for override in [*QUICK, "optimizer.max_iterations=1", "objective.kind=static", bound]:
-        line += ["--set", override]
-    done = subprocess.run(line, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    asked = overrides(*QUICK, "optimizer.max_iterations=1", "objective.kind=static", bound)
+    done = shell("optimize", TWO_ARM, *asked, "--no-plots", "--out", tmp_path / "out")
     feasible = bound.endswith("1.0")
     assert done.returncode == (0 if feasible else 1)
     assert "minimised compliance under static loads" in done.stdout
@@ -193,20 +182,18 @@ def test_exit_status_of_an_optimisation(bound, tmp_path):
 
 
 def test_the_last_line_says_what_was_minimised(shared_tmp_path, capsys):
-    def run(command, *overrides):
-        line = [command, str(SCENE), "--no-plots", "--out", str(shared_tmp_path / overrides[-1])]
-        for override in (*QUICK, *overrides):
-            line += ["--set", override]
-        commands.main(line, standalone_mode=False, obj=WORLD)
+    def last_line(command, *changes):
+        out = ["--no-plots", "--out", shared_tmp_path / changes[-1]]
+        run(command, TWO_ARM, *overrides(*QUICK, *changes), *out)
         return capsys.readouterr().out.splitlines()[-1] if WORLD.rank == 0 else ""
 
-    line = run("optimize", "optimizer.max_iterations=1", "objective.kind=eigenfrequency")
+    line = last_line("optimize", "optimizer.max_iterations=1", "objective.kind=eigenfrequency")
     if WORLD.rank == 0:
         assert (
             "minimised squared longest periods" in line and " s2 (first frequency of arm1" in line
         )
         assert "N m" not in line
-    line = run("simulate", "objective.kind=deviation")
+    line = last_line("simulate", "objective.kind=deviation")
     if WORLD.rank == 0:
         assert ": simulated, p-mean of the deviation" in line and "iterations" not in line
 
@@ -244,10 +231,8 @@ def test_robust_designs_take_the_scene_s_exponent(monkeypatch):
 
 def test_machine_figures(shared_tmp_path):
     """Masses, drives and settling are those of the trajectory; every figure has its unit."""
-    line = ["simulate", str(SCENE), "--no-plots", "--out", str(shared_tmp_path)]
-    for override in (*QUICK, "motion.horizon=2.5", "payload.mass=3"):
-        line += ["--set", override]
-    commands.main(line, standalone_mode=False, obj=WORLD)
+    asked = overrides(*QUICK, "motion.horizon=2.5", "payload.mass=3")
+    run("simulate", TWO_ARM, *asked, "--no-plots", "--out", shared_tmp_path)
     WORLD.barrier()
     summary = json.loads((shared_tmp_path / "summary.json").read_text())
     with np.load(shared_tmp_path / "trajectory.npz") as data:

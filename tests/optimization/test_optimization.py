@@ -1,9 +1,7 @@
 """The loop: what it reaches, that it resumes in the same bits, and on any number of ranks."""
 
-import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,33 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM, command, environment, overrides, run, scene, shell
 
 import dolfinopt as do
 from dolfinopt.output import checkpoint
 
 ROOT = Path(__file__).parents[2]
-SCENE = ROOT / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
 
 
-def scene(*overrides):
-    return do.load_scene(SCENE, overrides)
-
-
-def small(*overrides, iterations=6):
-    return scene("arms.cells=[40,4]", f"optimizer.max_iterations={iterations}", *overrides)
+def small(*settings, iterations=6):
+    return scene("arms.cells=[40,4]", f"optimizer.max_iterations={iterations}", *settings)
 
 
 QUICK = ["motion.horizon=2.0", "simulation.tolerance=1e-3"]
-
-
-def command(*arguments, ranks=0):
-    line = [sys.executable, "-m", "dolfinopt", *map(str, arguments)]
-    return ["mpirun", "-n", str(ranks), *line] if ranks else line
-
-
-# As it was before this process began MPI, which would confuse another mpirun.
-ENVIRONMENT = dict(os.environ)
 
 
 @pytest.mark.slow
@@ -247,20 +232,19 @@ def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
 @pytest.mark.slow
 def test_sigkill_and_resume(tmp_path):
     """Killed at any moment, a resumed run writes the same design to the last bit."""
-    line = ["optimize", SCENE, "--set", "arms.cells=[40,4]", "--no-plots"]
-    line += ["--set", "optimizer.max_iterations=120"]
-    run = {"env": ENVIRONMENT, "check": True, "capture_output": True, "timeout": 120}
-    subprocess.run(command(*line, "--out", tmp_path / "whole"), **run)
-    for moment in (0.0, 0.5, 1.5):
+    line = ["optimize", TWO_ARM, *overrides("arms.cells=[40,4]", "optimizer.max_iterations=60")]
+    line += ["--no-plots", "--out"]
+    run(*line, tmp_path / "whole")
+    for moment in (0.0, 0.4):
         folder = tmp_path / str(moment)
-        process = subprocess.Popen(command(*line, "--out", folder), env=ENVIRONMENT)
+        process = subprocess.Popen(command(*line, folder), env=environment())
         deadline = time.monotonic() + 60.0
         while not (folder / checkpoint.NAME).exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(moment)
         process.send_signal(signal.SIGKILL)
         process.wait()
-        subprocess.run(command(*line, "--out", folder, "--resume"), **run)
+        run(*line, folder, "--resume")
         with np.load(tmp_path / "whole" / "design.npz") as a, np.load(folder / "design.npz") as b:
             assert a.files == b.files
             for key in a.files:
@@ -286,13 +270,16 @@ def test_more_iterations_may_be_asked_for_on_resume(shared_tmp_path):
 @pytest.mark.serial
 @pytest.mark.slow
 def test_same_design_on_any_number_of_ranks(tmp_path):
-    """1, 2, 3 and 4 ranks: whole arms are dealt out, sums run in the arms' order."""
+    """One rank, and four of which two have no arm: sums run in the arms' order."""
     designs = []
-    for ranks in (1, 2, 3, 4):
+    for ranks in (1, 4):
         folder = tmp_path / str(ranks)
-        line = ["optimize", SCENE, "--no-plots", "--out", folder]
-        line += ["--set", "arms.cells=[100,6]", "--set", "optimizer.max_iterations=15"]
-        subprocess.run(command(*line, ranks=ranks), env=ENVIRONMENT, check=True, timeout=120)
+        line = ["optimize", TWO_ARM, "--no-plots", "--out", folder]
+        line += overrides("arms.cells=[60,4]", "optimizer.max_iterations=8")
+        if ranks == 1:
+            run(*line)
+        else:
+            assert shell(*line, ranks=ranks).returncode == 0
         with np.load(folder / "design.npz") as data:
             keys = [key for key in data.files if key != "units"]
             designs.append(np.concatenate([data[key].ravel() for key in keys]))

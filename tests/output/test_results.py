@@ -1,17 +1,16 @@
 """What a run leaves: the same files from both ways, the summary last."""
 
 import json
-from pathlib import Path
 
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.output.views import gather_views
 
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
 SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01")
 FILES = {
@@ -26,11 +25,11 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def result():
-    return do.optimize(do.load_scene(SCENE, SMALL))
+    return do.optimize(do.load_scene(TWO_ARM, SMALL))
 
 
 def simulated(result):
-    scene, profile = do.load_scene(SCENE, SMALL), do.Profile()
+    scene, profile = do.load_scene(TWO_ARM, SMALL), do.Profile()
     evaluation, trajectory = do.evaluate(
         scene, result.partition, result.arms, result.x_phys, profile
     )
@@ -46,7 +45,7 @@ def test_files(result, shared_tmp_path, paraview):
         one.mkdir()
         other.mkdir()
     WORLD.barrier()
-    scene = do.load_scene(SCENE, SMALL)
+    scene = do.load_scene(TWO_ARM, SMALL)
     written = write_result(scene, one, result, 12.5, paraview=paraview)
     again = write_simulation(other, simulated(result), 2.5, paraview=paraview)
     if WORLD.rank > 0:
@@ -91,7 +90,7 @@ def test_summary_of_a_simulation_and_an_optimisation_agree(result, shared_tmp_pa
 
 def test_views_of_arms_without_a_current_design():
     """Studies and the paper's page draw designs that they have read but never assembled."""
-    scene = do.load_scene(SCENE, SMALL)
+    scene = do.load_scene(TWO_ARM, SMALL)
     partition = do.partition_arms(WORLD, scene.cell_counts)
     arms = do.build_arms(scene, partition, do.Profile())
     views = gather_views(scene, partition, arms, {k: arm.uniform(0.5) for k, arm in arms.items()})

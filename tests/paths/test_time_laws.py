@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from bodies import assert_close
 from mpi4py import MPI
+from runs import TWO_ARM
 from scipy.integrate import quad
 
 import dolfinopt as do
@@ -22,7 +23,6 @@ from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)
 DEGREES = {"quintic": 5, "septic": 7, "trapezoidal": 2, "s-curve": 3}  # of s between knots
@@ -169,7 +169,7 @@ def test_fastest_s_curve(limits: dict[str, float], expected: float) -> None:
 
 def posed(**motion: Any) -> Scene:
     """Return the example with another motion."""
-    data = load_scene(SCENE, ("arms.cells=[20,2]",)).to_dict()
+    data = load_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
     return scene_from_dict(data | {"motion": motion}, "test.toml")
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
+from runs import TWO_ARM
 
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.mechanism import Mechanism
@@ -21,7 +21,6 @@ from dolfinopt.plots import animation, curves, design, machine, shapes, style
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
-TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LENGTHS = (1.0, 0.7, 0.4)  # m
 
 

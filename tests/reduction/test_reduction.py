@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
 from mpi4py import MPI
+from runs import TWO_ARM
 from scipy.optimize import brentq
 
 import dolfinopt as do
@@ -37,7 +37,6 @@ from dolfinopt.reduction.gramian import quadrature
 from dolfinopt.reduction.subspace import ritz
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
-TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 LENGTH, HEIGHT, THICKNESS = 1.0, 0.06, 0.01  # m
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # Pa, -, kg/m3
 REDUCTORS = {"craig-bampton": craig_bampton, "modal": modal}  # by eigenproblems
@@ -588,6 +587,7 @@ def simulated(*overrides):
     return scene, partition, arms, x, evaluation, slopes
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_simulations_agree_between_methods():
     """Compliance and largest deviation against 16 Craig-Bampton coordinates; frozen gradients."""
     best = ["simulation.tolerance=1e-6", "reduction.coordinates=16"]
@@ -609,6 +609,7 @@ def test_simulations_agree_between_methods():
             assert np.abs(ours[k] - slope).max() < slope_limit * np.abs(slope).max(), method
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
 def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
     """Nothing behind the reduction takes K_r or M_r for diagonal, or coordinates for modes."""

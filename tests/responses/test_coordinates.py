@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import SCENE, Built, build, wave
+from remainders import Built, build, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import simulate
@@ -97,6 +98,7 @@ def padded_error(built: Built, x, few: int, many: int) -> float:
     return WORLD.bcast(result, root=0)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [*((name, ()) for name in DESIGNS), ("uniform", SHAKEN)],
@@ -111,6 +113,7 @@ def test_estimate_is_the_error(name, overrides):
     assert error(built, x, 4) == pytest.approx(padded_error(built, x, 4, 48), rel=0.1)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("method", ["modal", "krylov", "balanced"])
 def test_estimate_of_other_bases(method):
     """Node by node: the energy of what the displacements of two motions differ by."""
@@ -159,12 +162,17 @@ def test_scenarios_count():
     ("overrides", "tolerance"),
     [
         ([], 1e-2),
-        ([], 3e-4),
-        (["reduction.method=krylov", "reduction.shifts=[0.0,20.0]"], 1e-3),
-        (["reduction.method=balanced"], 1e-2),
-        (["reduction.method=modal"], 0.4),
         (["arms.arm1.rigid=true"], 1e-3),
-        (["simulation.integrator=generalized-alpha"], 1e-3),
+        *(
+            pytest.param(overrides, tolerance, marks=pytest.mark.serial)
+            for overrides, tolerance in (
+                ([], 3e-4),
+                (["reduction.method=krylov", "reduction.shifts=[0.0,20.0]"], 1e-3),
+                (["reduction.method=balanced"], 1e-2),
+                (["reduction.method=modal"], 0.4),
+                (["simulation.integrator=generalized-alpha"], 1e-3),
+            )
+        ),
     ],
 )
 def test_fewest_that_meet_the_tolerance(overrides, tolerance):
@@ -191,7 +199,7 @@ def test_shared_design_counts_like_two():
 
 def test_three_arms():
     scene = do.load_scene(
-        SCENE.parent / "three_arm.toml",
+        TWO_ARM.parent / "three_arm.toml",
         (AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"),
     )
     partition = do.partition_arms(WORLD, scene.cell_counts)
@@ -210,6 +218,7 @@ def test_a_given_number_costs_nothing():
     assert all(arm.coordinates == 5 and arm.basis is None for arm in built.arms.values())
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_more_coordinates_than_dofs_are_not_tried():
     """2 x 1 cells: 2 dofs at each of two free nodes and 3 of the interface, 7 in all: exact."""
     built = auto("payload.mass=0.1", "motion.horizon=1.9", tolerance=1e-5, cells=(2, 1))
@@ -238,7 +247,7 @@ def test_unresolved():
 
 def small(*overrides: str, iterations: int = 3):
     settings = ["arms.cells=[24,3]", "motion.horizon=1.9", f"optimizer.max_iterations={iterations}"]
-    return do.load_scene(SCENE, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
+    return do.load_scene(TWO_ARM, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
 
 
 def test_optimises_with_the_choice():
@@ -318,7 +327,7 @@ def test_commands(tmp_path):
         return result.output
 
     sentence = 'reduction.coordinates = "auto": '
-    assert sentence in run("simulate", SCENE, "--no-plots", "--out", tmp_path / "s")
+    assert sentence in run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "s")
     summary = json.loads((tmp_path / "s" / "summary.json").read_text())
     found = summary["reduction"]
     assert found["error_estimate"] <= 1e-3 == summary["scene"]["reduction"]["tolerance"]
@@ -326,9 +335,9 @@ def test_commands(tmp_path):
     assert found["tried"][0]["coordinates"] == 3
     with np.load(tmp_path / "s" / "trajectory.npz") as data:
         assert data["q_e"].shape[1] == 2 * found["coordinates"]
-    said = run("export", SCENE, "--out", tmp_path / "e")
+    said = run("export", TWO_ARM, "--out", tmp_path / "e")
     assert f"{sentence}{found['coordinates']} coordinates an arm" in said
-    assert sentence in run("gradient", SCENE, "--out", tmp_path / "g.npz")
+    assert sentence in run("gradient", TWO_ARM, "--out", tmp_path / "g.npz")
     from dolfinopt.cli.shared import scene_of
 
     assert scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
@@ -341,7 +350,7 @@ def test_arm_from_a_file(tmp_path):
 
     from dolfinopt.cli import commands
 
-    line = ["export", str(SCENE), "--out", str(tmp_path), "--set", "arms.cells=[24,3]"]
+    line = ["export", str(TWO_ARM), "--out", str(tmp_path), "--set", "arms.cells=[24,3]"]
     CliRunner().invoke(commands, line, obj=WORLD, catch_exceptions=False)
     built = auto(f"arms.arm1.sid={tmp_path / 'arm1.sid'}", tolerance=1e-3)
     choice = choose(built, built.fields(wave))

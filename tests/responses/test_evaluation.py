@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from bodies import Chain, Cloud
 from mpi4py import MPI
-from remainders import SCENE, beside_volume, build, rates, tip, uneven, wave
+from remainders import beside_volume, build, rates, tip, uneven, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm, chain_of
@@ -145,7 +146,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
     """Mass, centre and inertia of the meshed solid bar, with the arm's own density."""
     built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
     body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0, 1.0)})[0]
-    scene = do.load_scene(SCENE, ("arms.cells=[24,3]", "arms.length=0.8", "material.density=5e3"))
+    scene = do.load_scene(TWO_ARM, ("arms.cells=[24,3]", "arms.length=0.8", "material.density=5e3"))
     meshed = Arm(scene, 0, MPI.COMM_SELF, do.Profile())
     twin = meshed.reduce(np.ones(meshed.mesh.num_cells))
     # Gmsh places nodes to 1e-12 of the length.
@@ -161,7 +162,10 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
 def body_of(*overrides: str, index: int = 1) -> ShapeIntegrals:
     """Return one arm's body, on its own ranks."""
     arm = Arm(
-        do.load_scene(SCENE, ("arms.cells=[24,3]", *overrides)), index, MPI.COMM_SELF, do.Profile()
+        do.load_scene(TWO_ARM, ("arms.cells=[24,3]", *overrides)),
+        index,
+        MPI.COMM_SELF,
+        do.Profile(),
     )
     return arm.reduce(wave(index, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0])))
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from remainders import SCENE, Built, beside_volume, build, rates, uneven, wave
+from remainders import Built, beside_volume, build, rates, uneven, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
@@ -116,7 +117,7 @@ QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
 
 def test_a_new_response_is_minimised() -> None:
     """The optimiser finds what is known: x0 everywhere; nothing but the result is simulated."""
-    scene = minimised(do.load_scene(SCENE, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
+    scene = minimised(do.load_scene(TWO_ARM, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
     result = do.optimize(scene)  # no limit is active: there is no gradient left to be balanced
     for k, x in result.x_phys.items():
         # The filter smooths away what is left at the solid ends, if any.
@@ -128,7 +129,7 @@ def test_a_new_response_is_minimised() -> None:
 def test_a_new_response_is_a_limit() -> None:
     """Of the stiffest design that is nearly even: the limit is met and in its row's name."""
     options = [*QUICK, "optimizer.max_iterations=60", "objective.kind=static"]
-    scene = do.load_scene(SCENE, [*options, "design.initial=0.4"])
+    scene = do.load_scene(TWO_ARM, [*options, "design.initial=0.4"])
     limit = 2e-4
     free, kept = do.optimize(scene), do.optimize(limited(scene, roughness=limit))
     values = {one.name: one for one in kept.limits}
@@ -180,7 +181,7 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
 def test_deviation_is_limited_and_compliance_minimised() -> None:
     """Through the registry alone: the limit, tighter than the free design is, is met."""
     options = [*QUICK, "objective.kind=compliance", "objective.gradient=exact"]
-    scene = do.load_scene(SCENE, [*options, "optimizer.max_iterations=60"])
+    scene = do.load_scene(TWO_ARM, [*options, "optimizer.max_iterations=60"])
     free, built = do.optimize(scene), build(*options)
     measured = rebuilt(built, limited(built.scene, deviation=1.0)).evaluate(free.x_phys)[0]
     limit = 0.99 * measured.values_of("deviation")[0]
@@ -193,7 +194,7 @@ def test_deviation_is_limited_and_compliance_minimised() -> None:
 def test_the_volume_is_minimised_under_a_limit() -> None:
     """The volume is a response like the others: least material that is stiff enough."""
     options = [*QUICK, "objective.kind=static", "optimizer.max_iterations=80"]
-    scene = do.load_scene(SCENE, [*options, "design.volume_fraction=0.9", "design.initial=0.8"])
+    scene = do.load_scene(TWO_ARM, [*options, "design.volume_fraction=0.9", "design.initial=0.8"])
     built = build(*QUICK)
     full = built.fields(lambda k, x, y: np.ones(len(x)))
     solid = rebuilt(built, limited(built.scene, tip_deflection=1.0)).evaluate(full)[0]

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import SCENE, build, tip, uneven, wave
+from remainders import build, tip, uneven, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.multibody.shape_integrals import TABLE, of_material
@@ -111,7 +112,7 @@ def test_one_reduction_for_all_scenarios():
     assert counts[0] == counts[1] == counts[2]
 
 
-@pytest.mark.parametrize("combination", ["sum", "worst"])
+@pytest.mark.parametrize("combination", [pytest.param("sum", marks=pytest.mark.serial), "worst"])
 @pytest.mark.parametrize(
     "options",
     [
@@ -172,15 +173,16 @@ def test_weights_scale_the_worst_case():
     assert value == pytest.approx(2.0, rel=1e-12) and slopes[0] == pytest.approx(2.0, rel=1e-12)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_robust_against_two_payloads():
     """The worst case of a light and a heavy payload is better than that of the nominal design."""
     fast = ["optimizer.max_iterations=25", "arms.cells=[30,4]", "simulation.tolerance=1e-3"]
     uses = scenarios(
         ("payload.mass=2", "motion.flattening=1.0"), ("payload.mass=8",), weights=[8, 1]
     )
-    scene = do.load_scene(SCENE, [*fast, uses, "objective.scenarios=worst"])
+    scene = do.load_scene(TWO_ARM, [*fast, uses, "objective.scenarios=worst"])
     robust = do.optimize(scene)
-    nominal = do.optimize(do.load_scene(SCENE, fast))
+    nominal = do.optimize(do.load_scene(TWO_ARM, fast))
     partition, arms = robust.partition, robust.arms
     other, _ = do.evaluate(scene, partition, arms, nominal.x_phys, do.Profile())
     first = on_root(WORLD, lambda: robust.history[0].objective)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
 from mpi4py import MPI
+from runs import ROOT, TWO_ARM, environment, overrides, run
 from scipy.optimize import brentq
 
 import dolfinopt as do
@@ -37,11 +37,7 @@ from dolfinopt.parallel import sum_over_arms
 from dolfinopt.reduction import METHODS, AdjointFields, Basis, Method
 from dolfinopt.scene.load import Scene
 
-ROOT = Path(__file__).parents[2]
-SCENE = ROOT / "demos" / "two_arm.toml"
 WORLD = MPI.COMM_WORLD
-# As it was before this process began MPI, which would confuse another mpirun.
-ENVIRONMENT = dict(os.environ)
 
 CONSTANTS = [one.name for one in TABLE if one.name != "outboard_point"]
 ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
@@ -161,6 +157,7 @@ def orthonormal(cloud: Cloud) -> Cloud:
     return replace(cloud, modes=cloud.modes @ T, K=K, D=D, outboard=cloud.outboard @ T)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("arms", "gravity", "stages"),
     [(1, (1.0, -9.81), 3), (2, (0.0, 0.0), 3), (3, (1.0, -9.81), 2)],
@@ -208,7 +205,7 @@ def test_trajectory_slopes(
 
 def scene(*overrides: str) -> Scene:
     """Return the two-arm scene on few cells."""
-    return do.load_scene(SCENE, ("arms.cells=[24,3]", *overrides))
+    return do.load_scene(TWO_ARM, ("arms.cells=[24,3]", *overrides))
 
 
 def noise(arm: Arm, index: int) -> np.ndarray:
@@ -283,7 +280,7 @@ def test_gradient_on_skew_triangles(kind: str, shared_tmp_path: Path) -> None:
     WORLD.barrier()
     test = taylor(
         do.load_scene(
-            SCENE,
+            TWO_ARM,
             (f"arms.mesh='{path}'", "design.filter_radius=0.02", f"objective.kind={kind}"),
         )
     )
@@ -329,7 +326,7 @@ def test_nothing_to_check(overrides: list[str], expected: str) -> None:
     """Where there is no exact gradient, one line says so and what to choose."""
     with pytest.raises(InputError, match=expected) as caught:
         taylor(scene(*overrides))
-    assert "\n" not in str(caught.value) and str(SCENE) in str(caught.value)
+    assert "\n" not in str(caught.value) and str(TWO_ARM) in str(caught.value)
 
 
 def test_frozen_deviation_stands_beside_the_exact_one() -> None:
@@ -370,7 +367,7 @@ def random_scene(seed: int) -> Scene:
             "interpolation.floor": 10.0 ** rng.uniform(-6.0, -2.0),
         }
         try:
-            drawn = do.load_scene(SCENE, [f"{key}={value}" for key, value in values.items()])
+            drawn = do.load_scene(TWO_ARM, [f"{key}={value}" for key, value in values.items()])
             check_motion(drawn)
         except InputError:  # out of the arms' reach: draw again
             continue
@@ -420,6 +417,7 @@ def no_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dolfinopt.arms.arm.Arm.backward", lambda arm, slope, _: arm._active(slope))
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("fault", [no_modes, no_trajectory, no_start, no_filter])
 def test_a_wrong_gradient_is_found(
     monkeypatch: pytest.MonkeyPatch, fault: Callable[[pytest.MonkeyPatch], None]
@@ -448,6 +446,7 @@ def fixed_frequencies(height: float) -> tuple[float, float]:
     return float(values[axial]), float(np.delete(values, axial)[1])
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("apart", [0.0, 1e-6], ids=["equal", "close"])
 def test_repeated_frequencies(apart: float) -> None:
     """Bending and axial modes of one frequency mix anyhow, and the gradient does not care."""
@@ -514,11 +513,13 @@ def test_same_gradient_on_any_number_of_ranks(tmp_path: Path, method: str, ranks
     found = []
     for count in (1, ranks):
         out = tmp_path / f"{count}.npz"
-        line = [sys.executable, "-c", SPLIT, "gradient", str(SCENE), "--kind", "exact"]
-        line += ["--set", "arms.cells=[40,4]", "--set", f"reduction.method={method}"]
-        line += ["--out", str(out)]
-        line = ["mpirun", "-n", str(count), *line] if count > 1 else line
-        subprocess.run(line, env=ENVIRONMENT, check=True, capture_output=True, timeout=120)
+        line = ["gradient", str(TWO_ARM), "--kind", "exact", "--out", str(out)]
+        line += overrides("arms.cells=[40,4]", f"reduction.method={method}")
+        if count == 1:
+            run(*line)
+        else:
+            line = ["mpirun", "-n", str(count), sys.executable, "-c", SPLIT, *line]
+            subprocess.run(line, env=environment(), check=True, capture_output=True, timeout=120)
         with np.load(out) as data:
             found.append({key: data[key] for key in data.files})
     assert found[1].keys() == found[0].keys()

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
-from remainders import SCENE, beside_volume, build, rates, tip, uneven, wave
+from remainders import beside_volume, build, rates, tip, uneven, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -20,7 +21,7 @@ UNIT = np.eye(3)  # a force along the arm, one across it, a moment
 
 def solid(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
     """Return the first arm, solid, on its own ranks."""
-    scene = do.load_scene(SCENE, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
     arm = Arm(scene, 0, comm, do.Profile())
     arm.set_design(np.ones(arm.mesh.num_cells))
     return arm

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from runs import TWO_ARM
 
 from dolfinopt.scene.load import load_scene
 from dolfinopt.scene.plausibility import implausible
@@ -15,7 +16,6 @@ from dolfinopt.scene.plausibility import implausible
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
 DEMOS = sorted((Path(__file__).parents[2] / "demos").glob("*.toml"))
-TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 
 
 @pytest.mark.parametrize("demo", DEMOS, ids=lambda path: path.stem)

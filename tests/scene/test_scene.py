@@ -15,6 +15,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from runs import TWO_ARM
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -31,7 +32,6 @@ from dolfinopt.scene.load import (
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
-TWO_ARM = Path(__file__).parents[2] / "demos" / "two_arm.toml"
 MATERIAL = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}  # Pa, -, kg/m3
 ARM = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}  # m
 FILE = "some/where.toml"

@@ -1,0 +1,54 @@
+"""Scenes, and commands run in this process or in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.cli.main import commands
+from dolfinopt.scene.load import Scene
+
+ROOT = Path(__file__).parents[2]
+TWO_ARM = ROOT / "demos" / "two_arm.toml"
+
+
+def scene(*changes: str) -> Scene:
+    """Return the two-arm scene with "key.path=value" changed."""
+    return do.load_scene(TWO_ARM, changes)
+
+
+def overrides(*changes: str) -> list[str]:
+    """Return the options of a command that change the scene."""
+    return [word for change in changes for word in ("--set", change)]
+
+
+def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:
+    """Run a command in this process, on all ranks of `world`; errors of dolfinopt are raised."""
+    commands.main([str(word) for word in words], standalone_mode=False, obj=world)
+
+
+def environment() -> dict[str, str]:
+    """Return the environment as it was before this process began MPI, which misleads mpirun."""
+    return dict(os.environ)
+
+
+def command(*words: object, ranks: int = 0) -> list[str]:
+    """Return the command line of dolfinopt, or of mpirun with it."""
+    line = [sys.executable, "-m", "dolfinopt", *map(str, words)]
+    return ["mpirun", "-n", str(ranks), *line] if ranks else line
+
+
+def shell(*words: object, ranks: int = 0) -> subprocess.CompletedProcess:
+    """Run dolfinopt in a process of its own, or under mpirun; return status and output."""
+    return subprocess.run(
+        command(*words, ranks=ranks),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment(),
+    )
