@@ -76,7 +76,7 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
 
 def test_summary_of_a_simulation_and_an_optimisation_agree(result, shared_tmp_path):
     """Of one design: the same keys in the same order, and motions to the scene's tolerance."""
-    scene = do.load_scene(SCENE, SMALL)
+    scene = do.load_scene(TWO_ARM, SMALL)
     written = [write_result(scene, shared_tmp_path, result, 1.0, paraview=False)]
     written.append(write_simulation(shared_tmp_path, simulated(result), 1.0, paraview=False))
     if WORLD.rank == 0:
