@@ -146,19 +146,19 @@ def test_deflection_bounds_the_largest(rows: list[tuple[float, ...]], exponent: 
     value = response.deflection(exponent)
     assert largest <= value * (1.0 + 1e-15)
     assert value <= largest * len(rows) ** (1.0 / exponent) * (1.0 + 1e-14)
-    slope = response.deflection_slope(exponent)
+    slope = response.deflection_gradient(exponent)
     # Homogeneous of degree one: Euler's theorem.
     assert np.sum(slope * response.tip) == pytest.approx(value, rel=1e-12)
     assert not slope[2].any()
 
 
 @pytest.mark.parametrize("exponent", [2.0, 3.0, 20.0, 200.0])
-def test_deflection_slope(exponent: float) -> None:
+def test_deflection_gradient(exponent: float) -> None:
     """Every entry against central differences; their error is (p h)^2."""
     rng = np.random.default_rng(1)
     u = rng.normal(size=(3, 4))
     u[:2, 3] = u[:2, 0] * [1.0, -1.0]  # two cases equally large
-    slope = StaticResponse(np.ones((3, 4)), u).deflection_slope(exponent)
+    slope = StaticResponse(np.ones((3, 4)), u).deflection_gradient(exponent)
     h = 1e-6
     for index in np.ndindex(u.shape):
         step = np.zeros_like(u)
