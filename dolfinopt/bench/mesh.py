@@ -24,13 +24,13 @@ from dolfinopt.study.variants import changed
 
 CELLS = (50, 3), (100, 6), (200, 12), (400, 24), (800, 48), (1600, 96)
 QUICK = (50, 3), (100, 6), (200, 12)
-# Of third degree, one order above the elements that are judged, and graded towards the corners.
+# Of third degree, one order above the elements compared, and graded towards the corners.
 REFERENCE, QUICK_REFERENCE = (240, 32), (120, 16)
-MOST_DOFS = 700_000  # of an element that is judged: more takes minutes and gigabytes
+MOST_DOFS = 700_000  # of an element compared; more does not fit small machines
 LARGE = 100_000  # degrees of freedom of a design that is timed twice only
 COORDINATES = 12  # Craig-Bampton: the first frequency is then right to 1e-6 of the mesh's
-GOALS = 1e-2, 1e-3, 1e-4
-TOLERANCE, STAGES = 1e-6, 5
+GOALS = 1e-2, 1e-3, 1e-4  # errors that the notes give the cheapest element for
+TOLERANCE, STAGES = 1e-6, 5  # of the motions: below the errors of all meshes
 
 
 def diagram() -> Diagram:
@@ -122,7 +122,7 @@ class IncompatibleModes(LagrangeElement):
             for eta in (-gauss, gauss):
                 jacobian = _jacobian(corners, xi, eta)
                 weight = np.abs(np.linalg.det(jacobian))
-                nodal = _slopes(xi, eta) @ np.linalg.inv(jacobian)
+                nodal = _shape_gradients(xi, eta) @ np.linalg.inv(jacobian)
                 B = strains(np.concatenate([nodal, _inner(corners, xi, eta)], axis=1))
                 total += weight[:, None, None] * (B.transpose(0, 2, 1) @ law @ B)
         coupling = total[:, 8:, :8]
@@ -148,7 +148,7 @@ def _inner(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
     return np.diag([-2.0 * xi, -2.0 * eta]) @ np.linalg.inv(centre) * ratio[:, None, None]
 
 
-def _slopes(xi: float, eta: float) -> np.ndarray:
+def _shape_gradients(xi: float, eta: float) -> np.ndarray:
     """Return the derivatives (4, 2) of the bilinear shape functions on [-1, 1]^2."""
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
     a, b = signs.T
@@ -157,7 +157,7 @@ def _slopes(xi: float, eta: float) -> np.ndarray:
 
 def _jacobian(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
     """Return dX_i/dxi_k (n, 2, 2)."""
-    return np.einsum("eni,nk->eik", corners, _slopes(xi, eta))
+    return np.einsum("eni,nk->eik", corners, _shape_gradients(xi, eta))
 
 
 Operators = Callable[[ArmMesh, float, float], ElementOperators]
@@ -239,11 +239,11 @@ def respond(scene: Scene, element: Element, cells: tuple[int, int], repeats: int
         now, body = timed(reduce, 1)
         seconds = min(seconds, now)
     flexibility = np.linalg.inv(at(1.0).constraint_modes().stiffness)
-    moved = simulate(scene, [body] * len(scene.arms), Profile())
+    trajectory = simulate(scene, [body] * len(scene.arms), Profile())
     return Response(
         float(flexibility[1, 1]),
         first_frequency(body),
-        moved.max_deviation[0],
+        trajectory.max_deviation[0],
         dofs,
         seconds,
         setup,
@@ -307,18 +307,18 @@ def _by(cells: tuple[int, int]) -> str:
 def _notes(rows: Sequence[Row]) -> list[str]:
     notes = [
         f"Reference: Q3 on {_by(REFERENCE)} cells ({_by(QUICK_REFERENCE)} in a quick bench), one "
-        "order above the elements that are judged, on a grid graded towards the corners of the "
+        "order above the elements compared, on a grid graded towards the corners of the "
         "clamped end, which are singular and limit every order on the uniform grids that are "
-        "judged; how far it is to be trusted shows in the same with half as many cells either "
+        "compared; how far it is to be trusted shows in the same with half as many cells either "
         "way. Solid arms.",
         f"Q2 and P2 on {_by(CELLS[-1])} cells, above {MOST_DOFS:,} degrees of freedom, are left "
         "out: minutes and gigabytes for less than 0.01 %, which coarser ones reach.",
         "Seconds of one design: assembly, factorisation, Craig-Bampton basis of "
         f"{COORDINATES} coordinates, inertia integrals.",
     ]
-    judged = [row for row in rows if "Q3" not in str(row[0])]
+    compared = [row for row in rows if "Q3" not in str(row[0])]
     for goal in GOALS:
-        met = [row for row in judged if max(float(e) for e in row[5:8]) <= goal]
+        met = [row for row in compared if max(float(e) for e in row[5:8]) <= goal]
         if met:
             best = min(met, key=lambda row: float(row[3]))
             notes.append(

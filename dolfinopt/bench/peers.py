@@ -132,7 +132,7 @@ def _static_arm(scene: Scene, cells: tuple[int, int]) -> StaticArm:
 # -- the motion ------------------------------------------------------------------------------
 
 
-def _moved(scene: Scene, element: Element, cells: tuple[int, int]) -> Trajectory:
+def _simulated(scene: Scene, element: Element, cells: tuple[int, int]) -> Trajectory:
     """Simulate the scene with solid arms, each like the first one."""
     arm, solid = scene.arms[0], scene.material_of(0)
     mesh = element.arm(arm.length, arm.height, cells)
@@ -146,7 +146,7 @@ def _moved(scene: Scene, element: Element, cells: tuple[int, int]) -> Trajectory
     return simulate(scene, [body] * len(scene.arms), Profile())
 
 
-def _reduced_and_moved(
+def _reduced_and_simulated(
     scene: Scene, arms: dict[int, Arm], x_phys: dict[int, np.ndarray]
 ) -> Trajectory:
     return simulate(scene, bodies_of(scene, arms, x_phys), Profile())
@@ -155,7 +155,7 @@ def _reduced_and_moved(
 def _motions(plan: Plan, tell: Tell) -> list[Row]:
     tell("the motion's reference")
     fine = changed(plan.scene, "simulation.tolerance=1e-6")
-    right = _moved(changed(fine, "simulation.stages=5"), FINER, REFERENCE)
+    right = _simulated(changed(fine, "simulation.stages=5"), FINER, REFERENCE)
     rows: list[Row] = []
     for cells in QUICK if plan.quick else CELLS:
         size = f"{cells[0]} x {cells[1]}"
@@ -169,9 +169,13 @@ def _motions(plan: Plan, tell: Tell) -> list[Row]:
         for _ in range(max(2, plan.repeats)):
             for k, arm in arms.items():
                 arm.set_design(half[k])
-            now, here, moved = clocked(partial(_reduced_and_moved, scene, arms, solid), 1)
+            now, here, trajectory = clocked(partial(_reduced_and_simulated, scene, arms, solid), 1)
             seconds, wall = min(seconds, now), min(wall, here)
-        error = place_error(right, moved.t, end_effector(moved.mechanism, moved.motion, moved.q_e))
+        error = place_error(
+            right,
+            trajectory.t,
+            end_effector(trajectory.mechanism, trajectory.motion, trajectory.q_e),
+        )
         rows.append((MOTION, OURS, size, cells[0] * cells[1], seconds, wall, error))
     if not exudyn_available():
         return rows
@@ -223,7 +227,7 @@ def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
 def _notes(rows: Sequence[Row]) -> list[str]:
     notes = [
         "Static iterations: K assembled anew, factorised (plain DOLFINx: MUMPS Cholesky; pyMOTO: "
-        "the solver it chooses), one load, the compliance's slope by every density. Dynamic: "
+        "the solver it chooses), one load, the compliance's gradient by every density. Dynamic: "
         "filter, reduction, simulation, load cases, gradient, MMA; median of the iterations, where "
         "the others are the least of the repeats. Two ranks: CPU seconds of the first one.",
         "Motion: two solid arms; errors of the end-effector's place over the largest deviation. "

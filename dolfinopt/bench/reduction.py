@@ -18,7 +18,7 @@ from dolfinopt.study.tables import Panel
 from dolfinopt.study.variants import changed, reduced
 
 COUNTS = 3, 4, 5, 6, 8, 12, 16, 24, 32, 48
-# More coordinates than any method that is judged has, and of the kind that converges surely.
+# More coordinates than any method compared has, and of the kind that converges surely.
 REFERENCE = 100
 QUICK_COUNTS, QUICK_REFERENCE = (3, 4, 6, 12), 32
 # Of every motion here. The steps come out alike, so that what they leave cancels in the
@@ -55,8 +55,8 @@ class Response:
 
 
 def _response(scene: Scene, arms: dict[int, Arm], x_phys: dict[int, np.ndarray]) -> Response:
-    moved = simulate(scene, bodies_of(scene, arms, x_phys), Profile())
-    return Response(moved.compliance.sum(axis=1), moved.deviation)
+    trajectory = simulate(scene, bodies_of(scene, arms, x_phys), Profile())
+    return Response(trajectory.compliance.sum(axis=1), trajectory.deviation)
 
 
 def _measure(plan: Plan, tell: Tell) -> list[Row]:

@@ -35,7 +35,7 @@ CHOICES = (
     ("mumps", "its own"),
 )
 OURS = "petsc, natural"
-SOLVES = 18  # of a design iteration with 4 coordinates and their slopes
+SOLVES = 18  # of a design iteration with 4 coordinates and their gradients
 # A choice that took longer is not tried on more elements.
 PATIENCE = 10.0  # s
 THREADS = 1, 2

@@ -31,7 +31,7 @@ class StaticArm:
 
 
 # Densities (n_cells,) -> compliance under a unit force across the end, spread over it, N m, and
-# its slope by every density.
+# its gradient by every density.
 Iteration = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
@@ -43,7 +43,7 @@ def dolfinx_iteration(arm: StaticArm) -> Iteration:
     mesh = grid.mesh
     space = compat.lagrange_space(mesh, 1, components=2)
     cellwise = _cellwise(mesh)
-    density, moved = fem.Function(cellwise), fem.Function(space)
+    density, displacement = fem.Function(cellwise), fem.Function(space)
     u, v, w = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.TestFunction(cellwise)
     nu = arm.poisson_ratio
     law = FLOOR + (1.0 - FLOOR) * density**PENALTY
@@ -58,7 +58,9 @@ def dolfinx_iteration(arm: StaticArm) -> Iteration:
         return factor * ((1 - nu) * strain(a) + nu * trace)
 
     bilinear = compat.compile_form(law * ufl.inner(stress(u), strain(v)) * ufl.dx)
-    slope = compat.compile_form(-by_density * ufl.inner(stress(moved), strain(moved)) * w * ufl.dx)
+    gradient = compat.compile_form(
+        -by_density * ufl.inner(stress(displacement), strain(displacement)) * w * ufl.dx
+    )
     x = ufl.SpatialCoordinate(mesh)
     end = ufl.conditional(ufl.gt(x[0], arm.length * (1 - 1e-9)), 1.0 / arm.height, 0.0)
     load = petsc.assemble_vector(compat.compile_form(end * v[1] * ufl.ds))
@@ -81,8 +83,8 @@ def dolfinx_iteration(arm: StaticArm) -> Iteration:
         matrix.setOption(PETSc.Mat.Option.SPD, True)
         ksp.setOperators(matrix)
         ksp.solve(load, solution)
-        moved.x.array[:] = solution.array_r
-        return float(load.dot(solution)), petsc.assemble_vector(slope).array_r.copy()
+        displacement.x.array[:] = solution.array_r
+        return float(load.dot(solution)), petsc.assemble_vector(gradient).array_r.copy()
 
     return iterate
 
@@ -115,7 +117,7 @@ def pymoto_iteration(arm: StaticArm) -> Iteration | None:
     force[2 * right + 1] = share
     density, load = pym.Signal("x", np.ones(domain.nel)), pym.Signal("f", force)
     stiff, matrix = pym.Signal("s"), pym.Signal("K")
-    moved, compliance = pym.Signal("u"), pym.Signal("c")
+    displacement, compliance = pym.Signal("u"), pym.Signal("c")
     network = pym.Network(
         pym.MathGeneral(
             density, stiff, expression=f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
@@ -124,8 +126,8 @@ def pymoto_iteration(arm: StaticArm) -> Iteration | None:
             stiff, matrix, domain=domain, bc=fixed, plane="stress",
             e_modulus=arm.young_modulus, poisson_ratio=arm.poisson_ratio,
         ),
-        pym.LinSolve([matrix, load], moved),
-        pym.EinSum([moved, load], compliance, expression="i,i->"),
+        pym.LinSolve([matrix, load], displacement),
+        pym.EinSum([displacement, load], compliance, expression="i,i->"),
     )  # fmt: skip
 
     def iterate(densities: np.ndarray) -> tuple[float, np.ndarray]:

@@ -36,15 +36,15 @@ from dolfinopt.profiling import Profile
 from dolfinopt.study.tables import Panel
 from dolfinopt.study.variants import reduced
 
-# One stage more than the methods that are judged: of order 11, theirs is 9 at most.
+# One stage more than the methods compared: of order 11, theirs is 9 at most.
 REFERENCE_STAGES, REFERENCE_TOLERANCE = 6, 1e-8
-SAMPLES = 3001
-TOLERANCES = 1e-2, 1e-3, 1e-4, 1e-5, 1e-6
+SAMPLES = 3001  # instants at which errors are taken, 1 ms apart
+TOLERANCES = 1e-2, 1e-3, 1e-4, 1e-5, 1e-6  # the points of a curve
 QUICK_TOLERANCES, QUICK_REFERENCE = TOLERANCES[:3], 1e-6
 # CPU seconds that the next finer setting may take, by guess, in a quick bench and a full one.
 PATIENCE = 1.0, 20.0
 SHORT = 0.3  # what takes less is timed several times
-GOAL = 1e-4
+GOAL = 1e-4  # the default of simulation.tolerance
 USUAL = "Radau, 4 stages", f"tolerance {GOAL:g}"  # a simulation as scenes have it by default
 LIMITS = (4, 0.03), (48, 0.3)  # seconds that it should take at most, by coordinates per arm
 FASTER = 50.0  # times as fast as SciPy
@@ -77,7 +77,7 @@ def diagram() -> Diagram:
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class Reference:
     """A problem and what its solutions are measured against.
 
     Attributes:
@@ -100,7 +100,7 @@ class Judge:
         return relative_error(mechanism, q - self.q, self.q), far
 
 
-def judge(problem: ElasticSystem, tolerance: float = REFERENCE_TOLERANCE) -> Judge:
+def find_reference(problem: ElasticSystem, tolerance: float = REFERENCE_TOLERANCE) -> Reference:
     """Solve by Radau of six stages to `tolerance`, or to what rounding leaves of it."""
     while True:
         try:
@@ -111,7 +111,7 @@ def judge(problem: ElasticSystem, tolerance: float = REFERENCE_TOLERANCE) -> Jud
                 raise
             tolerance *= 10.0
     t = np.linspace(0.0, problem.breakpoints[-1], SAMPLES)
-    return Judge(problem, t, solution.sample(t))
+    return Reference(problem, t, solution.sample(t))
 
 
 def accelerations(problem: ElasticSystem, t: float, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
@@ -136,8 +136,8 @@ def jacobian(problem: ElasticSystem, t: float, y: np.ndarray) -> np.ndarray:
     q, qd = y[:size], y[size:]
     qdd = accelerations(problem, t, q, qd)
     motion = problem.motion(np.array([t]))
-    slopes = linearise(problem.mechanism, motion, q[None], qd[None], qdd[None]).dense()[0]
-    lower = np.linalg.solve(slopes[:, 2 * size :], -slopes[:, : 2 * size])
+    tangent = linearise(problem.mechanism, motion, q[None], qd[None], qdd[None]).dense()[0]
+    lower = np.linalg.solve(tangent[:, 2 * size :], -tangent[:, : 2 * size])
     upper = np.hstack([np.zeros((size, size)), np.eye(size)])
     return np.vstack([upper, lower])
 
@@ -162,14 +162,14 @@ def scipy_motion(problem: ElasticSystem, method: str, tolerance: float, t: np.nd
     q = np.empty((len(t), size))
     atol = tolerance * np.repeat(scales, size)
 
-    def slope(now: float, y: np.ndarray) -> np.ndarray:
+    def derivative(now: float, y: np.ndarray) -> np.ndarray:
         return np.concatenate([y[size:], accelerations(problem, now, y[:size], y[size:])])
 
     ends = problem.breakpoints
     for first, last in pairwise(ends):
         here = (t >= first) & (t <= last)
         done = solve_ivp(
-            slope,
+            derivative,
             (first, last),
             y,
             method,
@@ -190,9 +190,9 @@ def scipy_motion(problem: ElasticSystem, method: str, tolerance: float, t: np.nd
 Solver = Callable[[], np.ndarray]
 
 
-def _ours(judge: Judge, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solver]]]]:
+def _ours(reference: Reference, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solver]]]]:
     """Yield this package's methods: name, settings and solvers, coarse to fine."""
-    problem, t = judge.problem, judge.t
+    problem, t = reference.problem, reference.t
     tolerances = QUICK_TOLERANCES if plan.quick else TOLERANCES
 
     def collocated(stages: int, tolerance: float) -> np.ndarray:
@@ -216,15 +216,15 @@ def _ours(judge: Judge, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solve
         yield name, [(f"{n} steps", partial(stepped, rho_inf, n)) for n in counts]
 
 
-def _scipys(judge: Judge, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solver]]]]:
+def _scipys(reference: Reference, plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solver]]]]:
     """Yield SciPy's methods, in the coordinates that suit them."""
-    modes = modes_of(judge.problem)
-    z = modes.to_modes(judge.q)
-    rates = np.gradient(z, judge.t, axis=0)
+    modes = modes_of(reference.problem)
+    z = modes.to_modes(reference.q)
+    rates = np.gradient(z, reference.t, axis=0)
     scales = float(np.abs(z).max()), float(np.abs(rates).max())
 
     def solved(method: str, tolerance: float) -> np.ndarray:
-        found = scipy_motion(modes.system, method, tolerance, judge.t, scales)
+        found = scipy_motion(modes.system, method, tolerance, reference.t, scales)
         return modes.from_modes(found)
 
     for method in ("Radau", "BDF", "LSODA"):
@@ -243,7 +243,7 @@ def _measure(plan: Plan, tell: Tell) -> list[Row]:
             mechanism = build_mechanism(scene, bodies_of(scene, arms, x_phys))
             motion = partial(rigid_motion, scene=scene)
             tell(f"reference, {label}, q = {coordinates}")
-            reference = judge(
+            reference = find_reference(
                 ElasticSystem(mechanism, motion, breakpoints(scene)),
                 QUICK_REFERENCE if plan.quick else REFERENCE_TOLERANCE,
             )
@@ -255,7 +255,7 @@ def _measure(plan: Plan, tell: Tell) -> list[Row]:
 
 
 def _timed_all(
-    solvers: Sequence[tuple[str, Solver]], reference: Judge, plan: Plan
+    solvers: Sequence[tuple[str, Solver]], reference: Reference, plan: Plan
 ) -> Iterator[tuple[str, float, float, float]]:
     """Yield setting, seconds and errors; stops where the next one would take too long."""
     patience = PATIENCE[0] if plan.quick else PATIENCE[1]

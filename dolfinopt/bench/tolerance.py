@@ -33,17 +33,17 @@ from dolfinopt.study.variants import changed, reduced
 SEED, CASES, QUICK_CASES = 3, 50, 8
 CELLS = 48, 6
 TOLERANCES, FINEST = (1e-2, 1e-3, 1e-4), 1e-6
-EVERY = 10  # of so many cases one is solved to the finest tolerance: its reference takes seconds
+EVERY = 10  # of so many cases one is solved to the finest tolerance
 STAGES = 4  # as scenes have by default
-# The reference: another order, other steps, and a hundredth of the finest tolerance judged.
+# The reference: another order, other steps, and a hundredth of the finest tolerance.
 REFERENCE_STAGES, FINER, MOST_STEPS = 5, 100.0, 5000
 INSTANTS = 10_001
 # References of the shortest motions, of one vibration an arm, are checked by SciPy's explicit
-# method: with all coordinates its Radau took 17 s to 1e-5, of the case that is cheapest for it.
+# method, as its Radau takes too long with all coordinates.
 CHECKED, QUICK_CHECKED, CHECK_METHOD, CHECK_TOLERANCE = 5, 1, "DOP853", 1e-10
 DESIGNS = "uniform", "smooth", "void and solid", "weak tips"
 PATHS, LAWS = ("arc", "line", "joints"), ("quintic", "septic")
-WAVES = 64
+WAVES = 64  # random waves that make a smooth design
 # Radians w T of the slowest vibration during the motion: the quintic's largest acceleration, 5.8 of
 # the path's length over T^2, bends the arms by 5.8 / (w T)^2 of it. With fewer it is no small bend.
 LEAST_SWING = 10.0
@@ -239,7 +239,7 @@ def _measure(plan: Plan, tell: Tell) -> list[Row]:
         for case in cases:
             tell(f"case {case.number + 1} of {count}")
             check = checked(_slowest(case, arms)) if case in short else math.nan
-            rows += judged(case, check)
+            rows += compared(case, check)
     return rows
 
 
@@ -250,7 +250,7 @@ def _slowest(case: Case, arms: dict[int, Arm]) -> ElasticSystem:
     return replace(case.problem, mechanism=mechanism)
 
 
-def judged(case: Case, check: float = math.nan) -> list[Row]:
+def compared(case: Case, check: float = math.nan) -> list[Row]:
     """Return a row for every tolerance: the case's estimated and true error.
 
     Args:
@@ -281,7 +281,7 @@ def run(problem: ElasticSystem, tolerance: float) -> Run:
     return Run(tolerance, *timed(solve, 1))
 
 
-def reference(problem: ElasticSystem, judged: Run) -> Solution:
+def reference(problem: ElasticSystem, run: Run) -> Solution:
     """Return the motion to a hundredth of the tolerance of a run, by its own steps and order.
 
     Steps are doubled until the estimate is below the goal, from one more than the run has: not by
@@ -290,10 +290,10 @@ def reference(problem: ElasticSystem, judged: Run) -> Solution:
     Raises:
         ConvergenceError: that many steps are not enough, or Newton fails.
     """
-    if isinstance(judged.found, ConvergenceError):
-        raise judged.found
-    goal = judged.tolerance / FINER
-    start, count = judged.found, len(judged.found.a) + 1
+    if isinstance(run.found, ConvergenceError):
+        raise run.found
+    goal = run.tolerance / FINER
+    start, count = run.found, len(run.found.a) + 1
     while count <= MOST_STEPS:
         start = radau.on_grid(problem, even_steps(problem, count), goal, REFERENCE_STAGES, start)
         if start.error <= goal:

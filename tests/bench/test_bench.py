@@ -42,9 +42,9 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def judge(problem):
+def reference(problem):
     """What the problem's solutions are measured against."""
-    return times.judge(problem, 1e-7)
+    return times.find_reference(problem, 1e-7)
 
 
 # -- elements --------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ def test_accelerations_solve_the_rows(problem):
     assert np.abs(rows).max() < 1e-11 * np.abs(at_rest).max()
 
 
-def test_jacobian_is_the_slope_of_accelerations(problem):
+def test_jacobian_is_the_derivative_of_accelerations(problem):
     problem = modes_of(problem).system
     size = problem.mechanism.num_coordinates
     rng = np.random.default_rng(2)
@@ -135,23 +135,25 @@ def test_jacobian_is_the_slope_of_accelerations(problem):
     np.testing.assert_allclose(central, exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
 
 
-def test_scipy_and_radau_agree(problem, judge):
+def test_scipy_and_radau_agree(problem, reference):
     """Two independent paths through the same rows; the errors fall with the tolerance."""
     modes = modes_of(problem)
-    found = times.scipy_motion(modes.system, "Radau", 1e-4, judge.t, (0.1, 10.0))
-    assert max(judge.errors(modes.from_modes(found))) < 3e-2
+    found = times.scipy_motion(modes.system, "Radau", 1e-4, reference.t, (0.1, 10.0))
+    assert max(reference.errors(modes.from_modes(found))) < 3e-2
     ours = [
-        radau.integrate(problem, tolerance, 3, Profile()).sample(judge.t)
+        radau.integrate(problem, tolerance, 3, Profile()).sample(reference.t)
         for tolerance in (1e-3, 1e-5)
     ]
-    errors = [judge.errors(q)[0] for q in ours]
+    errors = [reference.errors(q)[0] for q in ours]
     assert errors[0] < 1e-3 and errors[1] < 1e-5  # the tolerances
 
 
-def test_newmark_is_of_second_order(problem, judge):
+def test_newmark_is_of_second_order(problem, reference):
     errors = [
-        judge.errors(
-            generalized_alpha.on_grid(problem, even_steps(problem, n), 1e-8, 1.0).sample(judge.t)
+        reference.errors(
+            generalized_alpha.on_grid(problem, even_steps(problem, n), 1e-8, 1.0).sample(
+                reference.t
+            )
         )[0]
         for n in (400, 800)
     ]
@@ -204,7 +206,7 @@ def test_exudyn_moves_alike():
     if not exudyn_available():
         pytest.skip("not installed")
     scene = load_paper()
-    right = peers._moved(scene, meshes.FINER, (15, 2))
+    right = peers._simulated(scene, meshes.FINER, (15, 2))
     found = exudyn_tip(scene, 8, 1500)
     # Steps of 2 ms: 1.8e-3 was seen.
     assert peers.place_error(right, found[:, 0], found[:, 1:]) < 5e-3

@@ -77,7 +77,7 @@ def test_errors_of_a_damped_case(draw):
     """The largest difference at the reference's own instants, found by hand."""
     case = next(c for n in range(20) if (c := draw(number=n)).cells()[5] > 1e-5)
     case = replace(case, number=1)  # none to the finest tolerance
-    rows = tolerance.judged(case)
+    rows = tolerance.compared(case)
     assert [row[tolerance.TOLERANCE] for row in rows] == list(tolerance.TOLERANCES)
     run = tolerance.run(case.problem, 1e-3)
     right = tolerance.reference(case.problem, run)
@@ -107,11 +107,11 @@ def test_failures_have_names(draw, monkeypatch):
     run = tolerance.run(case.problem, 1e-2)
     with monkeypatch.context() as patch:
         patch.setattr(tolerance.radau, "integrate", fail)
-        rows = tolerance.judged(case)
+        rows = tolerance.compared(case)
     assert all(row[tolerance.FAILURE] == "gave up" and math.isnan(row[9]) for row in rows)
     with monkeypatch.context() as patch:
         patch.setattr(tolerance, "reference", fail)
-        rows = tolerance.judged(case)
+        rows = tolerance.compared(case)
     assert all(row[tolerance.FAILURE] == "reference: gave up" for row in rows)
     assert rows[0][tolerance.ESTIMATE] == run.found.error and math.isnan(rows[0][tolerance.TRUE])
     with pytest.raises(ConvergenceError, match="gave up"):
