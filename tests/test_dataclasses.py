@@ -63,7 +63,7 @@ def hints(of: type) -> Iterator[Any]:
 def test_dataclasses_with_arrays_compare_by_identity() -> None:
     """The generated == raises where a field is an array: it has no single truth value."""
     found = list(dataclasses())
-    assert len(found) > 100
+    assert RigidMotion in found
     wrong = [
         f"{one.__module__}.{one.__qualname__}"
         for one in found

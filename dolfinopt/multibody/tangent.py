@@ -179,7 +179,7 @@ class Tangent:
         return by_q, by_v, by_a
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Places:
     """Where the coordinates asked for stand among the S columns.
 
