@@ -19,7 +19,8 @@ from dolfinopt.errors import InputError, OutputError
 from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.output import checkpoint
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study.store import Case, run_cases
+from dolfinopt.study.cases import Case
+from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF

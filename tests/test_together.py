@@ -35,9 +35,10 @@ from dolfinopt.parallel import (
 from dolfinopt.responses import eigenfrequency, evaluation, motion, static, tip_deflection
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study import store as cases
+from dolfinopt.study import store
 from dolfinopt.study import studies as study
-from dolfinopt.study.store import Case, run_cases
+from dolfinopt.study.cases import Case
+from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 COMM = MPI.COMM_WORLD
@@ -432,7 +433,7 @@ def payloads(*overrides):
 @pytest.mark.parametrize("name", ["_optimise", "_read"])
 def test_cases(name, monkeypatch, shared_tmp_path):
     """A rank that fails ends the others' work, too; what they have finished stays."""
-    fail_on(monkeypatch, LONE, cases, name)
+    fail_on(monkeypatch, LONE, store, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
         run_cases(payloads(), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -445,7 +446,7 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
     if COMM.size == 1:
         pytest.skip("needs two ranks")
     long = payloads("optimizer.max_iterations=100000", "optimizer.tolerance=1e-300")
-    fail_on(monkeypatch, LONE, cases, "_optimise")
+    fail_on(monkeypatch, LONE, store, "_optimise")
     with pytest.raises(Unusual):
         run_cases(long, shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -454,7 +455,7 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
 def test_samples(monkeypatch, shared_tmp_path):
     scene = load_scene(paper_scene(), COARSE)
     samples = [(), *((f"payload.mass={mass}",) for mass in np.linspace(4.0, 6.0, 60))]
-    fail_on(monkeypatch, LONE, cases, "_sample")
+    fail_on(monkeypatch, LONE, store, "_sample")
     with pytest.raises(Unusual, match=r"^_sample$"):
         run_cases(sample_cases(scene, samples, "", None), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()

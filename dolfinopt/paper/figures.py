@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from dolfinopt.paper.reproduction import INITIAL, METHODS, OPTIMUM, SHOWN, SWEEPS, loss
+from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.plans import design_figure, deviation_panels
-from dolfinopt.study.store import Case, Outcome, Outcomes
 from dolfinopt.study.tables import Figure, Line, LineFigure, MatrixFigure, Panel, Table
 
 LABELS = {"compliance": "compliance [N m]", "deviation": "maximal deviation [mm]"}

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.output.views import ArmView
     from dolfinopt.scene.load import Scene
-    from dolfinopt.study.store import Case, Outcomes
+    from dolfinopt.study.cases import Case, Outcomes
 
 WIDTH = 900  # px of a picture of the longest arm
 FRAMES = 121  # of the animation

@@ -37,7 +37,8 @@ import pandas as pd
 from dolfinopt.data import paper_scene
 from dolfinopt.output.summary import FILTER_CELLS
 from dolfinopt.scene.load import Scene, load_scene
-from dolfinopt.study.store import Case, Outcome, Outcomes, run_cases
+from dolfinopt.study.cases import Case, Outcome, Outcomes
+from dolfinopt.study.store import run_cases
 from dolfinopt.study.variants import OBJECTIVES, changed, reduced, reference_scene
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.store import Case, Outcome, Outcomes
+from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.tables import DesignFigure, Figure, Line, Panel, Table
 
 Item = TypeVar("Item")

@@ -14,6 +14,7 @@ import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
+from dolfinopt.study.cases import Case, Outcome
 from dolfinopt.study.plans import (
     COMPLIANCE,
     DEVIATION,
@@ -26,7 +27,6 @@ from dolfinopt.study.plans import (
     deviation_panels,
     given_designs,
 )
-from dolfinopt.study.store import Case, Outcome
 from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table
 from dolfinopt.study.variants import (
     METHODS,

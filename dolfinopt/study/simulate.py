@@ -40,7 +40,7 @@ def simulate_scenarios(
     and are simulated in one batch, whose time and counts the first of them bears.
 
     Args:
-        scenes: that differ in `store.SCENARIO` alone; neighbours also in what `Case.batch_key`
+        scenes: that differ in `cases.SCENARIO` alone; neighbours also in what `Case.batch_key`
             allows.
         design: design.npz, or None, the initial one.
 
@@ -107,7 +107,7 @@ def compare(
     """Compare one design's bases with those of `variants.REFERENCE` coordinates, on this rank.
 
     Args:
-        scenes: that differ in `store.SCENARIO` alone; their reduction counts.
+        scenes: that differ in `cases.SCENARIO` alone; their reduction counts.
         design: design.npz, or None, the initial one.
 
     Raises:

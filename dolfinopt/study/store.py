@@ -13,26 +13,24 @@ bits. What is done is done: a study that grows computes the new cases alone.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
 
 from dolfinopt.disk import make_folder
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene.contents import file_digest, program, with_digests
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import variants
+from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.progress import Progress
 from dolfinopt.study.tasks import do_tasks
 
@@ -41,232 +39,16 @@ if TYPE_CHECKING:
 
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.run_folder import Simulated
-    from dolfinopt.study.simulate import BasisFigures
-
-Action = Literal["optimize", "simulate", "compare", "sample"]
 
 CASES = "cases"  # folder of all cases
 SUMMARY, FAILURE, BATCH = "summary.json", "failure.json", "batch.json"
-# Scenes that differ in nothing but these tables have the same arms: they are meshed, assembled
-# and factorised once.
-SCENARIO = (
-    "motion",
-    "payload",
-    "damping",
-    "reduction",
-    "simulation",
-    "objective",
-    "constraints",
-    "optimizer",
-    "scenarios",
-)
-
-
-# These values of material and arms do no more to the reduced arms than scale their integrals, where
-# the basis does not depend on them: Krylov's shifts and the Gramian's band are frequencies.
-SCALING = ("young_modulus", "density", "thickness")
-SCALABLE = ("craig-bampton", "modal")
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """One thing to compute. Two cases are equal when they compute the same.
-
-    Attributes:
-        scene: complete; its name does not matter.
-        action: "optimize" finds a design, "simulate" moves a given one, "compare" says what its
-            reduced basis misses of `variants.REFERENCE` Craig-Bampton coordinates, "sample" moves
-            it at several samples of the scene's values, one after the other.
-        design: given; that of an optimising case, of a file, or None, the initial one.
-        label: what progress and messages call it.
-        samples: what each sample changes, "key.path=value" each.
-        first: number of the first sample, for messages.
-    """
-
-    scene: Scene
-    action: Action = "simulate"
-    design: Case | Path | None = None
-    label: str = field(default="", compare=False)
-    samples: tuple[tuple[str, ...], ...] = ()
-    first: int = field(default=0, compare=False)
-
-    @cached_property
-    def key(self) -> str:
-        """Sixteen hexadecimal digits that stand for everything the case computes."""
-        parts: list[Any] = [program(), self.action, scene_content(self.scene), self.design_key]
-        if self.action == "compare":
-            from dolfinopt.study.simulate import MODES
-
-            parts += [variants.REFERENCE_METHOD, variants.REFERENCE, MODES]
-        return _digest([*parts, self.samples])
-
-    @property
-    def title(self) -> str:
-        """Its label, with the numbers of its samples."""
-        if not self.samples:
-            return self.label
-        return f"{self.label}, samples {self.first} to {self.first + len(self.samples) - 1}"
-
-    @cached_property
-    def design_key(self) -> str:
-        """What stands for the given design in the key."""
-        if isinstance(self.design, Case):
-            return self.design.key
-        return "initial" if self.design is None else file_digest(self.design)
-
-    @cached_property
-    def arms_key(self) -> str:
-        """Equal where the same arms with the same design are simulated or compared.
-
-        Optimisations and samples share nothing.
-        """
-        if self.action in ("optimize", "sample"):
-            return self.key
-        content = scene_content(self.scene)
-        kept = {table: value for table, value in content.items() if table not in SCENARIO}
-        return _digest([self.action, kept, self.design_key])
-
-    @cached_property
-    def batch_key(self) -> str:
-        """Equal where cases are done at once: simulations of the same arms and basis."""
-        scene, content = self.scene, scene_content(self.scene)
-        if self.action != "simulate" or scene.reduction.coordinates == "auto":  # each its own
-            return self.key
-        free = {*SCENARIO} - {"reduction"}
-        if scene.reduction.method == "balanced":  # the Gramian knows the damping
-            free.remove("damping")
-        kept = {table: value for table, value in content.items() if table not in free}
-        motion_alone = scene.objective.needs("motion") and not any(vars(scene.constraints).values())
-        if motion_alone and scene.reduction.method in SCALABLE:
-            for row in (kept["material"], *kept["arms"]):
-                for key in SCALING:
-                    row.pop(key, None)
-        return _digest([kept, self.design_key])
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Case) and self.key == other.key
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What came out of a case, read back from its folder. What it does not have is nan.
-
-    Attributes:
-        case, folder: which, and where its files are.
-        failure: message, "" where it succeeded.
-        objective: N m, N m s, m or s2.
-        compliance: of the load cases, N m.
-        max_deviation, max_deviation_time: m, s.
-        grayness: over all arms.
-        iterations, stop_reason: of an optimisation.
-        seconds: that it took.
-        bases: of a comparison, one an arm with a design of its own.
-        samples: compliance, max_deviation and max_deviation_time (n,) of samples.
-        messages: of the samples that failed, by number.
-    """
-
-    case: Case
-    folder: Path
-    failure: str = ""
-    objective: float = math.nan
-    compliance: float = math.nan
-    max_deviation: float = math.nan
-    max_deviation_time: float = math.nan
-    grayness: float = math.nan
-    iterations: int = 0
-    stop_reason: str = ""
-    seconds: float = math.nan
-    bases: tuple[BasisFigures, ...] = ()
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)
-    messages: Mapping[int, str] = field(default_factory=dict)
-
-    @property
-    def failures(self) -> list[str]:
-        """What failed, a line each."""
-        if not self.messages:
-            return [f"{self.case.title}: {self.failure}"] if self.failure else []
-        return [
-            f"{self.case.label}, sample {number} "
-            f"({', '.join(self.case.samples[number - self.case.first])}): {message}"
-            for number, message in self.messages.items()
-        ]
-
-    @property
-    def design(self) -> Path:
-        """Path of the design.npz."""
-        return self.folder / "design.npz"
-
-    def deviation(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return sample instants (n,), s, and the end-effector's distance from its path (n,), m."""
-        with np.load(self.folder / "trajectory.npz", allow_pickle=False) as data:
-            return data["t"], np.hypot(*data["deviation"].T)
-
-    def history(self) -> list[HistoryRow]:
-        """Return the optimisation's history."""
-        from dolfinopt.output.history import read_history
-
-        return read_history(self.folder / "history.csv")
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """All cases of a run.
-
-    Attributes:
-        by_case: in the order asked for.
-        computed: how many were not there before; every sample counts.
-    """
-
-    by_case: Mapping[Case, Outcome]
-    computed: int
-
-    def __getitem__(self, case: Case) -> Outcome:
-        """Return what came out of a case, under its label."""
-        return replace(self.by_case[case], case=case)
-
-    @property
-    def failures(self) -> list[Outcome]:
-        """Those that failed."""
-        return [outcome for outcome in self.by_case.values() if outcome.failure]
-
-
-# -- keys ------------------------------------------------------------------------------------
-
-
-def scene_content(scene: Scene) -> dict[str, Any]:
-    """Return everything that a scene computes with: its values, and its files' content."""
-    data = with_digests(scene.to_dict())
-    del data["name"]
-    return data
-
-
-def _digest(content: Any) -> str:
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 # -- the run ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Cases that are done at once, in an order that depends on nothing but what they are."""
-
-    cases: tuple[Case, ...]
-
-    @property
-    def cost(self) -> float:
-        """Rough measure of the time it takes; the reduced equations' cost grows with q^2."""
-        first = self.cases[0]
-        steps = first.scene.optimizer.max_iterations if first.action == "optimize" else 1
-        if first.action == "sample":  # all alike: those of one design stay together
-            return 1.0
-        coordinates = first.scene.reduction.coordinates
-        size = 1.0 + ((variants.REFERENCE if coordinates == "auto" else coordinates) / 10.0) ** 2
-        return steps * size * len(self.cases)
+# Cases that are done at once, in an order that depends on nothing but what they are.
+Batch = tuple[Case, ...]
 
 
 @dataclass(frozen=True)
@@ -315,13 +97,13 @@ class _Place:
 class _Job:
     """What one rank does in one go: an optimisation, one design in many scenes, or its samples."""
 
-    batches: tuple[_Batch, ...]
+    batches: tuple[Batch, ...]
     place: _Place
 
     @property
     def first(self) -> Case:
         """All others have its action and its design."""
-        return self.batches[0].cases[0]
+        return self.batches[0][0]
 
     @property
     def key(self) -> str:
@@ -330,13 +112,19 @@ class _Job:
 
     @property
     def cost(self) -> float:
-        """See `_Batch.cost`."""
-        return sum(batch.cost for batch in self.batches)
+        """Rough measure of the time it takes; the reduced equations' cost grows with q^2."""
+        if self.first.action == "sample":  # all alike: those of one design stay together
+            return 1.0
+        steps = self.first.scene.optimizer.max_iterations
+        found = [case.scene.reduction.coordinates for batch in self.batches for case in batch]
+        counts = [variants.REFERENCE if count == "auto" else count for count in found]
+        total = sum(1.0 + (count / 10.0) ** 2 for count in counts)
+        return total * (steps if self.first.action == "optimize" else 1)
 
     @property
     def missing(self) -> list[Case]:
         """Cases that have neither been done nor failed."""
-        return [case for batch in self.batches for case in batch.cases if not self.place.has(case)]
+        return [case for batch in self.batches for case in batch if not self.place.has(case)]
 
     def is_done(self) -> bool:
         """Tell whether no case is missing."""
@@ -366,7 +154,7 @@ class _Job:
             for case in missing:
                 _sample(case, given, self.place, progress)
         else:
-            batches = [one for one in self.batches if not set(missing).isdisjoint(one.cases)]
+            batches = [one for one in self.batches if not set(missing).isdisjoint(one)]
             _examine(batches, missing, given, self.place, progress)
 
 
@@ -399,7 +187,7 @@ def run_cases(
         return done, [[numbers[case] for case in batch] for batch in batches]
 
     done, found = on_root(world, look)
-    batches = [_Batch(tuple(wanted[i] for i in batch)) for batch in found]
+    batches = [tuple(wanted[i] for i in batch) for batch in found]
     missing = [case for case, there in zip(wanted, done, strict=True) if not there]
     jobs = _jobs(batches, place, world)
     do_tasks(jobs, place.folder, world, len(missing), shown=shown)
@@ -418,9 +206,7 @@ def _with_dependencies(cases: Iterable[Case]) -> list[Case]:
     return list(found)
 
 
-def _batches(
-    missing: Sequence[Case], wanted: Sequence[Case], place: _Place
-) -> list[tuple[Case, ...]]:
+def _batches(missing: Sequence[Case], wanted: Sequence[Case], place: _Place) -> list[Batch]:
     """Return what is to be done at once, and keep it beside the cases (root only).
 
     Those that an earlier run had begun together stay so if all of them are wanted again.
@@ -452,16 +238,16 @@ def _read_batch(folder: Path) -> tuple[str, ...]:
         return ()
 
 
-def _jobs(batches: Iterable[_Batch], place: _Place, world: MPI.Comm) -> list[_Job]:
+def _jobs(batches: Iterable[Batch], place: _Place, world: MPI.Comm) -> list[_Job]:
     """Return the jobs, optimisations first, as others wait for them, and longest first.
 
     Batches of the same arms and design are one job, so that these are built once, unless that
     leaves a rank without. Every rank begins with other samples: with several designs each rank
     reduces those it needs.
     """
-    groups: dict[str, list[_Batch]] = {}
+    groups: dict[str, list[Batch]] = {}
     for batch in batches:
-        groups.setdefault(batch.cases[0].arms_key, []).append(batch)
+        groups.setdefault(batch[0].arms_key, []).append(batch)
     jobs = []
     for group in groups.values():
         parts = world.size if len(groups) < world.size else 1
@@ -515,7 +301,7 @@ def _optimise(case: Case, place: _Place, progress: Progress) -> None:
 
 
 def _examine(
-    batches: Sequence[_Batch],
+    batches: Sequence[Batch],
     missing: Sequence[Case],
     design: Path | None,
     place: _Place,
@@ -525,7 +311,7 @@ def _examine(
     from dolfinopt.output.run_folder import write_simulation
     from dolfinopt.study.simulate import compare, simulate_scenarios
 
-    cases = [case for batch in batches for case in batch.cases]
+    cases = [case for batch in batches for case in batch]
     progress.tell(missing[0].label, text="...")
     scenes = [_unnamed(case) for case in cases]
     examine: Any = simulate_scenarios if cases[0].action == "simulate" else compare

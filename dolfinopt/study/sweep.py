@@ -14,6 +14,7 @@ import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
+from dolfinopt.study.cases import Case
 from dolfinopt.study.plans import (
     COMPLIANCE,
     QUANTITIES,
@@ -25,7 +26,6 @@ from dolfinopt.study.plans import (
     given_designs,
     magnitudes,
 )
-from dolfinopt.study.store import Case
 from dolfinopt.study.tables import (
     Figure,
     FrameFigure,

@@ -17,6 +17,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.tables.base import without_none
+from dolfinopt.study.cases import Case
 from dolfinopt.study.plans import QUANTITIES, Design, Plan, Report, by_design, given_designs
 from dolfinopt.study.simulate import scales_bodies, with_sample
 from dolfinopt.study.statistics import (
@@ -32,7 +33,6 @@ from dolfinopt.study.statistics import (
     statistics,
     unit_points,
 )
-from dolfinopt.study.store import Case
 from dolfinopt.study.studies import carry_out
 from dolfinopt.study.tables import Figure, FrameFigure, Study, Table, file_name
 from dolfinopt.study.variants import axis_of, changed

@@ -30,7 +30,7 @@ from dolfinopt.paper.statements import (
     power,
     span,
 )
-from dolfinopt.study import store as cases
+from dolfinopt.study import cases
 
 ROOT = Path(__file__).parents[2]
 WORLD = MPI.COMM_WORLD

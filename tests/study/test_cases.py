@@ -14,9 +14,10 @@ import dolfinopt as do
 from dolfinopt.optimization import loop as optimization
 from dolfinopt.output import checkpoint, run
 from dolfinopt.responses import evaluation
-from dolfinopt.study import store as cases
+from dolfinopt.study import store
+from dolfinopt.study.cases import Case, scene_content
 from dolfinopt.study.simulate import simulate_scenarios
-from dolfinopt.study.store import Case, run_cases, scene_content
+from dolfinopt.study.store import run_cases
 
 ROOT = Path(__file__).parents[2]
 SCENE = ROOT / "demos" / "two_arm.toml"
@@ -402,7 +403,7 @@ def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(cases.Progress, "tell", tell)
+        patch.setattr(store.Progress, "tell", tell)
         if stop is None:
             from dolfinopt.output import run_folder as results
 
