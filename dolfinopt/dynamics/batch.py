@@ -74,6 +74,8 @@ def integrate(
     Returns:
         In the same order; a system that cannot be solved has its error.
     """
+    if len(systems) == 1:  # as a batch of one it takes 1.6 times as long from cold, q = 4
+        return [_alone(systems[0], tolerance, stages, profile, guesses[0])]
     found: list[Solution | ConvergenceError | None] = [None] * len(systems)
     order = sorted(range(len(systems)), key=lambda i: _content(systems[i]))
     while order:

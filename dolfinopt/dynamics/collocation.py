@@ -150,7 +150,7 @@ def at_stages(stages: Stages, state: State, a: np.ndarray) -> tuple[np.ndarray, 
 def stage_values(
     stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return q, qd (n, s, N) at all stages from those (n, N) at the steps' step_beginnings."""
+    """Return q, qd (n, s, N) at all stages from those (n, N) at the steps' beginnings."""
     method, h = stages.method, stages.h[:, None, None]
     q_s = q[:, None] + method.c[:, None] * h * qd[:, None] + h * h * (method.A2 @ a)
     return q_s, qd[:, None] + h * (method.A @ a)

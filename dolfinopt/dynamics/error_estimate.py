@@ -48,7 +48,7 @@ def estimated_errors(
     Args:
         stages: what was solved.
         time_grid: (n + 1,), or (runs, n + 1), s.
-        begin: q, qd (n, N) at the steps' step_beginnings.
+        begin: q, qd (n, N) at the steps' beginnings.
         a: (n, s, N).
         limits: of the slow coordinates, tried in turn.
         rate: (runs,) contraction of Newton's method with this matrix, if the answer need not be
@@ -130,7 +130,7 @@ def _corrected(
 
     Args:
         stages, matrix: of one stage more.
-        begin: q, qd (n, N) at the steps' step_beginnings.
+        begin: q, qd (n, N) at the steps' beginnings.
         a, residual, q: (n, s + 1, N).
 
     Returns:

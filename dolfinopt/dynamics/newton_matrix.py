@@ -162,7 +162,7 @@ class NewtonMatrix:
 
         Args:
             by_a: (n, s, N) slopes of J by the accelerations.
-            by_y: (n, 2, N) by the states (q, qd) at the steps' step_beginnings.
+            by_y: (n, 2, N) by the states (q, qd) at the steps' beginnings.
             after: (2, N) by the state at the end of the last.
         """
         multipliers = np.zeros_like(by_a)

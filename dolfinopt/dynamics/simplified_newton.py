@@ -81,7 +81,7 @@ def simplified_newton_matrix(
 
     Args:
         stages: n steps.
-        begin: q, qd (n, N) at the steps' step_beginnings.
+        begin: q, qd (n, N) at the steps' beginnings.
         a: (n, s, N).
         slow: ascending coordinates (S,) that are treated densely.
     """

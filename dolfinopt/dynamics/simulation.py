@@ -152,19 +152,10 @@ def simulate(
     Raises:
         ConvergenceError: the integrator gave up; the message says what to try.
     """
-    options = scene.simulation
-    problem = ElasticSystem(
-        build_mechanism(scene, bodies), lambda t: rigid_motion(t, scene), breakpoints(scene)
-    )
-    with profile.phase("simulation"):
-        if options.integrator == "radau":
-            solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
-        else:
-            solution = generalized_alpha.integrate(
-                problem, options.tolerance, options.rho_inf, profile
-            )
-    profile.counts.simulations += 1
-    return _trajectory(problem, scene, solution)
+    (found,) = simulate_batch([scene], [bodies], profile, [start])
+    if isinstance(found, ConvergenceError):
+        raise found
+    return found
 
 
 def simulate_batch(
@@ -187,7 +178,7 @@ def simulate_batch(
         bodies: of each, from the cart outwards.
         profile: counts the simulations.
         starts: solution of a nearby design for each, or None.
-        differentiated: whether slopes are asked of the trajectories: Newton's method then leaves
+        differentiated: whether gradients are asked of the trajectories: Newton's method then leaves
             1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
@@ -196,21 +187,19 @@ def simulate_batch(
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
     problems = _problems(scenes, bodies)
     found: list[Trajectory | ConvergenceError | None] = [None] * len(scenes)
-    groups: dict[tuple[float, int], list[int]] = {}
-    for i, (scene, own) in enumerate(zip(scenes, bodies, strict=True)):
+    groups: dict[tuple[str, float, int, float], list[int]] = {}
+    for i, scene in enumerate(scenes):
         options = scene.simulation
-        if len(scenes) > 1 and options.integrator == "radau":
-            groups.setdefault((options.tolerance, options.stages), []).append(i)
-            continue
-        try:
-            found[i] = simulate(scene, own, profile, starts[i])
-        except ConvergenceError as error:
-            found[i] = error
-    for (tolerance, stages), group in groups.items():
+        key = (options.integrator, options.tolerance, options.stages, options.rho_inf)
+        groups.setdefault(key, []).append(i)
+    for (integrator, tolerance, stages, rho_inf), group in groups.items():
+        own, begun = [problems[i] for i in group], [starts[i] for i in group]
         with profile.phase("simulation"):
-            goal = radau.GOAL if differentiated else batch.GOAL
-            own, begun = [problems[i] for i in group], [starts[i] for i in group]
-            solutions = batch.integrate(own, tolerance, stages, profile, begun, goal)
+            if integrator == "radau":
+                goal = radau.GOAL if differentiated else batch.GOAL
+                solutions = batch.integrate(own, tolerance, stages, profile, begun, goal)
+            else:
+                solutions = [_conventional(one, tolerance, rho_inf, profile) for one in own]
         for i, one in zip(group, solutions, strict=True):
             if isinstance(one, ConvergenceError):
                 found[i] = one
@@ -218,6 +207,15 @@ def simulate_batch(
             found[i] = _trajectory(problems[i], scenes[i], one)
             profile.counts.simulations += 1
     return [one for one in found if one is not None]
+
+
+def _conventional(
+    problem: ElasticSystem, tolerance: float, rho_inf: float, profile: Profile
+) -> Solution | ConvergenceError:
+    try:
+        return generalized_alpha.integrate(problem, tolerance, rho_inf, profile)
+    except ConvergenceError as error:
+        return error
 
 
 def _problems(

@@ -17,7 +17,7 @@ class Solution:
     Attributes:
         time_grid: (n + 1,) ends of the steps, s.
         nodes: (s,) of each step, in [0, 1].
-        q, qd: (n, N) at the steps' step_beginnings.
+        q, qd: (n, N) at the steps' beginnings.
         a: (n, s, N) accelerations at the nodes.
         error: estimated relative error of the elastic coordinates.
         iterations: Newton iterations spent.
