@@ -67,7 +67,7 @@ def export(
         write_arrays(folder / f"{arm.name}.sid.npz", sid_arrays(data))
         write_text(folder / f"{arm.name}.fem", fem_text(element))
         click.echo(
-            f"{arm.name}: {data.mass:.6g} kg, {data.coordinates} coordinates, "
+            f"{arm.name}: {data.mass:.6g} kg, {data.num_modes} coordinates, "
             f"{len(element.labels)} nodes; in {folder / arm.name}.sid, .sid.npz, .fem"
         )
 

@@ -131,19 +131,19 @@ def _answered(
     None where corrections do not shrink by `POOR`.
     """
     multipliers = matrix.solve_transposed(by_a, by_y, after)
-    moved = np.abs(multipliers).max()
-    enough = ENOUGH * moved
+    size = np.abs(multipliers).max()
+    enough = ENOUGH * size
     while True:
         gradient = exact.transposed(multipliers.reshape(-1, by_a.shape[2]))
         more_a, more_y = vector_jacobian_product(
             matrix.stages, *(x.reshape(by_a.shape) for x in gradient)
         )
         left_a, left_y = by_a + more_a, by_y + more_y
-        if len(matrix.fast) == 0 or moved <= enough:
+        if len(matrix.fast) == 0 or size <= enough:
             return multipliers, _before(matrix.stages, left_y, after)
         step = matrix.solve_transposed(left_a, left_y, after)
-        before, moved = moved, np.abs(step).max()
-        if not moved <= POOR * before:
+        before, size = size, np.abs(step).max()
+        if not size <= POOR * before:
             return None
         multipliers += step
 

@@ -29,10 +29,10 @@ from dolfinopt.dynamics.time_grid import (
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.profiling import Profile
 
-# Of runs that share a matrix. Coordinates are slow up to an angle of 20: with 40, as for one
-# system, nine take a third longer with 4 coordinates an arm. What needs more than 6 matrices needs
-# damping, and windows. A new matrix costs four iterations: one is kept with a contraction of 0.2,
-# or 0.6 where a new one would be no better.
+# Of runs that share a matrix. Coordinates are slow up to an angle of 20: dense blocks of many runs
+# cost more than an iteration. What needs more than 6 matrices needs damping, and windows. A new
+# matrix costs four iterations: one is kept with a contraction of 0.2, or 0.6 where a new one would
+# be no better.
 RUNS = Tuning(
     limits=(20.0, np.inf),
     least_rate=0.2,  # the first step may fall far better than later ones

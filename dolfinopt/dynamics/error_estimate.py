@@ -125,8 +125,8 @@ def _corrected(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative size of what takes the residual away, and whether it can be believed.
 
-    Corrected by what it leaves, as long as that shrinks: of arms without damping, optimised, on
-    163 steps the first answer is 7 % off.
+    Corrected by what it leaves, as long as that shrinks: without damping the first answer may be
+    7 % off.
 
     Args:
         stages, matrix: of one stage more.
@@ -145,9 +145,9 @@ def _corrected(
     for _ in range(CORRECTIONS):
         with np.errstate(all="ignore"):  # of what diverges
             there = at_stages(stages, state, a + step)
-            more, moved = matrix.solve(residual_at(stages, *there, a + step), rest)
-            step, shift = step + more, shift + moved
-        error, correction = stages.relative(shift, q), stages.relative(moved, q)
+            more, shift_more = matrix.solve(residual_at(stages, *there, a + step), rest)
+            step, shift = step + more, shift + shift_more
+        error, correction = stages.relative(shift, q), stages.relative(shift_more, q)
         believed = pending & (correction <= ROUGHLY * error) & np.isfinite(error)
         found[believed] = error[believed]
         pending &= ~believed & (correction <= 0.7 * before)

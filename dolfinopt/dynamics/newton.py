@@ -208,33 +208,33 @@ class _Iteration:
         while True:
             self.iterations[self.active[~self.done]] += 1
             step, shift = matrix.solve(self.at.residual, rest)
-            moved = self.stages.relative(shift, self.at.q + shift)
+            step_size = self.stages.relative(shift, self.at.q + shift)
             if age == 0 and tuning.near:
-                kept = np.where(moved <= tuning.near, tuning.keep_near, keep)
+                kept = np.where(step_size <= tuning.near, tuning.keep_near, keep)
             with np.errstate(all="ignore"):  # inf / inf of what diverges
-                contraction = moved / self.before
+                contraction = step_size / self.before
                 left = _left(np.maximum(contraction, self.at.norm / self.norm_before), tuning)
-            ends = left * moved <= tuning.goal * self.tolerance
+            ends = left * step_size <= tuning.goal * self.tolerance
             if exact and age == 0:
-                ends |= moved <= 1e-3 * self.tolerance
+                ends |= step_size <= 1e-3 * self.tolerance
             ends &= ~self.done
-            seen = ~self.done & np.isfinite(self.before) & np.isfinite(moved)
+            seen = ~self.done & np.isfinite(self.before) & np.isfinite(step_size)
             rate = self.rate[self.active]
             self.rate[self.active] = np.where(seen, np.maximum(rate, contraction), rate)
             self._end(ends, step)
             if self.done.all():
                 return ~self.done
-            poor = (moved > kept * self.before) if age else np.zeros(runs, dtype=bool)
-            wanted = ~self.done & np.isfinite(moved)
+            poor = (step_size > kept * self.before) if age else np.zeros(runs, dtype=bool)
+            wanted = ~self.done & np.isfinite(step_size)
             if runs == 1:  # of many, the next matrix comes for all: a poor step is still a step
                 wanted &= ~poor
             stepped = self._damped(step, wanted)
             failed = ~self.done & (~stepped | poor)
             self.norm_before = np.where(stepped, self._norm_was, self.norm_before)
             earlier = self.before
-            self.before = np.where(stepped, moved, self.before)
+            self.before = np.where(stepped, step_size, self.before)
             if failed.any():
-                return self._after_failure(failed, moved, earlier, age, exact)
+                return self._after_failure(failed, step_size, earlier, age, exact)
             age += 1
 
     def _end(self, ends: np.ndarray, step: np.ndarray) -> None:
@@ -281,7 +281,7 @@ class _Iteration:
     def _after_failure(
         self,
         failed: np.ndarray,
-        moved: np.ndarray,
+        step_size: np.ndarray,
         before: np.ndarray,
         age: int,
         exact: bool,
@@ -293,7 +293,7 @@ class _Iteration:
                 return ~self.done & ~failed
             return ~self.done
         if exact and age == 0:  # rounding, where the step is small: nothing is left to gain
-            self.converged[self.active] = moved <= max(self.tolerance, ROUNDING)
+            self.converged[self.active] = step_size <= max(self.tolerance, ROUNDING)
             return np.zeros(1, dtype=bool)
         if age == 0 or (age == 1 and before[0] <= SETTLED):
             if self.simplified:

@@ -6,7 +6,7 @@ small beside the stiffness. Newton's matrix keeps of its row the diagonal and wh
 coordinates do to it; the slow rows keep all of their slow columns,
     [ P_ss   0   ]
     [ J_fs  p_ff ],
-each of them block lower bidiagonal over the steps. The rows themselves stay exact, so that the
+each of them block lower bidiagonal over the steps. The residual itself stays exact, so that the
 matrix decides about the number of iterations alone; with every coordinate slow it is exact.
 Without J_fs, which costs a tenth of an iteration, it takes two to three times as many.
 """
@@ -29,14 +29,13 @@ from dolfinopt.dynamics.collocation import (
 from dolfinopt.dynamics.system import Linearisation
 
 BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
-# Angles w h up to which coordinates are slow, tried in turn. Simulations of a running optimisation
-# of the paper's example, 4 stages, take 35 ms with 20, 20 with 30, 17 with 40 (10, 6 and 6 Newton
-# iterations); with 3 stages 23 ms with each.
+# Angles w h up to which coordinates are slow, tried in turn: 6 Newton iterations with 30 and 40, 10
+# with 20, in an optimisation of the paper's example.
 LIMITS = (40.0, 120.0, np.inf)
 # As long as not all must be, the slowest so many are, or fewer that have room: on short steps
-# nearly all would. Without damping, optimised, 48 coordinates an arm, to 1e-5: 4 instead of 50 s.
+# nearly all would.
 MOST = 24
-SMALL = 12  # coordinates up to which the exact matrix is cheap: an adjoint of 8 in 12, not 24 ms
+SMALL = 12  # coordinates up to which the exact matrix costs less than more iterations
 MEMORY_BYTES = 256e6  # of the factors of steps that are solved together
 
 
@@ -92,7 +91,7 @@ class NewtonMatrix:
         transfer: (n, 2 S, 2 S) change of that state over a step by that before it.
         band: the same for `bidiagonal_solve`.
         fast_inverse: (s, s, n, F).
-        fast_loads: (2, n, s, F) change of the fast rows by their state (q, qd) at the beginning.
+        fast_loads: (2, n, s, F) change of the fast rows by their state at the beginning.
         fast_transfer: (n, 2, 2, F).
         fast_band: the same for `bidiagonal_solve`, coordinate after coordinate.
     """
@@ -110,43 +109,45 @@ class NewtonMatrix:
     fast_transfer: np.ndarray
     fast_band: np.ndarray
 
-    def solve(self, rows: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the change of a that takes `rows` away, and that of q, both (n, s, N).
+    def solve(self, residual: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the change of a that takes `residual` away, and that of q, both (n, s, N).
 
         Args:
-            rows: (n, s, N).
+            residual: (n, s, N).
             before: (2, N) change of q, qd at the beginning of the first step of every run.
         """
-        step, shift = np.empty_like(rows), np.empty_like(rows)
-        slow = self._solve_slow(rows[:, :, self.slow], before[:, self.slow])
+        step, shift = np.empty_like(residual), np.empty_like(residual)
+        slow = self._solve_slow(residual[:, :, self.slow], before[:, self.slow])
         step[:, :, self.slow], shift[:, :, self.slow] = slow[0], slow[1]
         if len(self.fast):
             a, q, qd = (x.reshape(-1, len(self.slow)) for x in slow)
-            felt = self.tangent.times(q, qd, a, self.fast)
-            left = rows[:, :, self.fast] + felt.reshape(*rows.shape[:2], -1)
+            change = self.tangent.times(q, qd, a, self.fast)
+            left = residual[:, :, self.fast] + change.reshape(*residual.shape[:2], -1)
             step[:, :, self.fast], shift[:, :, self.fast] = self._solve_fast(
                 left, before[:, self.fast]
             )
         return step, shift
 
     def _solve_slow(
-        self, rows: np.ndarray, before: np.ndarray
+        self, residual: np.ndarray, before: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the changes of a, q, qd (n, s, S)."""
-        count, s, size = rows.shape
-        forced = -(self.inverse @ rows.reshape(count, s * size, 1)).reshape(rows.shape)
+        count, s, size = residual.shape
+        forced = -(self.inverse @ residual.reshape(count, s * size, 1)).reshape(residual.shape)
         y = np.empty((count, 2 * size))
         y[1:] = end_gain(self.stages, forced[..., None])[:-1, :, 0]
         y[:: self.stages.length] = before.ravel()
         y = bidiagonal_solve(self.band, y)
         answer = self.answer.reshape(count, s * size, -1)
-        step = forced + (answer @ y[:, :, None]).reshape(rows.shape)
+        step = forced + (answer @ y[:, :, None]).reshape(residual.shape)
         return step, *stage_values(self.stages, y[:, :size], y[:, size:], step)
 
-    def _solve_fast(self, rows: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _solve_fast(
+        self, residual: np.ndarray, before: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the changes of a and q (n, s, F)."""
-        forced = -_diagonal(self.fast_inverse, rows)
-        count, _, size = rows.shape
+        forced = -_diagonal(self.fast_inverse, residual)
+        count, _, size = residual.shape
         y = np.empty((count, 2, size))
         y[1:] = end_gain(self.stages, forced[..., None])[:-1].reshape(-1, 2, size)
         y[:: self.stages.length] = before
@@ -158,10 +159,10 @@ class NewtonMatrix:
         return step, stage_values(self.stages, y[:, 0], y[:, 1], step)[0]
 
     def solve_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Return multipliers (n, s, N): J + sum multipliers . rows, by this matrix, rests.
+        """Return multipliers (n, s, N): J + sum multipliers . residual, by this matrix, rests.
 
         Args:
-            by_a: (n, s, N) slopes of J by the accelerations.
+            by_a: (n, s, N) gradient of J by the accelerations.
             by_y: (n, 2, N) by the states (q, qd) at the steps' beginnings.
             after: (2, N) by the state at the end of the last.
         """
@@ -172,8 +173,8 @@ class NewtonMatrix:
                 by_a[:, :, self.fast], by_y[:, :, self.fast], after[:, self.fast]
             )
             shape = (*by_a.shape[:2], len(self.slow))
-            felt = self.tangent.transposed(multipliers.reshape(-1, by_a.shape[2]))
-            more_a, more_y = vector_jacobian_product(self.stages, *(x.reshape(shape) for x in felt))
+            slow = self.tangent.transposed(multipliers.reshape(-1, by_a.shape[2]))
+            more_a, more_y = vector_jacobian_product(self.stages, *(x.reshape(shape) for x in slow))
             by_a_s, by_y_s = by_a_s + more_a, by_y_s + more_y
         multipliers[:, :, self.slow] = self._slow_transposed(by_a_s, by_y_s, after[:, self.slow])
         return multipliers
@@ -190,14 +191,14 @@ class NewtonMatrix:
         return -(self.inverse.swapaxes(1, 2) @ flat).reshape(by_a.shape)
 
     def _fast_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
-        turned = self.fast_inverse.swapaxes(0, 1)
-        eased = _diagonal(turned, by_a)
-        direct = by_y - np.einsum("injk,njk->nik", self.fast_loads, eased)
+        inverse = self.fast_inverse.swapaxes(0, 1)
+        answered = _diagonal(inverse, by_a)
+        direct = by_y - np.einsum("injk,njk->nik", self.fast_loads, answered)
         direct[-1] += np.einsum("ik,ijk->jk", after, self.fast_transfer[-1])
         count, _, size = direct.shape
         p = bidiagonal_solve(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
         p = np.concatenate([p.transpose(1, 2, 0)[1:], after[None]])
-        return -_diagonal(turned, by_a + _end_gradient(self.stages, p.reshape(len(p), -1)))
+        return -_diagonal(inverse, by_a + _end_gradient(self.stages, p.reshape(len(p), -1)))
 
 
 def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
@@ -216,8 +217,7 @@ def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
 def bidiagonal_solve(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
     """Return y_n+1 = T_n y_n + gain_n (n, m) from y_0 and the gains (n, m), or the transposed.
 
-    One call instead of a loop over the steps: for 176 steps of 5 fast coordinates 0.01 instead of
-    0.6 ms, of 92 coordinates 0.2 instead of 0.7 ms.
+    One call of BLAS instead of a loop over the steps.
     """
     k = len(band) - 1
     return dtbsv(k, band, y.ravel(), lower=1, trans=transposed, diag=1).reshape(y.shape)
@@ -234,7 +234,7 @@ def _diagonal(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _end_gradient(stages: Stages, p: np.ndarray) -> np.ndarray:
-    """Return slopes by a (n, s, S) of states after each step whose slopes are p (n, 2 S)."""
+    """Return the gradient by a (n, s, S) from that p (n, 2 S) by the states after each step."""
     h = stages.h[:, None, None]
     by_q, by_v = np.split(p[:, None], 2, axis=2)
     method = stages.method
@@ -275,15 +275,15 @@ def factorise(
     return NewtonMatrix(stages, tangent, slow, fast, *dense, *single)
 
 
-def _blocks(stages: Stages, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slopes of every step's rows by its accelerations and by the state it begins from.
+def _blocks(stages: Stages, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivative of every step's residual by its accelerations and first state.
 
     Returns:
         (n, s S, s S) and (n, s S, 2 S).
     """
-    method, size = stages.method, slopes.shape[1]
+    method, size = stages.method, jacobian.shape[1]
     count, s = len(stages.h), len(method.c)
-    by_q, by_v, by_a = np.split(slopes.reshape(count, s, size, 3 * size), 3, axis=3)
+    by_q, by_v, by_a = np.split(jacobian.reshape(count, s, size, 3 * size), 3, axis=3)
     h = stages.h[:, None, None]
     by_stage = np.stack([h * method.A, h * h * method.A2])[:, :, :, None, :, None]
     block = by_stage[0] * by_v[:, :, :, None]
@@ -333,7 +333,7 @@ def solve_once(
     qd: np.ndarray,
     a: np.ndarray,
     slow: np.ndarray,
-    rows: np.ndarray,
+    residual: np.ndarray,
 ) -> np.ndarray:
     """Return the change of q (n, s, N) as `NewtonMatrix.solve`, factors made window by window."""
     shift = np.empty_like(a)
@@ -341,6 +341,6 @@ def solve_once(
     for part in windows(stages, slow):
         window = stages.window(part.start, part.stop)
         matrix = factorise(window, q[part], qd[part], a[part], slow)
-        step, shift[part] = matrix.solve(rows[part], before)
+        step, shift[part] = matrix.solve(residual[part], before)
         before = np.stack([x[-1] for x in step_ends(window, (before[0], before[1]), step)])
     return shift

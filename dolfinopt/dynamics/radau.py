@@ -36,31 +36,24 @@ from dolfinopt.profiling import Profile
 from dolfinopt.progress import SlowWork
 
 GOAL = ONE_RUN.goal  # what Newton may leave, as a share of the tolerance
-MAX_GRIDS = 12
-# Newton may fail for too long a step: so many times four times more steps are tried, up to
-# a number of them whose attempt still ends in a minute.
-MAX_FAILURES = 3
-MAX_RETRY = 80_000
+MAX_GRIDS = 12  # each at least 1.1 times finer
+# Newton may fail for too long a step: so many times four times more steps are tried, up to a number
+# of them whose attempt still ends in a minute.
+MAX_FAILURES, MAX_RETRY = 3, 80_000
 # Grids that fail, or are solved window by window with an error above `LOST`, until the motion is
-# given up; one with a larger error than a coarser grid counts twice. Large vibrations feed on
-# themselves there, and every grid finds another motion: errors of 1 on 52 and 7 on 329 steps with
-# 2 stages, of 4 on 54 and 31 on 216 with 3 (11 kg on uniform arms, 0.87 s, undamped). Steps that
-# are merely too long have errors below 1 and need no windows.
-MAX_LOST = 2
-LOST = 0.5
+# given up; one with a larger error than a coarser grid counts twice: large vibrations feed on
+# themselves, and every grid finds another motion. Of steps merely too long errors are below 1.
+MAX_LOST, LOST = 2, 0.5
 # Least growth of the steps at one refinement after the other: as long as vibrations are not
 # resolved the error falls more slowly than the order says.
 REFINED = (1.1, 1.4, 2.0)
-# Share of the tolerance that the estimate may take: where vibrations are not resolved one stage
-# more shares a part of the error. Estimates down to 0.55 of it were seen, mostly 0.9 to 1.
+# Share of the tolerance that the estimate may take: it is 0.55 to 1 times the error.
 ACCEPT = 0.6
-# Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent
-# between neighbouring designs, and a grid that is refined twice costs more than one too fine.
+# Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent between
+# neighbouring designs, and a grid that is refined twice costs more than one too fine.
 AIM = 0.4
 # Error with eight steps a period of the slowest vibration, by stages: paper's example, initial
-# design (optimised 0.012, 9e-4, 2e-5, 4e-6). Where so many more steps are needed the first grid is
-# the last one, mostly: from cold 24 instead of 30 ms with 4 stages; else it is better coarse: with
-# 3 stages 48 coordinates an arm take 78 ms, on the fine one at once 125.
+# design. The first grid is chosen by it where so many more steps are needed; else coarse.
 FIRST_ERROR = {1: np.inf, 2: 0.083, 3: 4.6e-3, 4: 1.1e-4, 5: 7e-6}
 FIRST_GROWTH = 1.6
 

@@ -32,40 +32,40 @@ class SimplifiedNewtonMatrix(NewtonMatrix):
     """Newton's matrix with held tangents; its slow blocks are kept in A's eigenvectors.
 
     Attributes:
-        slopes: (n, S, 3 S) of the slow rows in the middle of every step, by q, qd, qdd.
-        into: (m, s) complex, rows of stages to eigenvectors, of conjugate ones one.
+        jacobian: (n, S, 3 S) of the slow rows in the middle of every step, by q, qd, qdd.
+        into: (m, s) complex, stages to eigenvectors, of conjugate ones one.
         out: (s, 2 m) real, real and imaginary parts there to stages.
         parts: (m, n, S, S) complex, inverted.
     """
 
-    slopes: np.ndarray
+    jacobian: np.ndarray
     into: np.ndarray
     out: np.ndarray
     parts: np.ndarray
 
     def _solve_slow(
-        self, rows: np.ndarray, before: np.ndarray
+        self, residual: np.ndarray, before: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the changes of a, q, qd (n, s, S)."""
-        count, _, size = rows.shape
+        count, _, size = residual.shape
         stages = self.stages
         y = np.empty((count, 2 * size))
-        y[1:] = end_gain(stages, -self._applied(rows)[..., None])[:-1, :, 0]
+        y[1:] = end_gain(stages, -self._applied(residual)[..., None])[:-1, :, 0]
         y[:: stages.length] = before.ravel()
         y = bidiagonal_solve(self.band, y)
         q, qd = y[:, :size], y[:, size:]
-        # What the state at the beginning does to the rows: K q + (D + c h K) qd.
-        at_once = (self.slopes[:, :, : 2 * size] @ y[:, :, None])[:, None, :, 0]
-        late = stages.h[:, None] * (self.slopes[:, :, :size] @ qd[:, :, None])[:, :, 0]
-        rows = rows + at_once + stages.method.c[:, None] * late[:, None]
-        step = -self._applied(rows)
+        # What the state at the beginning does to the residual: K q + (D + c h K) qd.
+        at_once = (self.jacobian[:, :, : 2 * size] @ y[:, :, None])[:, None, :, 0]
+        late = stages.h[:, None] * (self.jacobian[:, :, :size] @ qd[:, :, None])[:, :, 0]
+        residual = residual + at_once + stages.method.c[:, None] * late[:, None]
+        step = -self._applied(residual)
         return step, *stage_values(stages, q, qd, step)
 
-    def _applied(self, rows: np.ndarray) -> np.ndarray:
-        """Return the inverted blocks times rows (n, s, S)."""
-        count, s, size = rows.shape
-        turned = np.ascontiguousarray(rows.swapaxes(0, 1)).reshape(s, -1)
-        into = (self.into @ turned).reshape(-1, count, size, 1)
+    def _applied(self, residual: np.ndarray) -> np.ndarray:
+        """Return the inverted blocks times a residual (n, s, S)."""
+        count, s, size = residual.shape
+        by_stage = np.ascontiguousarray(residual.swapaxes(0, 1)).reshape(s, -1)
+        into = (self.into @ by_stage).reshape(-1, count, size, 1)
         found = (self.parts @ into).reshape(len(self.into), -1)
         both = np.concatenate([found.real, found.imag])
         return (self.out @ both).reshape(s, count, size).swapaxes(0, 1)
@@ -87,16 +87,16 @@ def simplified_newton_matrix(
     """
     fast = np.setdiff1d(np.arange(a.shape[2]), slow)
     tangent = _tangent(stages, begin, a, slow)
-    slopes = tangent.dense()
+    jacobian = tangent.dense()
     method = stages.method
     into, out = _eigenvectors(method)
-    parts = _parts(method, stages.h, slopes)
-    transfer = _transfer(stages, slopes, parts, into, out)
+    parts = _parts(method, stages.h, jacobian)
+    transfer = _transfer(stages, jacobian, parts, into, out)
     none = np.empty(0)  # the blocks of all stages are never formed
     dense = (none, none, transfer, band_of(transfer, stages.length))
     single = diagonal_matrix(stages, *(x[:, fast] for x in stages.uncoupled))
     return SimplifiedNewtonMatrix(
-        stages, tangent, slow, fast, *dense, *single, slopes, into, out, parts
+        stages, tangent, slow, fast, *dense, *single, jacobian, into, out, parts
     )
 
 
@@ -109,13 +109,13 @@ def _eigenvectors(method: Collocation) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.inv(X)[upper], np.concatenate([out.real, -out.imag], axis=1)
 
 
-def _parts(method: Collocation, h: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of slopes by q, qd, qdd."""
+def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of the derivative by q, qd, qdd."""
     values = np.linalg.eigvals(method.A)
     values = values[values.imag >= -1e-12]
-    count, size = slopes.shape[:2]
+    count, size = jacobian.shape[:2]
     parts = np.empty((len(values), count, size, size), dtype=complex)
-    K, D, M = np.split(slopes.transpose(1, 2, 0), 3, axis=1)
+    K, D, M = np.split(jacobian.transpose(1, 2, 0), 3, axis=1)
     for first in range(0, count, CHUNK):
         part = slice(first, first + CHUNK)
         hl = values[:, None] * h[part]
@@ -125,7 +125,7 @@ def _parts(method: Collocation, h: np.ndarray, slopes: np.ndarray) -> np.ndarray
 
 
 def _transfer(
-    stages: Stages, slopes: np.ndarray, parts: np.ndarray, into: np.ndarray, out: np.ndarray
+    stages: Stages, jacobian: np.ndarray, parts: np.ndarray, into: np.ndarray, out: np.ndarray
 ) -> np.ndarray:
     """Return the change (n, 2 S, 2 S) of the state over a step by that before it."""
     method, h = stages.method, stages.h[:, None, None]
@@ -145,11 +145,11 @@ def _transfer(
         weights[:, k, :m] = real * right[:, k].real + imaginary * right[:, k].imag
         weights[:, k, m:] = imaginary * right[:, k].real - real * right[:, k].imag
     sums = (weights.reshape(4, -1) @ both).reshape(2, 2, count, size, size)
-    K = slopes[:, :, :size]
+    K = jacobian[:, :, :size]
     transfer = np.empty((count, 2 * size, 2 * size))
     for row, power in ((0, h * h), (1, h)):
         place = slice(row * size, (row + 1) * size)
-        transfer[:, place] = -power * (sums[row, 0] @ slopes[:, :, : 2 * size])
+        transfer[:, place] = -power * (sums[row, 0] @ jacobian[:, :, : 2 * size])
         transfer[:, place, size:] -= power * h * (sums[row, 1] @ K)
     transfer += np.eye(2 * size)
     diagonal = np.arange(size)
@@ -158,7 +158,7 @@ def _transfer(
 
 
 def _tangent(stages: Stages, begin: State, a: np.ndarray, slow: np.ndarray) -> Linearisation:
-    """Return the rows' derivative by the slow coordinates in the middle of every step."""
+    """Return the residual's derivative by the slow coordinates in the middle of every step."""
     value, first, second = lagrange_integrals(stages.method.c, np.array([0.5]))
     h = stages.h[:, None]
     q = begin[0] + 0.5 * h * begin[1] + h * h * np.einsum("j,njk->nk", second[0], a)

@@ -79,7 +79,7 @@ class Trajectory:
         return np.array(largest)
 
     @cached_property
-    def turns(self) -> np.ndarray:
+    def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
         parts = zip(self.mechanism.slices, self.mechanism.bodies, strict=True)
         return np.array([np.abs(self.q_e[:, s] @ body.outboard[2]).max() for s, body in parts])

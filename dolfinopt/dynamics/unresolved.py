@@ -1,12 +1,10 @@
 """The error of vibrations that steps do not resolve, which one stage more does not see.
 
-Where the prescribed motion sets in, changes its law or ends, loads have kinks, and every vibration
-sets in with an amplitude of its own. Steps much longer than its period damp it out by the method
-with s stages and with s + 1 alike: the difference of both says nothing about it. Without damping
-it is there to the end, though. So estimated by the amplitude at each kink, asymptotically for
-fast vibrations, times what the method with s + 1 stages makes of a free vibration.
-
-The paper's example without damping, void tips, 41 steps: the estimate was 0.0055, the error 0.065.
+Where the prescribed motion sets in, changes its law or ends, loads have breakpoints, and every
+vibration sets in with an amplitude of its own. Steps much longer than its period damp it out by the
+method with s stages and with s + 1 alike: the difference of both says nothing about it. Without
+damping it is there to the end, though. So estimated by the amplitude at each breakpoint,
+asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
 """
 
 from __future__ import annotations

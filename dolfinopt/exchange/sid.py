@@ -142,7 +142,7 @@ class StandardInputData:
     comment: str = ""
 
     @property
-    def coordinates(self) -> int:
+    def num_modes(self) -> int:
         """Number nq of elastic coordinates."""
         return len(self.names)
 
@@ -189,7 +189,7 @@ def write_sid(path: Path, data: StandardInputData) -> None:
 
 def sid_text(data: StandardInputData) -> str:
     """Return the content of the text file, numbers with 17 digits and Fortran's exponent."""
-    nq = data.coordinates
+    nq = data.num_modes
     comment = " ".join(data.comment.split())
     lines = [
         f"{len(data.nodes):5d}{nq:5d}    :No. nodes, No. modes:{comment}",

@@ -41,8 +41,8 @@ SINGULAR = 1e-6
 # Instants of the whole motion at which its reach is checked and its angles are told apart.
 DENSE = 2001
 CART = "cart"  # first column of a table of joints
-# With more rows a table's kinks are many and small; the integrator's steps need not end there.
-MAX_KINKS = 20
+# With more rows a table's corners are many and small; the integrator's steps need not end there.
+MAX_CORNERS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,14 +122,14 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     rows of a short table without times: there the third derivative of the cubic spline jumps.
     """
     motion = scene.motion
-    kinks, timed = np.zeros(0), False
+    corners, timed = np.zeros(0), False
     if motion.path in ("points", "joints"):
         curve, timed = _curve(motion, _columns(scene), file_stamp(motion))
-        kinks = np.array(curve.kinks)
+        corners = np.array(curve.kinks)
     if not timed:
-        rows = _when(kinks, motion) if 0 < len(kinks) <= MAX_KINKS else []
-        kinks = np.concatenate([rows, time_law(motion).knots * motion.duration])
-    instants = np.sort(np.append(kinks, motion.duration))
+        rows = _when(corners, motion) if 0 < len(corners) <= MAX_CORNERS else []
+        corners = np.concatenate([rows, time_law(motion).knots * motion.duration])
+    instants = np.sort(np.append(corners, motion.duration))
     apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
     apart &= instants < motion.horizon * (1.0 - SAME_TIME)
     return (0.0, *instants[apart].tolist(), motion.horizon)

@@ -299,7 +299,7 @@ def from_sid(
     return plane_body(
         mass=data.mass,
         moment=data.mdCM.M0[:2, 0].copy(),
-        inertia=float(data.inertia(np.zeros(data.coordinates))[2, 2]),
+        inertia=float(data.inertia(np.zeros(data.num_modes))[2, 2]),
         C=data.Ct.M0[:, :2].T.copy(),
         j=0.0 - data.Oe.M0[:, 2],
         r=data.Cr.M0[:, 2].copy(),
@@ -334,17 +334,17 @@ def _ends(
 
 def _check_nodes(data: StandardInputData, first: Node, last: Node, source: str) -> None:
     """Check that the frame is held at the first node, and that the last moves in the plane."""
-    reach = np.abs(last.origin.M0).max()
-    if not reach > 0.0:
+    length = np.abs(last.origin.M0).max()
+    if not length > 0.0:
         raise InputError(f"{source}: the outboard node {last.name} is at the origin")
     push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
     # Of the two scales the other follows over the arm's length.
-    push, turn = max(push, reach * turn), max(turn, push / reach)
+    push, turn = max(push, length * turn), max(turn, push / length)
     checks = [
-        (first, "origin", first.origin.M0, reach, "at the origin"),
+        (first, "origin", first.origin.M0, length, "at the origin"),
         (first, "phi", first.phi.M0, push, "held in the frame"),
         (first, "psi", first.psi.M0, turn, "held in the frame"),
-        (last, "origin", last.origin.M0[2], reach, "in the plane z = 0"),
+        (last, "origin", last.origin.M0[2], length, "in the plane z = 0"),
         (last, "phi", last.phi.M0[2], push, "in the plane"),
         (last, "psi", last.psi.M0[:2], turn, "in the plane"),
     ]
@@ -359,7 +359,7 @@ def _check_nodes(data: StandardInputData, first: Node, last: Node, source: str) 
 
 def _check_plane(data: StandardInputData, source: str) -> None:
     """Check that plane motion stays in the plane."""
-    inertia = data.inertia(np.zeros(data.coordinates))
+    inertia = data.inertia(np.zeros(data.num_modes))
     spatial: Iterable[tuple[str, np.ndarray, np.ndarray]] = (
         ("row 3 of mdCM", data.mdCM.M0[2], data.mdCM.M0),
         ("J(1, 3), J(2, 3)", inertia[:2, 2], inertia),
@@ -376,7 +376,7 @@ def _check_plane(data: StandardInputData, source: str) -> None:
 
 def _check_definite(data: StandardInputData, source: str) -> None:
     """Check that a mechanical body may have these masses and stiffnesses."""
-    inertia = data.inertia(np.zeros(data.coordinates))[2, 2]
+    inertia = data.inertia(np.zeros(data.num_modes))[2, 2]
     for name, number in (("mass", data.mass), ("J(3, 3)", inertia)):
         if not number > 0.0:
             raise InputError(f"{source}: {name} = {number:g} must be > 0")

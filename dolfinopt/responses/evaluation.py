@@ -385,5 +385,5 @@ def _figures(trajectory: Trajectory) -> Motion:
         first_frequencies=tuple(map(first_frequency, trajectory.mechanism.bodies)),
         error=trajectory.solution.error,
         deflections=tuple(map(float, trajectory.deflections)),
-        turns=tuple(map(float, trajectory.turns)),
+        turns=tuple(map(float, trajectory.interface_rotations)),
     )

@@ -642,7 +642,7 @@ def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
         K=K,
         D=damping * K,
         outboard=outboard,
-        reach=np.array([length, 0.0]),
+        outboard_point=np.array([length, 0.0]),
     )
 
 

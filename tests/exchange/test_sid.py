@@ -140,7 +140,7 @@ def matrix(*shape, **entries):
 
 def test_a_file_in_the_manner_of_fembs(tmp_path):
     data = read(tmp_path, bar())
-    assert data.mass == 3.0 and data.coordinates == 2 and data.comment == "a bar"
+    assert data.mass == 3.0 and data.num_modes == 2 and data.comment == "a bar"
     assert data.names == ("Eigen Mode    1 :        1.135 Hz", "Eigen Mode    2 :        2.557 Hz")
     [node] = data.nodes
     assert (node.name, node.rframe, node.sigma) == ("17", "body ref", None)

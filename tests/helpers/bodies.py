@@ -22,7 +22,7 @@ class Cloud:
         modes: (n, 2, q) displacement of every point.
         K, D: (q, q) stiffness and damping.
         outboard: (3, q) u_x, u_y, theta of the outboard interface.
-        reach: (2,) its reference position, m.
+        outboard_point: (2,) its reference position, m.
     """
 
     points: np.ndarray
@@ -31,7 +31,7 @@ class Cloud:
     K: np.ndarray
     D: np.ndarray
     outboard: np.ndarray
-    reach: np.ndarray
+    outboard_point: np.ndarray
 
     def body(self) -> ShapeIntegrals:
         """Return the shape integrals as sums over the points."""
@@ -50,7 +50,7 @@ class Cloud:
             K=self.K,
             D=self.D,
             outboard=self.outboard,
-            outboard_point=self.reach,
+            outboard_point=self.outboard_point,
         )
 
 
@@ -65,7 +65,7 @@ def random_cloud(rng: np.random.Generator, coordinates: int) -> Cloud:
         K=root @ root.T + np.eye(coordinates),
         D=damping @ damping.T,
         outboard=rng.normal(scale=0.3, size=(3, coordinates)),
-        reach=np.array([1.0, 0.2]),
+        outboard_point=np.array([1.0, 0.2]),
     )
 
 
@@ -96,7 +96,7 @@ def beam(
         K=K,
         D=damping * K,
         outboard=np.array([[0.0, 0.0, 1.0], [1.0, length / 2.0, 0.0], [1.5 / length, 1.0, 0.0]]),
-        reach=np.array([length, 0.0]),
+        outboard_point=np.array([length, 0.0]),
     )
 
 
@@ -149,7 +149,7 @@ class Chain:
             angle = angle + joint
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             points.append(origin + (cloud.points + cloud.modes @ e) @ turn.T)
-            origin = origin + turn @ (cloud.reach + cloud.outboard[:2] @ e)
+            origin = origin + turn @ (cloud.outboard_point + cloud.outboard[:2] @ e)
             angle = angle + cloud.outboard[2] @ e
         return np.concatenate(points), origin, angle
 

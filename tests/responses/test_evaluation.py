@@ -114,7 +114,7 @@ def gauss_cloud(length: float, height: float, mass: float) -> Cloud:
         K=none,
         D=none,
         outboard=np.zeros((3, 0)),
-        reach=np.array([length, 0.0]),
+        outboard_point=np.array([length, 0.0]),
     )
 
 
