@@ -169,7 +169,7 @@ def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
         bbox_to_anchor=(1.0, 1.02),
         frameon=False,
         fontsize=9,
-        handlelength=3.0,
+        handlelength=5.0,
     )
 
 
@@ -192,7 +192,7 @@ def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
                 borderaxespad=0.0,
                 frameon=False,
                 fontsize=9,
-                handlelength=3.0,
+                handlelength=5.0,
             )
     drawn.align_ylabels(list(grid))
     return drawn
