@@ -30,7 +30,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
 
-THRESHOLDS = 0.25, 0.75
+THRESHOLDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 
 # How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
 CLIPPED = 1e-10
@@ -391,7 +391,7 @@ def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[S
 
 @cache
 def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
-    """Read a body once for every state of its file: 4 ms, as long as the rest of an evaluation."""
+    """Read a body once for every state of its file."""
     return load_body(Path(sid), length)
 
 

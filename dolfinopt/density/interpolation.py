@@ -28,7 +28,7 @@ MASS_6, MASS_7 = 6e5, -5e6
 
 @dataclass(frozen=True, eq=False)
 class Interpolated:
-    """Relative stiffness and mass of cells and their slopes; every array like x, dimensionless.
+    """Relative stiffness and mass of cells, and derivatives; arrays like x, dimensionless.
 
     Attributes:
         stiffness: E / E0.
@@ -112,7 +112,7 @@ def _above_void(
     mass: np.ndarray,
     mass_slope: np.ndarray,
 ) -> Interpolated:
-    """Add the second material to the shapes e, m and their slopes."""
+    """Add the second material to the functions e, m and their derivatives."""
     span = 1.0 - void
     return Interpolated(
         stiffness=void + span * stiffness,

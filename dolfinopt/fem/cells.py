@@ -16,10 +16,18 @@ def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
         operators: of the arm.
         field: (n_nodes, 2, k).
     """
-    cells = operators.cells
-    values = field[cells]
-    values -= values.mean(axis=1, keepdims=True)
-    return values.reshape(len(cells), 2 * cells.shape[1], field.shape[2])
+    num_cells, num_nodes = operators.cells.shape
+    flat = field.reshape(len(field), -1)
+    # Node by node: rows are contiguous, which a mean over the nodes' axis is not.
+    corners = [flat[nodes] for nodes in operators.cells.T]
+    mean = corners[0].copy()
+    for corner in corners[1:]:
+        mean += corner
+    mean /= num_nodes
+    values = np.empty((num_cells, num_nodes, flat.shape[1]))
+    for k, corner in enumerate(corners):
+        np.subtract(corner, mean, out=values[:, k])
+    return values.reshape(num_cells, 2 * num_nodes, field.shape[2])
 
 
 def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:

@@ -247,8 +247,7 @@ def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float
     E = generators(d)
     rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))  # M [1, X], per component
     MX, MV_flat = rigid[:, :, 1], MV.reshape(-1, q)
-    EX = np.einsum("cab,nb->cna", E, X)
-    EV = np.einsum("cab,nbl->cnal", E, V).reshape(len(E), -1, q)
+    EX, EV = _applied(E, X), _applied(E, V).reshape(len(E), -1, q)
     parts = (
         rigid[:, 0, 0].sum(),
         MX.sum(axis=0),
@@ -273,6 +272,14 @@ def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float
         outboard=basis.outboard,
         outboard_point=arm.mesh.outboard_point,
     )
+
+
+def _applied(E: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Return E_c times every node's vectors (c, n, d, ...); E is sparse."""
+    out = np.zeros((len(E), *field.shape))
+    for c, a, b in np.argwhere(E):
+        out[c, :, a] += E[c, a, b] * field[:, b]
+    return out
 
 
 def _assembled(

@@ -23,11 +23,11 @@ from dolfinopt.scene.load import Scene
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-FALL = 4.0  # from one step to the next
-STEPS = tuple(0.01 / FALL**k for k in range(5))  # of the design variable
-MARGIN = 0.05  # design variables are drawn this far inside [0, 1]: the steps must not leave it
-ROUNDING = 1e-10  # of the objective: what Newton's tolerance leaves of it
-PASSES = 1.9  # least rate; 2 is exact
+FALL = 4.0  # ratio of one step to the next: remainders of second order fall by 16
+STEPS = tuple(0.01 / FALL**k for k in range(5))  # of the design variable, down to 4e-5
+MARGIN = 0.05  # design variables are moved this far inside [0, 1]: the steps must not leave it
+ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
+PASSES = 1.9  # least rate; 2 is exact, a wrong gradient has 1
 
 Cells = Mapping[int, np.ndarray]
 
@@ -148,10 +148,10 @@ def _physical(partition: Partition, arms: Mapping[int, Arm], x: Cells) -> dict[i
 
 
 def _by_x(
-    partition: Partition, arms: Mapping[int, Arm], slopes: Cells, x: Cells
+    partition: Partition, arms: Mapping[int, Arm], gradient: Cells, x: Cells
 ) -> dict[int, np.ndarray]:
     with together(partition.world):
-        return {k: arm.backward(slopes[k], arm.filtered(x[k])) for k, arm in arms.items()}
+        return {k: arm.backward(gradient[k], arm.filtered(x[k])) for k, arm in arms.items()}
 
 
 def _dot(partition: Partition, a: Cells, b: Cells) -> float:

@@ -30,29 +30,35 @@ Array = npt.NDArray[np.float64]
 _INITIAL_DISTANCE = 0.5
 _SMALLEST_DISTANCE = 0.01
 _LARGEST_DISTANCE = 10.0
-_WIDEN = 1.2  # the variable went on in the same direction
-_NARROW = 0.7  # the variable turned back
+_WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: asyincr)
+_NARROW = 0.7  # where it turned back (asydecr)
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
 # A move below this part of the range is rounding and its sign chance: without the limit the
 # asymptotes of variables at rest would depend on the order of summation over the ranks.
 _AT_REST = 1e-9
 
-_CURVATURE = 1.002  # Svanberg's 1.001 + 0.001
-_RAA0 = 1e-5
-_PENALTY = 1000.0  # c_i; violating a normalised constraint by y costs c y + y^2 / 2
+_CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
+_RAA0 = 1e-5  # his raa0: convex even where all gradients are zero
+_PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y + y^2 / 2
 
 # The dual is stepped in units of (multiplier + _FLOOR), because multipliers span many decades.
-# The floor is of the order of raa0: smaller multipliers hardly change the design.
+# Multipliers below raa0 hardly change the design beside the curvature that raa0 adds.
 _FLOOR = 1e-5
-_FIRST_RADIUS = 10.0
-_LARGEST_RADIUS = 1000.0
-_SMALLEST_STEP = 1e-14
-_MAX_EVALUATIONS = 300
+_FIRST_RADIUS = 10.0  # of the trust region in these units: about a decade of every multiplier
+_LARGEST_RADIUS = 1000.0  # three decades
+_SMALLEST_STEP = 1e-14  # in these units: the rounding of the multipliers
+_MAX_EVALUATIONS = 300  # of the dual; 4 to 5 are the rule
+_ROUNDING = 1e-14  # of the dual's value relative to its terms: some ten units of the last place
+_ACTIVE_MULTIPLIER = 1e-7 * _FLOOR  # smaller ones move no variable
+# Allowed rest of an active constraint relative to its terms. Near rounding is the rule; only
+# constraints that nearly repeat each other end in between.
+_COMPLEMENTARY = 1e-6
+_REGULARISATION = 1e-12  # of the dual's curvature, for constraints that say the same
+_FLAT = 1e-6  # part of the gradient added to it, for a flat dual; vanishes at the maximum
 _TINY = float(np.finfo(np.float64).tiny)
 
-# Variables are treated in blocks whose temporaries stay in the cache and below the size at which
-# the allocator asks the system for fresh pages: 0.4 ms instead of 1.1 ms an evaluation at
-# n = 19 200, m = 2, one core; a step with its 4 to 5 evaluations takes 3 to 4 ms.
+# Variables are treated in blocks whose temporaries stay in the cache (96 kB of doubles), which
+# makes an evaluation of the dual nearly three times as fast at 19 200 variables.
 _BLOCK_ENTRIES = 12288
 
 
@@ -66,8 +72,8 @@ class MMAState:
         x_old2: (n,) design before the step before the last.
         low: (n,) lower asymptotes of the last step.
         upp: (n,) upper asymptotes of the last step.
-        multipliers: (m,) multipliers of the last step for the normalised constraints, the start
-            of the next one's dual; any other length means a cold start.
+        multipliers: (m,) multipliers of the last step for the normalised constraints, the initial
+            guess of the next one; any other length stands for none.
     """
 
     iteration: int
@@ -142,12 +148,12 @@ def mma_step(
         {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
     )
     f_agreed, largest = _agree(given, comm)
-    felt = largest[1:] > 0.0
+    active = largest[1:] > 0.0
     dual = _Dual(given, f_agreed, largest, comm)
-    started = state.multipliers.shape == felt.shape
-    point = _solve_dual(dual, state.multipliers[felt] if started else np.ones(felt.sum()))
-    multipliers = np.zeros(felt.size)
-    multipliers[felt] = point.multipliers
+    known = state.multipliers.shape == active.shape
+    point = _solve_dual(dual, state.multipliers[active] if known else np.ones(active.sum()))
+    multipliers = np.zeros(active.size)
+    multipliers[active] = point.multipliers
     return _conclude(given, dual, point, multipliers)
 
 
@@ -266,8 +272,8 @@ class _Block:
     distance: Array
 
 
-def _block(given: _Given, columns: slice, felt: npt.NDArray[np.bool_], scale: Array) -> _Block:
-    """Build the approximation of the objective and the felt constraints in some variables."""
+def _block(given: _Given, columns: slice, active: npt.NDArray[np.bool_], scale: Array) -> _Block:
+    """Build the approximation of the objective and the active constraints in some variables."""
     room_down = given.x[columns] - given.xmin[columns]
     room_up = given.xmax[columns] - given.x[columns]
     width = given.xmax[columns] - given.xmin[columns]
@@ -275,7 +281,7 @@ def _block(given: _Given, columns: slice, felt: npt.NDArray[np.bool_], scale: Ar
     relative = _asymptote_distance(given, columns, width)
     distance = relative * width
     step = np.minimum(_LARGEST_STEP, given.move / relative)
-    G = given.gradients(columns)[felt] / scale[:, None]
+    G = given.gradients(columns)[active] / scale[:, None]
     H = relative * (_CURVATURE * np.abs(G) + 2.0 * _RAA0)
     G *= relative
     s_min, s_max = -np.minimum(step, room_down / distance), np.minimum(step, room_up / distance)
@@ -305,15 +311,15 @@ class _Dual:
     """
 
     def __init__(self, given: _Given, f: Array, largest: Array, comm: MPI.Comm | None):
-        felt = largest > 0.0
-        felt[0] = True  # an objective without gradient still holds the variables in place
-        scale = np.where(largest > 0.0, largest, 1.0)[felt]
+        active = largest > 0.0
+        active[0] = True  # an objective without gradient still holds the variables in place
+        scale = np.where(largest > 0.0, largest, 1.0)[active]
         # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
         with np.errstate(over="ignore"):
-            self.f = np.clip(f[felt[1:]] / scale[1:], -1e30, 1e30)
+            self.f = np.clip(f[active[1:]] / scale[1:], -1e30, 1e30)
         self.comm = comm
         self.numbers = list(given.pieces)
-        self.blocks = [(k, _block(given, columns, felt, scale)) for k, columns in given.blocks()]
+        self.blocks = [(k, _block(given, columns, active, scale)) for k, columns in given.blocks()]
         totals = {number: np.zeros(scale.size) for number in given.pieces}
         for number, block in self.blocks:
             totals[number] += block.H.sum(axis=1)
@@ -375,11 +381,10 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     The dual is concave and once continuously differentiable; its curvature jumps where variables
     meet their bounds. A step is accepted if the dual still rises at its end, hence rose all the
     way, or if it falls there no more than half as steeply as it rose at the beginning and is not
-    lower. These slopes keep their meaning down to rounding, where the values have long lost it.
+    lower. The derivatives are known down to rounding, the values are not.
 
     Raises:
-        ConvergenceError: the constraints are not met to 1e-6 of their size. Near rounding is the
-            rule; only constraints that nearly repeat each other end in between.
+        ConvergenceError: the constraints are not met to `_COMPLEMENTARY`.
     """
     point = dual.at(multipliers)
     radius = np.full(multipliers.size, _FIRST_RADIUS)
@@ -392,7 +397,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
         evaluations += 1
         change = trial.multipliers - point.multipliers
         rise, rise_there = point.gradient * change, trial.gradient * change
-        rounding = 1e-14 * (dual.size[0] + trial.multipliers @ dual.size[1:])
+        rounding = _ROUNDING * (dual.size[0] + trial.multipliers @ dual.size[1:])
         not_lower = trial.value >= point.value - rounding
         turned = -rise_there.sum()
         mean_curvature = 0.5 * (point.curvature + trial.curvature)
@@ -403,7 +408,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
             radius = np.where(rise_there >= 0.0, np.maximum(radius, 4.0 * np.abs(z)), radius)
             radius = np.minimum(radius, _LARGEST_RADIUS)
         else:
-            # The multipliers that turned the slope go less far. What was met on the way enters
+            # The multipliers that turned the derivative go less far. What was met on the way enters
             # the curvature: on a ridge between two kinks either side alone points off the ridge.
             part = np.maximum(rise, 0.0) / np.maximum(np.abs(rise) + np.abs(rise_there), _TINY)
             shrunk = np.abs(z) * np.minimum(np.maximum(part, 0.1), 0.5)
@@ -415,10 +420,10 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
 
 
 def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
-    """Raise ConvergenceError unless multipliers and constraints are complementary to 1e-6."""
-    active = point.multipliers > 1e-7 * _FLOOR  # less than that moves nothing
+    """Raise ConvergenceError unless multipliers and constraints are complementary."""
+    active = point.multipliers > _ACTIVE_MULTIPLIER
     left = np.where(active, np.abs(point.gradient), np.maximum(point.gradient, 0.0))
-    allowed = 1e-6 * (dual.size[1:] + _TINY)
+    allowed = _COMPLEMENTARY * (dual.size[1:] + _TINY)
     if (left > allowed).any():
         i = int(np.argmax(left / allowed))
         raise ConvergenceError(
@@ -466,7 +471,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     m = gradient.size
     # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
     # is flat; the relative part is for equivalent constraints.
-    diagonal = 1e-12 * np.diag(curvature) + 1e-6 * np.abs(gradient) + _TINY
+    diagonal = _REGULARISATION * np.diag(curvature) + _FLAT * np.abs(gradient) + _TINY
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)
     fixed = ((lower == 0.0) & (gradient <= 0.0)) | ((upper == 0.0) & (gradient >= 0.0))

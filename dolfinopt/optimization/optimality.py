@@ -9,9 +9,12 @@ from scipy.optimize import nnls
 
 Sum = Callable[[Mapping[int, np.ndarray]], np.ndarray]
 
-# A constraint f <= 0 (relative) further away than that is inactive: its multiplier is zero.
+# A relative constraint f below minus that is inactive, its multiplier zero: what counts as met.
 ACTIVE = 1e-3
-ROUNDS = 10  # of the free variables; two or three are the rule
+ROUNDS = 10  # of choosing the free variables; two or three are the rule
+# Eigenvalues of the scaled Gram matrix below this share of the largest are rounding: constraints
+# whose gradients say the same.
+DEPENDENT = 1e-12
 
 
 def kkt_residual(
@@ -94,7 +97,7 @@ def _multipliers(
     scale[scale == 0.0] = 1.0
     # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > 1e-12 * values[-1]
+    kept = values > DEPENDENT * values[-1]
     if not kept.any():
         return np.zeros(m)
     root = np.sqrt(values[kept])

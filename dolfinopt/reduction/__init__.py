@@ -23,7 +23,7 @@ class Method:
 
     Attributes:
         reduce: (arm, options, start) -> basis.
-        adjoint: (arm, basis, options, interior slopes, outboard slopes) -> fields, see
+        adjoint: (arm, basis, options, cotangents interior, outboard) -> fields, see
             `craig_bampton_adjoint`; None where there is none.
     """
 

@@ -17,16 +17,19 @@ OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
 # equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
 EIGEN_TOLERANCE = 1e-12
-# Relative distance of eigenvalues up to which there may be more of the same.
+# Relative distance of eigenvalues up to which there may be more of the same: with the tolerance
+# above, vectors of values that close are known to 1e-6 of one another only.
 REPEATED = 1e-6
 # Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
-# to 1e-10 by themselves: 1e-6 was seen in a hundred modes of a checkerboard, from 0.2 Hz to 30 kHz.
+# to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
 WIDE = 1e6
 # Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
 # which leaves more digits than an optimiser can use.
 ADJOINT_TOLERANCE = 1e-8
-MAX_ADJOINT = 500
-RAMP_SHARE = 1e-6  # of the start without symmetry beside the old modes, in norm
+MAX_ADJOINT = 500  # steps of conjugate gradients for one mode
+# Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
+# finds modes of another symmetry, up to 1e-4 it is not slower.
+RAMP_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -67,9 +70,9 @@ class Basis:
 
 @dataclass(frozen=True, eq=False)
 class AdjointFields:
-    """Nodal fields that carry slopes by V to the cells.
+    """Nodal fields that carry cotangents of V to the cells.
 
-    d(slopes . V) = sum_k -stiffness_k . dK V_k + mass_k . dM V_k + frame_k . dM R_k  with the
+    d(cotangents . V) = sum_k -stiffness_k . dK V_k + mass_k . dM V_k + frame_k . dM R_k  with the
     rigid motions R of `frame_fields`.
 
     Attributes:
@@ -132,16 +135,9 @@ def lowest_eigenpairs(
 def _searches(count: int, warm: bool) -> tuple[tuple[int, int], ...]:
     """Return vectors and restarts of the searches to try in turn for `count` eigenpairs.
 
-    Few extra vectors at first: the search looks at its residuals once a sweep (400 x 24, one mode:
-    10 ms with 5 vectors, 18 ms with 10). A warm start saves less than it seems to: a solve brings
-    1.5 digits of the first mode, the last design two or three of twelve. In 40 iterations one mode
-    took 10 solves with 5 vectors, warm or cold, with 6 vectors 9 and 11; four clamped-free modes
-    25.5 and 27.5, 23.5 and 26.5.
-
-    Equal windows of nearly no material have bundles of modes equal to 1e-7, of which few vectors
-    never part the first from the next. Five windows, three modes: none after 800 solves with 7
-    vectors, all after 58 with 26. Neither a residual of 1e-10 (none) nor asking for five modes
-    more (104 solves) is better.
+    Few extra vectors at first, as the search looks at its residuals once a sweep: 4 from cold and
+    5 with an initial guess take the fewest solves. Bundles of modes equal to 1e-7, as equal windows
+    of nearly no material have, need more vectors, not more restarts.
     """
     extra = 5 if warm else 4
     return (max(count + extra, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100)
@@ -216,9 +212,8 @@ class _Eigenproblem:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return as many pairs, with those in place that a search passed over.
 
-        A Krylov subspace holds one vector of every eigenvalue but for rounding: of ten windows
-        with modes equal to 1e-13, five of the first six were found. What is left is searched
-        beside what is known, until it lies above.
+        A Krylov subspace holds one vector of every eigenvalue but for rounding. What is left is
+        searched in the M-complement of what is known, until it lies above.
 
         Raises:
             ConvergenceError: that search does not converge.
@@ -281,8 +276,7 @@ def _initial_space(like: PETSc.Vec, start: np.ndarray | None) -> Sequence[PETSc.
         return [ramp]
     vector = _filled(like, start.sum(axis=1))
     # Old modes of a symmetric design stay within their symmetry for ever, even when a mode of
-    # another one has become the lowest. From a share of 1e-8 on the search finds it, up to 1e-4
-    # nothing is slower.
+    # another one has become the lowest.
     vector.axpy(RAMP_SHARE * vector.norm() / ramp.norm(), ramp)
     return [vector]
 
@@ -306,9 +300,9 @@ def complement_solve(
     """Solve (K - lambda_k M) mu_k = right_k in the M-complement of the modes, for every k.
 
     The adjoint of the eigenproblem, less its part within the modes' span. A reduced model depends
-    on nothing but that span, so what the modes do among themselves has no slope: neither close nor
-    repeated eigenvalues divide by zero. In the complement K - lambda_k M is positive definite, and
-    conjugate gradients with the factor of K at hand converge as 1 - lambda_k / lambda_next allows.
+    on nothing but that span, so what the modes do among themselves has no influence: neither close
+    nor repeated eigenvalues divide by zero. In the complement K - lambda_k M is positive definite,
+    and conjugate gradients with the factor of K converge as 1 - lambda_k / lambda_next allows.
 
     Args:
         arm: for its communicator.

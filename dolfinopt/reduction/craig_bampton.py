@@ -56,15 +56,15 @@ def craig_bampton_adjoint(
     interior: np.ndarray,
     outboard: np.ndarray,
 ) -> AdjointFields:
-    """Return mu and lambda mu with d(slopes . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
+    """Return mu and lambda mu with d(cotangents . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
-    Constraint modes: K_II mu = slopes, one solve each with the factor at hand. Normal modes: see
-    `complement_solve`. The outboard rows of V are constant.
+    Constraint modes: K_II mu = cotangents, one solve each with the factor at hand. Normal modes:
+    see `complement_solve`. The outboard rows of V are constant.
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) slopes by the owned interior rows of V.
-        outboard: (3, q) slopes by its outboard rows; without effect here.
+        interior: (num_interior, q) cotangents of the owned interior rows of V.
+        outboard: (3, q) cotangents of its outboard rows; without effect here.
     """
     mu = arm.solve(interior[:, :3])
     values = np.concatenate([np.zeros(3), np.diag(basis.stiffness)[3:]])

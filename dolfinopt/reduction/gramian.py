@@ -24,11 +24,11 @@ from dolfinopt.reduction.subspace import InverseSpace, combine, dot, ritz
 
 # Relative residual of the responses in the band, after multiplication by K^-1, in energy.
 RESPONSE_TOLERANCE = 1e-10
-MAX_BLOCKS = 60
-# Directions whose response is below this share of the largest are not known.
+MAX_BLOCKS = 60  # of the Krylov space
+# Directions whose response is below this share of the largest are lost in RESPONSE_TOLERANCE.
 RANK_TOLERANCE = 1e-10
 INDEPENDENT = 1e-12  # share of a Krylov vector's length below which its remainder is rounding
-POINTS = 8  # of Gauss-Legendre in each panel
+POINTS = 8  # of Gauss-Legendre in each panel, exact to degree 15
 
 
 def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:

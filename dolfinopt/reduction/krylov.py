@@ -19,7 +19,7 @@ from dolfinopt.reduction.subspace import Expansion, combine, dot, orthonormalise
 
 # Relative residual of solutions at a shift, in the norm of M after multiplication by K^-1.
 SHIFT_TOLERANCE = 1e-12
-MAX_SHIFT_STEPS = 60
+MAX_SHIFT_STEPS = 60  # blocks; 5 to 10 are the rule up to 40 times the first frequency
 
 
 def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
@@ -52,21 +52,21 @@ def krylov_adjoint(
     interior: np.ndarray,
     outboard: np.ndarray,
 ) -> AdjointFields:
-    """Return the fields of `AdjointFields` for slopes by V of a function of its span.
+    """Return the fields of `AdjointFields` for cotangents of V of a function of its span.
 
     Column by column backwards through V_new = (K_w^-1 f - V H_1) H_2^-1, f = M V_source or inputs:
-    one solve each. What the columns do within their span has no slope and is left out; each
+    one solve each. What the columns do within their span has no influence and is left out; each
     block's source and predecessors are complete, so that nothing else is.
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) slopes by the owned interior rows of V.
-        outboard: (3, q) slopes by its outboard rows.
+        interior: (num_interior, q) cotangents of the owned interior rows of V.
+        outboard: (3, q) cotangents of its outboard rows.
     """
     recursion = _recursion(arm, options)
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
-    # Within the span a trajectory that is right to its tolerance leaves slopes that are not quite
-    # zero, and the recursion would amplify them.
+    # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
+    # quite zero, and the recursion would amplify them.
     inner = arm.comm.allreduce(basis.V[arm.interior_nodes].reshape(interior.shape).T @ interior)
     inner += basis.outboard.T @ outboard
     weighted = arm.restrict(basis.MV)
@@ -78,10 +78,10 @@ def krylov_adjoint(
         kept, H = block.expansion.kept, block.expansion.coefficients[:, block.expansion.kept]
         old, new = slice(0, len(H) - len(kept)), slice(len(H) - len(kept), len(H))
         inverse = np.linalg.inv(H[new])
-        slopes = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
-        interior[:, old] -= slopes[0] @ H[old].T
-        outboard[:, old] -= slopes[1] @ H[old].T
-        mu = solve_at(recursion.free, block.omega, slopes, SHIFT_TOLERANCE, MAX_SHIFT_STEPS)
+        cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
+        interior[:, old] -= cotangents[0] @ H[old].T
+        outboard[:, old] -= cotangents[1] @ H[old].T
+        mu = solve_at(recursion.free, block.omega, cotangents, SHIFT_TOLERANCE, MAX_SHIFT_STEPS)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired

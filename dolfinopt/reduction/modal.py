@@ -44,12 +44,12 @@ def modal_adjoint(
     interior: np.ndarray,
     outboard: np.ndarray,
 ) -> AdjointFields:
-    """Return mu and lambda mu with d(slopes . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
+    """Return mu and lambda mu with d(cotangents . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) slopes by the owned interior rows of V.
-        outboard: (3, q) slopes by its outboard rows.
+        interior: (num_interior, q) cotangents of the owned interior rows of V.
+        outboard: (3, q) cotangents of its outboard rows.
     """
     operator = FreeOperators(arm)
     values = np.diag(basis.stiffness)

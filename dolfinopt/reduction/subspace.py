@@ -18,7 +18,7 @@ DEFLATION = 1e-10
 SHRINKS = 0.1
 # Largest entry of V' M V - I: two rounds leave 1e-15 to 1e-14.
 ORTHONORMAL = 1e-12
-MAX_ROUNDS = 4
+MAX_ROUNDS = 4  # two are the rule
 
 
 def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -220,9 +220,8 @@ def solve_at(free: FreeArm, omega: float, right: Rows, tolerance: float, most: i
     Block GMRES preconditioned with the factor of K at hand, in the inner product of M. Above the
     first natural frequency K - omega^2 M is indefinite, but the preconditioned eigenvalues
     1 - omega^2 / lambda cluster at 1: at 1.1, 4, 13 and 43 times the first frequency each column
-    takes 5, 6, 8 and 10 solves of 0.2 ms (200 x 12 cells). MUMPS would take 4 ms for a factor
-    LDL' of the interior of K - omega^2 M and 0.8 ms a solve, and its constraint modes are
-    infinite at the natural frequencies of the arm held at both ends.
+    takes 5, 6, 8 and 10 solves. A factor LDL' of the interior of K - omega^2 M would be dearer, and
+    its constraint modes are infinite at the natural frequencies of the arm held at both ends.
 
     Args:
         free: the arm with its factor.

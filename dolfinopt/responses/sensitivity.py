@@ -10,6 +10,7 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, mass_partners, rigid_body
 from dolfinopt.reduction import METHODS, frame_fields
+from dolfinopt.reduction.subspace import combine
 from dolfinopt.responses.statics import StaticResponse
 
 # Directions of A below this share of its largest are the rounding of its sums.
@@ -35,7 +36,7 @@ def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
         keep = values > RANK_TOLERANCE * values[0]
         V = state.basis.V
         energies = state.elastic.cell_stiffness_products(
-            V @ (left[:, keep] * values[keep]), V @ right[keep].T
+            combine(V, left[:, keep] * values[keep]), combine(V, right[keep].T)
         )
         return -state.young_slope * energies
 
@@ -61,14 +62,14 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
         by_K = cotangents.K + damping * cotangents.D
         partners = mass_partners(elastic.points, V, cotangents)
         by_V = elastic.mass_times(partners.by_modes)
-        by_V += elastic.stiffness_times(V @ (by_K + by_K.T))
+        by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
         interior, outboard = elastic.restrict(by_V)
         method = METHODS[state.scene.reduction.method]
         assert method.adjoint is not None  # the scene refuses the others
         fields = method.adjoint(
             elastic, basis, state.reduction_options, interior, outboard + cotangents.outboard
         )
-        energies = elastic.cell_stiffness_products(V @ by_K.T - fields.stiffness, V)
+        energies = elastic.cell_stiffness_products(combine(V, by_K.T) - fields.stiffness, V)
         partners.left[:, :, 1:-1] += fields.mass
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
