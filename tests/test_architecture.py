@@ -1,14 +1,21 @@
-"""The picture of the rooms is that of the code."""
+"""The page on the architecture is true: picture, files, and the words of the scene."""
 
 import importlib.util
 import re
-from pathlib import Path
+from typing import get_args
 
 import pytest
+from runs import ROOT
+
+from dolfinopt.density.interpolation import LAWS
+from dolfinopt.reduction import METHODS
+from dolfinopt.scene.tables.constraints import Constraints
+from dolfinopt.scene.tables.interpolation import Law
+from dolfinopt.scene.tables.objective import ObjectiveKind
+from dolfinopt.scene.tables.reduction import ReductionMethod
+from dolfinopt.scene.tables.responses import NEEDS
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
-
-ROOT = Path(__file__).parents[1]
 
 
 def rooms():
@@ -28,8 +35,22 @@ def test_arrows_that_follow_from_others_are_left_out():
     assert rooms().shortest(graph) == [("a", "b"), ("b", "c"), ("c", "d")]
 
 
+INVENTED = {"responses/mean_acceleration.py", "dynamics/bdf.py", "reduction/hankel.py"}
+INVENTED |= {"exchange/adams.py"}  # what the exercise adds
+
+
 def test_files_that_the_page_names_exist():
     page = (ROOT / "docs/pages/develop/architecture.md").read_text(encoding="utf-8")
+    for name in INVENTED:
+        assert page.count(name) == 1 and (ROOT / "dolfinopt" / name).parent.is_dir()
+        page = page.replace(name, "")
     for name in set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py|tests/[\w/]+(?:\.py)?)`", page)):
         path = ROOT / name if name.startswith(("tests/", "docs/")) else ROOT / "dolfinopt" / name
         assert path.exists(), name
+
+
+def test_words_of_the_scene_are_those_of_the_code():
+    """A method is known to the scene by the word under which its room lists it."""
+    assert set(get_args(ReductionMethod)) == METHODS.keys()
+    assert set(get_args(Law)) == LAWS.keys()
+    assert {*get_args(ObjectiveKind), *Constraints.model_fields} == NEEDS.keys()
