@@ -8,7 +8,7 @@ simplified Newton matrix, is left to `radau.integrate`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -75,7 +75,7 @@ def integrate(
         In the same order; a system that cannot be solved has its error.
     """
     if len(systems) == 1:  # as a batch of one it takes 1.6 times as long from cold, q = 4
-        return [_alone(systems[0], tolerance, stages, profile, guesses[0])]
+        return [attempted(radau.integrate, systems[0], tolerance, stages, profile, guesses[0])]
     found: list[Solution | ConvergenceError | None] = [None] * len(systems)
     order = sorted(range(len(systems)), key=lambda i: _content(systems[i]))
     while order:
@@ -88,16 +88,17 @@ def integrate(
         else:
             solutions = [None]
         for i, solution in zip(mine, solutions, strict=True):
-            found[i] = solution or _alone(systems[i], tolerance, stages, profile, guesses[i])
+            found[i] = solution or attempted(
+                radau.integrate, systems[i], tolerance, stages, profile, guesses[i]
+            )
         order = [i for i, scale in zip(order, scales, strict=True) if scale is None]
     return [one for one in found if one is not None]
 
 
-def _alone(
-    system: ElasticSystem, tolerance: float, stages: int, profile: Profile, guess: Solution | None
-) -> Solution | ConvergenceError:
+def attempted(solve: Callable[..., Solution], *arguments: Any) -> Solution | ConvergenceError:
+    """Return what `solve` finds, or its error."""
     try:
-        return radau.integrate(system, tolerance, stages, profile, guess)
+        return solve(*arguments)
     except ConvergenceError as error:
         return error
 

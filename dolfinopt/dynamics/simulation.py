@@ -199,7 +199,8 @@ def simulate_batch(
                 goal = radau.GOAL if differentiated else batch.GOAL
                 solutions = batch.integrate(own, tolerance, stages, profile, begun, goal)
             else:
-                solutions = [_conventional(one, tolerance, rho_inf, profile) for one in own]
+                solve, rest = generalized_alpha.integrate, (tolerance, rho_inf, profile)
+                solutions = [batch.attempted(solve, one, *rest) for one in own]
         for i, one in zip(group, solutions, strict=True):
             if isinstance(one, ConvergenceError):
                 found[i] = one
@@ -207,15 +208,6 @@ def simulate_batch(
             found[i] = _trajectory(problems[i], scenes[i], one)
             profile.counts.simulations += 1
     return [one for one in found if one is not None]
-
-
-def _conventional(
-    problem: ElasticSystem, tolerance: float, rho_inf: float, profile: Profile
-) -> Solution | ConvergenceError:
-    try:
-        return generalized_alpha.integrate(problem, tolerance, rho_inf, profile)
-    except ConvergenceError as error:
-        return error
 
 
 def _problems(

@@ -8,8 +8,10 @@ Coordinates may be free rigid ones (m, rad) beside elastic ones: control forces 
 are part of the residual. A constraint g(q, t) = 0 is a row of the residual, its multiplier the
 second derivative of a coordinate that nothing else depends on: collocation then fulfils it at every
 stage, positions with order 2 s - 1, velocities s, multipliers s - 1 (Hairer, Lubich & Roche 1989,
-doi:10.1007/BFb0093947). Neither is definite: such a system has no preconditioner (`Unchanged`), and
-all its coordinates are treated densely, with pivots. tests/dynamics/test_system.py has examples.
+doi:10.1007/BFb0093947). That holds for the method's own `collocation.stage_values`; a solution's
+interpolant meets it at the steps' ends, and between them to its order. Neither is definite: such a
+system has no preconditioner (`Unchanged`), and all its coordinates are treated densely, with
+pivots. tests/dynamics/test_system.py has examples.
 """
 
 from __future__ import annotations

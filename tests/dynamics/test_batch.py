@@ -93,13 +93,13 @@ def solve(problems: list[ElasticSystem], starts_: list[Solution | None] | None =
 def alone(monkeypatch) -> list[ElasticSystem]:
     """Return what the batch leaves to the single method."""
     left: list[ElasticSystem] = []
-    single = batch._alone
+    single = batch.attempted
 
-    def counted(problem: ElasticSystem, *rest):
+    def counted(solve, problem: ElasticSystem, *rest):
         left.append(problem)
-        return single(problem, *rest)
+        return single(solve, problem, *rest)
 
-    monkeypatch.setattr(batch, "_alone", counted)
+    monkeypatch.setattr(batch, "attempted", counted)
     return left
 
 
