@@ -27,7 +27,7 @@ from dolfinopt.paper.reproduction import (
     loss,
     setting_of,
 )
-from dolfinopt.paper.statements import Check, mm, percent
+from dolfinopt.paper.statements import Check, mm
 from dolfinopt.study.tables import DesignFigure, LineFigure, as_text
 
 if TYPE_CHECKING:
@@ -98,7 +98,44 @@ def page(
     """Return report.html; the figures' pictures lie in the folder."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    scene, by = plan.scene, dict(iter(results.groupby("table")))
+    scene, objectives = plan.scene, results[results.table == "objectives"]
+    optimised = [o for case, o in outcomes.by_case.items() if case.action == "optimize"]
+    templates = Environment(
+        loader=FileSystemLoader(page_folder()),
+        autoescape=lambda name: str(name).endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    )
+    size = max(cell_sizes(scene).values(), default=0.0)
+    text = templates.get_template("report.html").render(
+        as_text=as_text,
+        setting=setting_of(scene),
+        initial=objectives.iloc[0],
+        best=objectives[objectives.kind == "esl"].iloc[0],
+        player=_player(plan, outcomes),
+        checks=checks,
+        sections=_sections(results, outcomes, checks, figures, folder),
+        scene=scene,
+        cells=scene.arms[0].cells or (),
+        cases=outcomes.by_case,
+        optimised=optimised,
+        seconds=sum(o.seconds for o in optimised if not o.failure),
+        filter_cells=scene.design.radius / size if size else 0.0,
+        overridden=_overridden(scene),
+        failures=outcomes.failures,
+    )
+    return text.lstrip()
+
+
+def _sections(
+    results: pd.DataFrame,
+    outcomes: Outcomes,
+    checks: Sequence[Check],
+    figures: Sequence[Numbered],
+    folder: Path,
+) -> list[dict[str, Any]]:
+    """Return the page's sections: statements, plots, tables and designs of each."""
+    by = dict(iter(results.groupby("table")))
     tables = {
         "objectives": _ends_table(by["ends objectives"], by["ends reductions"]),
         "reductions": _reduction_table(by["reductions"]),
@@ -124,33 +161,7 @@ def page(
                 "designs": _gallery(designs.get(name, ()), outcomes),
             }
         )
-    optimised = [o for case, o in outcomes.by_case.items() if case.action == "optimize"]
-    templates = Environment(
-        loader=FileSystemLoader(page_folder()),
-        autoescape=lambda name: str(name).endswith(".html"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
-    templates.filters |= {"mm": mm, "percent": percent}
-    size = max(cell_sizes(scene).values(), default=0.0)
-    text = templates.get_template("report.html").render(
-        as_text=as_text,
-        setting=setting_of(scene),
-        initial=by["objectives"].iloc[0],
-        best=by["objectives"].query("kind == 'esl'").iloc[0],
-        player=_player(plan, outcomes),
-        checks=checks,
-        sections=sections,
-        scene=scene,
-        cells=scene.arms[0].cells or (),
-        cases=outcomes.by_case,
-        optimised=optimised,
-        seconds=sum(o.seconds for o in optimised if not o.failure),
-        filter_cells=scene.design.radius / size if size else 0.0,
-        overridden=_overridden(scene),
-        failures=outcomes.failures,
-    )
-    return text.lstrip()
+    return sections
 
 
 # -- words and tables ------------------------------------------------------------------------
