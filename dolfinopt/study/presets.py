@@ -69,13 +69,13 @@ def _objectives(frame: pd.DataFrame) -> Report:
     title = "Designs optimised for every objective, simulated in the scene."
     table = Table("", title, frame[columns].rename(columns={"label": "objective"}))
     good = _good(frame)
-    moved = [
+    dynamic = [
         o for o in good if o.case.action == "optimize" and o.case.scene.objective.needs("motion")
     ]
-    others = [o for o in good if o not in moved]
+    others = [o for o in good if o not in dynamic]
     panels = [
         *deviation_panels("initial, static, eigenfrequency", others),
-        *deviation_panels(MOTION, moved),
+        *deviation_panels(MOTION, dynamic),
     ]
     return [table], [
         LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
@@ -171,10 +171,10 @@ def _reductions(frame: pd.DataFrame, called: str) -> Report:
     tables = [_reduction_table(own, again, called), *tables, _bases(parts["compared"], called)]
     title = f"Designs optimised with every reduction, simulated with {called}"
     pairs = zip(own["outcome"], again["outcome"], strict=True)
-    moved = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
-    if panels := deviation_panels("", moved):
+    simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
+    if panels := deviation_panels("", simulated):
         figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
-        figures.append(design_figure("designs", title, moved))
+        figures.append(design_figure("designs", title, simulated))
     if good := _good(own):
         figures.append(_convergence(good))
     return tables, figures

@@ -28,8 +28,9 @@ QUANTILES = (0.05, 0.5, 0.95)
 RESAMPLES = 400  # of a bootstrap: its ends are right to a tenth of the interval
 # Quantiles beyond it, at both ends, are out of reach of any number of samples.
 REMOTE = 1e-12
-NODES = 400  # of the quadrature over a distribution
-MAX_DEGREE = 10  # of the polynomial; total
+DEPENDENT = 1e-10  # of a basis' largest column: below, its terms are one another's to rounding
+NODES = 400  # of the quadrature over a distribution: moments to 1e-9, as far as seven deviations
+MAX_DEGREE = 10  # total, of the polynomial: Ishigami's function to 1e-5 of its variance
 # Samples a term of the polynomial: with fewer it fits the noise, and neighbours of a point decide.
 SAMPLES_A_TERM = 3
 
@@ -46,7 +47,7 @@ class Distribution:
         law: SciPy's frozen distribution.
         bounded: whether it has bounds of its own.
         low, high: where it is cut off.
-        kink: where the density has one.
+        breakpoint: where the density's slope jumps.
     """
 
     text: str
@@ -54,7 +55,7 @@ class Distribution:
     bounded: bool
     low: float = -math.inf
     high: float = math.inf
-    kink: float | None = None
+    breakpoint: float | None = None
 
     @property
     def cut_off(self) -> float:
@@ -97,10 +98,10 @@ class Distribution:
     def _quadrature(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes (2 n,) and weights, with sum 1, of integrals over the distribution.
 
-        Gauss's rule on both sides of a kink.
+        Gauss's rule on both sides of a breakpoint.
         """
         ends = self.at(np.array([0.0, 1.0]))
-        middle = float(np.clip(ends.mean() if self.kink is None else self.kink, *ends))
+        middle = float(np.clip(ends.mean() if self.breakpoint is None else self.breakpoint, *ends))
         nodes, weights = legendre.leggauss(NODES)
         parts = [(ends[0], middle), (middle, ends[1])]
         x = np.concatenate([0.5 * (a + b) + 0.5 * (b - a) * nodes for a, b in parts])
@@ -158,7 +159,7 @@ def parse_distribution(text: str) -> Distribution:
     if name == "uniform" and a < b:
         return Distribution(text, stats.uniform(a, b - a), True)
     if name == "triangular" and a <= b <= c and a < c:
-        return Distribution(text, stats.triang((b - a) / (c - a), a, c - a), True, kink=b)
+        return Distribution(text, stats.triang((b - a) / (c - a), a, c - a), True, breakpoint=b)
     raise wrong
 
 
@@ -344,7 +345,7 @@ def _fit(basis: np.ndarray, values: np.ndarray, powers: np.ndarray) -> _Fit:
     """Fit values (n,) in a basis (n, terms)."""
     q, r = np.linalg.qr(basis)
     diagonal = np.abs(np.diag(r))
-    if len(basis) <= basis.shape[1] or diagonal.min() < 1e-10 * diagonal.max():
+    if len(basis) <= basis.shape[1] or diagonal.min() < DEPENDENT * diagonal.max():
         none = np.full(len(powers), math.nan)
         return _Fit(powers, none, np.full(basis.shape, math.nan), math.inf)
     own = 1.0 - np.sum(q**2, axis=1)  # what a sample does not decide alone

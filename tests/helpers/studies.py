@@ -1,4 +1,4 @@
-"""Studies in tests: the command on all ranks, and what it wrote."""
+"""What studies wrote, and designs for them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.cli import commands
 from dolfinopt.study.tables import Table
-
-SCENE = Path(__file__).parents[2] / "demos" / "two_arm.toml"
-
-
-def run_command(command: str, *arguments: Any) -> None:
-    """Run a command on all ranks."""
-    commands.main([command, *map(str, arguments)], standalone_mode=False, obj=MPI.COMM_WORLD)
-    MPI.COMM_WORLD.barrier()
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

@@ -4,11 +4,11 @@ import json
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.optimization import loop as optimization
@@ -19,14 +19,12 @@ from dolfinopt.study.cases import Case, scene_content
 from dolfinopt.study.simulate import simulate_scenarios
 from dolfinopt.study.store import run_cases
 
-ROOT = Path(__file__).parents[2]
-SCENE = ROOT / "demos" / "two_arm.toml"
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=3", "simulation.sample=0.01")
 
 
 def scene(*overrides):
-    return do.load_scene(SCENE, [*SMALL, *overrides])
+    return do.load_scene(TWO_ARM, [*SMALL, *overrides])
 
 
 def design_of(folder):

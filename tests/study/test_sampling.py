@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from studies import SCENE, write_uniform
+from runs import TWO_ARM
+from studies import write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
@@ -26,7 +27,7 @@ def _small_chunks(monkeypatch):
 
 
 def scene(*overrides):
-    return do.load_scene(SCENE, [*SMALL, *overrides])
+    return do.load_scene(TWO_ARM, [*SMALL, *overrides])
 
 
 def masses(count):

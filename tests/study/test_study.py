@@ -14,7 +14,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from mpi4py import MPI
-from studies import SCENE, cells_of, column, rows_of, run_command, write_uniform
+from runs import TWO_ARM, overrides
+from runs import run as run_command
+from studies import cells_of, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
@@ -25,7 +27,7 @@ from dolfinopt.study.variants import parse_vary
 ROOT = Path(__file__).parents[2]
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 SMALL = ["arms.cells=[20,3]", "optimizer.max_iterations=3", "simulation.sample=0.01"]
-SETTINGS = [word for value in SMALL for word in ("--set", value)]
+SETTINGS = overrides(*SMALL)
 # Of the coordinates, whose square is the compliance. A batch's steps are not those of one scene:
 # both results are right to it.
 TOLERANCE = 1e-4
@@ -34,7 +36,7 @@ ENVIRONMENT = dict(os.environ)
 
 
 def scene(*overrides):
-    return do.load_scene(SCENE, [*SMALL, *overrides])
+    return do.load_scene(TWO_ARM, [*SMALL, *overrides])
 
 
 def run(*arguments, command="sweep"):
@@ -125,7 +127,7 @@ def test_bad_input_is_one_line(name, shared_tmp_path):
     WORLD.barrier()
     arguments = [str(other) if part == other.name else part for part in arguments]
     with pytest.raises((InputError, click.UsageError)) as caught:
-        run(SCENE, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
+        run(TWO_ARM, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
     error = caught.value
     message = error.format_message() if isinstance(error, click.UsageError) else str(error)
     assert "\n" not in message and word in message
@@ -137,7 +139,7 @@ def test_bad_input_is_one_line(name, shared_tmp_path):
 
 def test_payload(folder, capsys):
     """Every figure is that of a simulation by itself; the second time nothing is computed."""
-    arguments = (SCENE, "payload", "--vary", "payload.mass=4,6,8", *SETTINGS, "--out", folder)
+    arguments = (TWO_ARM, "payload", "--vary", "payload.mass=4,6,8", *SETTINGS, "--out", folder)
     run(*arguments)
     first = capsys.readouterr()
     rows = rows_of(folder / "payload.csv")
@@ -174,16 +176,16 @@ def test_payload(folder, capsys):
 def test_cross_evaluation(folder):
     """The matrix holds design i in scenario j, the losses follow from it."""
     base = scene()
-    done = study.study(base, "payload", ["payload.mass=4,8"], [], folder, WORLD, reoptimize=True,
+    done = study.study(base, "payload", ["payload.mass=8,4"], [], folder, WORLD, reoptimize=True,
                        shown=False)  # fmt: skip
     tables = {table.name: table for table in done.tables}
     values = np.array([row[1:] for row in cells_of(tables["cross_compliance"])])
     loss = np.array([row[1:] for row in cells_of(tables["cross_compliance_loss"])])
     np.testing.assert_array_equal(loss, 100.0 * (values / np.diag(values) - 1.0))
     assert (np.diag(loss) == 0.0).all()
-    for i, made in enumerate((4, 8)):
+    for i, made in enumerate((8, 4)):
         design = do.optimize(scene(f"payload.mass={made}"), world=SELF)
-        for j, used in enumerate((4, 8)):
+        for j, used in enumerate((8, 4)):
             other = scene(f"payload.mass={used}")
             found, _ = do.evaluate(
                 other, design.partition, design.arms, design.x_phys, do.Profile()
@@ -292,7 +294,7 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
     quick = [*SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder]
 
     def computed(*arguments):
-        run(SCENE, *arguments, *quick)
+        run(TWO_ARM, *arguments, *quick)
         said = capsys.readouterr().out
         return int(re.search(r"(\d+) cases computed", said)[1]) if WORLD.rank == 0 else None
 
@@ -327,11 +329,11 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "word"),
     [
-        (["compare", SCENE], "what"),
-        (["compare", SCENE, "designs"], "objectives"),
-        (["compare", SCENE, "objectives", "--coordinates", "4"], "--coordinates"),
-        (["compare", SCENE, "reductions", "--coordinates", "100000"], "100000"),
-        (["study", SCENE, "payload", "--designs", "a.npz"], "sweep"),
+        (["compare", TWO_ARM], "what"),
+        (["compare", TWO_ARM, "designs"], "objectives"),
+        (["compare", TWO_ARM, "objectives", "--coordinates", "4"], "--coordinates"),
+        (["compare", TWO_ARM, "reductions", "--coordinates", "100000"], "100000"),
+        (["study", TWO_ARM, "payload", "--designs", "a.npz"], "sweep"),
     ],
 )
 def test_bad_comparison_is_one_line(words, word, shared_tmp_path):
@@ -347,16 +349,20 @@ def test_bad_comparison_is_one_line(words, word, shared_tmp_path):
 
 @pytest.mark.slow
 def test_objective(folder):
-    run(SCENE, "objectives", *SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder,
+    run(TWO_ARM, "objectives", *SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder,
         command="compare")  # fmt: skip
     rows = rows_of(folder / "objective.csv")
     names = [row["objective"] for row in rows]
-    assert names[0] == "initial design" and len(names) == 11
-    assert not any("nothing attached" in name for name in names)  # it needs solid ends
-    assert [row["iterations"] for row in rows] == ["0"] + 10 * ["1"]
-    compliance = column(rows, "compliance [N m]")
-    assert (compliance[1:9] < compliance[0]).all()
-    assert len(set(compliance)) >= 9  # they are different designs
+    # "Nothing attached" needs solid ends.
+    possible = [label for label, _ in variants.OBJECTIVES if "nothing attached" not in label]
+    assert names == ["initial design", *possible]
+    assert [row["iterations"] for row in rows] == ["0"] + len(possible) * ["1"]
+    compliance = dict(zip(names, column(rows, "compliance [N m]"), strict=True))
+    for name in possible:
+        if "eigenfrequency" not in name:
+            assert compliance[name] < compliance["initial design"]
+    # One iteration from the same start: at most two objectives may agree.
+    assert len({*compliance.values()}) >= len(names) - 2
     for name in ("objective_deviation.png", "objective_designs.png"):
         assert is_drawn(folder / name)
     curves = rows_of(folder / "objective_deviation_curves.csv")
@@ -371,7 +377,7 @@ def test_objective(folder):
 def test_solid_ends_allow_nothing_attached():
     plan = presets.objective_plan(scene("arms.passive=0.05"))
     labels = [case.label for _, case in plan.rows]
-    assert "eigenfrequency, nothing attached" in labels and len(labels) == 12
+    assert labels == ["initial design", *(label for label, _ in variants.OBJECTIVES)]
 
 
 def test_exact_gradient_only_where_there_is_one():
@@ -386,7 +392,7 @@ def test_reduction(folder, monkeypatch):
     monkeypatch.setattr(presets, "COMPARED", (4,))
     monkeypatch.setattr(variants, "REFERENCE", 8)
     run(
-        SCENE, "reductions", "--coordinates", 4, *SETTINGS, "--set",
+        TWO_ARM, "reductions", "--coordinates", 4, *SETTINGS, "--set",
         "optimizer.max_iterations=1", "--out", folder, command="compare",
     )  # fmt: skip
     main = {row["method"]: row for row in rows_of(folder / "reduction.csv")}
@@ -443,7 +449,7 @@ def test_failures_end_with_status_one(folder, monkeypatch):
 
     monkeypatch.setattr(evaluation, "simulate_batch", fail_at_seven)
     with pytest.raises(ConvergenceError, match=r"mass = 7\.25: no solution \(and 1 more\)"):
-        run(SCENE, "payload", "--vary", "payload.mass=4,7.25", *SETTINGS, "--out", folder)
+        run(TWO_ARM, "payload", "--vary", "payload.mass=4,7.25", *SETTINGS, "--out", folder)
     WORLD.barrier()
     rows = rows_of(folder / "payload.csv")
     assert rows[0]["failed"] == "" and rows[0]["initial design: compliance [N m]"]
@@ -459,7 +465,15 @@ def test_failures_end_with_status_one(folder, monkeypatch):
 def test_killed_study_goes_on(tmp_path, ranks):
     """Killed after some cases, the next call does the rest and ends the same."""
     overrides = [*SETTINGS, "--set", "optimizer.max_iterations=5", "--no-plots"]
-    words = ["sweep", SCENE, "payload", "--vary", "payload.mass=4:8:4", "--reoptimize", *overrides]
+    words = [
+        "sweep",
+        TWO_ARM,
+        "payload",
+        "--vary",
+        "payload.mass=4:8:4",
+        "--reoptimize",
+        *overrides,
+    ]
     line = [sys.executable, "-m", "dolfinopt", *map(str, words), "--out"]
     if ranks > 1:
         line = ["mpirun", "-n", str(ranks), *line]

@@ -6,7 +6,9 @@ import click
 import numpy as np
 import pytest
 from mpi4py import MPI
-from studies import SCENE, cells_of, column, rows_of, run_command, write_uniform
+from runs import TWO_ARM, overrides
+from runs import run as run_command
+from studies import cells_of, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
@@ -16,13 +18,13 @@ from dolfinopt.study.uncertainty import Sampling, nominal_value, parse_input, st
 WORLD = MPI.COMM_WORLD
 SMALL = ["arms.cells=[12,3]", "optimizer.max_iterations=2", "simulation.sample=0.01",
          "simulation.tolerance=1e-2"]  # fmt: skip
-SETTINGS = [word for value in SMALL for word in ("--set", value)]
+SETTINGS = overrides(*SMALL)
 MASS, YOUNG = "payload.mass=normal:6:0.3", "material.young_modulus=normal:70e9:2e9"
 TWO = "uncertainty_payload.mass_material.young_modulus"
 
 
 def scene(*overrides):
-    return do.load_scene(SCENE, [*SMALL, *overrides])
+    return do.load_scene(TWO_ARM, [*SMALL, *overrides])
 
 
 def run(*arguments):
@@ -73,7 +75,7 @@ BAD = {
 def test_bad_input_is_one_line(name, shared_tmp_path):
     arguments, word = BAD[name]
     with pytest.raises((InputError, click.UsageError)) as caught:
-        run(SCENE, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
+        run(TWO_ARM, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
     error = caught.value
     message = error.format_message() if isinstance(error, click.UsageError) else str(error)
     assert "\n" not in message and word in message
@@ -108,7 +110,7 @@ def test_nominal_values():
 
 def test_command(folder, capsys):
     """Statistics are those of the samples in the file; the second time nothing is computed."""
-    arguments = (SCENE, "--random", MASS, "--random", YOUNG, "--samples", 32, *SETTINGS,
+    arguments = (TWO_ARM, "--random", MASS, "--random", YOUNG, "--samples", 32, *SETTINGS,
                  "--out", folder / "two")  # fmt: skip
     run(*arguments)
     first = capsys.readouterr().out
@@ -240,7 +242,7 @@ def test_failures_end_with_status_1(folder, given, monkeypatch):
 
     monkeypatch.setattr(simulate, "simulate_batch", failing)
     with pytest.raises(ConvergenceError, match=r"solid, sample 0 \(\): no luck \(and 10 more\)"):
-        run(SCENE, "--random", MASS, "--samples", 10, "--design", given, *SETTINGS,
+        run(TWO_ARM, "--random", MASS, "--samples", 10, "--design", given, *SETTINGS,
             "--out", folder / "f")  # fmt: skip
     rows = rows_of(folder / "f" / "uncertainty_payload.mass.csv")
     assert len(rows) == 10 and rows[0]["solid: compliance [N m]"] == ""
