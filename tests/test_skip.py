@@ -28,7 +28,7 @@ from runs import TWO_ARM
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
-from dolfinopt.dynamics.simulation import build_mechanism
+from dolfinopt.dynamics.build import build_mechanism
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.tangent import linearise

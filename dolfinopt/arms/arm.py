@@ -61,6 +61,8 @@ class Arm:
         solid: the arm's solid material.
         substructure: finite elements whatever the design.
         coordinates: number q of the basis; None until `set_order`, where the scene says "auto".
+        stiffened: whether its bodies have geometric stiffness; False until `set_stiffening`, where
+            the scene says "auto".
         initial: eigenvectors from which the next design's searches set out.
         places: of the arms in the chain that have this design.
     """
@@ -90,6 +92,7 @@ class Arm:
                 f"at most {self.substructure.T.num_dofs}, the degrees of freedom of arm "
                 f"{arm.name!r}"
             )
+        self.stiffened = scene.simulation.stiffening is True
         self.profile = profile
         self.initial = InitialVectors()
         self._state: DesignState | None = None
@@ -200,7 +203,14 @@ class Arm:
             self.solid.young_modulus * material.stiffness, self.solid.density * material.mass
         )
         self._state = DesignState(
-            x_phys, material, elastic, self.solid, self.scene, self.coordinates, self.initial
+            x_phys,
+            material,
+            elastic,
+            self.solid,
+            self.scene,
+            self.coordinates,
+            self.initial,
+            self.stiffened,
         )
         return self._state
 
@@ -266,7 +276,13 @@ class Arm:
         self.coordinates = num_modes
         self.initial.basis = None
         if self._state is not None:
-            self._state = self._state.under(self.scene, num_modes, self.initial)
+            self._state = self._state.under(self.scene, num_modes, self.initial, self.stiffened)
+
+    def set_stiffening(self, stiffened: bool) -> None:
+        """Give bodies geometric stiffness from now on, or none."""
+        self.stiffened = stiffened
+        if self._state is not None:
+            self._state = self._state.under(self.scene, self.coordinates, self.initial, stiffened)
 
     def under(self, scene: scenes.Scene) -> Arm:
         """Return this arm in a scene that differs in what it does, not in what it is.
@@ -280,10 +296,14 @@ class Arm:
         other.scene, other.initial = scene, InitialVectors()
         if self.scene.reduction != scene.reduction:
             other.coordinates = scene.reduction.count or None
+        if self.scene.simulation.stiffening != scene.simulation.stiffening:
+            other.stiffened = scene.simulation.stiffening is True
         if same_basis(self.scene, scene) and self.basis is not None:
             other.initial.basis = self.initial.basis
         if self._state is not None:
-            other._state = self._state.under(scene, other.coordinates, other.initial)
+            other._state = self._state.under(
+                scene, other.coordinates, other.initial, other.stiffened
+            )
         return other
 
     # -- initial vectors of searches for modes -----------------------------------------------
@@ -400,4 +420,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     arm = scene.arms[index]
     if arm.sid is not None:
         return _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
-    return rigid_bar(arm.length, arm.height, arm.thickness, scene.material_of(index).density)
+    mass = arm.mass
+    if mass is None:
+        mass = scene.material_of(index).density * arm.length * arm.height * arm.thickness
+    return rigid_bar(arm.length, arm.height, mass, arm.inertia)

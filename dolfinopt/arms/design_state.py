@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, loaded_modes
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.geometric_stiffness import UnitLoads, unit_loads
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.reduction import METHODS, Basis, Options
@@ -45,6 +47,7 @@ class DesignState:
         solid: the material where x_phys is 1.
         scene: says how to reduce, and the damping.
         num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
+        stiffened: whether its body has geometric stiffness.
     """
 
     def __init__(
@@ -56,11 +59,12 @@ class DesignState:
         scene: scenes.Scene,
         num_modes: int | None,
         initial: InitialVectors,
+        stiffened: bool = False,
     ):
         self.x_phys = x_phys.copy()
         self.x_phys.setflags(write=False)
         self.material, self.elastic, self.solid = material, elastic, solid
-        self.scene, self.num_modes = scene, num_modes
+        self.scene, self.num_modes, self.stiffened = scene, num_modes, stiffened
         self._initial = initial
         self._basis: Basis | None = None
         self._body: ShapeIntegrals | None = None
@@ -117,8 +121,14 @@ class DesignState:
             basis = self.basis
             with self.elastic.profile.phase("inertia integrals"):
                 damping = self.scene.damping.stiffness_proportional
-                self._body = shape_integrals(self.elastic, basis, damping)
+                loads = self.unit_loads if self.stiffened else None
+                self._body = shape_integrals(self.elastic, basis, damping, loads)
         return self._body
+
+    @cached_property
+    def unit_loads(self) -> UnitLoads:
+        """The static fields of unit accelerations, forces and moment, see there."""
+        return unit_loads(self.elastic)
 
     def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
         """Return the natural modes with what is carried; once for the same load.
@@ -137,15 +147,26 @@ class DesignState:
         return known[1]
 
     def under(
-        self, scene: scenes.Scene, num_modes: int | None, initial: InitialVectors
+        self,
+        scene: scenes.Scene,
+        num_modes: int | None,
+        initial: InitialVectors,
+        stiffened: bool = False,
     ) -> DesignState:
         """Return the same design in another scene of the same arm, with what stays the same."""
         other = DesignState(
-            self.x_phys, self.material, self.elastic, self.solid, scene, num_modes, initial
+            self.x_phys,
+            self.material,
+            self.elastic,
+            self.solid,
+            scene,
+            num_modes,
+            initial,
+            stiffened,
         )
         if self.num_modes == num_modes and same_basis(self.scene, scene):
             other._basis = self._basis
-            if self.scene.damping == scene.damping:
+            if self.scene.damping == scene.damping and self.stiffened == stiffened:
                 other._body = self._body
         return other
 

@@ -22,9 +22,9 @@ from dolfinopt.bench.common import (
     timed,
 )
 from dolfinopt.dynamics import generalized_alpha, radau
+from dolfinopt.dynamics.build import build_mechanism
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.simulation import build_mechanism
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError

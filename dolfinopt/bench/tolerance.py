@@ -17,9 +17,9 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, arms_of, bodies_of, timed
 from dolfinopt.bench.time import scipy_motion
 from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.build import build_mechanism
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.simulation import build_mechanism
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps

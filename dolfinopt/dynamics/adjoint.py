@@ -24,7 +24,7 @@ from dolfinopt.dynamics.collocation import (
     vector_jacobian_product,
 )
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.modal_coordinates import modes_of
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.newton_matrix import (
     NewtonMatrix,
     factorise,
@@ -34,7 +34,6 @@ from dolfinopt.dynamics.newton_matrix import (
 )
 from dolfinopt.dynamics.solution import Solution, lagrange_integrals
 from dolfinopt.dynamics.system import Linearisation
-from dolfinopt.multibody.body_gradient import body_gradient
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 # Share of the multipliers that a correction may have left: their error is a tenth of it or less.
@@ -43,7 +42,7 @@ POOR = 0.3  # contraction above which more coordinates are treated densely
 
 
 def trajectory_gradient(
-    system: ElasticSystem, solution: Solution, t: np.ndarray, by_q: np.ndarray
+    system: ElasticSystem | MachineSystem, solution: Solution, t: np.ndarray, by_q: np.ndarray
 ) -> list[ShapeIntegrals]:
     """Return dJ/d(constants) of every body through the trajectory's coordinates.
 
@@ -52,7 +51,7 @@ def trajectory_gradient(
         t: (m,) instants at which J looks at the coordinates, s.
         by_q: (m, N) dJ/dq there.
     """
-    method, modes = radau_iia(len(solution.nodes)), modes_of(system)
+    method, modes = radau_iia(len(solution.nodes)), system.preconditioner()
     stages = stages_of(modes, method, solution.time_grid)
     z, zd, a = (modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
     z_s, zd_s = stage_values(stages, z, zd, a)
@@ -61,12 +60,11 @@ def trajectory_gradient(
     q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
     size = q.shape[2]
     times = solution.time_grid[:-1, None] + np.diff(solution.time_grid)[:, None] * method.c
-    motion = system.motion(times.ravel())
     # Rows in z are T' times those in q: their multipliers turn like coordinates.
     flat = (x.reshape(-1, size) for x in (q, qd, solution.a, modes.from_modes(multipliers)))
-    gradient = body_gradient(system.mechanism, motion, *flat)
+    gradient = system.body_gradient(times.ravel(), *flat)
     by_start = modes.gradient_from_modes(first)
-    return add_gradients(gradient, _equilibrium_gradient(system, solution.q[0], by_start))
+    return add_gradients(gradient, system.start_gradient(solution.q[0], by_start))
 
 
 def add_gradients(
@@ -153,14 +151,3 @@ def _before(stages: Stages, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
     since = np.concatenate([[0.0], np.cumsum(stages.h)])[:, None]
     by_q, by_v = np.concatenate([by_y, after[None]]).transpose(1, 0, 2)
     return np.stack([by_q.sum(axis=0), (by_v + since * by_q).sum(axis=0)])
-
-
-def _equilibrium_gradient(
-    system: ElasticSystem, q: np.ndarray, by_q: np.ndarray
-) -> list[ShapeIntegrals]:
-    """Return the part through the static equilibrium (N,) at t = 0 that the motion starts from."""
-    instants = system.at(np.zeros(1))
-    rest = np.zeros((1, len(q)))
-    stiffness = instants.linearise(q[None], rest, rest).dense()[0, :, : len(q)]
-    multipliers = np.linalg.solve(stiffness.T, -by_q)
-    return body_gradient(system.mechanism, instants.motion, q[None], rest, rest, multipliers[None])

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.dynamics import modal_coordinates
-from dolfinopt.dynamics.system import Preconditioner, State, System, relative_errors
+from dolfinopt.dynamics.system import State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.body_gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import elastic_residual
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import Tangent, linearise
 
 MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
@@ -68,6 +70,11 @@ class ElasticSystem:
         return self.mechanism.num_coordinates
 
     @property
+    def elastic_columns(self) -> slice:
+        """Where the elastic coordinates stand among the unknowns."""
+        return slice(None)
+
+    @property
     def runs(self) -> int:
         """One."""
         return 1
@@ -112,9 +119,27 @@ class ElasticSystem:
             angle = max(angle, float(np.abs(q[:, part] @ body.outboard[2]).max(initial=0.0)))
         return f"the arms' ends turn by {angle:.2g} rad"
 
-    def preconditioner(self) -> Preconditioner:
+    def preconditioner(self) -> modal_coordinates.Modes:
         """Return the arms' vibrations."""
         return modal_coordinates.modes_of(self)
+
+    def body_gradient(
+        self,
+        t: np.ndarray,
+        q: np.ndarray,
+        qd: np.ndarray,
+        qdd: np.ndarray,
+        multipliers: np.ndarray,
+    ) -> list[ShapeIntegrals]:
+        """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
+        return body_gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
+
+    def start_gradient(self, q: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
+        """Return the derivative by every body of J through the equilibrium q (N,) at t = 0."""
+        rest = np.zeros((1, len(q)))
+        tangent = self.at(np.zeros(1)).linearise(q[None], rest, rest).dense()
+        multipliers = np.linalg.solve(tangent[0, :, : len(q)].T, -by_q)
+        return self.body_gradient(np.zeros(1), q[None], rest, rest, multipliers[None])
 
 
 def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:

@@ -9,13 +9,16 @@ from functools import cached_property, partial
 import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
+from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.end_effector import deviation
+from dolfinopt.multibody.end_effector import deviation, end_effector, end_effector_gradient
+from dolfinopt.multibody.interface_jacobian import interface_place
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism, compliance
-from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
+from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
@@ -33,7 +36,7 @@ class Trajectory:
         scenarios: the same design under the scene's scenarios.
     """
 
-    problem: ElasticSystem
+    problem: ElasticSystem | MachineSystem
     scene: Scene
     solution: Solution
     t: np.ndarray
@@ -50,9 +53,15 @@ class Trajectory:
         return self.problem.mechanism
 
     @cached_property
+    def unknowns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The system's coordinates and their rates, each (n, S)."""
+        y, yd, ydd = (self.solution.sample(self.t, k) for k in range(3))
+        return y, yd, ydd
+
+    @cached_property
     def q_e(self) -> np.ndarray:
         """Elastic coordinates (n, N)."""
-        return self.solution.sample(self.t, 0)
+        return self.solution.sample(self.t, 0)[:, self.problem.elastic_columns]
 
     @cached_property
     def q_r(self) -> np.ndarray:
@@ -61,8 +70,14 @@ class Trajectory:
 
     @cached_property
     def deviation(self) -> np.ndarray:
-        """Flexible minus rigid end-effector (n, 2), m."""
-        return deviation(self.mechanism, self.motion, self.q_e)
+        """Flexible minus rigid end-effector (n, 2), m.
+
+        Of free rigid coordinates the end-effector as it moves, less that of the desired motion.
+        """
+        if isinstance(self.problem, ElasticSystem):
+            return deviation(self.mechanism, self.motion, self.q_e)
+        wanted = end_effector(self.mechanism, self.desired, np.zeros_like(self.q_e))
+        return end_effector(self.mechanism, self.motion, self.q_e) - wanted
 
     @cached_property
     def compliance(self) -> np.ndarray:
@@ -90,13 +105,57 @@ class Trajectory:
 
         A fixed base bears the cart's as the horizontal force on the first joint.
         """
-        qd, qdd = self.solution.sample(self.t, 1), self.solution.sample(self.t, 2)
+        if isinstance(self.problem, MachineSystem):
+            return self.problem.at(self.t).forces(*self.unknowns)
+        qd, qdd = self.unknowns[1:]
         return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
     @cached_property
+    def closure_force(self) -> np.ndarray | None:
+        """Force of the ground on the closed loop's end along its normals (n, m), N; or None."""
+        if not isinstance(self.problem, MachineSystem) or self.problem.closure is None:
+            return None
+        return self.unknowns[2][:, self.problem.ends[1] :]
+
+    @cached_property
     def motion(self) -> RigidMotion:
-        """Rigid coordinates at the samples."""
-        return rigid_motion(self.t, self.scene)
+        """Rigid coordinates at the samples, as they move."""
+        if isinstance(self.problem, ElasticSystem):
+            return self.desired
+        return self.problem.at(self.t).motion(*self.unknowns)
+
+    @cached_property
+    def desired(self) -> RigidMotion:
+        """Rigid coordinates at the samples as the scene asks for them."""
+        return self.problem.motion(self.t)
+
+    def by_unknowns(self, by_q: np.ndarray) -> np.ndarray:
+        """Return derivatives by the system's coordinates (n, S) from those by the elastic ones."""
+        out = np.zeros((len(by_q), self.problem.num_coordinates))
+        out[:, self.problem.elastic_columns] = by_q
+        return out
+
+    def by_end_effector(
+        self, indices: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return the gradient of sum_n weights_n . end_effector_n at some samples.
+
+        Args:
+            indices: (n,) of the samples.
+            weights: (n, 2).
+
+        Returns:
+            By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
+        """
+        motion, q = self.motion[indices], self.q_e[indices]
+        by_q, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
+        by = self.by_unknowns(by_q)
+        if isinstance(self.problem, MachineSystem) and self.problem.ends[0]:
+            free = self.problem.drives.free
+            jacobian = interface_place(self.mechanism, motion, q).jacobian[:, free]
+            w = weights[:, 0] - 1j * weights[:, 1]
+            by[:, : len(free)] = (w[:, None] * jacobian).real
+        return by, by_bodies
 
     @property
     def settling(self) -> float:
@@ -125,17 +184,6 @@ class Trajectory:
         distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
         worst = int(np.argmax(distance))
         return float(distance[worst]), float(self.t[worst])
-
-
-def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
-    """Put the bodies on the scene's cart, with its payload."""
-    return Mechanism(
-        bodies=tuple(bodies),
-        payload_mass=scene.payload.mass,
-        payload_inertia=scene.payload.inertia,
-        gravity=scene.motion.gravity,
-        joint_height=scene.motion.joint_height,
-    )
 
 
 def simulate(
@@ -197,7 +245,7 @@ def simulate_batch(
         with profile.phase("simulation"):
             if integrator == "radau":
                 goal = radau.GOAL if differentiated else batch.GOAL
-                solutions = batch.integrate(own, tolerance, stages, profile, begun, goal)
+                solutions = _by_radau(own, tolerance, stages, profile, begun, goal)
             else:
                 solve, rest = generalized_alpha.integrate, (tolerance, rho_inf, profile)
                 solutions = [batch.attempted(solve, one, *rest) for one in own]
@@ -210,20 +258,44 @@ def simulate_batch(
     return [one for one in found if one is not None]
 
 
+def _by_radau(
+    problems: Sequence[ElasticSystem | MachineSystem],
+    tolerance: float,
+    stages: int,
+    profile: Profile,
+    starts: Sequence[Solution | None],
+    goal: float,
+) -> list[Solution | ConvergenceError]:
+    """Return the solutions in their order: together of prescribed motions, machines one by one."""
+    together = [i for i, one in enumerate(problems) if isinstance(one, ElasticSystem)]
+    own = [one for one in problems if isinstance(one, ElasticSystem)]
+    begun = [starts[i] for i in together]
+    solved = batch.integrate(own, tolerance, stages, profile, begun, goal) if own else []
+    found = dict(zip(together, solved, strict=True))
+    for i, one in enumerate(problems):
+        if i not in found:
+            options = (tolerance, stages, profile, starts[i])
+            found[i] = batch.attempted(radau.integrate, one, *options)
+    return [found[i] for i in range(len(problems))]
+
+
 def _problems(
     scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]
-) -> list[ElasticSystem]:
+) -> list[ElasticSystem | MachineSystem]:
     """Return what moves in every scene; scenes of one motion share it."""
     motions: dict[object, Callable[[np.ndarray], RigidMotion]] = {}
-    problems = []
+    problems: list[ElasticSystem | MachineSystem] = []
     for scene, own in zip(scenes, bodies, strict=True):
-        key = (scene.motion, tuple((arm.name, arm.length) for arm in scene.arms))
+        lengths = tuple((arm.name, arm.length) for arm in scene.arms)
+        key = (scene.motion, scene.closure, lengths)
         motion = motions.setdefault(key, partial(rigid_motion, scene=scene))
-        problems.append(ElasticSystem(build_mechanism(scene, own), motion, breakpoints(scene)))
+        problems.append(build_system(scene, own, motion))
     return problems
 
 
-def _trajectory(problem: ElasticSystem, scene: Scene, solution: Solution) -> Trajectory:
+def _trajectory(
+    problem: ElasticSystem | MachineSystem, scene: Scene, solution: Solution
+) -> Trajectory:
     """Return a solution with its sample instants."""
     horizon, sample = scene.motion.horizon, scene.simulation.sample
     t = np.arange(round(horizon / sample) + 1) * sample

@@ -158,6 +158,14 @@ class Unchanged:
         """Return z."""
         return z
 
+    def gradient_to_modes(self, by_q: np.ndarray) -> np.ndarray:
+        """Return dJ/dq."""
+        return by_q
+
+    def gradient_from_modes(self, by_z: np.ndarray) -> np.ndarray:
+        """Return dJ/dz."""
+        return by_z
+
     def chosen(self, runs: np.ndarray) -> Unchanged:
         """Return itself: there is one run."""
         return self

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 
 from dolfinopt.fem.elements import ElementOperators
 
@@ -32,9 +33,12 @@ def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
 
 def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
     """Return the nodal field (n_nodes, 2, k) of the cells' forces (n_cells, n, 2, k)."""
-    field = np.zeros((len(operators.points), *forces.shape[2:]))
-    np.add.at(field, operators.cells, forces)
-    return field
+    cells, shape = operators.cells, forces.shape[2:]
+    corners = sp.csr_matrix(
+        (np.ones(cells.size), cells.ravel(), np.arange(cells.size + 1)),
+        shape=(cells.size, len(operators.points)),
+    )
+    return (corners.T @ forces.reshape(cells.size, -1)).reshape(-1, *shape)
 
 
 def stiffness_products(

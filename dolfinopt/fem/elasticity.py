@@ -18,7 +18,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem import cells
 from dolfinopt.fem.assembly import AffineMatrix
 from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
-from dolfinopt.fem.elements import ElementOperators
+from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.interior import InteriorSystem
@@ -62,6 +62,11 @@ class Substructure:
         """Which cells share a facet, and which lie at the interfaces."""
         operators, T = self.operators, self.T
         return Connectivity(T.comm, operators.space, operators.cells, T.inboard, T.outboard)
+
+    @cached_property
+    def quadrature(self) -> Quadrature:
+        """Stress and gradients at the quadrature points."""
+        return quadrature(self.mesh, self.operators)
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.

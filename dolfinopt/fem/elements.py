@@ -28,6 +28,9 @@ class ElementOperators:
         points: (n_nodes, 2) reference positions, m.
         stiffness: (n_cells, 2n, 2n) plane stress, m (thickness included); times E0 gives N/m.
         mass: (n_cells, n, n) of one displacement component, m3; times rho0 gives kg.
+        element: whose they are.
+        thickness: t, m.
+        poisson_ratio: nu.
         recovery: (n_cells, m, 2n) amplitudes of the m modes that were condensed out of
             `stiffness`, by the nodal displacements; None of an element without such modes.
     """
@@ -37,6 +40,9 @@ class ElementOperators:
     points: np.ndarray
     stiffness: np.ndarray
     mass: np.ndarray
+    element: Element
+    thickness: float
+    poisson_ratio: float
     recovery: np.ndarray | None = None
 
 
@@ -50,6 +56,14 @@ class Element(Protocol):
             mesh: the arm.
             thickness: t, m.
             poisson_ratio: nu.
+        """
+
+    def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (n_cells, p, n, 2) of the shape functions by x and y, 1/m.
+
+        Args:
+            mesh: the arm.
+            points: (p, 2) places in the reference cell, which is [0, 1]^2 or the unit triangle.
         """
 
     def strain_operator(
@@ -101,16 +115,22 @@ class LagrangeElement:
                 points=vector.tabulate_dof_coordinates()[:, :2].copy(),
                 stiffness=compat.tabulate_cells(k_form, [thickness, poisson_ratio], coordinates),
                 mass=compat.tabulate_cells(m_form, [thickness], coordinates),
+                element=self,
+                thickness=thickness,
+                poisson_ratio=poisson_ratio,
             )
+
+    def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
+        """Return those in the reference cell times the inverse Jacobian, see `Element`."""
+        corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
+        local = _shape_derivatives(corners, self.degree, points)
+        return local @ np.linalg.inv(_jacobian(corners, points))
 
     def strain_operator(
         self, mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
     ) -> np.ndarray:
         """Return B from the derivatives of the shape functions, see `Element`."""
-        corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
-        jacobian = np.einsum("eni,pnk->epik", corners, _shape_derivatives(corners, 1, points))
-        local = _shape_derivatives(corners, self.degree, points)
-        return strains(local @ np.linalg.inv(jacobian))
+        return strains(self.derivatives(mesh, points))
 
 
 ELEMENTS: dict[str, Element] = {"linear": LagrangeElement(1)}
@@ -130,6 +150,56 @@ def plane_stress(poisson_ratio: float) -> np.ndarray:
     nu = poisson_ratio
     C = np.array([[1.0, nu, 0.0], [nu, 1.0, 0.0], [0.0, 0.0, 0.5 * (1.0 - nu)]])
     return C / (1.0 - nu**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrature:
+    """Stress and gradients at the quadrature points of one arm, whatever its design; n nodes.
+
+    Attributes:
+        derivatives: (n_cells, 2 p, n) of the shape functions by x and y, 1/m.
+        stress: (n_cells, 3 p, 2 n) stress xx, yy, xy times t dA by nodal displacements, unit E.
+    """
+
+    derivatives: np.ndarray
+    stress: np.ndarray
+
+
+def quadrature(mesh: ArmMesh, operators: ElementOperators) -> Quadrature:
+    """Return the operators at Gauss points that integrate a product of three gradients.
+
+    Two points a direction do so exactly for bilinear displacements on parallelograms.
+    """
+    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
+    points, weights = gauss_points(corners.shape[1], 2)
+    area = weights * np.abs(np.linalg.det(_jacobian(corners, points)))
+    strain = operators.element.strain_operator(mesh, operators, points)
+    elasticity = operators.thickness * plane_stress(operators.poisson_ratio)
+    stress = area[:, :, None, None] * (elasticity @ strain)
+    derivatives = operators.element.derivatives(mesh, points).swapaxes(2, 3)
+    count, n = operators.cells.shape
+    return Quadrature(
+        np.ascontiguousarray(derivatives).reshape(count, -1, n), stress.reshape(count, -1, 2 * n)
+    )
+
+
+def gauss_points(corners: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (p, 2) and weights (p,) in the reference cell with so many corners.
+
+    Tensor products of `order` Gauss points; on the unit triangle in collapsed coordinates.
+    """
+    x, w = np.polynomial.legendre.leggauss(order)
+    x, w = 0.5 * (x + 1.0), 0.5 * w
+    first, second = (a.ravel() for a in np.meshgrid(x, x, indexing="ij"))
+    weights = np.outer(w, w).ravel()
+    if corners == 3:
+        return np.stack([first, second * (1.0 - first)], axis=1), weights * (1.0 - first)
+    return np.stack([first, second], axis=1), weights
+
+
+def _jacobian(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (n_cells, p, 2, 2) of cells (n_cells, 3 or 4, 2) with straight sides."""
+    return np.einsum("eni,pnk->epik", corners, _shape_derivatives(corners, 1, points))
 
 
 def _shape_derivatives(corners: np.ndarray, degree: int, points: np.ndarray) -> np.ndarray:

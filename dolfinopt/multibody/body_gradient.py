@@ -8,12 +8,20 @@ that carries the derivatives with respect to the frames' motion beside the force
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dolfinopt.multibody.instants import FEW, several
-from dolfinopt.multibody.inverse_dynamics import Frame, Rates, body_force, inertia, outward_pass
+from dolfinopt.multibody.instants import FEW, PerInstant, several
+from dolfinopt.multibody.inverse_dynamics import (
+    Frame,
+    Rates,
+    along,
+    body_force,
+    body_moment,
+    inertia,
+    outward_pass,
+)
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -46,25 +54,18 @@ def body_gradient(
         return body_gradient(*few)
     frames, tip = outward_pass(mechanism, motion, q, qd, qdd)
     first = np.conj(motion.joint_rotations[0]) * of_forces[:, 0]
-    moves, (tip_p, tip_rotation) = _virtual_motion(
-        mechanism, frames, multipliers, first, of_forces[:, 1:]
-    )
-    outer = _Outer(
-        force=mechanism.payload_mass * tip[0],
-        moment=mechanism.payload_inertia * tip[2],
-        a=mechanism.payload_mass * tip_p,
-        w=np.zeros_like(tip_rotation),
-        wd=mechanism.payload_inertia * tip_rotation,
-        next_a=tip[0],
-        next_p=tip_p,
-    )
+    moves, ends = _virtual_motion(mechanism, frames, multipliers, first, of_forces[:, 1:])
+    none, zero = np.zeros_like(tip[0]), np.zeros_like(tip[2])
+    outer = _Outer(none, zero, none, zero, zero, next_a=tip[0], next_p=ends[-1][0])
     gradient: list[ShapeIntegrals] = []
     for k in reversed(range(len(frames))):
         part = mechanism.slices[k]
         rates = (q[:, part], qd[:, part], qdd[:, part])
         virtual = (*moves[k], multipliers[:, part])
+        if carried := mechanism.carried(k):
+            outer = _with_carried(frames[k], ends[k], carried, outer)
         outboard, outer = _outboard_gradient(frames[k], rates, virtual, outer)
-        gradient.insert(0, _integral_gradient(frames[k], rates, virtual, outboard))
+        gradient.insert(0, _integral_gradient(frames[k], rates, virtual, *outboard))
         outer = _with_body(frames[k], rates, virtual, outer)
     return gradient
 
@@ -94,8 +95,10 @@ def _virtual_motion(
     multipliers: np.ndarray,
     first: np.ndarray,
     joints: np.ndarray,
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], tuple[np.ndarray, np.ndarray]]:
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], list[tuple[np.ndarray, np.ndarray]]]:
     """Return every frame's virtual displacement (complex, its components) and rotation.
+
+    And the same of every outboard interface, in the components of the next frame.
 
     Args:
         mechanism, frames: as they move.
@@ -104,23 +107,39 @@ def _virtual_motion(
         joints: (n, arms) virtual rotations of the joints.
     """
     p, rotation = first, np.zeros(len(multipliers))
-    moves = []
+    moves, ends = [], []
     for k, (part, frame) in enumerate(zip(mechanism.slices, frames, strict=True)):
-        constants = frame.constants
         rotation = rotation + joints[:, k]
         moves.append((p, rotation))
         p = np.conj(frame.joint_rotation) * (
-            p + 1j * rotation * frame.d + multipliers[:, part] @ constants.B
+            p + 1j * rotation * frame.d + along(multipliers[:, part], frame.B)
         )
-        rotation = rotation + multipliers[:, part] @ constants.rotation
-    return moves, (p, rotation)
+        rotation = rotation + along(multipliers[:, part], frame.rotation)
+        ends.append((p, rotation))
+    return moves, ends
+
+
+def _with_carried(
+    frame: Frame,
+    end: tuple[np.ndarray, np.ndarray],
+    carried: tuple[PerInstant, PerInstant],
+    outer: _Outer,
+) -> _Outer:
+    """Add force and gradient of mass and inertia at a body's outboard interface."""
+    (p, rotation), (mass, rotary) = end, carried
+    return replace(
+        outer,
+        force=outer.force + mass * frame.next_a,
+        moment=outer.moment + rotary * frame.next_wd,
+        a=outer.a + mass * p,
+        wd=outer.wd + rotary * rotation,
+    )
 
 
 def _outboard_gradient(
     frame: Frame, rates: Rates, virtual: Rates, outer: _Outer
-) -> tuple[np.ndarray, _Outer]:
-    """Return the gradient (3, q) of the outboard modes and `outer` brought into this frame."""
-    q, qd, qdd = rates
+) -> tuple[tuple[np.ndarray, np.ndarray], _Outer]:
+    """Return the gradient of the outboard modes and K0, and `outer` brought into this frame."""
     _, rotation, multipliers = virtual
     w = frame.w
     kappa = 1j * frame.wd - w * w
@@ -128,8 +147,13 @@ def _outboard_gradient(
     d = a * np.conj(kappa) - 1j * rotation * force
     phi = (np.conj(outer.a) * -1j * outer.next_a).real
     phi += (np.conj(outer.force) * -1j * outer.next_p).real
-    place = d @ q + (-2j * w * a) @ qd + a @ qdd + force @ multipliers
-    rotation = phi @ q + outer.w @ qd + outer.wd @ qdd + outer.moment @ multipliers
+    weights = (
+        _Weights(d.real, (-2j * w * a).real, a.real, force.real),
+        _Weights(d.imag, (-2j * w * a).imag, a.imag, force.imag),
+        _Weights(phi, outer.w, outer.wd, outer.moment),
+    )
+    modes = np.stack([one.linear(rates, multipliers) for one in weights])
+    K0 = _stacked(frame, [one.quadratic(rates, multipliers) for one in weights])
     inner = _Outer(
         force=force,
         moment=outer.moment + (np.conj(frame.d) * force).imag,
@@ -140,11 +164,45 @@ def _outboard_gradient(
         next_p=virtual[0],
     )
     # The virtual work of the outboard force on a turned lever is part of d above.
-    return np.stack([place.real, place.imag, rotation]), inner
+    return (modes, K0), inner
+
+
+@dataclass(frozen=True, eq=False)
+class _Weights:
+    """Derivatives (n,) of the virtual work by a quantity of the modes, its rates and variation.
+
+    The quantity is C . q - 1/2 q'K0 q.
+    """
+
+    value: np.ndarray
+    rate: np.ndarray
+    second: np.ndarray
+    virtual: np.ndarray
+
+    def linear(self, rates: Rates, multipliers: np.ndarray) -> np.ndarray:
+        """Return the derivative (q,) by C."""
+        q, qd, qdd = rates
+        return self.value @ q + self.rate @ qd + self.second @ qdd + self.virtual @ multipliers
+
+    def quadratic(self, rates: Rates, multipliers: np.ndarray) -> np.ndarray:
+        """Return the derivative (q, q) by K0, of which the symmetric part counts."""
+        q, qd, qdd = rates
+        other = (
+            0.5 * self.value[:, None] * q
+            + self.rate[:, None] * qd
+            + self.second[:, None] * qdd
+            + self.virtual[:, None] * multipliers
+        )
+        return -(q.T @ other + (self.second[:, None] * qd).T @ qd)
+
+
+def _stacked(frame: Frame, by_K0: list[np.ndarray]) -> np.ndarray:
+    """Return the derivatives by K0 (k, q, q); (0, q, q) of a linear body."""
+    return np.stack(by_K0) if frame.bent is not None else np.zeros((0, *by_K0[0].shape))
 
 
 def _integral_gradient(
-    frame: Frame, rates: Rates, virtual: Rates, outboard: np.ndarray
+    frame: Frame, rates: Rates, virtual: Rates, outboard: np.ndarray, K0_outboard: np.ndarray
 ) -> ShapeIntegrals:
     """Return the gradient of one body's virtual work by its shape integrals."""
     q, qd, _ = rates
@@ -173,25 +231,39 @@ def _integral_gradient(
         D=multipliers.T @ qd,
         outboard=outboard,
         outboard_point=np.zeros(2),
+        K0=_by_geometric_stiffness(frame, rates, virtual),
+        K0_outboard=K0_outboard,
     )
+
+
+def _by_geometric_stiffness(frame: Frame, rates: Rates, virtual: Rates) -> np.ndarray:
+    """Return the gradient (4, q, q) by the geometric stiffness of a_x, a_y, wd and -w^2."""
+    p, rotation, multipliers = virtual
+    w, wd, a = frame.w, frame.wd, frame.a
+    by_s = p * np.conj(1j * wd - w * w) - 1j * rotation * a
+    by_sd = -2j * w * p
+    zero = np.zeros_like(w)
+    weights = (
+        _Weights(by_s.real, by_sd.real, p.real, a.real),
+        _Weights(by_s.imag, by_sd.imag, p.imag, a.imag),
+        _Weights(zero, zero, rotation, wd),  # the angular momentum of the relative motion
+        _Weights(2.0 * rotation * wd, 2.0 * rotation * w, zero, -w * w),  # half the inertia
+    )
+    return _stacked(frame, [one.quadratic(rates, multipliers) for one in weights])
 
 
 def _with_body(frame: Frame, rates: Rates, virtual: Rates, outer: _Outer) -> _Outer:
     """Add one body's own force and gradient to what lies outboard of it."""
-    body, constants = frame.constants.body, frame.constants
-    _, qd, qdd = rates
+    body = frame.constants.body
+    _, qd, _ = rates
     p, rotation, multipliers = virtual
     w = frame.w
     spin = np.einsum("nk,nk->n", frame.jM, qd)
     gyro = -2.0 * w[:, None] * frame.jM - 2.0 * (qd @ body.G)
     return _Outer(
         force=outer.force + body_force(frame),
-        moment=outer.moment
-        + (np.conj(frame.s) * frame.a).imag
-        + inertia(frame) * frame.wd
-        + 2.0 * w * spin
-        + np.einsum("nk,nk->n", frame.rG, qdd),
-        a=outer.a + body.mass * p + 1j * frame.s * rotation + multipliers @ constants.C,
+        moment=outer.moment + body_moment(frame, rates),
+        a=outer.a + body.mass * p + 1j * frame.s * rotation + along(multipliers, frame.C),
         w=outer.w
         + (np.conj(p) * (2j * frame.sd - 2.0 * w * frame.s)).real
         + 2.0 * spin * rotation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.multibody.instants import FEW, several
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Mechanism, ModalConstants
 from dolfinopt.multibody.motion import RigidMotion
 
 
@@ -19,9 +19,19 @@ def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np
         zip(mechanism.slices, mechanism.modal_constants, strict=True)
     ):
         joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
-        place = place + joint_rotation * (constants.outboard_position + q[:, part] @ constants.B)
-        joint_rotation = joint_rotation * np.exp(1j * (q[:, part] @ constants.rotation))
+        d, angle = outboard(constants, q[:, part])
+        place = place + joint_rotation * d
+        joint_rotation = joint_rotation * np.exp(1j * angle)
     return np.stack([place.real, place.imag], axis=1)
+
+
+def outboard(constants: ModalConstants, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outboard point (n,), complex, and rotation, see `inverse_dynamics`."""
+    d, angle = constants.outboard_position + e @ constants.B, e @ constants.rotation
+    if constants.K0 is not None:
+        x, y, bent = (-0.5 * np.einsum("nk,nk->n", e @ K0, e) for K0 in constants.K0[4:])
+        d, angle = d + (x + 1j * y), angle + bent
+    return d, angle
 
 
 def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
@@ -35,7 +45,7 @@ def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.nd
 
 def end_effector_gradient(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, list[np.ndarray]]:
+) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     """Return the gradient of sum_n weights_n . end_effector_n.
 
     Args:
@@ -43,7 +53,8 @@ def end_effector_gradient(
         weights: (n, 2).
 
     Returns:
-        By q (n, N), and by every body's outboard modes (3, q).
+        By q (n, N), and by every body's outboard modes (3, q) and their geometric stiffness
+        (3, q, q), under the names of the shape integrals.
     """
     if 0 < len(q) < FEW:
         few = several(mechanism, motion, q, weights)
@@ -58,10 +69,11 @@ def end_effector_gradient(
     ):
         joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
         rotations.append(joint_rotation)
-        levers.append(joint_rotation * (constants.outboard_position + q[:, part] @ constants.B))
-        joint_rotation = joint_rotation * np.exp(1j * (q[:, part] @ constants.rotation))
+        d, angle = outboard(constants, q[:, part])
+        levers.append(joint_rotation * d)
+        joint_rotation = joint_rotation * np.exp(1j * angle)
     by_q = np.empty_like(q)
-    by_outboard: list[np.ndarray] = []
+    by_outboard: list[dict[str, np.ndarray]] = []
     beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
     for k in reversed(range(len(rotations))):
         part, constants = mechanism.slices[k], mechanism.modal_constants[k]
@@ -72,7 +84,12 @@ def end_effector_gradient(
             + np.outer(place.imag, constants.B.imag)
             + np.outer(rotation, constants.rotation)
         )
-        rows = [weight @ q[:, part] for weight in (place.real, place.imag, rotation)]
-        by_outboard.insert(0, np.stack(rows))
+        e, pulls = q[:, part], (place.real, place.imag, rotation)
+        by = {"outboard": np.stack([pull @ e for pull in pulls])}
+        if constants.K0 is not None:
+            pairs = zip(pulls, constants.K0[4:], strict=True)
+            by_q[:, part] -= sum(pull[:, None] * (e @ K0) for pull, K0 in pairs)
+            by["K0_outboard"] = np.stack([-0.5 * (e.T * pull) @ e for pull in pulls])
+        by_outboard.insert(0, by)
         beyond = beyond + levers[k]
     return by_q, by_outboard

@@ -8,6 +8,12 @@ angular velocity w and acceleration wd of a body,
     f = C'a + (r + G q) wd - w^2 (j + M q) + 2 w G qd + M qdd + K q + D qd
 plus what is attached outboard. Source: Featherstone, Rigid Body Dynamics Algorithms (2008);
 Schwertassek & Wallrapp (1999).
+
+A body with geometric stiffness K0_p by the loads p = (a_x, a_y, wd, -w^2, F_x, F_y, T) deforms in
+the second order, too: whatever these loads do work on loses 1/2 q'K0_p q, and its derivative by q
+loses K0_p q. That is c + C q for a, the outboard displacement and rotation for F and T; and
+j + M q loses K0 q of -w^2, r + G q that of wd. The residual gains -p . K0 q by the same rule.
+Source: Wallrapp & Schwertassek (1991), doi:10.1002/nme.1620320818.
 """
 
 from __future__ import annotations
@@ -25,6 +31,34 @@ Rates = tuple[np.ndarray, np.ndarray, np.ndarray]  # q, qd, qdd
 
 
 @dataclass(frozen=True, eq=False)
+class SecondOrder:
+    """Deformation of the second order by each of the seven loads; arrays over n instants.
+
+    Attributes:
+        K0: (7, q, q).
+        q, qd, qdd: (n, 7, q) K0_p times the coordinates and their rates.
+        value, rate, second: (n, 7) -1/2 q'K0_p q and its time derivatives.
+    """
+
+    K0: np.ndarray
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    value: np.ndarray
+    rate: np.ndarray
+    second: np.ndarray
+
+
+def _second_order(K0: np.ndarray, rates: Rates) -> SecondOrder:
+    flat = K0.transpose(1, 0, 2).reshape(K0.shape[1], -1)  # K0_p is symmetric
+    shape = (len(rates[0]), *K0.shape[:2])
+    e, ed, edd = ((x @ flat).reshape(shape) for x in rates)
+    value, rate, bent = (-np.einsum("npk,nk->np", e, x) for x in rates)
+    second = bent - np.einsum("npk,nk->np", ed, rates[1])
+    return SecondOrder(K0, e, ed, edd, 0.5 * value, rate, second)
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """Motion of one tangent frame and what one body makes of it; arrays over n instants.
 
@@ -36,6 +70,9 @@ class Frame:
         joint_rotation: (n,) complex exp(i (theta + joint angle)) from the next frame to this one.
         constants: of the body.
         e: (n, q) its coordinates.
+        next_a, next_wd: acceleration of the outboard interface less gravity, in the next frame's
+            components, and its angular acceleration.
+        bent: its deformation of the second order, None of a linear body.
     """
 
     a: np.ndarray
@@ -50,16 +87,44 @@ class Frame:
     joint_rotation: np.ndarray
     constants: ModalConstants
     e: np.ndarray
+    next_a: np.ndarray
+    next_wd: np.ndarray
+    bent: SecondOrder | None = None
 
     @cached_property
     def jM(self) -> np.ndarray:
-        """Return j + M q (n, q)."""
-        return self.constants.body.j + self.e @ self.constants.body.M
+        """Return j + M q (n, q), half the derivative of the inertia."""
+        linear = self.constants.body.j + self.e @ self.constants.body.M
+        return linear if self.bent is None else linear - self.bent.q[:, 3]
 
     @cached_property
     def rG(self) -> np.ndarray:
         """Return r + G q (n, q); G is skew: (G q)' = -q' G."""
-        return self.constants.body.r - self.e @ self.constants.body.G
+        linear = self.constants.body.r - self.e @ self.constants.body.G
+        return linear if self.bent is None else linear - self.bent.q[:, 2]
+
+    @cached_property
+    def C(self) -> np.ndarray:
+        """Return the derivative of s by the coordinates, (q,), or (n, q) if bent; complex."""
+        C, bent = self.constants.C, self.bent
+        return C if bent is None else C - bent.q[:, 0] - 1j * bent.q[:, 1]
+
+    @cached_property
+    def B(self) -> np.ndarray:
+        """Return that of the outboard point."""
+        B, bent = self.constants.B, self.bent
+        return B if bent is None else B - bent.q[:, 4] - 1j * bent.q[:, 5]
+
+    @cached_property
+    def rotation(self) -> np.ndarray:
+        """Return that of the outboard rotation."""
+        rotation, bent = self.constants.rotation, self.bent
+        return rotation if bent is None else rotation - bent.q[:, 6]
+
+
+def along(x: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """Return x . modes (n,) for x (n, q) and modes (q,), or (n, q) that differ by instant."""
+    return x @ modes if modes.ndim == 1 else np.einsum("nk,nk->n", x, modes)
 
 
 def outward_pass(
@@ -80,18 +145,51 @@ def outward_pass(
         s, d, rotation = (e @ constants.kinematics).view(complex).T
         sd, dd, rotation_d = (qd[:, part] @ constants.kinematics).view(complex).T
         sdd, ddd, rotation_dd = (qdd[:, part] @ constants.kinematics).view(complex).T
+        bent = None
+        if constants.K0 is not None:
+            bent = _second_order(constants.K0, (e, qd[:, part], qdd[:, part]))
+            s, d, rotation = _bent((s, d, rotation), bent.value)
+            sd, dd, rotation_d = _bent((sd, dd, rotation_d), bent.rate)
+            sdd, ddd, rotation_dd = _bent((sdd, ddd, rotation_dd), bent.second)
         joint_rotation = np.exp(1j * rotation.real)
         if k < last:  # behind the last arm the payload's frame has no joint of its own
             joint_rotation *= motion.joint_rotations[k + 1]
         d = constants.outboard_position + d
+        next_a = np.conj(joint_rotation) * (a + (1j * wd - w * w) * d + 2j * w * dd + ddd)
+        next_wd = wd + rotation_dd.real
         frames.append(
-            Frame(a, w, wd, d, dd, ddd, constants.c + s, sd, sdd, joint_rotation, constants, e)
+            Frame(
+                a,
+                w,
+                wd,
+                d,
+                dd,
+                ddd,
+                constants.c + s,
+                sd,
+                sdd,
+                joint_rotation,
+                constants,
+                e,
+                next_a,
+                next_wd,
+                bent,
+            )
         )
-        a = np.conj(joint_rotation) * (a + (1j * wd - w * w) * d + 2j * w * dd + ddd)
-        w, wd = w + rotation_d.real, wd + rotation_dd.real
+        a, w, wd = next_a, w + rotation_d.real, next_wd
         if k < last:
             w, wd = w + joints_d[:, k + 1], wd + joints_dd[:, k + 1]
     return frames, (a, w, wd)
+
+
+def _bent(
+    linear: tuple[np.ndarray, np.ndarray, np.ndarray], second: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return first moment, outboard displacement and rotation with what `second` (n, 7) adds."""
+    s, d, rotation = linear
+    s = s + (second[:, 0] + 1j * second[:, 1])
+    d = d + (second[:, 4] + 1j * second[:, 5])
+    return s, d, rotation + second[:, 6]
 
 
 def inverse_dynamics(
@@ -113,7 +211,10 @@ def inverse_dynamics(
         return rows[: len(q)], forces[: len(q)]
     rows, (force, drives) = inward_pass(mechanism, motion, (q, qd, qdd), driven=True)
     cart = (motion.joint_rotations[0] * force).real
-    return rows, np.stack([cart, *drives], axis=1)
+    forces = np.stack([cart, *drives], axis=1)
+    if mechanism.rotors.any():
+        forces += mechanism.rotors * motion.qdd
+    return rows, forces
 
 
 def elastic_residual(
@@ -130,12 +231,15 @@ def inward_pass(
 ) -> tuple[np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
     """Return the elastic residual and, if `driven`, the first joint's force and all moments."""
     frames, tip = outward_pass(mechanism, motion, *rates)
-    force, moment = mechanism.payload_mass * tip[0], mechanism.payload_inertia * tip[2]
+    force, moment = np.zeros_like(tip[0]), np.zeros_like(tip[2])
     rows = np.empty_like(rates[0])
     drives: list[np.ndarray] = []
     for k in reversed(range(len(frames))):
         part, frame, scale = mechanism.slices[k], frames[k], mechanism.scale(k)
         own = (rates[0][:, part], rates[1][:, part], rates[2][:, part])
+        if carried := mechanism.carried(k):
+            force = force + carried[0] * frame.next_a
+            moment = moment + carried[1] * frame.next_wd
         force = frame.joint_rotation * force  # of everything outboard, in this frame
         rows[:, part] = _body_residual(frame, own, (force, moment), scale)
         if k > 0 or driven:
@@ -163,6 +267,8 @@ def _body_residual(
     if isinstance(scale.mass, np.ndarray) or scale.mass != 1.0:
         inertial *= as_column(scale.mass)
     inertial += load_coefficients @ constants.loads
+    if frame.bent is not None:
+        inertial -= (load_coefficients[:, None] @ frame.bent.q)[:, 0]
     inertial += as_column(scale.stiffness) * product(e, constants.K)
     if constants.D is not None:
         inertial += as_column(scale.damping) * product(ed, constants.D)
@@ -172,12 +278,15 @@ def _body_residual(
 def body_moment(frame: Frame, rates: Rates) -> np.ndarray:
     """Return the moment T (n,) of one body's own inertia about its frame's origin, N m."""
     _, ed, edd = rates
-    return (
+    moment = (
         (np.conj(frame.s) * frame.a).imag
         + inertia(frame) * frame.wd
         + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, ed)
         + np.einsum("nk,nk->n", frame.rG, edd)
     )
+    if frame.bent is not None:
+        moment -= np.einsum("nk,nk->n", frame.bent.qd[:, 2], ed)
+    return moment
 
 
 def inertia(frame: Frame) -> np.ndarray:

@@ -31,6 +31,7 @@ class ModalConstants:
         kinematics: (q, 6) real: x and y of C, of B; rotation, 0.
         loads: (7, q) real: x and y of C; r; j; x and y of B; rotation.
         K, D: (q, q), or their diagonals (q,) where there is nothing else; no D, None.
+        K0: (7, q, q) geometric stiffness by each of `loads`, or None of a linear body.
     """
 
     body: ShapeIntegrals
@@ -43,6 +44,7 @@ class ModalConstants:
     loads: np.ndarray
     K: np.ndarray
     D: np.ndarray | None
+    K0: np.ndarray | None
 
 
 def _modal_constants(body: ShapeIntegrals) -> ModalConstants:
@@ -58,6 +60,7 @@ def _modal_constants(body: ShapeIntegrals) -> ModalConstants:
         loads=np.stack([C[0], C[1], body.r, body.j, B_x, B_y, rotation]),
         K=_diagonal_or_matrix(body.K),
         D=_diagonal_or_matrix(body.D) if body.D.any() else None,
+        K0=np.concatenate([body.K0, body.K0_outboard]) if body.is_stiffened else None,
     )
 
 
@@ -70,6 +73,24 @@ def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
 def product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
     """Return x A (n, q) of a matrix, or of its diagonal."""
     return x * A if A.ndim == 1 else x @ A
+
+
+@dataclass(frozen=True)
+class JointHardware:
+    """What sits at one arm's ends besides the arm itself.
+
+    Attributes:
+        mass, inertia: at the outboard interface, kg, kg m2.
+        rotor: inertia of the rotor that drives the inboard joint, times its gear ratio squared,
+            kg m2.
+    """
+
+    mass: float = 0.0
+    inertia: float = 0.0
+    rotor: float = 0.0
+
+
+BARE = JointHardware()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +106,8 @@ class Mechanism:
         gravity: (g_x, g_y), m/s2.
         joint_height: y of the first joint, m.
         scales: of every body's elastic rows, forces and moments, or none.
+        joints: what sits at every arm's ends, or none.
+        cart_mass: kg.
     """
 
     bodies: tuple[ShapeIntegrals, ...]
@@ -93,6 +116,8 @@ class Mechanism:
     gravity: tuple[PerInstant, PerInstant]
     joint_height: float
     scales: tuple[Scale, ...] = ()
+    joints: tuple[JointHardware, ...] = ()
+    cart_mass: float = 0.0
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -126,6 +151,19 @@ class Mechanism:
     def scale(self, k: int) -> Scale:
         """Return that of a body."""
         return self.scales[k] if self.scales else UNSCALED
+
+    def carried(self, k: int) -> tuple[PerInstant, PerInstant] | None:
+        """Return mass and inertia at the outboard interface of body k, kg, kg m2; None for none."""
+        joint = self.joints[k] if self.joints else BARE
+        if k < len(self.bodies) - 1:
+            return (joint.mass, joint.inertia) if joint.mass or joint.inertia else None
+        return self.payload_mass + joint.mass, self.payload_inertia + joint.inertia
+
+    @cached_property
+    def rotors(self) -> np.ndarray:
+        """Mass of the cart and reflected inertia of the joints' rotors (1 + arms,), kg, kg m2."""
+        joints = self.joints or (BARE,) * len(self.bodies)
+        return np.array([self.cart_mass, *(joint.rotor for joint in joints)])
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""

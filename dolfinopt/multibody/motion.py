@@ -14,6 +14,7 @@ from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.instants import FEW, repeated
+from dolfinopt.multibody.loop_motion import Derivatives, Loop, assembled, closed, rotation
 from dolfinopt.paths.tables import (
     TIME,
     Curve,
@@ -97,8 +98,9 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     if 0 < len(t) < FEW:
         return rigid_motion(t[repeated(len(t))], scene)[: len(t)]
     motion = scene.motion
-    if motion.path == "joints":
-        return _tabulated_joints(t, scene)
+    if motion.path in ("joints", "rotation"):
+        joints = _prescribed_joints(t, scene)
+        return _on_base(joints if scene.closure is None else _closed(t, joints, scene), motion)
     path = desired_path(t, motion)
     if len(scene.arms) == 1:
         return _one_arm(t, path, scene)
@@ -112,7 +114,9 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 
 def check_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
-    rigid_motion(np.linspace(0.0, scene.motion.duration, DENSE), scene)
+    motion = scene.motion
+    end = motion.horizon if motion.path == "rotation" else motion.duration
+    rigid_motion(np.linspace(0.0, end, DENSE), scene)
 
 
 def breakpoints(scene: Scene) -> tuple[float, ...]:
@@ -388,10 +392,18 @@ def _one_arm(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
     )
 
 
-def _tabulated_joints(t: np.ndarray, scene: Scene) -> RigidMotion:
-    """Return the joint coordinates of the scene's table."""
+def _prescribed_joints(t: np.ndarray, scene: Scene) -> Derivatives:
+    """Return the coordinates that a table or a rotation prescribes (n, k) and two derivatives."""
     motion = scene.motion
-    joints = _along(t, motion, _columns(scene))
+    if motion.path == "joints":
+        return _along(t, motion, _columns(scene))
+    turned = rotation(t, time_law(motion), motion.speed, motion.start_angle, motion.duration)
+    angle, rate, growth = (x[:, None] for x in turned)
+    return angle, rate, growth
+
+
+def _on_base(joints: Derivatives, motion: Motion) -> RigidMotion:
+    """Return all rigid coordinates: those of the joints alone have a fixed base before them."""
     if motion.base == "cart":
         return RigidMotion(*joints)
     places = (motion.base_position, 0.0, 0.0)
@@ -400,11 +412,51 @@ def _tabulated_joints(t: np.ndarray, scene: Scene) -> RigidMotion:
     )
 
 
+def _closed(t: np.ndarray, joints: Derivatives, scene: Scene) -> Derivatives:
+    """Return the joints of a closed loop on a fixed base, those that follow from others last."""
+    found = _loop_angles(t, joints, scene)
+    times, reference = _continuous_loop(scene, file_stamp(scene.motion))
+    near = np.stack([np.interp(t, times, column) for column in reference.T], axis=1)
+    first = len(scene.arms) - scene.dependent_joints
+    q = found[0].copy()
+    q[:, first:] += 2.0 * np.pi * np.round((near[:, first:] - q[:, first:]) / (2.0 * np.pi))
+    return q, found[1], found[2]
+
+
+def _loop_angles(t: np.ndarray, joints: Derivatives, scene: Scene) -> Derivatives:
+    loop = _loop(scene)
+    start = _prescribed_joints(np.zeros(1), scene)
+    return closed(t, joints, loop, assembled(start, loop, scene.source), scene.source)
+
+
+@lru_cache(maxsize=64)
+def _continuous_loop(scene: Scene, stamp: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return dense instants and all joint angles there (n, arms) without jumps, rad."""
+    t = np.linspace(0.0, scene.motion.horizon, DENSE)
+    angles = _loop_angles(t, _prescribed_joints(t, scene), scene)[0]
+    return t, np.unwrap(angles, axis=0)
+
+
+def _loop(scene: Scene) -> Loop:
+    """Return the scene's closed loop as rigid arms."""
+    closure, motion = scene.closure, scene.motion
+    assert closure is not None
+    direction = complex(*closure.direction)
+    return Loop(
+        lengths=tuple(arm.length for arm in scene.arms),
+        base=complex(motion.base_position, motion.joint_height),
+        point=complex(*closure.point),
+        direction=direction / abs(direction) if closure.kind == "slider" else None,
+        side=closure.side,
+    )
+
+
 def _columns(scene: Scene) -> tuple[str, ...]:
     """Return the columns of the scene's table."""
     if scene.motion.path == "points":
         return POINT
     names = tuple(arm.name for arm in scene.arms)
+    names = names[: len(names) - scene.dependent_joints]
     for reserved in (TIME, CART):
         if reserved in names:
             raise InputError(

@@ -22,6 +22,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
+    from dolfinopt.fem.geometric_stiffness import UnitLoads
     from dolfinopt.reduction import Basis
 
 # E_c of plane motion: A = wd S - w^2 I, and twice Omega = 2 w S.
@@ -56,6 +57,8 @@ TABLE = (
     Integral("D", "damping", modes=(0, 1)),
     Integral("outboard", modes=(1,)),
     Integral("outboard_point"),
+    Integral("K0", "mass", modes=(1, 2)),
+    Integral("K0_outboard", modes=(1, 2)),
 )
 
 
@@ -76,6 +79,10 @@ class ShapeIntegrals:
         outboard: (3, q) in the plane, (6, q) in space: displacement and rotation of the outboard
             interface in each mode.
         outboard_point: (d,) its reference position, m.
+        K0: (d + g, q, q) geometric stiffness by the inertia of unit accelerations of the frame:
+            a_x, a_y, wd and -w^2 in the plane, kg and kg m; (0, q, q) of a body that is linear.
+        K0_outboard: (3, q, q), (6, q, q) in space: that of unit forces and moments at the outboard
+            interface, 1/m and 1 for modes in m; (0, q, q) likewise.
     """
 
     mass: float
@@ -85,6 +92,8 @@ class ShapeIntegrals:
     D: np.ndarray
     outboard: np.ndarray
     outboard_point: np.ndarray
+    K0: np.ndarray
+    K0_outboard: np.ndarray
 
     @property
     def num_modes(self) -> int:
@@ -94,6 +103,11 @@ class ShapeIntegrals:
     def __add__(self, other: ShapeIntegrals) -> ShapeIntegrals:
         """Return the sum of derivatives, integral by integral."""
         return ShapeIntegrals(*(getattr(self, i.name) + getattr(other, i.name) for i in TABLE))
+
+    @property
+    def is_stiffened(self) -> bool:
+        """Whether geometric stiffness is known."""
+        return len(self.K0) > 0
 
     # -- as the equations of plane motion name them ----------------------------------------------
 
@@ -152,8 +166,8 @@ def plane_body(
     W = np.zeros((2, 1 + q, 1 + q))
     W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
     W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
-    w = np.column_stack([moment, C])
-    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point)
+    w, linear = np.column_stack([moment, C]), np.zeros((0, q, q))
+    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point, linear, linear)
 
 
 # -- what follows from the table -------------------------------------------------------------
@@ -234,13 +248,19 @@ def generators(dimension: int) -> np.ndarray:
     return PLANE if dimension == 2 else SPACE
 
 
-def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float) -> ShapeIntegrals:
+def shape_integrals(
+    arm: ElasticArm,
+    basis: Basis,
+    stiffness_proportional: float,
+    loads: UnitLoads | None = None,
+) -> ShapeIntegrals:
     """Integrate the body's inertia over its current design (collective on the arm's ranks).
 
     Args:
         arm: with its design set.
         basis: of that design.
         stiffness_proportional: beta in D = beta K, s.
+        loads: of that design, whose stress stiffens the body; None of a linear body.
     """
     X, V, MV = arm.points, basis.V, basis.MV
     d, q = X.shape[1], V.shape[2]
@@ -263,6 +283,7 @@ def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float
     mass, moment, C, second, first, modes = (
         piece.reshape(np.shape(part)) for piece, part in zip(pieces, parts, strict=True)
     )
+    K0 = np.zeros((0, q, q)) if loads is None else loads.geometric_stiffness(V)
     return ShapeIntegrals(
         mass=float(mass),
         w=np.column_stack([moment, C]),
@@ -271,6 +292,8 @@ def shape_integrals(arm: ElasticArm, basis: Basis, stiffness_proportional: float
         D=stiffness_proportional * basis.stiffness,
         outboard=basis.outboard,
         outboard_point=arm.mesh.outboard_point,
+        K0=K0[: len(E) + d],
+        K0_outboard=K0[len(E) + d :],
     )
 
 
@@ -360,11 +383,34 @@ def rigid_body(
     )  # fmt: skip
 
 
-def rigid_bar(length: float, height: float, thickness: float, density: float) -> ShapeIntegrals:
-    """Return a solid bar without elastic coordinates; m, kg/m3."""
-    mass = density * length * height * thickness
-    inertia = mass * (length**2 / 3.0 + height**2 / 12.0)
+def rigid_bar(
+    length: float, height: float, mass: float, inertia: float | None = None
+) -> ShapeIntegrals:
+    """Return a bar without elastic coordinates, its centre halfway.
+
+    Args:
+        length, height: m.
+        mass: kg.
+        inertia: about its centre, kg m2; None: of a rectangular bar.
+    """
+    if inertia is None:
+        inertia = mass * (length**2 + height**2) / 12.0
+    inertia += mass * length**2 / 4.0
     return rigid_body(mass, np.array([0.5 * mass * length, 0.0]), inertia, np.array([length, 0.0]))
+
+
+def padded(by: ShapeIntegrals, like: ShapeIntegrals) -> ShapeIntegrals:
+    """Return derivatives by `rigid_part` as those by the whole body `like`: zero by its modes."""
+    whole = in_basis(by, np.zeros((0, like.num_modes)))
+    none, outboard = np.zeros_like(like.K0), np.zeros_like(like.K0_outboard)
+    return replace(whole, K0=none, K0_outboard=outboard)
+
+
+def rigid_part(body: ShapeIntegrals) -> ShapeIntegrals:
+    """Return the body with its elastic coordinates held at zero."""
+    linear = np.zeros((0, body.num_modes, body.num_modes))
+    held = replace(body, K0=linear, K0_outboard=linear)
+    return in_basis(held, np.zeros((body.num_modes, 0)))
 
 
 def first_frequency(body: ShapeIntegrals) -> float:

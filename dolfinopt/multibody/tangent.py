@@ -14,7 +14,14 @@ from itertools import pairwise
 import numpy as np
 
 from dolfinopt.multibody.instants import FEW, PerInstant, Scale, as_column, several
-from dolfinopt.multibody.inverse_dynamics import Frame, Rates, body_force, inertia, outward_pass
+from dolfinopt.multibody.inverse_dynamics import (
+    Frame,
+    Rates,
+    body_force,
+    body_moment,
+    inertia,
+    outward_pass,
+)
 from dolfinopt.multibody.mechanism import Mechanism, ModalConstants
 from dolfinopt.multibody.motion import RigidMotion
 
@@ -37,6 +44,7 @@ class _BodyTangent:
         scale: of its constants; not of left and right.
         left: (n, q, r).
         right: (n, r, 3 S).
+        geometric: (n, q, q) sum_p p K0_p, which r' loses times q', or None of a linear body.
     """
 
     constants: ModalConstants
@@ -48,6 +56,7 @@ class _BodyTangent:
     scale: Scale
     left: np.ndarray
     right: np.ndarray
+    geometric: np.ndarray | None = None
 
     @property
     def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -58,7 +67,9 @@ class _BodyTangent:
     def at(self, part: slice) -> _BodyTangent:
         """Return it at some of the instants."""
         names = ("w", "wd", "scale", "left", "right")
-        return replace(self, **{name: getattr(self, name)[part] for name in names})
+        geometric = None if self.geometric is None else self.geometric[part]
+        changed = {name: getattr(self, name)[part] for name in names}
+        return replace(self, geometric=geometric, **changed)
 
     def factors(self, times: int = 1) -> tuple[PerInstant, ...]:
         """Return what K and M, by q; D and G, by qd; M, by qdd, are multiplied by, as columns.
@@ -118,6 +129,8 @@ class Tangent:
             if part.constants.D is not None:
                 rows[:, :, columns[1]] += d * D
             rows[:, :, columns[2]] += m * M
+            if part.geometric is not None:
+                rows[:, :, columns[0]] -= part.geometric[:, part.kept][:, :, part.kept]
         return jacobian
 
     def times(
@@ -149,6 +162,8 @@ class Tangent:
                 coupled += (k * e) @ K
             if D.any():
                 coupled += (d * ed) @ D
+            if part.geometric is not None:
+                coupled -= _by_instant(e, part.geometric[:, part.kept][:, :, own])
             out.append(coupled)
         return np.concatenate(out, axis=1)
 
@@ -176,7 +191,15 @@ class Tangent:
             if part.constants.D is not None:
                 by_v[:, part.columns] += d * (y @ body.D[:, part.kept])
             by_a[:, part.columns] += m * M
+            if part.geometric is not None:
+                by_q[:, part.columns] -= _by_instant(y, part.geometric[:, :, part.kept])
         return by_q, by_v, by_a
+
+
+def _by_instant(x: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """Return x A (m, W) for x (m, q) and A (n, q, W), every instant as often as m has it."""
+    rows = x.reshape(len(A), len(x) // len(A), x.shape[1]) @ A
+    return rows.reshape(len(x), A.shape[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,15 +269,19 @@ def linearise(
     frames, tip = outward_pass(mechanism, motion, q, qd, qdd)
     places = _places(mechanism, keep, rigid)
     motions = _outward_derivatives(frames, motion, places)
-    tip_v, _, rotation_v = motions[-1]
-    force, force_v = mechanism.payload_mass * tip[0], as_column(mechanism.payload_mass) * tip_v
-    moment_v = as_column(mechanism.payload_inertia) * rotation_v
+    force, moment = np.zeros_like(tip[0]), np.zeros_like(tip[2])
+    force_v, moment_v = np.zeros_like(motions[-1][0]), np.zeros_like(motions[-1][2])
     bodies: list[_BodyTangent] = []
     drives = np.empty((len(q), len(places.rigid), 3 * places.size))
     for k in reversed(range(len(frames))):
         part, scale = mechanism.slices[k], mechanism.scale(k)
         frame, chosen = frames[k], places.kept[k]
         rates = (q[:, part], qd[:, part], qdd[:, part])
+        if carried := mechanism.carried(k):
+            force, moment = force + carried[0] * frame.next_a, moment + carried[1] * frame.next_wd
+            next_a_v, next_wd_v = _interface_derivatives(motions[k + 1], places.of_rigid(k + 2))
+            force_v = force_v + as_column(carried[0]) * next_a_v
+            moment_v = moment_v + as_column(carried[1]) * next_wd_v
         force = frame.joint_rotation * force
         force_v = frame.joint_rotation[:, None] * force_v
         for columns, rotation in _rotating(frame, k, places):
@@ -262,22 +289,42 @@ def linearise(
         moves = k > 0 or len(places.rigid) > 0
         load = (force_v, moment_v)
         left, right = _coupling(frame, motions[k], rates[1], load, scale.mass, moves)
+        geometric = _geometric(frame, (force, moment), scale.mass)
         rows = slice(len(places.rigid) + part.start, len(places.rigid) + part.stop)
         own = (frame.constants, rows, places.bodies[k], chosen, frame.w, frame.wd, scale)
-        bodies.insert(0, _BodyTangent(*own, left, right))
+        bodies.insert(0, _BodyTangent(*own, left, right, geometric))
         if not moves:
             break
         columns = places.of_body(k)
         moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
-        moment_v[:, columns[0]] += (np.conj(frame.constants.B[chosen]) * force[:, None]).imag
+        moment_v[:, columns[0]] += (np.conj(frame.B[..., chosen]) * force[:, None]).imag
         force_b, moment_b = _body_load(frame, motions[k], columns, chosen, rates)
         mass = as_column(scale.mass)
         force_v, moment_v = force_v + mass * force_b, moment_v + mass * moment_b
+        moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame, rates)
         force = force + scale.mass * body_force(frame)
         drives[:, places.rigid == k + 1] = moment_v[:, None]
     if 0 in places.rigid:
         drives[:, 0] = _cart_force(motion, force, force_v, places)
+    own = np.arange(len(places.rigid))
+    drives[:, own, 2 * places.size + own] += mechanism.rotors[places.rigid]
     return Tangent(tuple(bodies), places.size, drives)
+
+
+def _interface_derivatives(
+    motion: _FrameDerivatives, joint: _Columns | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return those of an interface's acceleration and angular acceleration, the joint's own less.
+
+    Args:
+        motion: of the frame behind it.
+        joint: columns of the joint between the two, if it is free.
+    """
+    a_v, _, wd_v = motion
+    if joint is not None:
+        wd_v = wd_v.copy()
+        wd_v[:, joint[2]] -= 1.0
+    return a_v, wd_v
 
 
 def _rotating(frame: Frame, k: int, places: _Places) -> list[tuple[_Columns, np.ndarray | float]]:
@@ -286,7 +333,7 @@ def _rotating(frame: Frame, k: int, places: _Places) -> list[tuple[_Columns, np.
     They are the body's own, by its outboard rotation, and the joint behind it.
     """
     found: list[tuple[_Columns, np.ndarray | float]] = [
-        (places.of_body(k), frame.constants.rotation[places.kept[k]])
+        (places.of_body(k), frame.rotation[..., places.kept[k]])
     ]
     joint = places.of_rigid(k + 2)
     return found if joint is None else [*found, (joint, 1.0)]
@@ -328,7 +375,7 @@ def _next_motion(
     """Return the derivatives of (a, w, wd) of the frame behind body k."""
     a_v, w_v, wd_v = motion
     cq, cv, ca = places.of_body(k)
-    B = frame.constants.B[places.kept[k]]
+    B = frame.B[..., places.kept[k]]
     w, wd = frame.w[:, None], frame.wd[:, None]
     d, dd = frame.d[:, None], frame.dd[:, None]
     inner = a_v + 1j * d * wd_v + (2j * dd - 2.0 * w * d) * w_v
@@ -337,6 +384,13 @@ def _next_motion(
     inner[:, ca] += B
     next_a = frame.a + (1j * frame.wd - frame.w**2) * frame.d + 2j * frame.w * frame.dd + frame.ddd
     w_v, wd_v = w_v.copy(), wd_v.copy()
+    if (bent := frame.bent) is not None:
+        ed, edd = bent.qd[..., places.kept[k]], bent.qdd[..., places.kept[k]]
+        inner[:, cq] -= 2j * w * (ed[:, 4] + 1j * ed[:, 5]) + edd[:, 4] + 1j * edd[:, 5]
+        inner[:, cv] -= 2.0 * (ed[:, 4] + 1j * ed[:, 5])
+        w_v[:, cq] -= ed[:, 6]
+        wd_v[:, cq] -= edd[:, 6]
+        wd_v[:, cv] -= 2.0 * ed[:, 6]
     for (rq, rv, ra), rotation in _rotating(frame, k, places):
         inner[:, rq] -= 1j * next_a[:, None] * rotation
         w_v[:, rv] += rotation
@@ -355,12 +409,12 @@ def _coupling(
     """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
     force_v, moment_v = load
     constants = frame.constants
-    by = [constants.B.real, constants.B.imag, constants.rotation]
+    by = [frame.B.real, frame.B.imag, frame.rotation]
     coupled = [force_v.real, force_v.imag, moment_v]
     if moves:
         a_v, w_v, wd_v = motion
         by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ constants.body.G)
-        by += [constants.C.real, constants.C.imag, by_w, frame.rG]
+        by += [frame.C.real, frame.C.imag, by_w, frame.rG]
         coupled += [as_column(mass) * x for x in (a_v.real, a_v.imag, w_v, wd_v)]
     left = np.empty((*ed.shape, len(by)))
     for i, column in enumerate(by):
@@ -376,7 +430,7 @@ def _body_load(
     rates: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (n, 3 S) of one body's own force F and moment T."""
-    body, C = frame.constants.body, frame.constants.C[chosen]
+    body, C = frame.constants.body, frame.C[..., chosen]
     _, ed, edd = rates
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
@@ -396,4 +450,23 @@ def _body_load(
     )
     moment[:, cv] += 2.0 * w * frame.jM[:, chosen]
     moment[:, ca] += frame.rG[:, chosen]
+    if (bent := frame.bent) is not None:
+        K0_ed, K0_edd = bent.qd[..., chosen], bent.qdd[..., chosen]
+        force[:, cq] -= 2j * w * (K0_ed[:, 0] + 1j * K0_ed[:, 1])
+        force[:, cq] -= K0_edd[:, 0] + 1j * K0_edd[:, 1]
+        force[:, cv] -= 2.0 * (K0_ed[:, 0] + 1j * K0_ed[:, 1])
+        moment[:, cq] -= 2.0 * w * K0_ed[:, 3] + K0_edd[:, 2]
+        moment[:, cv] -= 2.0 * K0_ed[:, 2]
     return force, moment
+
+
+def _geometric(
+    frame: Frame, load: tuple[np.ndarray, np.ndarray], mass: PerInstant
+) -> np.ndarray | None:
+    """Return sum_p p K0_p (n, q, q) under the load on the outboard end, None of a linear body."""
+    if frame.bent is None:
+        return None
+    force, moment = load
+    inertial = [frame.a.real, frame.a.imag, frame.wd, -frame.w * frame.w]
+    p = [*(mass * x for x in inertial), force.real, force.imag, moment]
+    return np.tensordot(np.stack(p, axis=1), frame.bent.K0, 1)

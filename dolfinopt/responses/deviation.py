@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.end_effector import end_effector_gradient
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.p_norm import p_norm_of_lengths
 from dolfinopt.responses.response import register
@@ -29,11 +28,7 @@ class Deviation(MotionResponse):
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
         """Return its derivatives through the outboard interfaces' modes."""
         _, by_deviation = self._mean(trajectory, cases)
-        q = trajectory.q_e[cases.indices]
-        by_q, by_outboard = end_effector_gradient(
-            trajectory.mechanism, trajectory.motion, q, by_deviation
-        )
-        return by_q, [{"outboard": part} for part in by_outboard]
+        return trajectory.by_end_effector(cases.indices, by_deviation)
 
     def _mean(self, trajectory: Trajectory, cases: LoadCases) -> tuple[float, np.ndarray]:
         weights = cases.weights / cases.weights.sum()

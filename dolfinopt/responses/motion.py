@@ -87,7 +87,7 @@ class MotionResponse(Response):
         """Return the derivatives of `value` at held instants.
 
         Returns:
-            By the elastic coordinates of the instants (n, N), and of every body by the fields of
+            By the system's coordinates at the instants (n, S), and of every body by the fields of
             its `ShapeIntegrals` on which it depends directly.
         """
 
@@ -114,7 +114,7 @@ class MotionResponse(Response):
         dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j.
         """
         cases = self.load_cases(trajectory)
-        by_q, _ = self.derivatives(trajectory, cases)
+        by_q = self.derivatives(trajectory, cases)[0][:, trajectory.problem.elastic_columns]
         mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
         return [
             np.linalg.solve(body.K, by_q[:, part].T) @ q[:, part]
@@ -181,7 +181,7 @@ class ComplianceResponse(MotionResponse):
         """Return 2 w_j K q_j, and the second moments of q by K."""
         q = trajectory.q_e[cases.indices]
         by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
-        return by_q, [{"K": Q} for Q in second_moments(trajectory, cases)]
+        return trajectory.by_unknowns(by_q), [{"K": Q} for Q in second_moments(trajectory, cases)]
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return the second moments: lambda_j = w_j q_j with the loads frozen."""

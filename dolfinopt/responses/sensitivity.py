@@ -63,6 +63,11 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
         partners = mass_partners(elastic.points, V, cotangents)
         by_V = elastic.mass_times(partners.by_modes)
         by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
+        geometric = None
+        if cotangents.is_stiffened:
+            by_K0 = np.concatenate([cotangents.K0, cotangents.K0_outboard])
+            geometric = state.unit_loads.gradient(V, by_K0)
+            by_V += geometric.by_modes
         interior, outboard = elastic.restrict(by_V)
         method = METHODS[state.scene.reduction.method]
         assert method.adjoint is not None  # the scene refuses the others
@@ -74,6 +79,9 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
+        if geometric is not None:
+            energies += geometric.by_young
+            masses += geometric.by_density
         return state.young_slope * energies + state.density_slope * masses
 
 

@@ -12,7 +12,9 @@ from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_
 
 from dolfinopt.scene.tables.arms import Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
+from dolfinopt.scene.tables.closure import Closure
 from dolfinopt.scene.tables.constraints import Constraints
+from dolfinopt.scene.tables.control import Control
 from dolfinopt.scene.tables.damping import Damping
 from dolfinopt.scene.tables.design import Design
 from dolfinopt.scene.tables.interpolation import Interpolation
@@ -43,6 +45,14 @@ class Scene(Table):
     interpolation: Interpolation = Field(default=Interpolation(), description="material law")
     arms: tuple[Arm, ...] = Field(description="arms from the cart outwards")
     motion: Motion = Field(default=Motion(), description="prescribed motion")
+    control: Control | None = Field(
+        default=None,
+        description="feedback control; without this table the rigid coordinates follow the desired "
+        "motion exactly",
+    )
+    closure: Closure | None = Field(
+        default=None, description="closed loop; without this table the last arm's end is free"
+    )
     payload: Payload = Field(default=Payload(), description="load of the end-effector")
     damping: Damping = Field(default=Damping(), description="structural damping")
     reduction: Reduction = Field(default=Reduction(), description="model reduction")
@@ -76,6 +86,17 @@ class Scene(Table):
     def cell_counts(self) -> dict[int, int]:
         """Number of cells of every arm with a design of its own, by the arm's index."""
         return {i: self.arms[i].n_cells for i, owner in enumerate(self.owners) if owner == i}
+
+    @property
+    def dependent_joints(self) -> int:
+        """Number of joints, the last ones, that follow from the others in a closed loop."""
+        return 0 if self.closure is None else self.closure.dependent
+
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """Names of the rigid coordinates that are driven: the cart, and arms for their joints."""
+        names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
+        return names if self.motion.base == "fixed" else ("cart", *names)
 
     def material_of(self, index: int) -> Material:
         """Return the material of arm number `index`: its own values, or else the scene's."""

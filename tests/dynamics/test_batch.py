@@ -179,7 +179,7 @@ def test_related_bodies():
         two_arms(factors=(1.0, 1.0, 0.0)),
         two_arms(bending=11.0),
     ]
-    bar = rigid_bar(0.5, 0.05, 0.01, 2700.0)
+    bar = rigid_bar(0.5, 0.05, 0.675)
     last = replace(problems[0].mechanism, bodies=(problems[0].mechanism.bodies[0], bar))
     problems.append(replace(problems[0], mechanism=last))
     first, other, undamped, stiffer, rigid = batch.related(problems)
@@ -348,7 +348,7 @@ def test_adjoint_of_a_solution_from_the_batch():
 
 def test_bodies_without_coordinates(alone):
     """A rigid arm among them."""
-    bar = rigid_bar(0.5, 0.05, 0.01, 2700.0)
+    bar = rigid_bar(0.5, 0.05, 0.675)
 
     def problem(payload: float) -> ElasticSystem:
         whole = two_arms(payload=payload)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 
 
@@ -113,6 +113,8 @@ class Chain:
     payload_inertia: float
     gravity: tuple[float, float]
     joint_height: float
+    joints: tuple[JointHardware, ...] = ()
+    cart_mass: float = 0.0
 
     @property
     def rigid(self) -> int:
@@ -132,7 +134,37 @@ class Chain:
             self.payload_inertia,
             self.gravity,
             self.joint_height,
+            joints=self.joints,
+            cart_mass=self.cart_mass,
         )
+
+    def interfaces(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return places (arms, 2) and angles (arms,) of the outboard interfaces."""
+        origin = np.array([y[0], self.joint_height])
+        angle = np.zeros((), dtype=y.dtype)
+        places, angles = [], []
+        for cloud, joint, e in zip(self.clouds, y[1 : self.rigid], self.parts(y), strict=True):
+            origin = origin + _rotation(angle + joint) @ (cloud.reach + cloud.outboard[:2] @ e)
+            angle = angle + joint + cloud.outboard[2] @ e
+            places.append(origin)
+            angles.append(angle)
+        return np.array(places), np.array(angles)
+
+    def hardware_product(self, y: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
+        """Return what masses at the interfaces, rotors and the cart add to u' M(y) v."""
+        total = self.cart_mass * u[0] * v[0]
+        (p, a), (r, b) = (
+            tuple(x.imag * 1e30 for x in self.interfaces(y + 1e-30j * z)) for z in (u, v)
+        )
+        for k, joint in enumerate(self.joints):
+            total += joint.mass * p[k] @ r[k] + joint.inertia * a[k] * b[k]
+            total += joint.rotor * u[1 + k] * v[1 + k]
+        return total
+
+    def hardware_weight(self, y: np.ndarray) -> np.ndarray:
+        """Return the first moment of the masses at the interfaces (2,), kg m."""
+        places = self.interfaces(y)[0]
+        return sum((j.mass * p for j, p in zip(self.joints, places)), np.zeros(2))
 
     def parts(self, y: np.ndarray) -> list[np.ndarray]:
         """Return each arm's elastic coordinates."""
@@ -167,6 +199,7 @@ class Chain:
             np.einsum("n,ni,ni->", masses, points_u, points_v)
             + self.payload_mass * tip_u @ tip_v
             + self.payload_inertia * angle_u * angle_v
+            + self.hardware_product(y, u, v)
         )
 
     def kinetic(self, y: np.ndarray, yd: np.ndarray) -> float:
@@ -177,7 +210,7 @@ class Chain:
         """Return the potential of gravity and elasticity, J."""
         masses = np.concatenate([cloud.masses for cloud in self.clouds])
         points, tip, _ = self.places(y)
-        weight = masses @ points + self.payload_mass * tip
+        weight = masses @ points + self.payload_mass * tip + self.hardware_weight(y)
         elastic = sum(0.5 * e @ c.K @ e for c, e in zip(self.clouds, self.parts(y), strict=True))
         return elastic - weight @ np.array(self.gravity)
 
@@ -201,6 +234,94 @@ class Chain:
             + [c.D @ e for c, e in zip(self.clouds, self.parts(yd), strict=True)]
         )
         return derivative(momentum) - derivative(lagrangian) + damping
+
+
+@dataclass(frozen=True)
+class BentChain(Chain):
+    """A chain whose bodies deform in the second order, by Lagrange's equations.
+
+    First moment s, inertia J, angular momentum h of the relative motion and the outboard interface
+    lose 1/2 q'K0 q by the load that works on them; the kinetic energy is built of them, the mass
+    matrix of the elastic coordinates held: what geometric stiffness is in the theory.
+
+    Attributes:
+        K0: of every cloud, (7, q, q).
+    """
+
+    K0: tuple[np.ndarray, ...] = ()
+
+    def mechanism(self) -> Mechanism:
+        """Return the chain of bodies with geometric stiffness."""
+        linear = super().mechanism()
+        bodies = [
+            replace(body, K0=K0[:4], K0_outboard=K0[4:])
+            for body, K0 in zip(linear.bodies, self.K0, strict=True)
+        ]
+        return replace(linear, bodies=tuple(bodies))
+
+    def frames(self, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return origins (2,) and angles of all frames, the payload's last."""
+        origins, angles = [np.array([y[0], self.joint_height])], []
+        angle = np.zeros((), dtype=y.dtype)
+        for cloud, K0, joint, e in zip(
+            self.clouds, self.K0, y[1 : self.rigid], self.parts(y), strict=True
+        ):
+            angles.append(angle + joint)
+            d = cloud.reach + cloud.outboard[:2] @ e - 0.5 * np.array([e @ A @ e for A in K0[4:6]])
+            origins.append(origins[-1] + _rotation(angles[-1]) @ d)
+            angle = angles[-1] + cloud.outboard[2] @ e - 0.5 * e @ K0[6] @ e
+        return origins, [*angles, angle]
+
+    def interfaces(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return places (arms, 2) and angles (arms,) of the outboard interfaces."""
+        origins, angles = self.frames(y)
+        inner = [a - joint for a, joint in zip(angles[1:-1], y[2 : self.rigid], strict=True)]
+        return np.array(origins[1:]), np.array([*inner, angles[-1]])
+
+    def places(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return no points, the payload's place (2,) and angle."""
+        origins, angles = self.frames(y)
+        return np.zeros((0, 2)), origins[-1], angles[-1]
+
+    def momentum_product(self, y: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
+        """Return u' M(y) v from the bodies' integrals."""
+        moved = [self.frames(y + 1e-30j * x) for x in (u, v)]
+        angles = self.frames(y)[1]
+        total = 0.0
+        for k, (cloud, K0) in enumerate(zip(self.clouds, self.K0, strict=True)):
+            body, e = cloud.body(), self.parts(y)[k]
+            s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
+            J = body.inertia + 2.0 * body.j @ e + e @ (body.M - K0[3]) @ e
+            by_s, by_h = body.C - e @ K0[:2], body.r + body.G @ e - K0[2] @ e
+            rates = []
+            for (origins, turned), x in zip(moved, (u, v), strict=True):
+                velocity = _rotation(angles[k]).T @ origins[k].imag * 1e30
+                ed = self.parts(x)[k]
+                rates.append((velocity, turned[k].imag * 1e30, by_s @ ed, by_h @ ed, ed))
+            (v1, w1, s1, h1, e1), (v2, w2, s2, h2, e2) = rates
+            around = np.array([-s[1], s[0]])
+            total += body.mass * v1 @ v2 + v1 @ (s2 + w2 * around) + v2 @ (s1 + w1 * around)
+            total += J * w1 * w2 + w1 * h2 + w2 * h1 + e1 @ body.M @ e2
+        (tip1, angle1), (tip2, angle2) = (
+            (origins[-1].imag * 1e30, turned[-1].imag * 1e30) for origins, turned in moved
+        )
+        total += self.payload_mass * tip1 @ tip2 + self.payload_inertia * angle1 * angle2
+        return total + self.hardware_product(y, u, v)
+
+    def potential(self, y: np.ndarray) -> float:
+        """Return the potential of gravity and elasticity, J."""
+        origins, angles = self.frames(y)
+        weight, elastic = self.payload_mass * origins[-1] + self.hardware_weight(y), 0.0
+        for k, (cloud, K0) in enumerate(zip(self.clouds, self.K0, strict=True)):
+            body, e = cloud.body(), self.parts(y)[k]
+            s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
+            weight = weight + body.mass * origins[k] + _rotation(angles[k]) @ s
+            elastic = elastic + 0.5 * e @ body.K @ e
+        return elastic - weight @ np.array(self.gravity)
+
+
+def _rotation(angle: np.ndarray) -> np.ndarray:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def derivative(function: Callable[[float], ArrayLike], step: float = 5e-3) -> np.ndarray:

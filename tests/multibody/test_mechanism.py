@@ -7,12 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bodies import Chain, assert_close, derivative, random_cloud
+from bodies import BentChain, Chain, assert_close, derivative, random_cloud
 
 from dolfinopt.multibody.body_gradient import body_gradient
 from dolfinopt.multibody.end_effector import deviation, end_effector, end_effector_gradient
+from dolfinopt.multibody.interface_jacobian import (
+    InterfacePlace,
+    interface_place,
+    place_gradient,
+)
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
-from dolfinopt.multibody.mechanism import Mechanism, compliance
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.multibody.tangent import Tangent, linearise
@@ -21,7 +26,10 @@ from dolfinopt.scene.load import load_scene
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+# Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
+HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
 ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
+BENT = pytest.mark.parametrize("bent", [False, True], ids=["linear", "bent"])
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
 
 
@@ -31,10 +39,14 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
-def chain(rng: np.random.Generator, arms: int) -> Chain:
+def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
     """Return a chain of random clouds with payload and gravity in both directions."""
     clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
-    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4)
+    if not bent:
+        return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6)
+    K0 = [0.05 * rng.normal(size=(7, q, q)) for q in COORDINATES[:arms]]
+    stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
+    return BentChain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
 
 
 def states(rng: np.random.Generator, model: Chain, count: int) -> np.ndarray:
@@ -50,10 +62,13 @@ def forces(model: Chain, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.n
     return np.concatenate([drives, rows], axis=1)
 
 
+@BENT
 @ARMS
-def test_forces_are_those_of_lagranges_equations(rng: np.random.Generator, arms: int) -> None:
+def test_forces_are_those_of_lagranges_equations(
+    rng: np.random.Generator, arms: int, bent: bool
+) -> None:
     """Cart, joints and elastic rows: gravity, payload and damping included."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     y, yd, ydd = states(rng, model, 3)
     found = forces(model, y, yd, ydd)
     for n in range(3):
@@ -86,12 +101,13 @@ def full_tangent(model: Chain, state: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("base", ["cart", "fixed", "prescribed", "one joint"])
+@BENT
 @ARMS
 def test_tangent_is_the_derivative_of_the_forces(
-    rng: np.random.Generator, arms: int, base: str
+    rng: np.random.Generator, arms: int, bent: bool, base: str
 ) -> None:
     """By free rigid coordinates on a cart or a fixed base, by one of them, and by elastic ones."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     r = model.rigid
     state = states(rng, model, 4)
     if base == "fixed":
@@ -104,12 +120,13 @@ def test_tangent_is_the_derivative_of_the_forces(
     assert_close(found.reshape(exact.shape), exact, DIFFERENCES)
 
 
+@BENT
 @ARMS
 def test_parts_of_the_tangent_are_those_of_the_dense_one(
-    rng: np.random.Generator, arms: int
+    rng: np.random.Generator, arms: int, bent: bool
 ) -> None:
     """Some columns, some rows, and products from both sides, rigid coordinates free."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     r, size = model.rigid, model.size
     state = states(rng, model, 4)
     rigid, every = np.arange(r), np.arange(size)
@@ -131,18 +148,21 @@ def test_parts_of_the_tangent_are_those_of_the_dense_one(
     assert_close(part.window(1, 3).dense(), part.dense()[1:3], 0.0, 1.0)
 
 
+@BENT
 @ARMS
-def test_gradient_of_virtual_work_of_all_forces(rng: np.random.Generator, arms: int) -> None:
+def test_gradient_of_virtual_work_of_all_forces(
+    rng: np.random.Generator, arms: int, bent: bool
+) -> None:
     """By the integrals of every body, multipliers on cart and joints included."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     mechanism, r = model.mechanism(), model.rigid
     state = states(rng, model, 4)
     motion, rates = RigidMotion(*(x[:, :r] for x in state)), [x[:, r:] for x in state]
     weights = rng.normal(size=(4, model.size))
+    names = ("mass", "w", "W", "K", "D", "outboard", "K0", "K0_outboard")
 
     def work(t: float, k: int, change: ShapeIntegrals) -> float:
         bodies = list(mechanism.bodies)
-        names = ("mass", "w", "W", "K", "D", "outboard")
         bodies[k] = replace(
             bodies[k], **{n: getattr(bodies[k], n) + t * getattr(change, n) for n in names}
         )
@@ -152,18 +172,20 @@ def test_gradient_of_virtual_work_of_all_forces(rng: np.random.Generator, arms: 
     gradient = body_gradient(mechanism, motion, *rates, weights[:, r:], weights[:, :r])
     for k in range(arms):
         change = random_cloud(rng, COORDINATES[k]).body()
+        if bent:
+            K0 = rng.normal(size=(7, COORDINATES[k], COORDINATES[k]))
+            K0 = K0 + K0.swapaxes(1, 2)
+            change = replace(change, K0=K0[:4], K0_outboard=K0[4:])
         expected = derivative(lambda t, k=k, change=change: work(t, k, change))
-        found = sum(
-            np.sum(getattr(gradient[k], n) * getattr(change, n))
-            for n in ("mass", "w", "W", "K", "D", "outboard")
-        )
+        found = sum(np.sum(getattr(gradient[k], n) * getattr(change, n)) for n in names)
         assert_close(found, expected, DIFFERENCES, np.abs(weights).sum())
 
 
+@BENT
 @ARMS
-def test_mass_matrix_is_that_of_the_points(rng: np.random.Generator, arms: int) -> None:
+def test_mass_matrix_is_that_of_the_points(rng: np.random.Generator, arms: int, bent: bool) -> None:
     """Symmetric and positive definite over rigid and elastic coordinates together."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     y, yd, _ = states(rng, model, 1)[:, 0]
     unit = np.eye(model.size)
     repeat = np.ones((model.size, 1))
@@ -183,10 +205,11 @@ def test_mass_matrix_is_that_of_the_points(rng: np.random.Generator, arms: int) 
     assert_close(by_qdd, part, 1e-13)
 
 
+@BENT
 @ARMS
-def test_work_becomes_energy(rng: np.random.Generator, arms: int) -> None:
+def test_work_becomes_energy(rng: np.random.Generator, arms: int, bent: bool) -> None:
     """int (forces . yd - dissipation) dt = change of T + V along a motion nobody solved for."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     amplitude, phase = rng.normal(scale=0.3, size=(2, model.size))
     frequency = rng.uniform(1.0, 4.0, size=model.size)  # rad/s
     nodes, weights = np.polynomial.legendre.leggauss(40)  # exact to rounding over 1 s
@@ -263,10 +286,11 @@ def rigid_link(mass: float, centre: float, inertia: float, length: float) -> Sha
     )
 
 
+@BENT
 @ARMS
-def test_instants_do_not_feel_one_another(rng: np.random.Generator, arms: int) -> None:
+def test_instants_do_not_feel_one_another(rng: np.random.Generator, arms: int, bent: bool) -> None:
     """A batch gives what its instants give one by one."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     mechanism, r = model.mechanism(), model.rigid
     y, yd, ydd = states(rng, model, 5)
     together = forces(model, y, yd, ydd)
@@ -282,10 +306,13 @@ def test_instants_do_not_feel_one_another(rng: np.random.Generator, arms: int) -
         assert_close(slope[0], slopes[n], 1e-14, np.abs(slopes).max())
 
 
+@BENT
 @ARMS
-def test_end_effector_is_the_payloads_place(rng: np.random.Generator, arms: int) -> None:
+def test_end_effector_is_the_payloads_place(
+    rng: np.random.Generator, arms: int, bent: bool
+) -> None:
     """Positions, and the deviation from the rigid chain that is zero without deflection."""
-    model = chain(rng, arms)
+    model = chain(rng, arms, bent)
     mechanism, r = model.mechanism(), model.rigid
     y = states(rng, model, 4)[0]
     motion = RigidMotion(y[:, :r], y[:, :r], y[:, :r])
@@ -344,7 +371,7 @@ def test_few_instants_do_not_depend_on_memory(rng: np.random.Generator, count: i
             linearise(mechanism, motion, q, qd, qdd).dense(),
             end_effector(mechanism, motion, q),
             *(value for one in slopes for value in (one.w, one.W, one.K, one.outboard)),
-            *(by_q, *by_outboard),
+            *(by_q, *(one["outboard"] for one in by_outboard)),
             *vars(rigid_motion(t, scene)).values(),
         ]
         found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
@@ -374,9 +401,69 @@ def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) ->
     by_q, by_outboard = end_effector_gradient(mechanism, many[first], few[0], weights[first])
     whole_q, whole_outboard = end_effector_gradient(mechanism, many, rates[0], weights)
     np.testing.assert_allclose(by_q, whole_q[first], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(by_outboard[0], whole_outboard[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        by_outboard[0]["outboard"], whole_outboard[0]["outboard"], rtol=1e-12, atol=1e-12
+    )
     part = body_gradient(mechanism, many[first], *few, multipliers[first])
     whole = body_gradient(mechanism, many, *rates, multipliers)
     for a, b in zip(whole, part, strict=True):
         np.testing.assert_allclose(b.W, a.W, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(b.K, a.K, rtol=1e-12, atol=1e-12)
+
+
+@BENT
+@ARMS
+def test_jacobian_and_hessian_of_the_interface(
+    rng: np.random.Generator, arms: int, bent: bool
+) -> None:
+    """Derivatives of the end-effector's place by rigid and elastic coordinates."""
+    model = chain(rng, arms, bent)
+    mechanism, r = model.mechanism(), model.rigid
+    y = states(rng, model, 4)[0]
+
+    def at(y: np.ndarray, second: bool = False) -> InterfacePlace:
+        motion = RigidMotion(y[:, :r], 0.0 * y[:, :r], 0.0 * y[:, :r])
+        return interface_place(mechanism, motion, y[:, r:], second=second)
+
+    here = at(y, second=True)
+    place = end_effector(mechanism, RigidMotion(y[:, :r], y[:, :r], y[:, :r]), y[:, r:])
+    assert_close(here.place, place @ [1.0, 1j], 1e-14)
+    for c, unit in enumerate(np.eye(model.size)):
+        by_place = derivative(lambda t, unit=unit: at(y + t * unit).place)
+        assert_close(here.jacobian[:, c], by_place, DIFFERENCES, np.abs(here.jacobian).max())
+        by_jacobian = derivative(lambda t, unit=unit: at(y + t * unit).jacobian)
+        assert here.hessian is not None
+        assert_close(here.hessian[:, c], by_jacobian, DIFFERENCES, np.abs(here.hessian).max())
+
+
+@BENT
+@ARMS
+def test_gradient_of_the_interfaces_place_and_its_variation(
+    rng: np.random.Generator, arms: int, bent: bool
+) -> None:
+    """By the outboard modes of every body and their geometric stiffness."""
+    model = chain(rng, arms, bent)
+    mechanism, r = model.mechanism(), model.rigid
+    y, moved = states(rng, model, 4)[:2]
+    weights, pull = rng.normal(size=(2, 4)) + 1j * rng.normal(size=(2, 4))
+    motion, q = RigidMotion(y[:, :r], 0.0 * y[:, :r], 0.0 * y[:, :r]), y[:, r:]
+
+    def worth(one: Mechanism) -> float:
+        here = interface_place(one, motion, q)
+        swept = np.einsum("nc,nc->n", here.jacobian, moved)
+        return float((np.conj(weights) * here.place + np.conj(pull) * swept).real.sum())
+
+    found = place_gradient(mechanism, motion, q, weights, moved, pull)
+    for k, by in enumerate(found):
+        assert set(by) == ({"outboard", "K0_outboard"} if bent else {"outboard"})
+        for name, gradient in by.items():
+            change = rng.normal(size=gradient.shape)
+            change = change + change.swapaxes(1, 2) if name == "K0_outboard" else change
+
+            def other(t: float, k: int = k, name: str = name, change: np.ndarray = change) -> float:
+                bodies = list(mechanism.bodies)
+                value = getattr(bodies[k], name) + t * change
+                bodies[k] = replace(bodies[k], **{name: value})
+                return worth(replace(mechanism, bodies=tuple(bodies)))
+
+            assert_close(np.sum(gradient * change), derivative(other), 1e-10, 10.0)

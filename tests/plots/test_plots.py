@@ -500,7 +500,7 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
 @pytest.mark.serial
 def test_real_arms_join():
     from dolfinopt.arms.arm import build_arms
-    from dolfinopt.dynamics.simulation import build_mechanism
+    from dolfinopt.dynamics.build import build_mechanism
     from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import gather_arms, partition_arms
     from dolfinopt.profiling import Profile

@@ -145,7 +145,7 @@ def test_joint_forces_of_rigid_arms() -> None:
 def test_a_rigid_bar_is_the_solid_arm() -> None:
     """Mass, centre and inertia of the meshed solid bar, with the arm's own density."""
     built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
-    body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0, 1.0)})[0]
+    body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0)})[0]
     scene = do.load_scene(TWO_ARM, ("arms.cells=[24,3]", "arms.length=0.8", "material.density=5e3"))
     meshed = Arm(scene, 0, MPI.COMM_SELF, do.Profile())
     twin = meshed.reduce(np.ones(meshed.mesh.num_cells))

@@ -77,7 +77,7 @@ class MeanSquare(MotionResponse):
         by_q, by_outboard = deviation.end_effector_gradient(
             trajectory.mechanism, trajectory.motion, trajectory.q_e[cases.indices], by_deviation
         )
-        return by_q, [{"outboard": part} for part in by_outboard]
+        return by_q, by_outboard
 
 
 class MoreConstraints(Constraints):

@@ -53,10 +53,18 @@ def rng() -> np.random.Generator:
 # -- one instant -----------------------------------------------------------------------------
 
 
-def random_chain(rng: np.random.Generator, arms: int) -> Mechanism:
+def random_chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Mechanism:
     """Return random bodies with payload and gravity in both directions."""
     clouds = tuple(random_cloud(rng, q) for q in (2, 3, 1)[:arms])
-    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4).mechanism()
+    model = Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4).mechanism()
+    if not bent:
+        return model
+    bodies = []
+    for body in model.bodies:
+        K0 = rng.normal(scale=0.1, size=(7, body.num_modes, body.num_modes))
+        K0 = K0 + K0.swapaxes(1, 2)
+        bodies.append(replace(body, K0=K0[:4], K0_outboard=K0[4:]))
+    return replace(model, bodies=tuple(bodies))
 
 
 def random_instants(
@@ -73,8 +81,8 @@ def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
     for index in np.ndindex(shape):
         change = np.zeros(shape)
         change[index] = 1.0
-        if name in ("K", "D"):
-            change = change + change.T
+        if name in ("K", "D", "K0_outboard"):
+            change = change + change.swapaxes(-1, -2)
         elif name == "W":
             change[0] += change[0].T
             change[1] -= change[1].T
@@ -109,9 +117,10 @@ def test_body_slopes_are_those_of_the_rows(rng: np.random.Generator, arms: int, 
 
 
 @ARMS
-def test_end_effector_slopes(rng: np.random.Generator, arms: int) -> None:
-    """By the coordinates and by the outboard modes."""
-    model = random_chain(rng, arms)
+@pytest.mark.parametrize("bent", [False, True], ids=["linear", "bent"])
+def test_end_effector_slopes(rng: np.random.Generator, arms: int, bent: bool) -> None:
+    """By the coordinates, by the outboard modes and by their geometric stiffness."""
+    model = random_chain(rng, arms, bent)
     motion, (q, _, _, _) = random_instants(rng, model, 3)
     weights = rng.normal(size=(3, 2))
     by_q, by_outboard = end_effector_gradient(model, motion, q, weights)
@@ -123,12 +132,17 @@ def test_end_effector_slopes(rng: np.random.Generator, arms: int) -> None:
     expected = derivative(lambda t: [place(model, q + t * e) for e in unit])
     assert_close(by_q.ravel(), expected, DIFFERENCES)
     for arm, body in enumerate(model.bodies):
-        changes = list(unit_changes(body, "outboard"))
+        assert set(by_outboard[arm]) == ({"outboard", "K0_outboard"} if bent else {"outboard"})
+        for name, found in by_outboard[arm].items():
+            changes = list(unit_changes(body, name))
 
-        def moved(t: float, arm: int = arm, changes: list[np.ndarray] = changes) -> list[float]:
-            return [place(changed(model, arm, "outboard", t * c), q) for c in changes]
+            def moved(
+                t: float, arm: int = arm, name: str = name, all_of: list[np.ndarray] = changes
+            ) -> list[float]:
+                return [place(changed(model, arm, name, t * c), q) for c in all_of]
 
-        assert_close(by_outboard[arm].ravel(), derivative(moved), DIFFERENCES)
+            products = [np.sum(found * change) for change in changes]
+            assert_close(products, derivative(moved), DIFFERENCES)
 
 
 # -- a trajectory ----------------------------------------------------------------------------

@@ -23,8 +23,13 @@ MESH_FILES = (".geo", ".msh", ".step", ".stp")
 
 # What an arm is meshed from: an arm that states one of the first two takes none of the others from
 # the arm before.
+# What sits at an arm's ends; arms of one design may differ in it.
+JOINT_KEYS = (
+    "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
+    "joint_damping",
+)  # fmt: skip
 MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
-OWN_KEYS = ("name", "design", "rigid", "sid")  # never taken from the arm before
+OWN_KEYS = ("name", "design", "rigid", "mass", "inertia", "sid")  # never taken from the arm before
 
 
 def check_arm_name(name: str) -> str:
@@ -79,6 +84,53 @@ class Arm(Table):
     rigid: bool = Field(
         default=False, description="a rigid bar of solid material, not optimised [-]"
     )
+    mass: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        description="mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
+    )
+    inertia: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        description="moment of inertia of a rigid arm about its centre; default: that of a bar of "
+        "its mass [kg m2]",
+    )
+    joint_mass: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e9,
+        description="mass at the outboard interface: motor, gearbox, bearing [kg]",
+    )
+    joint_inertia: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e9,
+        description="moment of inertia at the outboard interface [kg m2]",
+    )
+    rotor_inertia: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e9,
+        description="moment of inertia of the rotor that drives this arm's inboard joint [kg m2]",
+    )
+    gear_ratio: float = Field(
+        default=1.0,
+        ge=1e-3,
+        le=1e6,
+        description="revolutions of the rotor per revolution of the inboard joint [-]",
+    )
+    joint_stiffness: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e15,
+        description="spring between the drive and this arm, at its inboard joint; 0: none, the "
+        "arm follows the drive exactly [N m/rad]",
+    )
+    joint_damping: float = Field(
+        default=0.0, ge=0, le=1e15, description="damper beside that spring [N m s/rad]"
+    )
     sid: FileName | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
@@ -102,6 +154,19 @@ class Arm(Table):
             raise Refusal(
                 f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
                 *((key,) for key in stated),
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_joint(self) -> Arm:
+        for key in ("mass", "inertia"):
+            if getattr(self, key) is not None and not self.rigid:
+                raise Refusal("expected only with rigid = true", (key,), ("rigid",))
+        if self.joint_damping > 0.0 and self.joint_stiffness == 0.0:
+            raise Refusal(
+                "expected 0 without arms.joint_stiffness, beside whose spring the damper acts",
+                ("joint_damping",),
+                ("joint_stiffness",),
             )
         return self
 
@@ -234,7 +299,7 @@ class Arm(Table):
             )
         for key in Arm.model_fields:
             value = getattr(owners[self.design], key)
-            if key not in ("name", "design") and getattr(self, key) != value:
+            if key not in ("name", "design", *JOINT_KEYS) and getattr(self, key) != value:
                 raise Refusal(
                     f"expected {shown(value)} as {self.design} has, whose design it shares",
                     (*at, key),

@@ -12,7 +12,7 @@ from dolfinopt.scene.tables.base import Duration, FileName, Length, Loc, Positio
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
-Path2D = Literal["arc", "line", "points", "joints"]
+Path2D = Literal["arc", "line", "points", "joints", "rotation"]
 TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
 Base = Literal["cart", "fixed"]
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
@@ -24,8 +24,8 @@ class Motion(Table):
 
     path: Path2D = Field(
         default="arc",
-        description="path of the end-effector (arc, line, table of points), or a table of joint "
-        "coordinates [-]",
+        description="path of the end-effector (arc, line, table of points), a table of joint "
+        "coordinates, or a first joint that runs up to constant speed [-]",
     )
     radius: Length = Field(
         default=1.0, description="radius of the arc, a semicircle about the origin [m]"
@@ -46,6 +46,16 @@ class Motion(Table):
         default=None,
         description="table (CSV) of points or joint coordinates; relative to the scene's folder "
         "or the working directory [-]",
+    )
+    speed: float = Field(
+        default=10.0,
+        ge=-1e6,
+        le=1e6,
+        description="angular velocity of the first joint after motion.duration, which the law "
+        "gives it; path rotation [rad/s]",
+    )
+    start_angle: float = Field(
+        default=0.0, ge=-1e3, le=1e3, description="angle of the first joint at the start [rad]"
     )
     law: TimeLaw = Field(
         default="quintic",
@@ -77,7 +87,7 @@ class Motion(Table):
     horizon: Duration = Field(
         default=3.0,
         description="simulated time, at least the duration, after which the machine stays at "
-        "rest; the default is the duration if that is longer [s]",
+        "rest or keeps its speed; the default is the duration if that is longer [s]",
     )
     base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
     base_position: Position = Field(
@@ -90,6 +100,7 @@ class Motion(Table):
         description="cart's position over the end-effector's desired x; not with one arm, a "
         "fixed base or a table of joint coordinates [-]",
     )
+    cart_mass: float = Field(default=0.0, ge=0, le=1e9, description="mass of the cart [kg]")
     joint_height: Position = Field(default=-0.5, description="y of the shoulder joint [m]")
     elbow: Literal[-1, 1] = Field(
         default=-1,
@@ -113,9 +124,13 @@ class Motion(Table):
         self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
         self.refuse_unused(self.path == "line", "path", "start", "end")
         self.refuse_unused(tabulated, "path", "file")
-        self.refuse_unused(self.path != "joints", "path", "cart_follow", "elbow")
+        self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
+        joints = self.path in ("joints", "rotation")
+        self.refuse_unused(not joints, "path", "cart_follow", "elbow")
+        if self.path == "rotation" and self.base != "fixed":
+            raise Refusal('expected "fixed" with motion.path = "rotation"', ("base",), ("path",))
         self._check_law()
-        self.refuse_unused(self.base == "cart", "base", "cart_follow")
+        self.refuse_unused(self.base == "cart", "base", "cart_follow", "cart_mass")
         self.refuse_unused(self.base == "fixed", "base", "base_position")
         return self
 
@@ -125,7 +140,7 @@ class Motion(Table):
         self.refuse_unused(profile, "law", "acceleration_share")
         self.refuse_unused(self.law != "trapezoidal", "law", "max_jerk")
         limits = ("max_speed", "max_acceleration", "max_jerk")
-        self.refuse_unused(self.path != "joints", "path", *limits)
+        self.refuse_unused(self.path not in ("joints", "rotation"), "path", *limits)
         last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
         share = type(self).model_fields["acceleration_share"].default
         if profile and getattr(self, last) is not None and self.acceleration_share != share:
@@ -143,8 +158,15 @@ class Motion(Table):
             )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse what a single joint cannot do."""
-        if len(scene.arms) > 1 or self.path == "joints":
+        """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
+        independent = len(scene.arms) - scene.dependent_joints
+        if self.path == "rotation" and independent != 1:
+            raise Refusal(
+                f'expected "joints" with {independent} independent joints: a rotation prescribes '
+                "one",
+                ("motion", "path"),
+            )
+        if len(scene.arms) > 1 or self.path in ("joints", "rotation"):
             return
         if self.base == "fixed":
             raise Refusal(

@@ -29,6 +29,11 @@ class Simulation(Table):
         default=0.8, ge=0, le=1, description="spectral radius at infinity of generalised-alpha [-]"
     )
     stages: int = Field(default=4, ge=2, le=5, description="stages of the Radau IIA method [-]")
+    stiffening: bool | Literal["auto"] = Field(
+        default="auto",
+        description="geometric stiffening by the arms' own stress: true, false, or where an "
+        "estimate says that it matters [-]",
+    )
     sample: float = Field(
         default=1e-3, ge=1e-9, le=1e5, description="sampling interval of the output [s]"
     )

@@ -1,0 +1,139 @@
+"""Scene + floating bodies -> mechanism, and the system of equations that moves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.drives import Closure, Drives, pin, slider
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism
+from dolfinopt.multibody.motion import CART, RigidMotion, breakpoints, rigid_motion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.paths.tables import TIME, read_table
+from dolfinopt.scene.load import Arm, Scene
+
+Motion = Callable[[np.ndarray], RigidMotion]
+
+
+def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
+    """Put the bodies on the scene's base, with what sits at their joints and its payload."""
+    joints = tuple(
+        JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
+        for arm in scene.arms
+    )
+    return Mechanism(
+        bodies=tuple(bodies),
+        payload_mass=scene.payload.mass,
+        payload_inertia=scene.payload.inertia,
+        gravity=scene.motion.gravity,
+        joint_height=scene.motion.joint_height,
+        joints=joints if any(joint != JointHardware() for joint in joints) else (),
+        cart_mass=scene.motion.cart_mass,
+    )
+
+
+def reflected_inertia(arm: Arm) -> float:
+    """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
+    return 0.0 if arm.joint_stiffness > 0.0 else arm.rotor_inertia * arm.gear_ratio**2
+
+
+def is_machine(scene: Scene) -> bool:
+    """Return whether rigid coordinates are unknown: by control, a closed loop, soft joints."""
+    soft = any(arm.joint_stiffness > 0.0 for arm in scene.arms)
+    return scene.control is not None or scene.closure is not None or soft
+
+
+def build_system(
+    scene: Scene, bodies: list[ShapeIntegrals], motion: Motion | None = None
+) -> ElasticSystem | MachineSystem:
+    """Return the equations of a scene.
+
+    Args:
+        scene: motion, payload, control and closure.
+        bodies: from the base outwards.
+        motion: the desired rigid motion, shared with other scenes; None: the scene's.
+    """
+    mechanism = build_mechanism(scene, bodies)
+    if motion is None:
+        motion = partial(rigid_motion, scene=scene)
+    elastic = ElasticSystem(mechanism, motion, breakpoints(scene))
+    if not is_machine(scene):
+        return elastic
+    closure = _closure(scene)
+    return MachineSystem(mechanism, motion, elastic.breakpoints, _drives(scene), closure)
+
+
+def _closure(scene: Scene) -> Closure | None:
+    closure = scene.closure
+    if closure is None:
+        return None
+    point = complex(*closure.point)
+    if closure.kind == "pin":
+        return pin(point)
+    return slider(point, complex(*closure.direction), closure.force)
+
+
+def _drives(scene: Scene) -> Drives:
+    """Return the drives of all rigid coordinates that are not prescribed.
+
+    With control all of them are free; without it those of a loop that follow from the others, which
+    have no drive, and joints with a spring between drive and arm.
+    """
+    first = 0 if scene.motion.base == "cart" else 1  # a fixed base has no coordinate
+    last = 1 + len(scene.arms) - scene.dependent_joints
+    stiffness, damping = np.zeros((2, 1 + len(scene.arms)))
+    limits = np.full(1 + len(scene.arms), np.inf)
+    free = np.zeros(1 + len(scene.arms), dtype=bool)
+    free[last:] = True
+    for k, arm in enumerate(scene.arms[: last - 1]):
+        if arm.joint_stiffness > 0.0:
+            free[1 + k], stiffness[1 + k], damping[1 + k] = True, arm.joint_stiffness, 0.0
+            damping[1 + k] = arm.joint_damping
+    control, driven = scene.control, slice(first, last)
+    if control is not None:
+        free[driven] = True
+        stiffness[driven], damping[driven] = control.stiffness, control.damping
+        if control.limits is not None:
+            limits[driven] = control.limits
+    rows = np.flatnonzero(free)
+    table = _table_of_forces(scene)
+    return Drives(
+        free=rows,
+        stiffness=stiffness[rows],
+        damping=damping[rows],
+        limits=limits[rows],
+        driven=(rows >= first) & (rows < last),
+        rigid_feed_forward=control is not None and control.feed_forward == "rigid",
+        table=None if table is None else lambda t: table(t)[:, rows],
+    )
+
+
+def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the scene's table of forces as a function of time (n, 1 + arms), or None."""
+    if scene.control is None or scene.control.forces is None:
+        return None
+    times, curve = _spline(scene.control.forces, scene.driven)
+    first = 1 if scene.driven[0] != CART else 0
+
+    def forces(t: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(t), 1 + len(scene.arms)))
+        inside = t <= times
+        out[inside, first : first + len(scene.driven)] = curve(t[inside])
+        return out
+
+    return forces
+
+
+@lru_cache(maxsize=16)
+def _spline(file: str, columns: tuple[str, ...]) -> tuple[float, Callable[..., np.ndarray]]:
+    """Return the last instant of a table of forces, s, and the line through its rows."""
+    table = read_table(file, columns)
+    if table.t is None:
+        raise InputError(f"{file}: expected a column {TIME} besides {', '.join(columns)}")
+    return float(table.t[-1]), make_interp_spline(table.t, table.rows, k=1)

@@ -1,0 +1,454 @@
+"""A machine with free rigid coordinates, feedback control and closed loops, as a `System`.
+
+Unknowns are y = (e, q, mu): the deviation e of the free rigid coordinates from the desired motion,
+the elastic coordinates q, and for every constraint a coordinate whose second derivative is its
+multiplier. Equations are those of the free rigid coordinates, forces of inverse dynamics less
+drives less what the closure does; of the elastic coordinates; and the constraints themselves at
+every stage: Radau IIA of index 3, of which positions have order 2 s - 1, velocities s and
+multipliers s - 1. Source: Hairer, Lubich & Roche (1989), doi:10.1007/BFb0093947.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.body_gradient import body_gradient
+from dolfinopt.multibody.drives import Closure, Drives
+from dolfinopt.multibody.instants import FEW, repeated
+from dolfinopt.multibody.interface_jacobian import interface_place, place_gradient
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, padded, rigid_part
+from dolfinopt.multibody.tangent import linearise
+
+MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
+ROUNDING = 1e-13  # of a step of that iteration, beside the coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class DenseLinearisation:
+    """Derivative of a residual at n instants as matrices, see `system.Linearisation`.
+
+    Attributes:
+        matrix: (n, S, 3 S) of all S coordinates, columns ordered q, qd, qdd.
+    """
+
+    matrix: np.ndarray
+
+    def window(self, first: int, last: int) -> DenseLinearisation:
+        """Return the instants first..last - 1."""
+        return DenseLinearisation(self.matrix[first:last])
+
+    def dense(self) -> np.ndarray:
+        """Return the matrices."""
+        return self.matrix
+
+    def times(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of the wanted rows (m, W), see `system.Linearisation`."""
+        change = np.concatenate([q, qd, qdd], axis=1)
+        change = change.reshape(len(self.matrix), -1, change.shape[1])
+        rows = change @ self.matrix[:, wanted].swapaxes(1, 2)
+        return rows.reshape(len(q), len(wanted))
+
+    def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the gradient of sum_n rows_n . residual_n by q, qd, qdd, each (n, S)."""
+        by_q, by_v, by_a = np.split((rows[:, None] @ self.matrix)[:, 0], 3, axis=1)
+        return by_q, by_v, by_a
+
+
+@dataclass(frozen=True, eq=False)
+class MachineInstants:
+    """A machine at n instants.
+
+    Attributes:
+        machine: the system.
+        desired: motion (n) of the rigid coordinates.
+        ahead: (n, R) feed-forward forces.
+    """
+
+    machine: MachineSystem
+    desired: RigidMotion
+    ahead: np.ndarray
+
+    def __len__(self) -> int:
+        """Return n."""
+        return len(self.ahead)
+
+    def __getitem__(self, part: slice | np.ndarray) -> MachineInstants:
+        """Return it at some of the instants."""
+        return MachineInstants(self.machine, self.desired[part], self.ahead[part])
+
+    def split(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the parts (n, R), (n, N), (n, m) of coordinates or their derivatives (n, S)."""
+        a, b, _ = self.machine.ends
+        return y[:, :a], y[:, a:b], y[:, b:]
+
+    def motion(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> RigidMotion:
+        """Return the rigid coordinates as they move."""
+        free, R = self.machine.drives.free, self.machine.ends[0]
+        parts = []
+        for desired, change in (
+            (self.desired.q, y), (self.desired.qd, yd), (self.desired.qdd, ydd)
+        ):  # fmt: skip
+            actual = desired.copy()
+            actual[:, free] += change[:, :R]
+            parts.append(actual)
+        return RigidMotion(*parts)
+
+    def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
+        """Return u (n, R) of the free coordinates."""
+        R = self.machine.ends[0]
+        return self.machine.drives.force(self.ahead, y[:, :R], yd[:, :R])
+
+    def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+        """Return the forces of all drives (n, 1 + arms), N and N m.
+
+        Those of free coordinates by their law; of prescribed ones, what moves them as they move.
+        """
+        if 0 < len(y) < FEW:
+            every = repeated(len(y))
+            return self[every].forces(y[every], yd[every], ydd[every])[: len(y)]
+        machine = self.machine
+        motion = self.motion(y, yd, ydd)
+        (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
+        forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
+        if machine.closure is not None:
+            jacobian = interface_place(machine.mechanism, motion, q).jacobian
+            pull = machine.ground_force(multipliers)
+            forces -= (np.conj(pull)[:, None] * jacobian[:, : forces.shape[1]]).real
+        forces[:, machine.drives.free] = self.drive_forces(y, yd)
+        return forces
+
+    def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+        """Return r (n, S); N m of joints, N of the cart, of modes as they are scaled, m."""
+        if 0 < len(y) < FEW:
+            every = repeated(len(y))
+            return self[every].residual(y[every], yd[every], ydd[every])[: len(y)]
+        machine = self.machine
+        motion = self.motion(y, yd, ydd)
+        (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
+        rows, forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)
+        rigid = forces[:, machine.drives.free] - self.drive_forces(y, yd)
+        out = np.concatenate([rigid, rows, np.zeros_like(multipliers)], axis=1)
+        if machine.closure is None:
+            return out
+        here = interface_place(machine.mechanism, motion, q)
+        pull = machine.ground_force(multipliers)
+        out[:, : machine.ends[1]] -= (
+            np.conj(pull)[:, None] * here.jacobian[:, machine.columns]
+        ).real
+        out[:, machine.ends[1] :] = machine.gap_scale * machine.closure.gap(here.place)
+        return out
+
+    def linearise(
+        self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
+    ) -> DenseLinearisation:
+        """Return its derivative; all coordinates are kept."""
+        if 0 < len(y) < FEW:
+            every = repeated(len(y))
+            return self[every].linearise(y[every], yd[every], ydd[every]).window(0, len(y))
+        machine = self.machine
+        (R, moving, S), count = machine.ends, len(y)
+        motion = self.motion(y, yd, ydd)
+        (e, q, _), (ed, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
+        matrix = np.zeros((count, S, 3, S))
+        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, machine.drives.free)
+        matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
+        passing = machine.drives.passing(self.ahead, e, ed)
+        every = np.arange(R)
+        matrix[:, every, 0, every] += passing * machine.drives.stiffness
+        matrix[:, every, 1, every] += passing * machine.drives.damping
+        if machine.closure is not None:
+            here = interface_place(machine.mechanism, motion, q, second=True)
+            assert here.hessian is not None
+            J = machine.closure.project(here.jacobian[:, machine.columns])  # (n, m, R + N)
+            H = here.hessian[:, machine.columns[:, None], machine.columns]
+            pull = np.conj(machine.ground_force(multipliers))
+            matrix[:, :moving, 0, :moving] -= (pull[:, None, None] * H).real
+            matrix[:, :moving, 2, moving:] -= J.swapaxes(1, 2)
+            matrix[:, moving:, 0, :moving] += machine.gap_scale * J
+        return DenseLinearisation(matrix.reshape(count, S, 3 * S))
+
+
+@dataclass(frozen=True, eq=False)
+class MachineSystem:
+    """See the module.
+
+    Attributes:
+        mechanism: N elastic coordinates.
+        motion: desired rigid coordinates at given instants (n,) s.
+        breakpoints: as of `System`.
+        drives: of the R free rigid coordinates; the others follow the desired motion exactly.
+        closure: of the last outboard interface, or None.
+    """
+
+    mechanism: Mechanism
+    motion: Callable[[np.ndarray], RigidMotion]
+    breakpoints: tuple[float, ...]
+    drives: Drives
+    closure: Closure | None = None
+
+    @cached_property
+    def ends(self) -> tuple[int, int, int]:
+        """Ends R, R + N, S = R + N + m of the three kinds of unknowns."""
+        moving = len(self.drives.free) + self.mechanism.num_coordinates
+        constraints = 0 if self.closure is None else self.closure.count
+        return len(self.drives.free), moving, moving + constraints
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Places of the free and the elastic coordinates among all of the mechanism's."""
+        rigid = 1 + len(self.mechanism.bodies)
+        return np.concatenate([self.drives.free, rigid + np.arange(self.mechanism.num_coordinates)])
+
+    @property
+    def num_coordinates(self) -> int:
+        """Number S of unknowns."""
+        return self.ends[2]
+
+    @property
+    def elastic_columns(self) -> slice:
+        """Where the elastic coordinates stand among the unknowns."""
+        return slice(*self.ends[:2])
+
+    @property
+    def runs(self) -> int:
+        """One."""
+        return 1
+
+    @cached_property
+    def elastic(self) -> ElasticSystem:
+        """The same machine, its rigid coordinates on the desired motion exactly."""
+        return ElasticSystem(self.mechanism, self.motion, self.breakpoints)
+
+    @cached_property
+    def gap_scale(self) -> float:
+        """Stiffness, N/m, that makes a force of a constraint's gap; it only scales rows."""
+        return self._softness**-1.0
+
+    @cached_property
+    def _softness(self) -> float:
+        """The largest static deflection of an arm's end by a unit force across it, m/N."""
+        found = [
+            float(body.outboard[1] @ np.linalg.solve(body.K, body.outboard[1]))
+            for body in self.mechanism.bodies
+            if body.num_modes
+        ]
+        return max(found, default=1e-6)
+
+    @cached_property
+    def rigid_scale(self) -> np.ndarray:
+        """Weights (R,), J^(1/2) per m or rad, that make free coordinates comparable to modes.
+
+        The energy that a deflection of the same size as the coordinate's at the chain's end would
+        store in the softest arm.
+        """
+        reach = sum(float(np.hypot(*body.outboard_point)) for body in self.mechanism.bodies)
+        lever = np.where(self.drives.free == 0, 1.0, reach)
+        return lever / np.sqrt(self._softness)
+
+    def ground_force(self, multipliers: np.ndarray) -> np.ndarray:
+        """Return the force (n,) on the interface, complex, N, by the multipliers (n, m)."""
+        assert self.closure is not None
+        return multipliers @ self.closure.normals + self.closure.force
+
+    def at(self, t: np.ndarray) -> MachineInstants:
+        """Return the machine at instants t (n,), s."""
+        desired = self.motion(t)
+        ahead = np.zeros((len(t), self.ends[0]))
+        if self.drives.rigid_feed_forward:
+            ahead += feed_forward(self.rigid, desired, self.drives, self.closure)
+        if self.drives.table is not None:
+            ahead += self.drives.table(t)
+        return MachineInstants(self, desired, ahead)
+
+    @cached_property
+    def rigid(self) -> Mechanism:
+        """The mechanism with rigid arms of the same mass and inertia."""
+        return replace(self.mechanism, bodies=tuple(map(rigid_part, self.mechanism.bodies)))
+
+    def initial_state(self) -> State:
+        """Return y, yd (1, S): the equilibrium of the controlled machine at t = 0.
+
+        Where a free coordinate has no stiffness it begins on the desired motion instead, the
+        elastic coordinates at rest, and so does a loop's, but for what keeps it closed.
+
+        Raises:
+            ConvergenceError: there is no equilibrium near the undeformed state.
+        """
+        y = np.zeros((1, self.num_coordinates))
+        R, moving, _ = self.ends
+        if self.is_held.any():
+            y[:, R:moving] = self.elastic.initial_state()[0]
+            return y, np.zeros_like(y)
+        return self._rest(y)[0], np.zeros_like(y)
+
+    @property
+    def is_held(self) -> np.ndarray:
+        """Where nothing but the start holds a free coordinate (R,): no gain and no loop."""
+        return self.drives.driven & (self.drives.stiffness == 0.0)
+
+    def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
+        instants, moving = self.at(np.zeros(1)), self.ends[1]
+        rest, ydd = np.zeros_like(y), np.zeros_like(y)
+        for _ in range(MAX_NEWTON):
+            residual = instants.residual(y, rest, ydd)[0]
+            if not residual.any():
+                return y, ydd[0, moving:]
+            by_q, _, by_a = np.split(instants.linearise(y, rest, ydd).dense()[0], 3, axis=1)
+            matrix = np.concatenate([by_q[:, :moving], by_a[:, moving:]], axis=1)
+            try:
+                step = np.linalg.solve(matrix, -residual)
+            except np.linalg.LinAlgError:
+                break
+            y = y + np.concatenate([step[:moving], np.zeros(len(step) - moving)])
+            ydd[0, moving:] += step[moving:]
+            if np.abs(step[:moving]).max() <= ROUNDING * max(1.0, np.abs(y).max()):
+                return y, ydd[0, moving:]
+        raise ConvergenceError(
+            "the machine finds no equilibrium at t = 0: the drives are too soft for gravity, or "
+            "the loop cannot be closed; raise control.stiffness or material.young_modulus, or "
+            'leave feed-forward on, control.feed_forward = "rigid"'
+        )
+
+    def body_gradient(
+        self,
+        t: np.ndarray,
+        y: np.ndarray,
+        yd: np.ndarray,
+        ydd: np.ndarray,
+        multipliers: np.ndarray,
+    ) -> list[ShapeIntegrals]:
+        """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals.
+
+        Args:
+            t: (n,) instants, s.
+            y, yd, ydd, multipliers: (n, S).
+        """
+        instants, moving = self.at(t), self.ends[1]
+        motion = instants.motion(y, yd, ydd)
+        (e, q, _), (ed, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
+        of_rigid, of_elastic, of_gap = instants.split(multipliers)
+        of_forces = np.zeros_like(motion.q)
+        of_forces[:, self.drives.free] = of_rigid
+        total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
+        if self.drives.rigid_feed_forward:
+            passing = self.drives.passing(instants.ahead, e, ed)
+            weights = feed_forward_weights(
+                self.rigid, instants.desired, self.drives, self.closure, -passing * of_rigid
+            )
+            none = np.zeros((len(t), 0))
+            rigid = body_gradient(self.rigid, instants.desired, none, none, none, none, weights)
+            total = [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
+        if self.closure is None:
+            return total
+        # -J' f . multipliers, by which the interface moves in their direction, and the gap's part.
+        moved = np.zeros((len(t), 1 + len(self.mechanism.bodies) + q.shape[1]))
+        moved[:, self.columns] = multipliers[:, :moving]
+        pull = -self.ground_force(ground)
+        along_gap = self.gap_scale * (of_gap @ self.closure.normals)
+        parts = place_gradient(self.mechanism, motion, q, along_gap, moved, pull)
+        return [
+            replace(a, **{key: getattr(a, key) + value for key, value in part.items()})
+            for a, part in zip(total, parts, strict=True)
+        ]
+
+    def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:
+        """Return the derivative by every body of J through the state y (S,) at t = 0."""
+        R, moving, _ = self.ends
+        if self.is_held.any():
+            return self.elastic.start_gradient(y[R:moving], by_y[R:moving])
+        rest, ydd = np.zeros((1, len(y))), np.zeros((1, len(y)))
+        _, ydd[0, moving:] = self._rest(y[None])
+        by_q, _, by_a = np.split(
+            self.at(np.zeros(1)).linearise(y[None], rest, ydd).dense()[0], 3, 1
+        )
+        matrix = np.concatenate([by_q[:, :moving], by_a[:, moving:]], axis=1)
+        right = np.concatenate([by_y[:moving], np.zeros(len(y) - moving)])
+        multipliers = np.linalg.solve(matrix.T, -right)
+        return self.body_gradient(np.zeros(1), y[None], rest, ydd, multipliers[None])
+
+    def norm(self, y: np.ndarray) -> np.ndarray:
+        """Return the largest norm over n instants (..., groups): free coordinates, then arms.
+
+        Multipliers are not measured: their order is lower, and nothing depends on them.
+        """
+        R, moving, _ = self.ends
+        arms = self.mechanism.norm(y[..., R:moving])
+        if R == 0:
+            return arms
+        rigid = np.sqrt(np.square(self.rigid_scale * y[..., :R]).sum(axis=-1)).max(axis=-1)
+        return np.concatenate([rigid[..., None], arms], axis=-1)
+
+    def slowest_frequency(self) -> float:
+        """Return that of the slowest vibration with rigid coordinates held, rad/s."""
+        return self.elastic.slowest_frequency()
+
+    def describe(self, y: np.ndarray) -> str:
+        """Say how far the arms' ends turn in a motion y (n, S)."""
+        R, moving, _ = self.ends
+        return self.elastic.describe(y[:, R:moving])
+
+    def preconditioner(self) -> Unchanged:
+        """Return the coordinates as they are: all are treated densely."""
+        return Unchanged(self)
+
+
+def feed_forward(
+    rigid: Mechanism, desired: RigidMotion, drives: Drives, closure: Closure | None
+) -> np.ndarray:
+    """Return the forces (n, R) that move the machine with rigid arms on the desired motion.
+
+    In a closed loop the joints that follow from others have no drive: what they would need, the
+    ground gives through the constraint.
+    """
+    none = np.zeros((len(desired.q), 0))
+    forces = inverse_dynamics(rigid, desired, none, none, none)[1]
+    if closure is not None:
+        place = interface_place(rigid, desired, none)
+        forces = forces - (np.conj(closure.force) * place.jacobian).real
+        forces = forces + _carried_over(forces, place.jacobian, drives, closure)
+    return forces[:, drives.free] * drives.driven
+
+
+def feed_forward_weights(
+    rigid: Mechanism,
+    desired: RigidMotion,
+    drives: Drives,
+    closure: Closure | None,
+    weights: np.ndarray,
+) -> np.ndarray:
+    """Return weights (n, 1 + arms) of inverse dynamics' forces from those (n, R) of its result.
+
+    The transpose of what `feed_forward` does with the forces.
+    """
+    out = np.zeros_like(desired.q)
+    out[:, drives.free] = weights * drives.driven
+    if closure is not None:
+        none = np.zeros((len(desired.q), 0))
+        J = closure.project(interface_place(rigid, desired, none).jacobian)
+        dependent = drives.free[~drives.driven]
+        pulled = np.linalg.solve(J[:, :, dependent], (J @ out[:, :, None]))[:, :, 0]
+        out[:, dependent] -= pulled
+    return out
+
+
+def _carried_over(
+    forces: np.ndarray, jacobian: np.ndarray, drives: Drives, closure: Closure
+) -> np.ndarray:
+    """Return what the constraints add to the forces (n, 1 + arms) when dependent ones vanish."""
+    J = closure.project(jacobian)
+    dependent = drives.free[~drives.driven]
+    ground = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), forces[:, dependent, None])
+    return -(J.swapaxes(1, 2) @ ground)[:, :, 0]

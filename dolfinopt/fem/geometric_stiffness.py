@@ -1,0 +1,210 @@
+"""Geometric stiffness of one arm by the stress of every unit load that acts on a moving body.
+
+A body in its tangent frame is loaded by seven unit loads ("pushes"): the inertia of unit
+accelerations a_x, a_y of the frame, of its angular acceleration and of -w^2, and unit forces and
+moment at the outboard interface. Each has a static field u_p, K u_p = f_p, whose stress stiffens
+the body in its modes:
+
+    K0_p[i, j] = int t sigma(u_p)_ab (d_a phi_i . d_b phi_j) dA
+
+Source: Wallrapp & Schwertassek, Int. J. Numer. Methods Eng. 32 (1991) 1751-1766,
+doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.fem.cells import sum_at_nodes
+
+if TYPE_CHECKING:
+    from dolfinopt.fem.elasticity import ElasticArm
+
+NUM_INERTIAL = 4  # loads by the arm's own inertia come first; the others act on the interface
+NUM_LOADS = 7
+# Entries of the products of gradients that are held at a time, so that they stay in the cache.
+CHUNK = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class UnitLoads:
+    """Static fields of the unit loads on one design of an arm.
+
+    Attributes:
+        arm: the design.
+        fields: (n_nodes, 2, 7) u_p, m per unit load: m/s2, m/s2, 1/s2, 1/s2, N, N, N m.
+    """
+
+    arm: ElasticArm
+    fields: np.ndarray
+
+    @cached_property
+    def stresses(self) -> np.ndarray:
+        """Stress xx, yy, xy times t dA at the quadrature points, unit E, (3, 7, n_cells p)."""
+        quadrature = self.arm.substructure.quadrature
+        values = self.fields[self.arm.operators.cells].reshape(
+            len(quadrature.stress), -1, NUM_LOADS
+        )
+        stress = (quadrature.stress @ values).reshape(-1, 3, NUM_LOADS)
+        return np.ascontiguousarray(np.moveaxis(stress, 0, 2))
+
+    def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
+        """Return K0 (7, q, q) in modes V (n_nodes, 2, q) (collective on the arm's ranks)."""
+        q = V.shape[2]
+        i, j = np.triu_indices(q)
+        packed = np.zeros((NUM_LOADS, len(i)))
+        for _, points, E, H in self._parts(V):
+            for stress, pairs in zip(self.stresses[:, :, points], _pairs(H), strict=True):
+                packed += (stress * E) @ pairs.T
+        packed = self.arm.comm.allreduce(packed)
+        K0 = np.empty((NUM_LOADS, q, q))
+        K0[:, i, j] = K0[:, j, i] = packed
+        return K0
+
+    def gradient(self, V: np.ndarray, by_K0: np.ndarray) -> GeometricGradient:
+        """Differentiate a function of K0 by modes and material (collective on the arm's ranks).
+
+        The stresses' part goes through one static solve a load, the adjoint of u_p.
+
+        Args:
+            V: (n_nodes, 2, q) as given to `geometric_stiffness`.
+            by_K0: (7, q, q) derivatives.
+        """
+        arm, q = self.arm, V.shape[2]
+        quadrature, (count, n) = arm.substructure.quadrature, arm.operators.cells.shape
+        i, j = np.triu_indices(q)
+        by_pairs = by_K0[:, i, j] + np.where(i == j, 0.0, by_K0[:, j, i])
+        by_young = np.empty(count)
+        by_modes, by_fields = np.empty((count, n, 2, q)), np.empty((count, n, 2, NUM_LOADS))
+        for cells, points, E, H in self._parts(V):
+            stress = self.stresses[:, :, points]
+            by_stress = by_pairs @ _pairs(H)
+            size = cells.stop - cells.start
+            by_young[cells] = (stress * by_stress).sum(axis=(0, 1)).reshape(size, -1).sum(axis=1)
+            by_stress *= E
+            forces = np.moveaxis(by_stress, 2, 0).reshape(size, -1, NUM_LOADS)
+            nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
+            by_fields[cells] = nodal.reshape(size, n, 2, NUM_LOADS)
+            by_H = _pairs_transposed(H, by_pairs.T @ (stress * E))
+            by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, 2 * q)
+            nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
+            by_modes[cells] = nodal.reshape(size, n, 2, q)
+        nodal_forces = sum_at_nodes(arm.operators, by_fields)
+        adjoint = static_response(arm, *arm.restrict(nodal_forces))
+        by_young -= arm.cell_stiffness_products(adjoint, self.fields)
+        return GeometricGradient(
+            by_modes=sum_at_nodes(arm.operators, by_modes),
+            by_young=by_young,
+            by_density=arm.cell_mass_products(adjoint[:, :, :NUM_INERTIAL], accelerations(arm)),
+        )
+
+    def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray, np.ndarray]]:
+        """Yield runs of cells: cells, points, Young's modulus (points,), modes' gradients there.
+
+        The gradients are d_a phi_c as (2, 2, q, points).
+        """
+        derivatives = self.arm.substructure.quadrature.derivatives
+        count, q = len(derivatives), V.shape[2]
+        p = derivatives.shape[1] // 2
+        step = max(1, CHUNK // (p * q * (q + 1)))
+        for first in range(0, count, step):
+            cells = slice(first, min(first + step, count))
+            values = V[self.arm.operators.cells[cells]]
+            H = derivatives[cells] @ values.reshape(*values.shape[:2], 2 * q)
+            H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, 2, 2, q), 0, 3))
+            points = slice(p * cells.start, p * cells.stop)
+            yield cells, points, np.repeat(self.arm.young[cells], p), H
+
+
+@dataclass(frozen=True, eq=False)
+class GeometricGradient:
+    """Derivatives of a function of K0.
+
+    Attributes:
+        by_modes: (n_nodes, 2, q) by the modes, contributions of this rank's cells.
+        by_young: (n_cells,) by Young's modulus, modes held.
+        by_density: (n_cells,) by mass density, modes held.
+    """
+
+    by_modes: np.ndarray
+    by_young: np.ndarray
+    by_density: np.ndarray
+
+
+def unit_loads(arm: ElasticArm) -> UnitLoads:
+    """Return the static fields of the unit loads: four solves with the factor at hand.
+
+    Collective on the arm's ranks.
+    """
+    interior, outboard = arm.restrict(arm.mass_times(accelerations(arm)))
+    forces = np.zeros((len(interior), NUM_LOADS - NUM_INERTIAL))
+    return UnitLoads(
+        arm,
+        static_response(arm, np.hstack([interior, forces]), np.hstack([outboard, np.eye(3)])),
+    )
+
+
+def accelerations(arm: ElasticArm) -> np.ndarray:
+    """Return the fields (n_nodes, 2, 4) whose inertia loads the body: 1_x, 1_y, S X and X."""
+    fields = np.zeros((len(arm.points), 2, NUM_INERTIAL))
+    fields[:, 0, 0] = fields[:, 1, 1] = 1.0
+    fields[:, 0, 2], fields[:, 1, 2] = -arm.points[:, 1], arm.points[:, 0]
+    fields[:, :, 3] = arm.points
+    return fields
+
+
+def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+    """Return the displacements (n_nodes, 2, k) of static loads, outboard interface free.
+
+    Args:
+        arm: clamped inboard.
+        interior: (num_interior, k) loads on the interior dofs, N; zero columns cost nothing.
+        outboard: (3, k) force and moment at the outboard interface, N, N m.
+    """
+    modes = arm.constraint_modes()
+    loaded = arm.comm.allreduce(np.any(interior, axis=0))
+    particular = np.zeros_like(interior)
+    particular[:, loaded] = arm.solve(interior[:, loaded])
+    load = outboard + arm.comm.allreduce(modes.interior.T @ interior)
+    tip = np.linalg.solve(modes.stiffness, load)
+    return arm.expand(particular + modes.interior @ tip, tip)
+
+
+def _pairs(H: np.ndarray) -> np.ndarray:
+    """Return d_a phi_i . d_b phi_j (3, pairs, points), what stress xx, yy and xy multiply.
+
+    Mode by mode in place: index arrays would take ten times as long.
+    """
+    q, points = H.shape[2:]
+    out, term = np.empty((3, q * (q + 1) // 2, points)), np.empty(points)
+    for place, (i, j) in enumerate(zip(*np.triu_indices(q), strict=True)):
+        for one, terms in zip(out[:, place], _TERMS, strict=True):
+            one[:] = 0.0
+            for a, b, c in terms:
+                np.multiply(H[a, c, i], H[b, c, j], out=term)
+                one += term
+    return out
+
+
+# Directions a, b and component c of every term of stress xx, yy, xy.
+_TERMS = (
+    ((0, 0, 0), (0, 0, 1)),
+    ((1, 1, 0), (1, 1, 1)),
+    ((0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1)),
+)
+
+
+def _pairs_transposed(H: np.ndarray, by_pairs: np.ndarray) -> np.ndarray:
+    """Return the derivatives (2, 2, q, points) by H, given those by `_pairs` (3, pairs, points)."""
+    by_H, term = np.zeros_like(H), np.empty(H.shape[3])
+    for place, (i, j) in enumerate(zip(*np.triu_indices(H.shape[2]), strict=True)):
+        for weight, terms in zip(by_pairs[:, place], _TERMS, strict=True):
+            for a, b, c in terms:
+                by_H[a, c, i] += np.multiply(weight, H[b, c, j], out=term)
+                by_H[b, c, j] += np.multiply(weight, H[a, c, i], out=term)
+    return by_H
