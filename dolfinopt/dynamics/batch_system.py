@@ -125,7 +125,7 @@ class BatchModes:
 
     system: BatchSystem
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
-    definite = True
+    definite = guided = True
 
     @property
     def frequencies(self) -> np.ndarray:

@@ -64,7 +64,7 @@ def estimated_errors(
     slow, _ = next_slow_coordinates(richer, limits, 0)
     one = richer.runs == 1
     error, sure = np.full(richer.runs, np.inf), np.zeros(richer.runs, dtype=bool)
-    simplified = richer.preconditioner.definite
+    simplified = richer.preconditioner.guided
     if simplified and not (one and len(windows(richer, slow)) > 1):
         matrix = simplified_newton_matrix(richer, begin, a, slow)
         if rate is not None and rate.max(initial=0.0) <= TRUSTED:
@@ -85,13 +85,15 @@ def _unresolved_error(
 ) -> np.ndarray:
     """Return the relative error (runs,) of vibrations that the steps do not resolve."""
     q, qd = stage_values(stages, *begin, a)
-    if not stages.preconditioner.definite:
+    vibrates = stages.preconditioner.frequencies.max(axis=0) > 0.0
+    if not vibrates.any():
         return np.zeros(stages.runs)  # nothing is known of single coordinates
     grid = time_grid.reshape(stages.runs, -1)[0]
     breakpoint_steps = np.searchsorted(grid, stages.preconditioner.system.breakpoints)[:-1]
     first = begin[0][:: stages.length]
     uncoupled = stages.preconditioner.uncoupled
     missed = unresolved(stages, uncoupled, (q, qd, a), first, breakpoint_steps)
+    missed[:, ~vibrates] = 0.0
     return stages.relative(missed[:, None], q)
 
 

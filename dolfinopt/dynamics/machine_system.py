@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.modal_coordinates import Modes
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_gradient import body_gradient
@@ -38,18 +39,20 @@ class DenseLinearisation:
     """Derivative of a residual at n instants as matrices, see `system.Linearisation`.
 
     Attributes:
-        matrix: (n, S, 3 S) of all S coordinates, columns ordered q, qd, qdd.
+        matrix: (n, N, 3, N) of all rows by all coordinates, their rates and accelerations.
+        keep: (S,) coordinates that have columns.
     """
 
     matrix: np.ndarray
+    keep: np.ndarray
 
     def window(self, first: int, last: int) -> DenseLinearisation:
         """Return the instants first..last - 1."""
-        return DenseLinearisation(self.matrix[first:last])
+        return DenseLinearisation(self.matrix[first:last], self.keep)
 
     def dense(self) -> np.ndarray:
-        """Return the matrices."""
-        return self.matrix
+        """Return the kept coordinates' own rows (n, S, 3 S)."""
+        return self._part(self.keep)
 
     def times(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
@@ -57,13 +60,18 @@ class DenseLinearisation:
         """Return the change of the wanted rows (m, W), see `system.Linearisation`."""
         change = np.concatenate([q, qd, qdd], axis=1)
         change = change.reshape(len(self.matrix), -1, change.shape[1])
-        rows = change @ self.matrix[:, wanted].swapaxes(1, 2)
+        rows = change @ self._part(wanted).swapaxes(1, 2)
         return rows.reshape(len(q), len(wanted))
 
     def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the gradient of sum_n rows_n . residual_n by q, qd, qdd, each (n, S)."""
-        by_q, by_v, by_a = np.split((rows[:, None] @ self.matrix)[:, 0], 3, axis=1)
-        return by_q, by_v, by_a
+        flat = self.matrix.reshape(*self.matrix.shape[:2], -1)
+        found = (rows[:, None] @ flat).reshape(len(rows), 3, -1)[:, :, self.keep]
+        return found[:, 0], found[:, 1], found[:, 2]
+
+    def _part(self, rows: np.ndarray) -> np.ndarray:
+        chosen = self.matrix[:, rows][..., self.keep]
+        return chosen.reshape(len(self.matrix), len(rows), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +161,10 @@ class MachineInstants:
     def linearise(
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
     ) -> DenseLinearisation:
-        """Return its derivative; all coordinates are kept."""
+        """Return its derivative by the coordinates `keep`, or all."""
         if 0 < len(y) < FEW:
             every = repeated(len(y))
-            return self[every].linearise(y[every], yd[every], ydd[every]).window(0, len(y))
+            return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
         (R, moving, S), count = machine.ends, len(y)
         motion = self.motion(y, yd, ydd)
@@ -177,7 +185,7 @@ class MachineInstants:
             matrix[:, :moving, 0, :moving] -= (pull[:, None, None] * H).real
             matrix[:, :moving, 2, moving:] -= J.swapaxes(1, 2)
             matrix[:, moving:, 0, :moving] += machine.gap_scale * J
-        return DenseLinearisation(matrix.reshape(count, S, 3 * S))
+        return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,9 +408,64 @@ class MachineSystem:
         R, moving, _ = self.ends
         return self.elastic.describe(y[:, R:moving])
 
-    def preconditioner(self) -> Unchanged:
-        """Return the coordinates as they are: all are treated densely."""
-        return Unchanged(self)
+    def preconditioner(self) -> MachineModes | Unchanged:
+        """Return the arms' vibrations beside the free coordinates.
+
+        Where nothing guides a free coordinate it goes far, and all are treated densely.
+        """
+        if self.is_held.any():
+            return Unchanged(self)
+        arms = self.elastic.preconditioner()
+        changed = replace(self, mechanism=arms.system.mechanism)
+        R, moving, size = self.ends
+        frequencies = np.zeros((1, size))
+        frequencies[:, R:moving] = arms.frequencies
+        k, d, m = np.ones((1, size)), np.zeros((1, size)), np.ones((1, size))
+        for each, value in zip((k, d, m), arms.uncoupled, strict=True):
+            each[:, R:moving] = value
+        return MachineModes(changed, arms, slice(R, moving), frequencies, (k, d, m))
+
+
+@dataclass(frozen=True, eq=False)
+class MachineModes:
+    """A machine in the coordinates of its arms' vibrations; the others stay as they are.
+
+    Free coordinates and multipliers have no frequency of their own: they are treated densely, and
+    with pivots. See `system.Preconditioner`.
+    """
+
+    system: MachineSystem
+    arms: Modes
+    columns: slice
+    frequencies: np.ndarray
+    uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
+    definite = False
+    guided = True
+
+    def to_modes(self, q: np.ndarray) -> np.ndarray:
+        """Return z (..., S) of coordinates (..., S)."""
+        return self._with(q, self.arms.to_modes)
+
+    def from_modes(self, z: np.ndarray) -> np.ndarray:
+        """Return the coordinates of z (..., S)."""
+        return self._with(z, self.arms.from_modes)
+
+    def gradient_to_modes(self, by_q: np.ndarray) -> np.ndarray:
+        """Return dJ/dz (..., S)."""
+        return self._with(by_q, self.arms.gradient_to_modes)
+
+    def gradient_from_modes(self, by_z: np.ndarray) -> np.ndarray:
+        """Return dJ/dq (..., S)."""
+        return self._with(by_z, self.arms.gradient_from_modes)
+
+    def chosen(self, runs: np.ndarray) -> MachineModes:
+        """Return itself: there is one run."""
+        return self
+
+    def _with(self, x: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        out = x.copy()
+        out[..., self.columns] = change(x[..., self.columns])
+        return out
 
 
 def feed_forward(

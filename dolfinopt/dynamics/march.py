@@ -44,7 +44,7 @@ class March:
         Raises:
             ConvergenceError: Newton fails in a single step, or spends more than `MAX_SWEEPS`.
         """
-        if stages.preconditioner.definite or guess.any():
+        if stages.preconditioner.guided or guess.any():
             a, spent = self._run(stages, state, guess, tuning, True)
         else:
             a, spent = self._from_nothing(stages, state, tuning)

@@ -41,7 +41,7 @@ class Modes:
     transforms: tuple[np.ndarray, ...]
     inverses: tuple[np.ndarray, ...]
     frequencies: np.ndarray
-    definite = True
+    definite = guided = True
 
     @cached_property
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

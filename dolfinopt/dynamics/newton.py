@@ -133,7 +133,7 @@ class _Iteration:
         self.converged = np.zeros(runs, dtype=bool)
         self.rate, self.iterations = np.zeros(runs), np.zeros(runs, dtype=int)
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
-        self.simplified = simplified and stages.preconditioner.definite
+        self.simplified = simplified and stages.preconditioner.guided
         self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0)
         self.at = self.point(a)
         self.active = np.arange(runs)  # those that are iterated, by index

@@ -53,7 +53,7 @@ def next_slow_coordinates(
     are left when all are.
     """
     angles = stages.angles
-    if not stages.preconditioner.definite:
+    if not stages.preconditioner.guided:
         return np.arange(len(angles)), ()
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))

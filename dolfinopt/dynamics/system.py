@@ -71,7 +71,9 @@ class Preconditioner(Protocol):
         frequencies: (runs, N) of every coordinate by itself, rad/s; 0 of what must be treated
             densely.
         uncoupled: stiffness, damping and mass (runs, N) of every coordinate by itself.
-        definite: whether mass and stiffness are: then the simplified Newton matrix may be used.
+        definite: whether mass and stiffness are: matrices are then inverted without pivots.
+        guided: whether zero is a guess of the whole motion: then all steps are solved at once,
+            with the simplified Newton matrix.
     """
 
     @property
@@ -82,6 +84,8 @@ class Preconditioner(Protocol):
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
     @property
     def definite(self) -> bool: ...
+    @property
+    def guided(self) -> bool: ...
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., N) of coordinates q (..., N)."""
@@ -141,7 +145,7 @@ class System(Protocol):
 class Unchanged:
     """A system in its own coordinates: all of them are treated densely, with pivots."""
 
-    definite = False
+    definite = guided = False
 
     def __init__(self, system: System) -> None:
         """Take the system."""
