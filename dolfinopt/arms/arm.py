@@ -25,6 +25,7 @@ from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.multibody.standard_input import load_body
+from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
@@ -61,8 +62,7 @@ class Arm:
         solid: the arm's solid material.
         substructure: finite elements whatever the design.
         coordinates: number q of the basis; None until `set_order`, where the scene says "auto".
-        stiffened: whether its bodies have geometric stiffness; False until `set_stiffening`, where
-            the scene says "auto".
+        stiffening: whether its bodies have geometric stiffness; None until `set_stiffening`.
         initial: eigenvectors from which the next design's searches set out.
         places: of the arms in the chain that have this design.
     """
@@ -92,7 +92,7 @@ class Arm:
                 f"at most {self.substructure.T.num_dofs}, the degrees of freedom of arm "
                 f"{arm.name!r}"
             )
-        self.stiffened = scene.simulation.stiffening is True
+        self.stiffening: Stiffening | None = None
         self.profile = profile
         self.initial = InitialVectors()
         self._state: DesignState | None = None
@@ -278,11 +278,20 @@ class Arm:
         if self._state is not None:
             self._state = self._state.under(self.scene, num_modes, self.initial, self.stiffened)
 
-    def set_stiffening(self, stiffened: bool) -> None:
+    @property
+    def stiffened(self) -> bool:
+        """Whether its bodies have geometric stiffness: as decided, or as the scene says."""
+        if self.stiffening is None:
+            return self.scene.simulation.stiffening is True
+        return self.stiffening.on
+
+    def set_stiffening(self, stiffening: Stiffening) -> None:
         """Give bodies geometric stiffness from now on, or none."""
-        self.stiffened = stiffened
-        if self._state is not None:
-            self._state = self._state.under(self.scene, self.coordinates, self.initial, stiffened)
+        before, self.stiffening = self.stiffened, stiffening
+        if self._state is not None and self.stiffened != before:
+            self._state = self._state.under(
+                self.scene, self.coordinates, self.initial, self.stiffened
+            )
 
     def under(self, scene: scenes.Scene) -> Arm:
         """Return this arm in a scene that differs in what it does, not in what it is.
@@ -296,8 +305,10 @@ class Arm:
         other.scene, other.initial = scene, InitialVectors()
         if self.scene.reduction != scene.reduction:
             other.coordinates = scene.reduction.count or None
-        if self.scene.simulation.stiffening != scene.simulation.stiffening:
-            other.stiffened = scene.simulation.stiffening is True
+        loads = ("motion", "payload", "closure")
+        same = all(getattr(self.scene, key) == getattr(scene, key) for key in loads)
+        if not same or self.scene.simulation.stiffening != scene.simulation.stiffening:
+            other.stiffening = None
         if same_basis(self.scene, scene) and self.basis is not None:
             other.initial.basis = self.initial.basis
         if self._state is not None:
@@ -394,6 +405,11 @@ def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, A
                 f"{least} between them; make group passive smaller, shorten arms.passive or raise "
                 "the volume"
             )
+
+
+def stiffening_of(arms: Mapping[int, Arm]) -> Stiffening | None:
+    """Return what was decided about the arms' bodies, the same for all of them; None for none."""
+    return next((arm.stiffening for arm in arms.values()), None)
 
 
 def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[ShapeIntegrals]:

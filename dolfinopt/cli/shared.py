@@ -168,6 +168,12 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     found = summary["reduction"]
     if found["error_estimate"] is not None:
         click.echo(_chosen(found["coordinates"], found["error_estimate"]))
+    loads, asked = summary["stiffening"], summary["scene"]["simulation"]["stiffening"]
+    if asked == "auto" and loads is not None and loads["on"]:
+        click.echo(
+            'simulation.stiffening = "auto": on, the loads of the motion change the stiffness of '
+            f"an arm by {100.0 * loads['estimate']:.2g} %"
+        )
     ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
     optimised = summary["kkt"] is not None
     if optimised:

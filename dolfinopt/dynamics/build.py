@@ -65,11 +65,12 @@ def build_system(
     elastic = ElasticSystem(mechanism, motion, breakpoints(scene))
     if not is_machine(scene):
         return elastic
-    closure = _closure(scene)
+    closure = closure_of(scene)
     return MachineSystem(mechanism, motion, elastic.breakpoints, _drives(scene), closure)
 
 
-def _closure(scene: Scene) -> Closure | None:
+def closure_of(scene: Scene) -> Closure | None:
+    """Return what holds the last interface, or None."""
     closure = scene.closure
     if closure is None:
         return None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.optimization.assessment import assess, initial_selection
 from dolfinopt.optimization.convergence import Ending, ending, stop_reason
 from dolfinopt.optimization.evaluator import Evaluator, densities
@@ -288,6 +289,7 @@ class _Run:
             beta=self.continuation.beta,
             thresholds=self.continuation.thresholds,
             choice=self.selection,
+            stiffening=stiffening_of(self.arms),
         )
 
     def _restore(self, memory: Memory) -> None:
@@ -299,6 +301,8 @@ class _Run:
         for k, arm in self.arms.items():
             if memory.choice is not None:
                 arm.set_order(memory.choice.coordinates)
+            if memory.stiffening is not None:
+                arm.set_stiffening(memory.stiffening)
             arm.initial_vectors = memory.modes[k]
         self.history = memory.history if self.partition.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.dynamics.solution import Solution
+from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.responses.order_selection import OrderSelection
 
@@ -29,6 +30,7 @@ class Memory:
         beta: steepness of the projection.
         thresholds: per arm its eta.
         choice: of the coordinates, where the scene leaves it to "auto".
+        stiffening: decided for the initial design; None where nothing was simulated.
     """
 
     iteration: int
@@ -42,3 +44,4 @@ class Memory:
     beta: float
     thresholds: Mapping[int, float]
     choice: OrderSelection | None = None
+    stiffening: Stiffening | None = None

@@ -12,6 +12,7 @@ import numpy as np
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
@@ -94,6 +95,8 @@ def _write(
     if memory.choice is not None:
         arrays["coordinates"] = memory.choice.coordinates
         arrays["tried"] = np.array(memory.choice.tried)
+    if memory.stiffening is not None:
+        arrays["stiffening"] = [memory.stiffening.estimate, float(memory.stiffening.on)]
     for k, solution in enumerate(memory.solutions):
         for name, field in (*SOLUTION.items(), ("error", "error")):
             arrays[f"solution{k}/{name}"] = getattr(solution, field)
@@ -151,6 +154,10 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
         count = int(arrays["coordinates"])
         choice = OrderSelection(count, dict(tried)[count], tried)
+    stiffening = None
+    if "stiffening" in arrays:
+        estimate, on = arrays["stiffening"].tolist()
+        stiffening = Stiffening(estimate, bool(on))
     return Memory(
         iteration=int(arrays["iteration"]),
         cells=cells,
@@ -163,6 +170,7 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         beta=float(arrays["sharpness"]),
         thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in arms},
         choice=choice,
+        stiffening=stiffening,
     )
 
 

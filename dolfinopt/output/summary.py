@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm
+from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.arms.vibration import frequency_excess
 from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.mesh import compat
+from dolfinopt.multibody.stiffening import WARN, Stiffening
 from dolfinopt.output.trajectory import drive_units, trajectory_units
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts, Profile
@@ -65,6 +66,7 @@ def summarise(run: Simulated, wall: float) -> dict[str, Any]:
             **_of_responses(run),
             "simulation_error_estimate": run.evaluation.error,
             "reduction": _reduction(scene, run.choice),
+            "stiffening": _stiffening(stiffening_of(run.arms)),
             "warnings": _all_warnings(run, traits),
             "iterations": run.iterations,
             "converged": run.converged,
@@ -159,6 +161,7 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *(note for one in traits.values() for note in one.notes),
         *_warnings(run.scene, run.evaluation),
         *_too_few(run.scene, run.choice),
+        *_unstiffened(stiffening_of(run.arms)),
         *(filter_warnings(run.scene, sizes) if run.iterations else ()),
     ]
 
@@ -317,6 +320,21 @@ def _too_few(scene: Scene, choice: OrderSelection | None) -> list[str]:
         f"final one has an estimated error of {choice.error:.2g}, above reduction.tolerance = "
         f"{scene.reduction.tolerance:g}; optimise with reduction.coordinates = "
         f"{2 * choice.coordinates}, or a smaller tolerance"
+    ]
+
+
+def _stiffening(stiffening: Stiffening | None) -> dict[str, Any] | None:
+    """Return whether the loads' geometric stiffness was taken into account, and how large it is."""
+    return None if stiffening is None else asdict(stiffening)
+
+
+def _unstiffened(stiffening: Stiffening | None) -> list[str]:
+    """Return a sentence where geometric stiffening is left out and matters."""
+    if stiffening is None or stiffening.on or stiffening.estimate < WARN:
+        return []
+    return [
+        f"the loads of the motion change the stiffness of an arm by {stiffening.estimate:.2g} of "
+        "it, which simulation.stiffening = false leaves out; set it to true"
     ]
 
 

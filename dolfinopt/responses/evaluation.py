@@ -31,6 +31,7 @@ from dolfinopt.responses.response import (
     objective_of,
 )
 from dolfinopt.responses.scenarios import bodies_in, combined
+from dolfinopt.responses.stiffening import decide_stiffening
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ def evaluate(
             arm.set_design(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or needs(scene, "motion"):
+        decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
         owned = _reduced(partition, arms, x_phys)
         [(found, trajectory)] = _simulated([scene], partition, owned, profile, [start])
         if isinstance(found, ConvergenceError):
@@ -161,6 +163,10 @@ def evaluate_batch(
     """
     _check_densities(partition, arms, x_phys)
     try:
+        with together(partition.world):
+            for k, arm in arms.items():
+                arm.set_design(x_phys[k])
+        decide_stiffening(scenes, partition, arms)
         owned = _reduced(partition, arms, x_phys)
     except ConvergenceError as error:
         return [error] * len(scenes)

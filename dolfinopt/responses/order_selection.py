@@ -21,6 +21,7 @@ from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis
 from dolfinopt.responses.scenarios import bodies_in, factors
+from dolfinopt.responses.stiffening import decide_stiffening
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
@@ -150,6 +151,7 @@ class _Comparison:
         with together(partition.world):
             for k, arm in arms.items():
                 arm.set_design(x_phys[k])
+        decide_stiffening(self.scenes, partition, arms)
         dofs = min((arm.elastic.num_dofs for arm in arms.values()), default=None)
         known = partition.world.allgather(dofs)
         self.limit: int = min(one for one in known if one is not None)
@@ -186,11 +188,16 @@ class _Comparison:
                     bases[k] = METHODS[method].reduce(arm.elastic, arm.options(count), None)
         return bases
 
+    def _body(self, k: int, basis: Basis, beta: float) -> ShapeIntegrals:
+        arm = self.arms[k]
+        loads = arm.current.unit_loads if arm.stiffened else None
+        return shape_integrals(arm.elastic, basis, beta, loads)
+
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
         beta = self.scenes[0].damping.stiffness_proportional
         with together(self.partition.world):
-            mine = {k: shape_integrals(self.arms[k].elastic, b, beta) for k, b in bases.items()}
+            mine = {k: self._body(k, basis, beta) for k, basis in bases.items()}
         owned = gather_arms(self.partition, mine)
         kept: list[Trajectory] = []
         on_root(

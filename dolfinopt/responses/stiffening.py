@@ -1,0 +1,63 @@
+"""Whether the arms' bodies get geometric stiffness: as the scene says, or by an estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.arms.arm import chain_of
+from dolfinopt.dynamics.build import build_mechanism, closure_of
+from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
+from dolfinopt.multibody.stiffening import SWITCH_ON, Stiffening, largest_change
+from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.reduction import METHODS, Options
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+INSTANTS = 201  # of the horizon, at which loads are looked at
+NUM_MODES = 3  # the static modes of the outboard interface: they need no eigenproblem
+
+
+def decide_stiffening(
+    scenes: Sequence[Scene], partition: Partition, arms: Mapping[int, Arm]
+) -> None:
+    """Let the arms' bodies have geometric stiffness from now on, or not (collective).
+
+    Decided once, by the design that the arms have, and estimated with rigid arms on the desired
+    motion: `Stiffening.estimate` says by how much the loads change an arm's stiffness.
+
+    Args:
+        scenes: of the same arms; the first one says true, false or "auto".
+        partition: which ranks do which arm.
+        arms: this rank's, with a design.
+    """
+    if partition.world.allreduce(all(arm.stiffening is not None for arm in arms.values()), min):
+        return
+    with together(partition.world):
+        mine = {k: _static_body(arm) for k, arm in arms.items()}
+    owned = gather_arms(partition, mine)
+    estimate: float = on_root(partition.world, _estimate, scenes, owned)
+    asked = scenes[0].simulation.stiffening
+    on = estimate >= SWITCH_ON if asked == "auto" else asked is True
+    for arm in arms.values():
+        arm.set_stiffening(Stiffening(estimate, on))
+
+
+def _static_body(arm: Arm) -> ShapeIntegrals:
+    state = arm.current
+    basis = METHODS["craig-bampton"].reduce(state.elastic, Options(NUM_MODES), None)
+    return shape_integrals(state.elastic, basis, 0.0, state.unit_loads)
+
+
+def _estimate(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> float:
+    largest = 0.0
+    for scene in scenes:
+        mechanism = build_mechanism(scene, chain_of(scene, owned))
+        motion = rigid_motion(np.linspace(0.0, scene.motion.horizon, INSTANTS), scene)
+        largest = max(largest, largest_change(mechanism, motion, closure_of(scene)))
+    return largest
