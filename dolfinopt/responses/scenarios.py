@@ -72,6 +72,7 @@ def cotangents_of_scene(cotangents: ShapeIntegrals, f: Factors, weight: float) -
         K=by_K,
         D=np.zeros_like(cotangents.D),
         outboard=weight * cotangents.outboard,
+        K0_outboard=weight * cotangents.K0_outboard,
     )
     return scaled(back, weight * f.mass, weight * f.stiffness, 1.0)
 

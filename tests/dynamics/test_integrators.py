@@ -559,6 +559,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
             "payload.mass=11.2",
             "motion.duration=0.87",
             "motion.flattening=0.46",
+            "simulation.stiffening=false",
             "damping.stiffness_proportional=0",
             "reduction.coordinates=9",
             "simulation.tolerance=1e-2",

@@ -46,7 +46,10 @@ EXTENDED = pytest.mark.skipif(
 
 def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
     """Build the two-arm scene on few cells."""
-    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(
+        TWO_ARM,
+        (f"arms.cells=[{cells[0]},{cells[1]}]", "simulation.stiffening=false", *overrides),
+    )
     profile = do.Profile()
     partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
     return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
@@ -54,7 +57,10 @@ def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
 
 def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3), comm: MPI.Comm | None = None) -> Arm:
     """Build the first arm of that scene."""
-    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    scene = do.load_scene(
+        TWO_ARM,
+        (f"arms.cells=[{cells[0]},{cells[1]}]", "simulation.stiffening=false", *overrides),
+    )
     return Arm(scene, 0, comm or MPI.COMM_SELF, do.Profile())
 
 

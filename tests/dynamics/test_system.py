@@ -297,7 +297,7 @@ class SliderCrank(TestSystem):
     num_coordinates, breakpoints = 3, (0.0, 0.1)
     lengths, speed = np.array([0.15, 0.30]), 40.0  # m, rad/s
     mechanism = Mechanism(
-        tuple(rigid_bar(length, 0.02, 0.01, 7870.0) for length in (0.15, 0.30)),
+        tuple(rigid_bar(length, 0.02, 7870.0 * length * 0.02 * 0.01) for length in (0.15, 0.30)),
         0.08,
         0.0,
         (0.0, -GRAVITY),

@@ -144,7 +144,9 @@ class Chain:
         angle = np.zeros((), dtype=y.dtype)
         places, angles = [], []
         for cloud, joint, e in zip(self.clouds, y[1 : self.rigid], self.parts(y), strict=True):
-            origin = origin + _rotation(angle + joint) @ (cloud.reach + cloud.outboard[:2] @ e)
+            origin = origin + _rotation(angle + joint) @ (
+                cloud.outboard_point + cloud.outboard[:2] @ e
+            )
             angle = angle + joint + cloud.outboard[2] @ e
             places.append(origin)
             angles.append(angle)
@@ -267,7 +269,11 @@ class BentChain(Chain):
             self.clouds, self.K0, y[1 : self.rigid], self.parts(y), strict=True
         ):
             angles.append(angle + joint)
-            d = cloud.reach + cloud.outboard[:2] @ e - 0.5 * np.array([e @ A @ e for A in K0[4:6]])
+            d = (
+                cloud.outboard_point
+                + cloud.outboard[:2] @ e
+                - 0.5 * np.array([e @ A @ e for A in K0[4:6]])
+            )
             origins.append(origins[-1] + _rotation(angles[-1]) @ d)
             angle = angles[-1] + cloud.outboard[2] @ e - 0.5 * e @ K0[6] @ e
         return origins, [*angles, angle]

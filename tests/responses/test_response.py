@@ -71,13 +71,8 @@ class MeanSquare(MotionResponse):
     def derivatives(
         self, trajectory: Trajectory, cases: LoadCases
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        from dolfinopt.responses import deviation
-
         by_deviation = 2.0 * cases.weights[:, None] * trajectory.deviation[cases.indices]
-        by_q, by_outboard = deviation.end_effector_gradient(
-            trajectory.mechanism, trajectory.motion, trajectory.q_e[cases.indices], by_deviation
-        )
-        return by_q, by_outboard
+        return trajectory.by_end_effector(cases.indices, by_deviation)
 
 
 class MoreConstraints(Constraints):
