@@ -13,14 +13,13 @@ from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.multibody.stiffening import SWITCH_ON, Stiffening, largest_change
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
-from dolfinopt.reduction import METHODS, Options
+from dolfinopt.reduction import Basis
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 INSTANTS = 201  # of the horizon, at which loads are looked at
-NUM_MODES = 3  # the static modes of the outboard interface: they need no eigenproblem
 
 
 def decide_stiffening(
@@ -49,9 +48,13 @@ def decide_stiffening(
 
 
 def _static_body(arm: Arm) -> ShapeIntegrals:
+    """Return the body in the static modes of its outboard interface: they need no eigenproblem."""
     state = arm.current
-    basis = METHODS["craig-bampton"].reduce(state.elastic, Options(NUM_MODES), None)
-    return shape_integrals(state.elastic, basis, 0.0, state.unit_loads)
+    elastic, static = state.elastic, state.elastic.constraint_modes()
+    none = np.empty((len(static.interior), 0))
+    weighted = elastic.mass_times(static.field)
+    basis = Basis(static.field, weighted, static.stiffness, np.eye(3), none)
+    return shape_integrals(elastic, basis, 0.0, state.unit_loads)
 
 
 def _estimate(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> float:

