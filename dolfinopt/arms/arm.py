@@ -23,7 +23,7 @@ from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
 from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.parallel import Partition, sum_over_arms, together
@@ -432,10 +432,15 @@ def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
 
 
 def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
-    """Return the body of an arm that is not designed here: rigid, or from a file."""
+    """Return the body of an arm that is not designed here: rigid, or from a file.
+
+    What a file holds of geometric stiffness counts unless the scene says stiffening = false.
+    """
     arm = scene.arms[index]
     if arm.sid is not None:
-        return _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
+        body = _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
+        unwanted = body.is_stiffened and scene.simulation.stiffening is False
+        return linear_part(body) if unwanted else body
     mass = arm.mass
     if mass is None:
         mass = scene.material_of(index).density * arm.length * arm.height * arm.thickness

@@ -38,22 +38,29 @@ def export(
 ) -> None:
     """Write the reduced arms of SCENE for other multibody codes.
 
-    Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem).
+    Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
+    geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
     """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.disk import write_arrays, write_text
     from dolfinopt.exchange.sid import sid_arrays, sid_text
     from dolfinopt.multibody.mbdyn import fem_text
-    from dolfinopt.parallel import gather_arms
+    from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.order_selection import choose_coordinates
+    from dolfinopt.responses.stiffening import decide_stiffening
+    from dolfinopt.scene.load import pose_scenarios
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
     claim(world, folder, overwrite, names)
     partition, arms, x_phys = design_of(world, loaded, design, Profile())
     prepare(world, folder)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))
+    with together(world):
+        for k, arm in arms.items():
+            arm.set_design(x_phys[k])
+    decide_stiffening([loaded, *pose_scenarios(loaded)], partition, arms)
     exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(partition, exported)
     if world.rank != 0:
@@ -66,9 +73,10 @@ def export(
         write_text(folder / f"{arm.name}.sid", sid_text(data))
         write_arrays(folder / f"{arm.name}.sid.npz", sid_arrays(data))
         write_text(folder / f"{arm.name}.fem", fem_text(element))
+        stiffness = ", geometric stiffness" if len(element.loads) else ""
         click.echo(
             f"{arm.name}: {data.mass:.6g} kg, {data.num_modes} coordinates, "
-            f"{len(element.labels)} nodes; in {folder / arm.name}.sid, .sid.npz, .fem"
+            f"{len(element.labels)} nodes{stiffness}; in {folder / arm.name}.sid, .sid.npz, .fem"
         )
 
 

@@ -53,7 +53,14 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
             if arm.sid is not None:
                 from dolfinopt.arms.arm import fixed_body
 
-                fixed_body(scene, index)
+                body = fixed_body(scene, index)
+                if scene.simulation.stiffening is True and not body.is_stiffened:
+                    warn(
+                        [
+                            f"{arm.sid} holds no geometric stiffness, which simulation.stiffening "
+                            f"= true asks for: arm {arm.name!r} is linear"
+                        ]
+                    )
         warn(implausible(scene))
         return scene
 

@@ -4,7 +4,23 @@ Record groups 1, 2 and 5 to 13 of MBDyn's input manual, "Modal element": header,
 coordinates, mode shapes, modal mass and stiffness, diagonal of the lumped mass matrix, global
 inertia, modal damping. MBDyn makes its coupling invariants of the lumped masses; total mass, centre
 of mass and inertia (group 12), modal mass, stiffness and damping are the consistent ones.
-Source: Masarati, MBDyn input file format, and the reader in MBDyn's mbdyn/struct/modal.cc.
+
+Group 19, of stiffened bodies, has their number and then one matrix K_i for every load, each behind
+the load's place in this list, counted from one: products of the angular velocity w1^2, w2^2, w3^2,
+w1 w2, w2 w3, w3 w1, angular acceleration 1 to 3, acceleration 1 to 3 (less gravity), then force and
+moment 1 to 3 of every interface node in the order of the joint's input. All in the body's frame.
+MBDyn's modal rows become (M qdd + ... + K q) + sum_i p_i K_i q of its motion and - f_i K_i q of the
+force and moment f that the joint exerts on the interface node. With the loads and signs of
+`ShapeIntegrals` that is, in the plane,
+
+    3: w3^2, K0_-ww   9: w3', -K0_wd   10, 11: a, -K0_ax, -K0_ay   13, 14, 18: f, K0_Fx, K0_Fy, K0_T
+
+The outboard interface, node 2, must be the joint's first interface node; the inboard one is the
+modal node itself. MBDyn uses the group with `use automatic differentiation;` in the control data,
+and needs the joint's `use invariant 9` for the -w^2 M q that stiffening outweighs. Its interface
+moves linearly in q: the displacement of the second order, -1/2 q'K0 q, is not in this format.
+Source: Masarati, MBDyn input file format, and the reader in MBDyn's mbdyn/struct/modal.cc, of
+group 19 modalad.cc.
 """
 
 from __future__ import annotations
@@ -40,7 +56,11 @@ _TITLES = {
     11: "DIAGONAL OF LUMPED MASS MATRIX",
     12: "GLOBAL INERTIA",
     13: "MODAL DAMPING MATRIX",
+    19: "MODAL STRESS STIFFENING MATRIX",
 }
+STIFFENING = 19  # the group that linear bodies do not have
+# Place in MBDyn's list and sign of K0 and K0_outboard: a_x, a_y, wd, -w^2, F_x, F_y, T.
+_LOADS = ((10, -1.0), (11, -1.0), (9, -1.0), (3, 1.0), (13, 1.0), (14, 1.0), (18, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +76,9 @@ class ModalElement:
         mass: kg.
         centre: (3,) of mass, m.
         inertia: (3, 3) about the centre of mass, kg m2.
+        loads: (k,) places of the loads that stiffen the body in group 19's list, ascending; none
+            of a linear body.
+        stiffening: (k, q, q) their matrices, MBDyn's signs.
     """
 
     labels: tuple[str, ...]
@@ -68,6 +91,8 @@ class ModalElement:
     mass: float
     centre: np.ndarray
     inertia: np.ndarray
+    loads: np.ndarray
+    stiffening: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +149,7 @@ def modal_element(
     inertia = np.diag([yy + moments.depth, xx + moments.depth, body.inertia])
     inertia[0, 1] = inertia[1, 0] = -xy
     inertia -= body.mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    loads, stiffening = _stiffening(body)
     return ModalElement(
         labels=tuple(str(k) for k in range(1, count + 1)),
         points=points,
@@ -135,7 +161,17 @@ def modal_element(
         mass=body.mass,
         centre=centre,
         inertia=inertia,
+        loads=loads,
+        stiffening=stiffening,
     )
+
+
+def _stiffening(body: ShapeIntegrals) -> tuple[np.ndarray, np.ndarray]:
+    """Return places (k,) and matrices (k, q, q) of group 19; k = 0 of a linear body."""
+    K0 = np.concatenate([body.K0, body.K0_outboard])
+    places, signs = np.array(_LOADS[: len(K0)]).reshape(-1, 2).T
+    order = np.argsort(places)
+    return places[order].astype(int), (signs[:, None, None] * K0)[order]
 
 
 # -- writing ---------------------------------------------------------------------------------
@@ -172,6 +208,11 @@ def fem_text(element: ModalElement) -> str:
     inertia = [*_rows(np.array([[element.mass]])), *_rows(element.centre[None])]
     group(12, [*inertia, *_rows(element.inertia)])
     group(13, _rows(element.D))
+    if len(element.loads):
+        matrices = [str(len(element.loads))]
+        for load, matrix in zip(element.loads, element.stiffening, strict=True):
+            matrices += [str(load), *_rows(matrix)]
+        group(STIFFENING, matrices)
     return "\n".join(lines) + "\n"
 
 
@@ -185,7 +226,8 @@ def _rows(values: np.ndarray) -> list[str]:
 def read_fem(path: Path) -> ModalElement:
     """Read a .fem file with the record groups that `write_fem` writes.
 
-    Groups may come in any order after the first; others are passed over.
+    Groups may come in any order after the first; others are passed over. Without group 19 the body
+    is linear.
 
     Raises:
         InputError: one line with the file, the group and what is wrong.
@@ -205,7 +247,7 @@ def read_fem(path: Path) -> ModalElement:
             groups[number] = []
         elif number and not line.startswith("**"):
             groups[number] += line.split()
-    missing = [k for k in _TITLES if k not in groups]
+    missing = [k for k in _TITLES if k not in groups and k != STIFFENING]
     if missing:
         raise InputError(f"{path}: record group {missing[0]}, {_TITLES[missing[0]]}, is missing")
     return _element(path, groups)
@@ -234,6 +276,18 @@ def _element(path: Path, groups: dict[int, list[str]]) -> ModalElement:
             raise InputError(f"{path}: record group {group}: {error}") from None
         return values.reshape(shape)
 
+    stride = 1 + q * q
+    loads, stiffening = np.zeros(0, dtype=int), np.zeros((0, q, q))
+    if STIFFENING in groups:
+        words = groups[STIFFENING]
+        known = int(words[0]) if words and words[0].isdecimal() else 0
+        table = numbers(STIFFENING, 1 + known * stride)[1:].reshape(known, stride)
+        loads, stiffening = table[:, 0].astype(int), table[:, 1:].reshape(known, q, q)
+        if not known or (loads != table[:, 0]).any() or loads.min() < 1:
+            raise InputError(
+                f"{path}: record group {STIFFENING} must hold a number of matrices >= 1 and, "
+                "before each of them, the place of its load, an integer >= 1"
+            )
     inertia = numbers(12, 13)
     return ModalElement(
         labels=tuple(groups[2]),
@@ -246,4 +300,6 @@ def _element(path: Path, groups: dict[int, list[str]]) -> ModalElement:
         mass=float(inertia[0]),
         centre=inertia[1:4],
         inertia=inertia[4:].reshape(3, 3),
+        loads=loads,
+        stiffening=stiffening,
     )

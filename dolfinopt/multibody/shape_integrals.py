@@ -160,14 +160,18 @@ def plane_body(
     D: np.ndarray,
     outboard: np.ndarray,
     outboard_point: np.ndarray,
+    K0: np.ndarray | None = None,
 ) -> ShapeIntegrals:
-    """Return a plane body from its integrals by name, see `ShapeIntegrals`."""
+    """Return a plane body from its integrals by name, see `ShapeIntegrals`.
+
+    K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
+    """
     q = len(K)
     W = np.zeros((2, 1 + q, 1 + q))
     W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
     W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
-    w, linear = np.column_stack([moment, C]), np.zeros((0, q, q))
-    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point, linear, linear)
+    w, K0 = np.column_stack([moment, C]), np.zeros((0, q, q)) if K0 is None else K0
+    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:])
 
 
 # -- what follows from the table -------------------------------------------------------------
@@ -406,11 +410,15 @@ def padded(by: ShapeIntegrals, like: ShapeIntegrals) -> ShapeIntegrals:
     return replace(whole, K0=none, K0_outboard=outboard)
 
 
+def linear_part(body: ShapeIntegrals) -> ShapeIntegrals:
+    """Return the body without geometric stiffness."""
+    linear = np.zeros((0, body.num_modes, body.num_modes))
+    return replace(body, K0=linear, K0_outboard=linear)
+
+
 def rigid_part(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body with its elastic coordinates held at zero."""
-    linear = np.zeros((0, body.num_modes, body.num_modes))
-    held = replace(body, K0=linear, K0_outboard=linear)
-    return in_basis(held, np.zeros((body.num_modes, 0)))
+    return in_basis(linear_part(body), np.zeros((body.num_modes, 0)))
 
 
 def first_frequency(body: ShapeIntegrals) -> float:

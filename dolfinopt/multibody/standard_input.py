@@ -3,6 +3,19 @@
 Motion is in x-y, rotation about z. What the planar equations know goes into its places in the
 spatial matrices bit by bit, so that body -> SID -> body is exact. What only a spatial code asks for
 (rotation about x and y, centrifugal forces of such rotation) comes from `SpatialMoments`.
+
+Geometric stiffness K0_p of the loads p = (a_x, a_y, wd, -w^2, F_x, F_y, T), see `ShapeIntegrals`,
+is what the matrices of the first order lose: with every load's work C q, r q, ..., 1/2 q'K0_p q,
+
+    Ct(q)  = C' - K0_ax q, K0_ay q in columns 1, 2        Cr(q)  = r + G q - K0_wd q in column 3
+    Oe(q)  = -j - M q + K0_-ww q in column 3              Gr(q)  = 2 (j + M q - K0_-ww q) at (3, 3)
+    phi(q) = B - q'K0_Fx, q'K0_Fy of the outboard node    psi(q) = theta - q'K0_T of its rotation
+
+(Wallrapp 1994, doi:10.1080/08905459408905214: K0t, K0r, K0omega, K0F and K0M; `ksigma`,
+stresses without a load, is zero.) Motion of the second order is not in the format: mdCM(q) and
+origin(q) lack -1/2 q'K0_p q, force and moment -qd'K0_p qd; a body read back has them again. Nor
+does a plane body know what stiffens it out of its plane: by a_z, rotation about x and y, F_z, T_x
+and T_y the matrices are those of a linear body, as those of all nodes but the outboard one are.
 """
 
 from __future__ import annotations
@@ -65,11 +78,14 @@ class PlaneNode:
         name: other than "1" and "2".
         point: (2,) reference position, m.
         motion: (3, q) u_x, u_y, theta by each coordinate.
+        K0: (3, q, q) geometric stiffness by unit forces and moment at the node; None, or
+            (0, q, q), of a linear body.
     """
 
     name: str
     point: np.ndarray
     motion: np.ndarray
+    K0: np.ndarray | None = None
 
 
 def spatial_moments(arm: ElasticArm, basis: Basis, thickness: float) -> SpatialMoments:
@@ -138,7 +154,8 @@ def to_sid(
     """
     q = body.num_modes
     held = PlaneNode("1", np.zeros(2), np.zeros((3, q)))
-    nodes = (held, *further, PlaneNode("2", body.outboard_point, body.outboard))
+    tip = PlaneNode("2", body.outboard_point, body.outboard, body.K0_outboard)
+    nodes = (held, *further, tip)
     frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
     names = tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1))
     moments = moments or slender_moments(body)
@@ -168,12 +185,16 @@ def _node(node: PlaneNode, q: int) -> Node:
     origin[:2, 0], phi[:2], psi[2] = node.point, node.motion[:2], node.motion[2]
     turn = np.zeros((3, q, 3))  # tilde(psi_k)
     turn[0, :, 1], turn[1, :, 0] = 0.0 - psi[2], psi[2]
+    phi_q = psi_q = None
+    if node.K0 is not None and len(node.K0):
+        phi_q, psi_q = np.zeros((3, q, q)), np.zeros((3, q, q))
+        phi_q[:2], psi_q[2] = 0.0 - node.K0[:2], 0.0 - node.K0[2]
     return Node(
         name=node.name,
         rframe="body ref",
         origin=taylor(origin, phi[:, :, None].copy(), nq=q, structure=GENERAL),
-        phi=taylor(phi, nq=q, structure=GENERAL),
-        psi=taylor(psi, nq=q, structure=GENERAL),
+        phi=taylor(phi, phi_q, nq=q, structure=GENERAL),
+        psi=taylor(psi, psi_q, nq=q, structure=GENERAL),
         AP=taylor(np.eye(3), turn, nq=q, structure=GENERAL if turn.any() else UNIT),
     )
 
@@ -204,6 +225,8 @@ def _rigid_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
         gyroscopic_q[i, :, :, other] = 0.0 - 2.0 * mixed[other, i]
     gyroscopic[2, :, 2] = 2.0 * body.j
     gyroscopic_q[2, :, :, 2] = 2.0 * body.M
+    if body.is_stiffened:
+        gyroscopic_q[2, :, :, 2] -= 2.0 * body.K0[3]
     return {
         "mdCM": taylor(centre, centre_q, nq=q, structure=GENERAL),
         "J": taylor(inertia, inertia_q, nq=q, structure=GENERAL),
@@ -234,8 +257,14 @@ def _elastic_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
         centrifugal_q[:, :, c] = 0.0 - columns_q[c]
     centrifugal[:, 3] = first[0, 1] + first[1, 0]
     centrifugal_q[:, :, 3] = mixed[0, 1] + mixed[1, 0]
+    push_q = None
+    if body.is_stiffened:
+        push_q = np.zeros((q, q, 3))
+        push_q[:, :, :2] = 0.0 - body.K0[:2].transpose(1, 2, 0)
+        turn_q[:, :, 2] -= body.K0[2]
+        centrifugal_q[:, :, 2] += body.K0[3]
     return {
-        "Ct": taylor(push, nq=q, structure=GENERAL),
+        "Ct": taylor(push, push_q, nq=q, structure=GENERAL),
         "Cr": taylor(turn, turn_q, nq=q, structure=GENERAL),
         "Ge": taylor(coriolis.reshape(q, 3 * q), nq=q, structure=GENERAL),
         "Oe": taylor(centrifugal, centrifugal_q, nq=q, structure=GENERAL),
@@ -285,14 +314,14 @@ def from_sid(
 
     Raises:
         InputError: one line: no such node, a frame that is not held at the inboard node, motion
-            out of the plane, initial stresses or geometric stiffening, matrices that are no
-            mechanical body's.
+            out of the plane, initial stresses, geometric stiffening by some loads only, matrices
+            that are no mechanical body's.
     """
     first, last = _ends(data, inboard, outboard, source)
     _check_nodes(data, first, last, source)
     _check_plane(data, source)
     _check_definite(data, source)
-    _check_stiffening(data, source)
+    _check_stresses(data, source)
     G, M = 0.5 * data.Ge.M0[:, 2::3], data.Me.M0
     if np.abs(G + G.T).max() > PLANAR * np.abs(M).max():
         raise InputError(f"{source}: the columns 3, 6, ... of Ge must be a skew matrix")
@@ -309,6 +338,7 @@ def from_sid(
         D=data.De.M0.copy(),
         outboard=np.vstack([last.phi.M0[:2], last.psi.M0[2]]),
         outboard_point=last.origin.M0[:2, 0].copy(),
+        K0=_geometric_stiffness(data, last, source),
     )
 
 
@@ -388,21 +418,47 @@ def _check_definite(data: StandardInputData, source: str) -> None:
             )
 
 
-def _check_stiffening(data: StandardInputData, source: str) -> None:
-    """Check that there are no initial stresses and no geometric stiffening."""
-    zero = {
-        "ksigma": data.ksigma.M0,
-        "m1 of Ct": data.Ct.M1,
-        "m1 of Ke": data.Ke.M1,
-        **{f"m1 of phi of node {node.name}": node.phi.M1 for node in data.nodes},
+def _check_stresses(data: StandardInputData, source: str) -> None:
+    """Check that there are no initial stresses, and that the stiffness is one matrix."""
+    for name, values in (("ksigma", data.ksigma.M0), ("m1 of Ke", data.Ke.M1)):
+        if values.any():
+            raise InputError(
+                f"{source}: {name} holds initial stresses or a stiffness that is not constant, "
+                "which arms do not have here; write the file without"
+            )
+
+
+def _geometric_stiffness(data: StandardInputData, last: Node, source: str) -> np.ndarray | None:
+    """Return K0 (7, q, q) of the seven loads in the plane, None if the body is linear.
+
+    All or none of them: a body that its own inertia stiffens, but no load at its outboard node, or
+    the other way round, is taken for one whose file lacks matrices.
+    """
+    q = data.num_modes
+    excess = data.Oe.M1[:, :, 2] + data.Me.M0 if data.Oe.order > 0 else np.zeros((q, q))
+    rotation = np.abs(excess).max(initial=0.0) > CENTRIFUGAL * np.abs(data.Me.M0).max(initial=0.0)
+    found = {
+        "m1 of Ct": bool(data.Ct.M1[:, :, :2].any()),
+        "m1 of Oe beyond -Me": bool(rotation),
+        f"m1 of phi of node {last.name}": bool(last.phi.M1[:2].any()),
     }
-    present = [name for name, values in zero.items() if values.any()]
-    if data.Oe.order > 0:
-        excess = np.abs(data.Oe.M1[:, :, 2] + data.Me.M0).max()
-        if excess > CENTRIFUGAL * np.abs(data.Me.M0).max():
-            present.append("m1 of Oe beyond -Me")
-    if present:
+    if not any(found.values()):
+        return None
+    if lacking := [name for name, present in found.items() if not present]:
+        present = next(name for name in found if found[name])
         raise InputError(
-            f"{source}: {present[0]} holds initial stresses or geometric stiffening, which arms do "
-            "not have here; write the file without"
+            f"{source}: {present} holds geometric stiffening, which {lacking[0]} lacks; write the "
+            "file with that of all accelerations and of the outboard node's forces, or with none"
         )
+    push = list(data.Ct.M1.transpose(2, 0, 1)[:2])
+    tip = [*last.phi.M1[:2], last.psi.M1[2] if last.psi.order else np.zeros((q, q))]
+    for name, matrices in (("Ct", push), (f"phi, psi of node {last.name}", tip)):
+        for matrix in matrices:
+            if np.abs(matrix - matrix.T).max() > PLANAR * np.abs(matrix).max():
+                raise InputError(
+                    f"{source}: m1 of {name} must be symmetric in coordinates and rows or columns: "
+                    "it is the geometric stiffness of one load"
+                )
+    turn = data.Cr.M1[:, :, 2] if data.Cr.order else np.zeros((q, q))  # its skew part is G
+    K0 = 0.0 - np.array([*push, turn, 0.0 - excess, *tip])
+    return 0.5 * (K0 + K0.transpose(0, 2, 1))

@@ -455,3 +455,22 @@ def test_help_and_version():
     for command in ("optimize", "simulate", "gradient", "plot"):
         assert command in done.stdout
     assert shell("--version").stdout.startswith("dolfinopt")
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("stiffening", ["false", "true"])
+def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening):
+    """A scene that asks for it hears that the file has none; a file that has it is no news."""
+    small = overrides("arms.cells=[20,3]", f"simulation.stiffening={stiffening}")
+    run("export", TWO_ARM, *small, "--out", tmp_path / "bodies")
+    text = (
+        Path(TWO_ARM)
+        .read_text()
+        .replace('name = "arm2"', f'name = "arm2"\nsid = "{tmp_path}/bodies/arm2.sid"')
+    )
+    (tmp_path / "scene.toml").write_text(text)
+    asked = overrides("arms.arm1.cells=[20,3]", "simulation.stiffening=true")
+    capsys.readouterr()
+    run("export", tmp_path / "scene.toml", *asked, "--out", tmp_path / "out")
+    told = capsys.readouterr().err
+    assert ("arm2.sid holds no geometric stiffness" in told) == (stiffening == "false")

@@ -1,18 +1,23 @@
 """MBDyn's modal element: format, lumped against consistent inertia; the command `export`."""
 
 import os
+from copy import deepcopy
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tomllib
 from mpi4py import MPI
 from runs import TWO_ARM
 
+from dolfinopt import Model
 from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import LagrangeElement
+from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mbdyn import (
     ModalElement,
@@ -33,7 +38,7 @@ LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.02  # m
 PLACING = 1e-10
 
 
-def reduced(cells, comm=MPI.COMM_SELF, uneven=False):
+def reduced(cells, comm=MPI.COMM_SELF, uneven=False, stiffened=False):
     """Return the body, its moments and nodes; nodes are None but on the first rank."""
     mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
     substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Profile())
@@ -43,7 +48,7 @@ def reduced(cells, comm=MPI.COMM_SELF, uneven=False):
         x = 0.5 + 0.4 * np.sin(30.0 * place[:, 0] + 170.0 * place[:, 1])
     elastic = substructure.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(4))
-    body = shape_integrals(elastic, basis, 2e-4)
+    body = shape_integrals(elastic, basis, 2e-4, unit_loads(elastic) if stiffened else None)
     return body, spatial_moments(elastic, basis, THICKNESS), lumped_nodes(elastic, basis)
 
 
@@ -63,6 +68,53 @@ def test_round_trip_is_exact(tmp_path, element):
     for field in fields(ModalElement):
         ours, theirs = getattr(element, field.name), getattr(again, field.name)
         assert np.shape(ours) == np.shape(theirs) and np.array_equal(ours, theirs), field.name
+
+
+@pytest.fixture(scope="module")
+def stiff_parts():
+    return reduced((8, 3), uneven=True, stiffened=True)
+
+
+@pytest.fixture(scope="module")
+def stiff_element(stiff_parts):
+    return modal_element(*stiff_parts, THICKNESS)
+
+
+def test_round_trip_of_a_stiffened_body_is_exact(tmp_path, stiff_element):
+    test_round_trip_is_exact(tmp_path, stiff_element)
+    assert len(stiff_element.loads) == 7
+
+
+def mbdyn_stiffening(groups, a, w, wd, force, moment):
+    """Return what MBDyn adds to the modal stiffness (left-hand side), by the steps of modalad.cc.
+
+    Args:
+        groups: as read.
+        a, w, wd: (3,) acceleration less gravity, angular velocity and acceleration, body frame.
+        force, moment: (3,) that the joint exerts on its first interface node.
+    """
+    products = [w[0] ** 2, w[1] ** 2, w[2] ** 2, w[0] * w[1], w[1] * w[2], w[2] * w[0]]
+    factors = np.concatenate([products, wd, a, -force, -moment])
+    return sum(factors[load - 1] * matrix for load, matrix in groups[19])
+
+
+def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
+    """Any motion in the plane, force and moment outboard: rows lose sum_p p K0_p q."""
+    body = stiff_parts[0]
+    rng = np.random.default_rng(0)
+    a, force = np.append(rng.normal(size=(2, 2)), [[0.0], [0.0]], axis=1)
+    w, wd, moment = np.zeros((3, 3))
+    w[2], wd[2], moment[2] = rng.normal(size=3)
+    p = np.array([a[0], a[1], wd[2], -(w[2] ** 2), force[0], force[1], moment[2]])
+    K0 = np.concatenate([body.K0, body.K0_outboard])
+    groups = read_as_mbdyn_does(fem_text(stiff_element))
+    found = mbdyn_stiffening(groups, a, w, wd, force, moment)
+    np.testing.assert_allclose(found, -np.tensordot(p, K0, 1), atol=1e-12 * np.abs(found).max())
+    # Rotation stiffens a slender beam, and so does a pull at its end: the joint gives -pull.
+    still = np.zeros(3)
+    for load in ({"w": w}, {"force": np.array([-1.0, 0.0, 0.0])}):
+        all_loads = {"a": still, "w": still, "wd": still, "force": still, "moment": still, **load}
+        assert mbdyn_stiffening(groups, **all_loads)[1, 1] > 0.0
 
 
 def read_as_mbdyn_does(text):
@@ -117,6 +169,10 @@ def read_as_mbdyn_does(text):
             groups[8] = np.array(shapes)
         else:
             square, nodal = (modes, modes), (count,)
+            if group == 19:
+                count = int(words(1)[0])
+                groups[19] = [(int(words(1)[0]), numbers(*square)) for _ in range(count)]
+                continue
             shape = {5: nodal, 6: nodal, 7: nodal, 11: (count, 6), 12: (13,)}.get(group, square)
             groups[group] = numbers(*shape)
     return groups
@@ -250,6 +306,18 @@ def test_damaged_file(tmp_path, element, old, new, words):
         assert word in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("MATRIX\n7\n", "MATRIX\n6\n", ["record group 19 has 120 numbers, expected 103"]),
+        ("MATRIX\n7\n3\n", "MATRIX\n7\n3.5\n", ["record group 19", "an integer >= 1"]),
+        ("MATRIX\n7\n", "MATRIX\nx\n", ["record group 19 has 120 numbers, expected 1"]),
+    ],
+)
+def test_damaged_stiffening(tmp_path, stiff_element, old, new, words):
+    test_damaged_file(tmp_path, stiff_element, old, new, words)
+
+
 def test_no_file(tmp_path):
     with pytest.raises(InputError, match=r"none\.fem: cannot be read"):
         read_fem(tmp_path / "none.fem")
@@ -283,6 +351,45 @@ def test_export_writes_every_arm(shared_tmp_path):
         assert np.array_equal(element.K, body.K) and np.array_equal(element.M, body.M)
         assert element.mass == body.mass and len(element.labels) == 21 * 4 + 2
         assert np.array_equal(element.points[1, :2], body.outboard_point)
+
+
+@pytest.mark.parametrize(
+    ("stiffening", "duration", "on"),
+    [("true", 1.9, True), ("false", 0.9, False), ("auto", 1.9, False), ("auto", 0.9, True)],
+)
+def test_export_with_geometric_stiffness(shared_tmp_path, stiffening, duration, on):
+    """Where the scene says so, or its motion; a scene that takes the file's arm moves the same."""
+    value = stiffening if stiffening != "auto" else '"auto"'
+    fast = ["--set", f"motion.duration={duration}", "--set", f"simulation.stiffening={value}"]
+    export(shared_tmp_path / "out", *fast)
+    for arm in ("arm1", "arm2"):
+        path = shared_tmp_path / "out" / f"{arm}.sid"
+        assert load_body(path).is_stiffened == on
+        assert len(read_fem(path.with_suffix(".fem")).loads) == 7 * on
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("stiffening", [True, False])
+def test_motion_of_exported_arms(tmp_path, stiffening):
+    """Arms from stiffened files move as the designed ones; as linear ones if the scene says so."""
+    export(tmp_path, "--set", "simulation.stiffening=true")
+    designed = tomllib.loads(Path(TWO_ARM).read_text())
+    designed["simulation"]["stiffening"] = stiffening
+    designed["motion"]["duration"] = 1.2
+    taken = deepcopy(designed)
+    for scene in (designed, taken):
+        scene["arms"][1] = dict(scene["arms"][0], name="arm2", length=0.8)
+    for arm in designed["arms"]:
+        arm["cells"] = [20, 3]
+    for arm in taken["arms"]:
+        arm["sid"] = str(tmp_path / f"{arm['name']}.sid")
+        del arm["cells"], arm["passive"]
+    for k in (0, 1):  # one arm must be designed
+        mixed = deepcopy(designed)
+        mixed["arms"][k] = taken["arms"][k]
+        found, expected = (Model(scene).simulate().trajectory for scene in (mixed, designed))
+        scale = np.abs(expected.deviation).max()
+        assert np.abs(found.deviation - expected.deviation).max() < 1e-6 * scale
 
 
 def test_export_is_the_same_on_any_number_of_ranks(shared_tmp_path):

@@ -8,15 +8,23 @@ import pytest
 from bodies import Cloud, assert_close, beam, random_cloud
 from mpi4py import MPI
 
+from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import Taylor, read_sid, read_sid_npz, write_sid, write_sid_npz
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import LagrangeElement
+from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, shape_integrals
+from dolfinopt.multibody.shape_integrals import (
+    TABLE,
+    ShapeIntegrals,
+    linear_part,
+    shape_integrals,
+)
 from dolfinopt.multibody.standard_input import (
     PlaneNode,
     SpatialMoments,
@@ -58,6 +66,23 @@ def same(body: ShapeIntegrals, other: ShapeIntegrals) -> None:
         assert a.shape == b.shape and np.array_equal(a, b), one.name
 
 
+def stiffened(body: ShapeIntegrals, seed: int) -> ShapeIntegrals:
+    """Return the body with some geometric stiffness by all seven loads."""
+    q = body.num_modes
+    K0 = np.random.default_rng(seed).normal(size=(7, q, q))
+    K0 += K0.swapaxes(1, 2)
+    return replace(body, K0=K0[:4], K0_outboard=K0[4:])
+
+
+def close(body: ShapeIntegrals, other: ShapeIntegrals) -> None:
+    """Assert equality but for the rounding of K0, which Oe and Cr hold in a sum."""
+    linear = {"K0": other.K0, "K0_outboard": other.K0_outboard}
+    same(replace(body, **linear), other)
+    scale = max(np.abs(other.M).max(), np.abs(other.K0).max())
+    assert_close(body.K0, other.K0, ROUNDING, size=float(scale))
+    assert np.array_equal(body.K0_outboard, other.K0_outboard)
+
+
 @pytest.fixture(scope="module")
 def arm():
     mesh = structured_arm(COMM, "arm", 1.2, 0.3, (10, 3))
@@ -66,7 +91,7 @@ def arm():
     x = 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
     elastic = substructure.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(5))
-    return elastic, basis, shape_integrals(elastic, basis, 2e-4)
+    return elastic, basis, shape_integrals(elastic, basis, 2e-4, unit_loads(elastic))
 
 
 @pytest.mark.parametrize("q", [1, 4])
@@ -90,7 +115,20 @@ def test_round_trip_of_an_arm_is_exact(tmp_path, arm):
     elastic, basis, body = arm
     data = to_sid(body, spatial_moments(elastic, basis, THICKNESS))
     write_sid(tmp_path / "arm.sid", data)
-    same(load_body(tmp_path / "arm.sid", length=1.2), body)
+    close(load_body(tmp_path / "arm.sid", length=1.2), body)
+
+
+@pytest.mark.parametrize("q", [1, 4])
+@pytest.mark.parametrize("known", [True, False])
+def test_round_trip_of_geometric_stiffness(tmp_path, q, known):
+    cloud = random_cloud(np.random.default_rng(q), q)
+    body = stiffened(symmetric(cloud.body()), q)
+    data = to_sid(body, cloud_moments(cloud, 0.1) if known else None)
+    close(from_sid(data), body)
+    write_sid(tmp_path / "a.sid", data)
+    close(load_body(tmp_path / "a.sid"), body)
+    write_sid_npz(tmp_path / "a.sid.npz", data)
+    close(from_sid(read_sid_npz(tmp_path / "a.sid.npz")), body)
 
 
 # -- forces ----------------------------------------------------------------------------------
@@ -214,6 +252,66 @@ def test_plane_forces_are_the_planar_ones(known):
     assert_close(drives[0], [force[0], moment[2]], ROUNDING)
 
 
+def test_stiffened_forces_are_the_planar_ones():
+    """Rows of any motion and outboard load; force and moment but for -qd'K0 qd and -1/2 q'K0 q.
+
+    The format has no place for them: they vanish in a body that moves about q = 0 with qd = 0.
+    """
+    rng = np.random.default_rng(11)
+    cloud, s = random_cloud(rng, 3), random_state(rng, 3, plane=True)
+    body = stiffened(symmetric(cloud.body()), 5)
+    data = to_sid(body, cloud_moments(cloud, 0.3))
+    a, w, g = s.a[:2], s.w[2], s.g[2]
+    none = np.zeros((1, 2))
+    motion = RigidMotion(none, np.array([[0.0, w]]), np.array([[0.0, g]]))
+
+    def planar(q, qd, payload=0.0):
+        gravity = (-a[0], -a[1])
+        machine = Mechanism((from_sid(data),), payload, 0.0, gravity, 0.0)
+        rows, drives = inverse_dynamics(machine, motion, q[None], qd[None], s.qdd[None])
+        return rows[0] - body.K @ q - body.D @ qd, drives[0]
+
+    _, _, rows = forces_of_sid(data, s)
+    found = planar(s.q, s.qd)[0]
+    assert_close(found, rows, ROUNDING, size=10.0 * float(np.abs(rows).max()))
+    # A force at the node does work on phi(q): what the payload's adds to the rows.
+    tip = data.nodes[-1]
+    phi, psi = tip.phi.at(s.q)[:2], tip.psi.at(s.q)[2]
+    stretched = body.outboard - np.einsum("pkl,k->pl", body.K0_outboard, s.q)
+    assert_close(np.vstack([phi, psi]), stretched, ROUNDING)
+    # The linear terms of force and moment: small coordinates at rest.
+    rest, small = np.zeros(3), 1e-7 * s.q
+    state = replace(s, q=small, qd=rest)
+    force, moment, _ = forces_of_sid(data, state)
+    assert_close(planar(small, rest)[1], [force[0], moment[2]], 1e-11)
+
+
+def test_stiffened_body_of_a_file_moves_the_same(tmp_path):
+    """A beam that is spun up, from its file: the motion of the body that was written."""
+    mesh = structured_arm(MPI.COMM_SELF, "beam", 1.0, 0.01, (40, 2))
+    operators = LagrangeElement().operators(mesh, 0.01, 0.0)
+    one = np.ones(mesh.num_cells)
+    elastic = Substructure(mesh, operators, Profile()).at(70e9 * one, 2700.0 * one)
+    basis = craig_bampton(elastic, Options(4))
+    body = shape_integrals(elastic, basis, 1e-3, unit_loads(elastic))
+    write_sid(tmp_path / "beam.sid", to_sid(body))
+
+    def deflection(body):
+        def motion(t):
+            zero = np.zeros_like(t)
+            columns = [np.stack([zero, 20.0 * t**k / k], axis=1) for k in (2, 1)]
+            return RigidMotion(columns[0], columns[1], np.stack([zero, 20.0 + zero], axis=1))
+
+        machine = Mechanism((body,), 0.1, 0.0, (0.0, 0.0), 0.0)
+        system = ElasticSystem(machine, motion, (0.0, 1.0))
+        return radau.integrate(system, 1e-6, 4, Profile()).sample(np.linspace(0.0, 1.0, 101), 0)
+
+    written = deflection(body)
+    assert_close(deflection(load_body(tmp_path / "beam.sid")), written, 1e-9)
+    linear = deflection(linear_part(body))
+    assert np.abs(linear - written).max() > 0.1 * np.abs(written).max()
+
+
 def test_names_hold_frequencies():
     """sqrt(K / M) of a bar in bending and in tension; other programs read it in Hz."""
     body = beam().body()
@@ -291,9 +389,9 @@ def swap(data, name, which="M0", **entries):
     return replace(data, **{name: replace(matrix, **{which: values, "order": order})})
 
 
-def node(data, place, name, **entries):
+def node(data, place, name, which="M0", **entries):
     nodes = list(data.nodes)
-    nodes[place] = swap(nodes[place], name, **entries)
+    nodes[place] = swap(nodes[place], name, which, **entries)
     return replace(data, nodes=tuple(nodes))
 
 
@@ -313,8 +411,23 @@ REFUSED = {
     "Ct": (lambda d: swap(d, "Ct", r13=0.1), ["column 3 of Ct"]),
     "Cr": (lambda d: swap(d, "Cr", r11=0.1), ["columns 1, 2 of Cr"]),
     "stress": (lambda d: swap(d, "ksigma", r11=1.0), ["ksigma", "initial stresses"]),
-    "stiffening": (lambda d: swap(d, "Oe", "M1", r113=0.2), ["Oe", "geometric stiffening"]),
-    "by acceleration": (lambda d: swap(d, "Ct", "M1", r111=0.2), ["m1 of Ct", "stiffening"]),
+    "stiffness": (lambda d: swap(d, "Ke", "M1", r111=1.0), ["m1 of Ke", "not constant"]),
+    "rotation alone": (
+        lambda d: swap(d, "Oe", "M1", r113=0.2),
+        ["m1 of Oe beyond -Me holds geometric stiffening, which m1 of Ct lacks"],
+    ),
+    "without rotation": (
+        lambda d: node(swap(d, "Ct", "M1", r111=0.2), 1, "phi", "M1", r111=0.2),
+        ["m1 of Ct holds geometric stiffening", "m1 of Oe beyond -Me lacks"],
+    ),
+    "without forces": (
+        lambda d: swap(swap(d, "Oe", "M1", r113=0.2), "Ct", "M1", r111=0.2),
+        ["m1 of Ct holds geometric stiffening", "m1 of phi of node 2 lacks"],
+    ),
+    "skew": (
+        lambda d: swap(to_sid(stiffened(from_sid(d), 1)), "Ct", "M1", r121=9.0),
+        ["m1 of Ct", "symmetric"],
+    ),
     "Ge": (lambda d: swap(d, "Ge", r13=0.2), ["Ge", "skew"]),
     "massless": (lambda d: replace(d, mass=0.0), ["mass = 0", "> 0"]),
     "inertia": (lambda d: swap(d, "J", r31=-1.0), ["J(3, 3) = -1"]),
