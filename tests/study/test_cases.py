@@ -71,6 +71,7 @@ def test_name_is_no_part_of_the_key():
         "constraints.first_frequency=1.0",
         "design.initial=0.4",
         "optimizer.max_iterations=4",
+        "control={stiffness=[1e3, 1e3, 1e3], damping=[1.0, 1.0, 1.0]}",
         "scenarios=[{changes=['payload.mass=4']}]",
     ],
 )
@@ -82,7 +83,8 @@ def test_every_table_is_tried_above():
     tried = set(scene_content(scene()))
     assert tried == {
         "material", "interpolation", "arms", "motion", "payload", "damping", "reduction",
-        "simulation", "objective", "constraints", "design", "optimizer", "scenarios",
+        "simulation", "objective", "constraints", "design", "optimizer", "scenarios", "control",
+        "closure",  # a table like the others, which asks for another motion
     }  # fmt: skip
 
 
