@@ -115,11 +115,12 @@ class SimulationResult:
 
     def plot_deviation(self) -> Figure | None:
         """Return the figure of the end-effector's distance from its rigid path over time."""
-        from dolfinopt.plots.curves import deviation_figure
+        from dolfinopt.plots.curves import deviation_figure, deviation_title
 
         if self.trajectory is None:
             return None
-        return deviation_figure(self.trajectory.t, self.trajectory.deviation, self._initial())
+        one = self.trajectory
+        return deviation_figure(one.t, one.deviation, self._initial(), deviation_title(one))
 
     def plot_design(self) -> Figure | None:
         """Return the figure of the arms' densities."""
@@ -129,12 +130,17 @@ class SimulationResult:
 
     def plot_machine(self) -> Figure | None:
         """Return the figure of the machine in a few poses along its path."""
-        from dolfinopt.plots.machine import machine_figure
+        from dolfinopt.plots.machine import figure_of
 
         if self.trajectory is None:
             return None
-        one = self.trajectory
-        return machine_figure(self.views, one.mechanism, one.t, one.q_r, self.scene.name)
+        return figure_of(self.views, self.trajectory, self.scene.name)
+
+    def plot_drives(self) -> Figure | None:
+        """Return the figure of the drives' errors and forces, and of what holds a closed loop."""
+        from dolfinopt.plots.drives import drives_figure
+
+        return None if self.trajectory is None else drives_figure(self.trajectory)
 
     def _initial(self) -> np.ndarray | None:
         """Return the deviation (n, 2) of the design to compare with, m."""

@@ -150,9 +150,11 @@ def draw(
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.views import designed
-    from dolfinopt.plots.curves import draw_deviation, draw_history
+    from dolfinopt.plots.curves import deviation_title, draw_deviation, draw_history
     from dolfinopt.plots.design import draw_design
-    from dolfinopt.plots.machine import draw_machine
+    from dolfinopt.plots.drives import draw_drives
+    from dolfinopt.plots.machine import figure_of
+    from dolfinopt.plots.style import save
     from dolfinopt.responses.response import objective_of
 
     minimised = objective_of(scene)
@@ -160,13 +162,19 @@ def draw(
     draw_design(folder / "design.png", designed(views), scene.name)
     if history:
         draw_history(folder / "history.png", history, label)
-    draw_deviation(folder / "deviation.png", trajectory.t, trajectory.deviation, initial)
     mechanism, t, q_r = trajectory.mechanism, trajectory.t, trajectory.q_r
-    draw_machine(folder / "machine.png", views, mechanism, t, q_r, scene.name)
+    desired, closure = trajectory.desired.q if trajectory.is_machine else None, trajectory.closure
+    if closure is None or closure.count == 1:  # a pinned end stays where it is
+        title = deviation_title(trajectory)
+        draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title)
+    if trajectory.is_machine:
+        draw_drives(folder / "drives.png", trajectory)
+    save(figure_of(views, trajectory, scene.name), folder / "machine.png")
     if animation:
         from dolfinopt.plots.animation import draw_motion
 
-        draw_motion(folder / "motion.gif", views, mechanism, t, q_r, trajectory.q_e)
+        film, q_e = folder / "motion.gif", trajectory.q_e
+        draw_motion(film, views, mechanism, t, q_r, q_e, desired=desired, closure=closure)
 
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:

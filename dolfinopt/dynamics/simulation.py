@@ -14,6 +14,7 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.drives import Closure
 from dolfinopt.multibody.end_effector import deviation, end_effector, end_effector_gradient
 from dolfinopt.multibody.interface_jacobian import interface_place
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
@@ -72,12 +73,13 @@ class Trajectory:
     def deviation(self) -> np.ndarray:
         """Flexible minus rigid end-effector (n, 2), m.
 
-        Of free rigid coordinates the end-effector as it moves, less that of the desired motion.
+        Of free rigid coordinates the end-effector as it moves, less that of the desired motion: of
+        a slider along its line; of a pinned end none but the integrator's error.
         """
         if isinstance(self.problem, ElasticSystem):
             return deviation(self.mechanism, self.motion, self.q_e)
         wanted = end_effector(self.mechanism, self.desired, np.zeros_like(self.q_e))
-        return end_effector(self.mechanism, self.motion, self.q_e) - wanted
+        return self.end - wanted
 
     @cached_property
     def compliance(self) -> np.ndarray:
@@ -103,19 +105,48 @@ class Trajectory:
     def joint_forces(self) -> np.ndarray:
         """Drive forces of cart (N) and joints (N m), (n, 1 + arms).
 
-        A fixed base bears the cart's as the horizontal force on the first joint.
+        With control they are the control's. A fixed base bears the cart's as the horizontal force
+        on the first joint; a joint that follows from the others in a closed loop has none.
         """
         if isinstance(self.problem, MachineSystem):
             return self.problem.at(self.t).forces(*self.unknowns)
         qd, qdd = self.unknowns[1:]
         return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
+    @property
+    def is_machine(self) -> bool:
+        """Whether rigid coordinates are unknown: they may differ from the desired ones."""
+        return isinstance(self.problem, MachineSystem)
+
+    @property
+    def closure(self) -> Closure | None:
+        """What holds the last interface of a closed loop, or None."""
+        return self.problem.closure if isinstance(self.problem, MachineSystem) else None
+
     @cached_property
     def closure_force(self) -> np.ndarray | None:
-        """Force of the ground on the closed loop's end along its normals (n, m), N; or None."""
+        """Force of the ground on the closed loop's end along its normals (n, m), N; or None.
+
+        Of a slider along the line's direction turned by +90 degrees, without the given constant
+        force; of a pin along x and y.
+        """
         if not isinstance(self.problem, MachineSystem) or self.problem.closure is None:
             return None
         return self.unknowns[2][:, self.problem.ends[1] :]
+
+    @cached_property
+    def end(self) -> np.ndarray:
+        """Place of the end-effector (n, 2), m, as it moves."""
+        return end_effector(self.mechanism, self.motion, self.q_e)
+
+    @cached_property
+    def slider_position(self) -> np.ndarray | None:
+        """Place of a slider on its line, from the closure's point along its direction (n,), m."""
+        if self.closure is None or self.closure.count != 1:
+            return None
+        x, y = self.end.T
+        along = self.closure.normals[0] / 1j
+        return (np.conj(along) * (x + 1j * y - self.closure.point)).real
 
     @cached_property
     def motion(self) -> RigidMotion:

@@ -25,6 +25,7 @@ RUN_FILES = (
     "design.png",
     "history.png",
     "deviation.png",
+    "drives.png",
     "motion.gif",
     "machine.png",
     CHECKPOINT,

@@ -20,7 +20,13 @@ from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.stiffening import WARN, Stiffening
-from dolfinopt.output.trajectory import drive_units, trajectory_units
+from dolfinopt.output.trajectory import (
+    drive_units,
+    driven_columns,
+    is_driven_freely,
+    rigid_units,
+    trajectory_units,
+)
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import limits_of, summary_of
@@ -182,17 +188,26 @@ def _cost(run: Simulated, wall: float) -> dict[str, Any]:
 
 
 def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
-    """Return masses, drives and residual vibration."""
+    """Return masses, drives and residual vibration; of machines control errors and reactions."""
+    columns = driven_columns(scene)
+
+    def by_drive(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(scene.driven, map(float, values[columns]), strict=True))
+
     peak, rms = trajectory.drives
-    names = list(drive_units(scene))
     bodies = trajectory.mechanism.bodies
-    driven = range(1 if scene.motion.base == "fixed" else 0, len(names))  # a base is no drive
-    return {
+    found = {
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
-        "drive_peak": {names[k]: float(peak[k]) for k in driven},
-        "drive_rms": {names[k]: float(rms[k]) for k in driven},
+        "drive_peak": by_drive(peak),
+        "drive_rms": by_drive(rms),
     }
+    if is_driven_freely(scene):
+        error = np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0)
+        found["drive_error_peak"] = by_drive(error)
+    if trajectory.closure_force is not None:
+        found["closure_force_peak"] = float(np.linalg.norm(trajectory.closure_force, axis=1).max())
+    return found
 
 
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
@@ -200,6 +215,11 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     unit = objective_of(scene).unit
     units: dict[str, Any] = {"objective": unit, **SUMMARY}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
+    if is_driven_freely(scene):
+        rigid = rigid_units(scene)
+        units["drive_error_peak"] = {name: rigid[name] for name in scene.driven}
+    if scene.closure is not None:
+        units["closure_force_peak"] = "N"
     units["history.csv"] = {"objective": unit, **HISTORY}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)

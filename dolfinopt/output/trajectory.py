@@ -32,56 +32,109 @@ def write_trajectory(
         "deviation": trajectory.deviation,
         "compliance": trajectory.compliance,
         "joint_forces": trajectory.joint_forces,
-    }
+    } | _of_machine(trajectory)
     if initial is not None:
         arrays["initial_deviation"] = initial
     scene = trajectory.scene
+    rigid = ", ".join(rigid_units(scene).values())
     units = {
         "t": "s",
-        "q_r": ", ".join(("m", *["rad"] * len(scene.arms))),
+        "q_r": rigid,
+        "q_r_desired": rigid,
         "q_e": "m or rad: times V is a displacement in m",
         "deviation": "m",
         "compliance": "N m",
-        "joint_forces": ", ".join(drive_units(scene).values()),
+        "joint_forces": ", ".join(("N", *["N m"] * len(scene.arms))),
+        "closure_force": "N, " + _directions(scene),
+        "slider_position": "m, from closure.point along closure.direction",
         "initial_deviation": "m",
     }
     arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])
     write_arrays(folder / "trajectory.npz", arrays)
-    distance = np.hypot(*trajectory.deviation.T)
-    table = np.column_stack(
-        [
-            trajectory.t,
-            trajectory.deviation,
-            distance,
-            trajectory.compliance.sum(axis=1),
-            trajectory.q_r,
-            trajectory.q_e,
-            trajectory.compliance,
-            trajectory.joint_forces,
-        ]
-    )
+    table = np.column_stack(_columns(trajectory))
     header = list(trajectory_units(trajectory))
     line = ",".join(["%.10g"] * len(header)) + "\n"
     text = line * len(table) % tuple(table.ravel().tolist())
     write_text(folder / "trajectory.csv", ",".join(header) + "\n" + text)
 
 
+def _of_machine(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """Return what there is beside a prescribed motion: desired coordinates, the closure's force."""
+    arrays = {}
+    if trajectory.is_machine:
+        arrays["q_r_desired"] = trajectory.desired.q
+    if trajectory.closure_force is not None:
+        arrays["closure_force"] = trajectory.closure_force
+    if trajectory.slider_position is not None:
+        arrays["slider_position"] = trajectory.slider_position
+    return arrays
+
+
+def _columns(trajectory: Trajectory) -> list[np.ndarray]:
+    """Return the columns of trajectory.csv, see `trajectory_units`."""
+    arrays = _of_machine(trajectory)
+    return [
+        trajectory.t,
+        trajectory.deviation,
+        np.hypot(*trajectory.deviation.T),
+        trajectory.compliance.sum(axis=1),
+        trajectory.q_r,
+        trajectory.q_e,
+        trajectory.compliance,
+        trajectory.joint_forces[:, driven_columns(trajectory.scene)],
+        *arrays.values(),
+    ]
+
+
+def rigid_units(scene: Scene) -> dict[str, str]:
+    """Return the unit of every rigid coordinate by its name: cart, then the arms."""
+    return {CART: "m", **{arm.name: "rad" for arm in scene.arms}}
+
+
 def drive_units(scene: Scene) -> dict[str, str]:
-    """Return the unit of the drive of every rigid coordinate, by its name: cart, then the arms."""
-    return {CART: "N", **{arm.name: "N m" for arm in scene.arms}}
+    """Return the unit of every drive by the name of its coordinate, see `Scene.driven`."""
+    return {name: "N" if name == CART else "N m" for name in scene.driven}
+
+
+def driven_columns(scene: Scene) -> slice:
+    """Return where the drives stand among all rigid coordinates: cart, then the arms.
+
+    A fixed base is no drive, and neither are joints that follow from the others in a closed loop.
+    """
+    first = 0 if scene.motion.base == CART else 1
+    return slice(first, first + len(scene.driven))
+
+
+def is_driven_freely(scene: Scene) -> bool:
+    """Return whether driven coordinates may leave the desired motion: control, or soft joints."""
+    return scene.control is not None or any(arm.joint_stiffness > 0.0 for arm in scene.arms)
 
 
 def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     """Return the unit of every column of trajectory.csv, in their order."""
     scene, slices = trajectory.scene, trajectory.mechanism.slices
     units = {"t": "s", "deviation_x": "m", "deviation_y": "m", "deviation": "m"}
-    units |= {"compliance": "N m", f"q_r_{CART}": "m"}
-    units |= {f"q_r_{arm.name}": "rad" for arm in scene.arms}
+    units |= {"compliance": "N m"}
+    units |= {f"q_r_{name}": unit for name, unit in rigid_units(scene).items()}
     for arm, part in zip(scene.arms, slices, strict=True):
         # Of normalised modes: a unit of their own, which times the mode is a displacement.
         units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
     units |= {f"compliance_{arm.name}": "N m" for arm in scene.arms}
-    return units | {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
+    units |= {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
+    if trajectory.is_machine:
+        units |= {f"q_r_desired_{name}": unit for name, unit in rigid_units(scene).items()}
+    if scene.closure is not None:
+        names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
+        units |= {f"closure_force_{name}": "N" for name in names}
+        units |= {"slider_position": "m"} if scene.closure.kind == "slider" else {}
+    return units
+
+
+def _directions(scene: Scene) -> str:
+    """Return in words along what the closure's forces are positive."""
+    if scene.closure is None or scene.closure.kind == "pin":
+        return "along x and y"
+    return "along closure.direction turned by +90 degrees"
 
 
 def read_initial_deviation(path: Path) -> np.ndarray | None:

@@ -10,9 +10,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.disk import write_atomically
+from dolfinopt.multibody.drives import Closure
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.shapes import CART, CELLS, base_corners, chain, deformed_cells, filled, thin
+from dolfinopt.plots.loops import BASE, block_corners, close_loop, draw_ground, ground_points
+from dolfinopt.plots.shapes import (
+    CART,
+    CELLS,
+    base_corners,
+    chain,
+    decimals,
+    deformed_cells,
+    filled,
+    slender,
+    thin,
+)
 from dolfinopt.plots.style import DENSITY, GREY, ORANGE, PathLike, round_number, ticks
 
 if TYPE_CHECKING:
@@ -53,12 +65,16 @@ class Film:
         t: (n,) s.
         q_e: (n, N) elastic coordinates, magnified.
         place, swing: of the magnified mechanism, see `chain`.
-        rigid: (n, arms + 1) m, complex: the same places of the equivalent rigid mechanism.
-        desired: (m, 2) m, the rigid end-effector's path at all instants.
+        rigid: (n, arms + 1) m, complex: the same places of the rigid mechanism on the desired
+            motion.
+        desired: (m, 2) m, the path at all instants of the rigid end-effector; of a pinned loop, of
+            the joint before the pin.
         trace: (m, 2) m, the magnified one's.
         at: (n,) index of each frame in `trace`.
-        magnification: of the deformation.
+        magnification: of the deformation, and of how far rigid coordinates are off.
         size: reach of all arms together, m.
+        closure: of a closed loop, or None.
+        is_free: whether rigid coordinates may leave the desired motion.
     """
 
     views: tuple[ArmView, ...]
@@ -73,6 +89,8 @@ class Film:
     at: np.ndarray
     magnification: float
     size: float
+    closure: Closure | None = None
+    is_free: bool = False
 
     @property
     def stands(self) -> bool:
@@ -97,32 +115,65 @@ def make_film(
     q_e: np.ndarray,
     magnification: float | None,
     frames: int,
+    desired: np.ndarray | None = None,
+    closure: Closure | None = None,
 ) -> Film:
     """Choose frames evenly from the instants and magnify the deformation; see `draw_motion`."""
     size = sum(float(np.hypot(*body.outboard_point)) for body in mechanism.bodies)
-    rigid = chain(mechanism, q_r, np.zeros_like(q_e))[0]
+    ideal = q_r if desired is None else desired
+    rigid = chain(mechanism, ideal, np.zeros_like(q_e))[0]
     if magnification is None:
-        largest = np.abs(chain(mechanism, q_r, q_e)[0][:, -1] - rigid[:, -1]).max()
+        away = chain(mechanism, q_r, q_e)[0] - rigid
+        # A held end tells nothing: the other joints do.
+        largest = np.abs(away[:, -1] if closure is None else away).max()
         parts = zip(mechanism.slices, mechanism.bodies, strict=True)
-        turn = max(np.abs(q_e[:, part] @ body.outboard[2]).max() for part, body in parts)
+        turns = [np.abs(q_e[:, part] @ body.outboard[2]).max() for part, body in parts]
+        turn = max(*turns, np.abs(q_r - ideal)[:, 1:].max())
         magnification = round_magnification(float(largest), size, float(turn))
-    q_e = magnification * q_e
+    q_r, q_e, magnification = _magnified(mechanism, closure, (ideal, q_r), q_e, magnification)
     place, swing = chain(mechanism, q_r, q_e)
     at = np.unique(np.round(np.linspace(0, len(t) - 1, frames)).astype(int))
+    end = -1 if closure is None or closure.count == 1 else -2
     return Film(
-        views=tuple(thin(view, CELLS // len(views)) for view in views),
+        views=tuple(slender(thin(view, CELLS // len(views)), size) for view in views),
         parts=mechanism.slices,
         t=t[at],
         q_e=q_e[at],
         place=place[at],
         swing=swing[at],
         rigid=rigid[at],
-        desired=np.stack([rigid[:, -1].real, rigid[:, -1].imag], axis=1),
-        trace=np.stack([place[:, -1].real, place[:, -1].imag], axis=1),
+        desired=np.stack([rigid[:, end].real, rigid[:, end].imag], axis=1),
+        trace=np.stack([place[:, end].real, place[:, end].imag], axis=1),
         at=at,
         magnification=magnification,
         size=size,
+        closure=closure,
+        is_free=desired is not None and closure is None,
     )
+
+
+def _magnified(
+    mechanism: Mechanism,
+    closure: Closure | None,
+    rigid: tuple[np.ndarray, np.ndarray],
+    q_e: np.ndarray,
+    magnification: float,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return coordinates q_r, q_e of the magnified machine, and the magnification that it bears.
+
+    Args:
+        mechanism, closure, q_e: as for `make_film`.
+        rigid: desired and actual rigid coordinates (n, 1 + arms).
+        magnification: that is wanted; a loop that cannot be closed with it takes less.
+    """
+    while True:
+        q_r = rigid[0] + magnification * (rigid[1] - rigid[0])
+        closed = close_loop(mechanism, closure, q_r, magnification * q_e)
+        if closed is not None:
+            return closed, magnification * q_e, magnification
+        if magnification <= 1.0:
+            return q_r, magnification * q_e, magnification
+        magnification = max(1.0, round_number(0.5 * magnification))
 
 
 def draw_motion(
@@ -135,6 +186,8 @@ def draw_motion(
     magnification: float | None = None,
     frames: int = FRAMES,
     duration: float = FILM_SECONDS,
+    desired: np.ndarray | None = None,
+    closure: Closure | None = None,
 ) -> Path:
     """Draw the moving, deformed manipulator (animated GIF).
 
@@ -149,11 +202,13 @@ def draw_motion(
             largest deviation as about a tenth of the mechanism's size.
         frames: number of pictures, at most n.
         duration: of the film, s.
+        desired: (n, 1 + arms) rigid coordinates that q_r may leave; default: q_r.
+        closure: what holds the last interface of a closed loop.
 
     Returns:
         The path.
     """
-    film = make_film(views, mechanism, t, q_r, q_e, magnification, frames)
+    film = make_film(views, mechanism, t, q_r, q_e, magnification, frames, desired, closure)
     delay = max(20.0, 10.0 * round(100.0 * duration / len(film.t)))  # ms; GIF counts in 10 ms
     speed = (t[-1] - t[0]) / (1e-3 * delay * len(film.t))
     stage = Stage(film, mechanism, speed)
@@ -206,6 +261,8 @@ def film_bounds(film: Film) -> tuple[np.ndarray, np.ndarray]:
     cart = CART * film.size
     feet = np.stack([film.place[:, 0].real, film.place[:, 0].imag], axis=1)
     parts = [film.desired, film.trace, feet - cart, feet + cart]
+    if film.closure is not None:
+        parts.append(ground_points(film.place[:, -1], film.size, film.closure))
     lows, highs = [p.min(axis=0) for p in parts], [p.max(axis=0) for p in parts]
     for frame in range(len(film.t)):
         for index in range(len(film.views)):
@@ -225,6 +282,7 @@ class Stage:
         from matplotlib.ticker import MultipleLocator
 
         self.film = film
+        self.digits = decimals(film.t)
         left, right, below, above = 0.75, 1.1, 1.0, 0.45  # inches around the axes
         width = FILM_WIDTH - left - right
         low, high = film_bounds(film)
@@ -259,7 +317,12 @@ class Stage:
         else:
             self.axes.axhline(ground, color=GREY, linewidth=2.0)
         self.desired = self.axes.plot(*self.film.desired.T, color="black", dashes=(4, 3), lw=1.2)[0]
-        note = f"deformation x {self.film.magnification:g}, shown at {speed:.2g} x real time"
+        if self.film.closure is not None:
+            ends = self.film.place[:, -1]
+            draw_ground(self.axes, ends, self.film.size, self.film.closure)
+            self.desired.set_visible(self.film.closure.count == 2)
+        what = "deviation" if self.film.is_free else "deformation"
+        note = f"{what} x {self.film.magnification:g}, shown at {speed:.2g} x real time"
         self.axes.set_title(note, loc="right", fontsize=11)
 
     def _cast(self, mechanism: Mechanism) -> list[Artist]:
@@ -268,19 +331,23 @@ class Stage:
 
         self.ghost = self.axes.plot([], [], color=GREY, lw=1.0, marker="o", ms=2.5)[0]
         self.trace = self.axes.plot([], [], color=ORANGE, lw=1.5)[0]
-        self.cart = Polygon(np.zeros((4, 2)), facecolor="#c9c9c9", edgecolor="black")
+        self.cart = Polygon(np.zeros((4, 2)), facecolor=BASE, edgecolor="black")
+        self.slider = Polygon(np.zeros((4, 2)), facecolor=BASE, edgecolor="black")
         self.axes.add_patch(self.cart)
+        self.axes.add_patch(self.slider)
         self.arms: list[Any] = []
         for view in self.film.views:
-            cells = filled(np.zeros((0, 4, 2)), view.density)
+            cells = filled(np.zeros((0, 4, 2)), view.density, designed=view.designed)
             self.arms.append(self.axes.add_collection(cells, autolim=False))
         self.joints = self.axes.plot([], [], "o", mfc="white", mec="black", ms=7)[0]
-        size = 11 if mechanism.payload_mass > 0.0 else 6
+        size = 11 if mechanism.payload_mass > 0.0 and self.film.closure is None else 6
         self.payload = self.axes.plot([], [], "o", color=ORANGE, mec="black", ms=size)[0]
         self.clock = self.axes.text(
             0.0, 1.0, "", transform=self.axes.transAxes + _shift(self.figure), fontsize=11
         )
-        moving = [self.ghost, self.trace, self.cart, *self.arms, self.joints, self.payload]
+        moving = [self.ghost, self.trace, self.cart, self.slider, *self.arms, self.joints]
+        moving.append(self.payload)
+        self.trace.set_visible(self.film.closure is None or self.film.closure.count == 2)
         for artist in (*moving, self.clock):
             artist.set_animated(True)
         return [*moving, self.clock]
@@ -288,17 +355,38 @@ class Stage:
     def _draw_keys(self, mechanism: Mechanism, right: float, box: tuple[float, ...]) -> None:
         """Draw colour scale and legend."""
         bar = self.figure.add_axes((right, box[1], 0.02, box[3]))
-        self.figure.colorbar(self.arms[0], cax=bar, label=DENSITY)
-        mass = mechanism.payload_mass
-        end = f"payload {mass:g} kg" if mass > 0.0 else "end-effector"
+        shown = [k for k, view in enumerate(self.film.views) if view.designed] or [0]
+        self.figure.colorbar(self.arms[shown[0]], cax=bar, label=DENSITY)
+        keys = self._names(float(mechanism.payload_mass))
         self.figure.legend(
-            [self.desired, self.ghost, self.trace, self.payload],
-            ["desired path", "rigid mechanism", "flexible end-effector's path", end],
+            list(keys.values()),
+            list(keys),
             loc="lower center",
-            ncols=4,
+            ncols=len(keys),
             frameon=False,
             fontsize=10,
         )
+
+    def _names(self, mass: float) -> dict[str, Artist]:
+        """Return what there is to be named, by its name; `mass` of the payload, kg."""
+        closure, carried = self.film.closure, f" {mass:g} kg" if mass > 0.0 else ""
+        if closure is None:
+            rigid = "rigid mechanism, desired motion" if self.film.is_free else "rigid mechanism"
+            end = f"payload{carried}" if carried else "end-effector"
+            return {
+                "desired path": self.desired,
+                rigid: self.ghost,
+                "flexible end-effector's path": self.trace,
+                end: self.payload,
+            }
+        if closure.count == 1:
+            return {"rigid mechanism": self.ghost, f"slider{carried}": self.slider}
+        return {
+            "rigid mechanism": self.ghost,
+            "path of its last moving joint": self.desired,
+            "of the flexible one": self.trace,
+            f"pin{carried}": self.payload,
+        }
 
     def draw(self, frame: int) -> np.ndarray:
         """Return a frame (height, width, 3), uint8."""
@@ -313,13 +401,15 @@ class Stage:
         film = self.film
         place, rigid = film.place[frame], film.rigid[frame]
         self.cart.set_xy(base_corners(place[0], film.size, film.stands))
+        if film.closure is not None and film.closure.count == 1:
+            self.slider.set_xy(block_corners(place[-1], film.size, film.closure))
         for k, cells in enumerate(self.arms):
             cells.set_verts(film.cells(k, frame))
         self.ghost.set_data(rigid.real, rigid.imag)
         self.trace.set_data(*film.trace[: film.at[frame] + 1].T)
         self.joints.set_data(place[:-1].real, place[:-1].imag)
         self.payload.set_data([place[-1].real], [place[-1].imag])
-        self.clock.set_text(f"t = {film.t[frame]:.2f} s")
+        self.clock.set_text(f"t = {film.t[frame]:.{self.digits}f} s")
 
 
 def _shift(figure: Figure) -> Any:

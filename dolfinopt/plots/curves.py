@@ -28,6 +28,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from dolfinopt.dynamics.simulation import Trajectory
+
+DEVIATION = "Deviation of the end-effector from the rigid path"
+OF_CONTROL = "Deviation of the end-effector from the desired path"
+OF_SLIDER = "Deviation of the slider from that of rigid arms"
 FEW = 40  # points a line that get markers
 
 
@@ -138,23 +143,35 @@ def draw_deviation(
     t: np.ndarray,
     deviation: np.ndarray,
     initial_deviation: np.ndarray | None = None,
+    title: str = DEVIATION,
 ) -> Path:
-    """Draw the end-effector's distance from its rigid path against time (PNG).
+    """Draw the end-effector's distance from its rigid or desired path against time (PNG).
 
     Args:
         path: of the picture.
         t: (n,) s.
         deviation: (n, 2) m.
         initial_deviation: (n, 2) m, of the initial design, or None.
+        title: above the picture, of what from what.
 
     Returns:
         The path.
     """
-    return save(deviation_figure(t, deviation, initial_deviation), path)
+    return save(deviation_figure(t, deviation, initial_deviation, title), path)
+
+
+def deviation_title(trajectory: Trajectory) -> str:
+    """Return what of a motion deviates from what."""
+    if trajectory.closure is not None:
+        return OF_SLIDER
+    return OF_CONTROL if trajectory.is_machine else DEVIATION
 
 
 def deviation_figure(
-    t: np.ndarray, deviation: np.ndarray, initial_deviation: np.ndarray | None
+    t: np.ndarray,
+    deviation: np.ndarray,
+    initial_deviation: np.ndarray | None,
+    title: str = DEVIATION,
 ) -> Figure:
     """Return the figure of `draw_deviation`; what a curve is stands at its peak."""
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
@@ -165,7 +182,8 @@ def deviation_figure(
     distances = [1e3 * np.hypot(*vectors.T) for _, vectors in curves]
     top = 1.1 * max(float(d.max()) for d in distances) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)
-    numbers = look_numbers([[label for label, _ in curves]])
+    # A curve alone looks like the optimised design's.
+    numbers = look_numbers([[label for label, _ in curves]]) if len(curves) > 1 else {"": 0}
     for (label, _), distance, height in zip(curves, distances, heights, strict=True):
         worst = int(np.argmax(distance))
         style = look(numbers[label]) | {"marker": "o", "markevery": [worst], "clip_on": False}
@@ -184,6 +202,6 @@ def deviation_figure(
         )
     axes.set(xlim=(t[0], t[-1]), ylim=(0.0, top), xlabel="time [s]")
     axes.set_ylabel("deviation [mm]")
-    axes.set_title("Deviation of the end-effector from the rigid path", loc="left", fontsize=12)
+    axes.set_title(title, loc="left", fontsize=12)
     axes.grid(True, alpha=0.3)
     return figure

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.multibody.drives import Closure
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.output.views import ArmView
+from dolfinopt.plots.loops import BASE, block_corners, close_loop, draw_ground, ground_points
 from dolfinopt.plots.shapes import (
     CELLS,
     base_corners,
     boundary,
     chain,
+    decimals,
     deformed_cells,
     filled,
     sides,
+    slender,
     thin,
 )
 from dolfinopt.plots.style import DENSITY, GREY, ORANGE, SOLID_FROM, PathLike, new_figure, save
@@ -26,7 +30,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from dolfinopt.dynamics.simulation import Trajectory
+
 POSES = 5
+LOOP_POSES = 4  # of one turn
+PALE = 0.3  # share of its colour
+LEANING = np.exp(0.25j * np.pi)  # the words lie beside the next arm, which may go straight on
 
 
 def draw_machine(
@@ -36,6 +45,9 @@ def draw_machine(
     t: np.ndarray,
     q_r: np.ndarray,
     title: str,
+    desired: np.ndarray | None = None,
+    end: np.ndarray | None = None,
+    closure: Closure | None = None,
 ) -> Path:
     """Draw the assembled machine with its designs in a few poses along the path (PNG).
 
@@ -46,11 +58,22 @@ def draw_machine(
         t: (n,) s.
         q_r: (n, 1 + arms) rigid coordinates; m, rad.
         title: above the picture.
+        desired: (n, 1 + arms) rigid coordinates that q_r may leave; default: q_r.
+        end: (n, 2) m, places of the end-effector as it moves, of which `desired` tells where they
+            should be; default: not drawn.
+        closure: what holds the last interface of a closed loop; of it one turn is shown.
 
     Returns:
         The path.
     """
-    return save(machine_figure(views, mechanism, t, q_r, title), path)
+    return save(machine_figure(views, mechanism, t, q_r, title, desired, end, closure), path)
+
+
+def figure_of(views: Sequence[ArmView], trajectory: Trajectory, title: str) -> Figure:
+    """Return the figure of `draw_machine` of a simulated motion."""
+    one = trajectory
+    known = (one.desired.q, one.end, one.closure) if one.is_machine else (None, None, None)
+    return machine_figure(views, one.mechanism, one.t, one.q_r, title, *known)
 
 
 def poses_along(points: np.ndarray, count: int) -> np.ndarray:
@@ -64,37 +87,76 @@ def poses_along(points: np.ndarray, count: int) -> np.ndarray:
     return np.unique(np.searchsorted(length, np.linspace(0.0, length[-1] * (1 - 1e-9), count)))
 
 
+def poses_of_turn(first_joint: np.ndarray, angles: np.ndarray, count: int) -> np.ndarray:
+    """Return the indices of at most `count` poses evenly spaced along a path, within one turn.
+
+    Args:
+        first_joint: (n,) complex, places of the joint that the first arm carries, m.
+        angles: (n,) of that arm, rad.
+        count: of poses; they begin half a pose after the start, which often is a dead centre.
+    """
+    beyond = np.abs(angles - angles[0]) >= 2.0 * np.pi
+    turn = first_joint[: int(np.argmax(beyond)) + 1] if beyond.any() else first_joint
+    return poses_along(turn, 2 * count + 1)[1::2]
+
+
 def machine_figure(
-    views: Sequence[ArmView], mechanism: Mechanism, t: np.ndarray, q_r: np.ndarray, title: str
+    views: Sequence[ArmView],
+    mechanism: Mechanism,
+    t: np.ndarray,
+    q_r: np.ndarray,
+    title: str,
+    desired: np.ndarray | None = None,
+    end: np.ndarray | None = None,
+    closure: Closure | None = None,
 ) -> Figure:
     """Return the figure of `draw_machine`: arms undeformed, void left open."""
     rigid = np.zeros((len(t), mechanism.slices[-1].stop))
-    place, swing = chain(mechanism, q_r, rigid)
+    closed = close_loop(mechanism, closure, q_r, rigid)
+    place, swing = chain(mechanism, q_r if closed is None else closed, rigid)
     size = sum(float(np.hypot(*body.outboard_point)) for body in mechanism.bodies)
     at = poses_along(place[:, -1], POSES)
+    if closure is not None:
+        at = poses_of_turn(place[:, 1], q_r[:, 1], LOOP_POSES)
     stands = bool(np.ptp(place[:, 0].real) == 0.0)
-    thinned = [thin(view, 2 * CELLS // len(views)) for view in views]
+    thinned = [slender(thin(view, 2 * CELLS // len(views)), size) for view in views]
     cells = [
         [deformed_cells(view, place[n, k], swing[n, k], np.zeros(view.modes.shape[-1]))
          for k, view in enumerate(thinned)]
         for n in at
     ]  # fmt: skip
     bases = [base_corners(place[n, 0], size, stands) for n in at]
-    path = np.stack([place[:, -1].real, place[:, -1].imag], axis=1)
-    points = [path, *bases, *(one.reshape(-1, 2) for pose in cells for one in pose)]
+    paths = _paths(mechanism, place, desired, end, closure)
+    points = [*paths.values(), *bases, *(one.reshape(-1, 2) for pose in cells for one in pose)]
+    if closure is not None:
+        points.append(ground_points(place[at, -1], size, closure))
     low, high = (
         np.min([p.min(axis=0) for p in points], axis=0),
         np.max([p.max(axis=0) for p in points], axis=0),
     )
-    low = low - size * np.array([0.12, 0.04])
+    low = low - size * np.array([0.12, 0.04] if closure is None else [0.18, 0.1])
     high = high + size * np.array([0.12, 0.1])
     figure, axes = _framed(high - low)
     _draw_ground(axes, bases, stands)
-    axes.plot(*path.T, color=ORANGE, dashes=(4, 3), lw=1.2, zorder=1.0)
+    if closure is not None:
+        draw_ground(axes, place[at, -1], size, closure)
+    for (label, path), dashes in zip(paths.items(), ((4, 3), (1, 0)), strict=False):
+        axes.plot(*path.T, color=ORANGE, dashes=dashes, lw=1.2, zorder=1.0, label=label)
+    if len(paths) > 1:
+        axes.legend(loc="best", frameon=False, fontsize=9)
     edges = [boundary(view.corners) for view in thinned]
     for number, (n, pose) in enumerate(zip(at, cells)):
-        _draw_pose(axes, pose, thinned, edges, place[n], bases[number], 2.0 + number)
-        _name_instant(axes, place[n], f"{t[n]:.2f} s" if len(at) > 1 else "", 3.0 + len(at))
+        # Loops lie on top of each other: but for the first pose they are pale.
+        pale = closure is not None and number > 0
+        order = 2.0 + (len(at) if closure is not None and number == 0 else number)
+        _draw_pose(axes, pose, thinned, edges, place[n], bases[number], order, pale=pale)
+        if closure is not None and closure.count == 1:
+            _draw_slider(axes, block_corners(place[n, -1], size, closure), order, pale=pale)
+        words = f"{t[n]:.{decimals(t)}f} s" if len(at) > 1 else ""
+        # The first arm's end tells poses of a loop apart, a slider's come back.
+        along = np.diff(place[n, -2:] if closure is None else place[n, :2] * LEANING)[0]
+        end = place[n, -1 if closure is None else 1]
+        _name_instant(axes, end, along, words, 3.0 + len(at))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.grid(True, alpha=0.3)
     axes.set_axisbelow(True)
@@ -102,6 +164,31 @@ def machine_figure(
     scale = filled(np.zeros((0, 4, 2)), np.zeros(0))
     figure.colorbar(scale, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)), label=DENSITY)
     return figure
+
+
+def _paths(
+    mechanism: Mechanism,
+    place: np.ndarray,
+    desired: np.ndarray | None,
+    end: np.ndarray | None,
+    closure: Closure | None,
+) -> dict[str, np.ndarray]:
+    """Return the paths (n, 2), m, that are worth a line, by what they are.
+
+    Of an open chain the end-effector's, desired and, where joints may leave the desired motion, as
+    it moves; of a pinned loop that of the joint before the pin.
+    """
+    if closure is not None:
+        path = {} if closure.count == 1 else {"last moving joint": place[:, -2]}
+    elif desired is None:
+        path = {"end-effector": place[:, -1]}
+    else:
+        rigid = np.zeros((len(place), mechanism.slices[-1].stop))
+        wanted = chain(mechanism, desired, rigid)[0][:, -1]
+        path = {"desired path": wanted}
+        if end is not None:
+            path["path of the end-effector"] = end[:, 0] + 1j * end[:, 1]
+    return {name: np.stack([z.real, z.imag], axis=1) for name, z in path.items()}
 
 
 def _framed(span: np.ndarray) -> tuple[Figure, Axes]:
@@ -132,6 +219,8 @@ def _draw_pose(
     place: np.ndarray,
     base: np.ndarray,
     order: float,
+    *,
+    pale: bool = False,
 ) -> None:
     """Draw cart, arms, joints and end-effector in one pose."""
     from matplotlib.collections import LineCollection
@@ -141,7 +230,14 @@ def _draw_pose(
     for corners, view, outer in zip(cells, views, edges, strict=True):
         frame = LineCollection(list(sides(corners)[outer]), colors=GREY, linewidths=0.6)
         solid = view.density > SOLID_FROM
-        fine = filled(corners[solid], view.density[solid], smooth=True)
+        fine = filled(
+            corners[solid],
+            view.density[solid],
+            smooth=True,
+            designed=view.designed,
+            strength=PALE if pale else 1.0,
+        )
+        frame.set_alpha(PALE if pale else None)
         for drawn in (fine, frame):
             drawn.set_zorder(order + 0.1)
             axes.add_collection(drawn, autolim=False)
@@ -151,19 +247,28 @@ def _draw_pose(
         "marker": "o",
         "mec": "black",
         "ms": 5.0,
+        "alpha": PALE if pale else None,
         "zorder": order + 0.2,
     }
     axes.plot(*joints[:, :-1], mfc="white", **style)
     axes.plot(*joints[:, -1:], mfc=ORANGE, **style)
 
 
-def _name_instant(axes: Axes, place: np.ndarray, words: str, order: float) -> None:
-    """Write the instant beyond the end-effector, away from the arm that carries it."""
-    along = place[-1] - place[-2]
+def _draw_slider(axes: Axes, corners: np.ndarray, order: float, *, pale: bool) -> None:
+    """Draw the block that slides, behind the arm that it is on."""
+    from matplotlib.patches import Polygon
+
+    block = Polygon(corners, facecolor=BASE, edgecolor="black", zorder=order)
+    block.set_alpha(PALE if pale else None)
+    axes.add_patch(block)
+
+
+def _name_instant(axes: Axes, end: complex, along: complex, words: str, order: float) -> None:
+    """Write the instant beyond an arm's end, in the direction `along`."""
     away = 12.0 * along / (abs(along) or 1.0)
     axes.annotate(
         words,
-        xy=(place[-1].real, place[-1].imag),
+        xy=(end.real, end.imag),
         xytext=(away.real, away.imag),
         textcoords="offset points",
         ha="left" if away.real > 4.0 else "right" if away.real < -4.0 else "center",

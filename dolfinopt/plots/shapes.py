@@ -11,6 +11,8 @@ from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots.style import COLOURS
 
+BAR = 0.025  # largest height of a rigid arm, as a share of the arms' reach
+UNDESIGNED = "#8a8a8a"  # arms without a design
 CELLS = 3000  # of all arms in a frame; finer ones would be hardly larger than a pixel
 CART = np.array([0.06, 0.045])  # half its width and its height, as shares of the arms' reach
 
@@ -153,14 +155,44 @@ def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
     return box + np.array([place.real, place.imag])
 
 
-def filled(corners: np.ndarray, density: np.ndarray, *, smooth: bool = False) -> Any:
+def slender(view: ArmView, size: float) -> ArmView:
+    """Return an arm without a design as a thin bar: its height is none that was designed.
+
+    Args:
+        view: of any arm; one that bends keeps its height, which its shapes go with.
+        size: reach of all arms together, m.
+    """
+    if view.designed or view.modes.shape[-1]:
+        return view
+    height = float(np.ptp(view.corners[..., 1]))
+    factor = min(1.0, BAR * size / height) if height > 0.0 else 1.0
+    return replace(view, corners=view.corners * [1.0, factor], centroid=view.centroid)
+
+
+def decimals(t: np.ndarray) -> int:
+    """Return how many decimals tell the instants (n,), s, of a motion of that length: 2 or more."""
+    span = float(np.ptp(t))
+    return 2 if span == 0.0 else max(2, 2 - int(np.floor(np.log10(span))))
+
+
+def filled(
+    corners: np.ndarray,
+    density: np.ndarray,
+    *,
+    smooth: bool = False,
+    designed: bool = True,
+    strength: float = 1.0,
+) -> Any:
     """Return polygons (n, k, 2) in the colours of their densities (n,), without seams.
 
     Args:
         corners: in order around each.
         density: in [0, 1].
         smooth: with edges that are blended, for cells of a pixel or two in any direction.
+        designed: or all in one grey, of arms that have no design.
+        strength: share of the colours, the rest white; below 1 they no longer form a scale.
     """
+    from matplotlib import colormaps, colors
     from matplotlib.collections import PolyCollection
 
     # Without smoothing neighbours share the pixels of their edge, nothing shines through; with it
@@ -168,6 +200,10 @@ def filled(corners: np.ndarray, density: np.ndarray, *, smooth: bool = False) ->
     look = {"edgecolors": "face", "linewidths": 0.2} if smooth else {"linewidths": 0.0}
     shapes: Any = corners  # as one array: a list would become a path a cell in Python
     cells = PolyCollection(shapes, cmap=COLOURS, antialiaseds=smooth, **look)
+    if not designed or strength < 1.0:
+        faces: Any = colormaps[COLOURS](density) if designed else colors.to_rgba_array(UNDESIGNED)
+        cells.set_facecolor(1.0 - strength * (1.0 - faces[:, :3]))
+        return cells
     cells.set_array(density)
     cells.set_clim(0.0, 1.0)
     return cells

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 from runs import TWO_ARM
 
+from dolfinopt.multibody.drives import Closure, pin, slider
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots import animation, curves, design, machine, shapes, style
+from dolfinopt.plots import animation, curves, design, loops, machine, shapes, style
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -566,3 +567,118 @@ def test_machine_is_drawn(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["machine.png"]
     solid = np.abs(image[..., :3] - np.array([8, 29, 88]) / 255.0).max(axis=2) < 0.05
     assert solid.sum() > 5000
+
+
+# -- closed loops and control ----------------------------------------------------------------
+
+
+def slider_crank(count: int = 61) -> tuple[list[ArmView], Mechanism, Closure, list[np.ndarray]]:
+    """Return a rigid crank and a bending rod whose end is on y = 0, over more than a turn.
+
+    The last entry has instants, desired and actual rigid coordinates, elastic coordinates.
+    """
+    crank = replace(beam("crank", 0.3, 0.2, 10, 2), modes=np.zeros((20, 4, 2, 0)), designed=False)
+    views = [crank, beam("rod", 0.7, 0.06, 20, 4)]
+    rigid = plane_body(
+        mass=1.0, moment=np.zeros(2), inertia=1.0, C=np.zeros((2, 0)), j=np.zeros(0),
+        r=np.zeros(0), M=np.zeros((0, 0)), G=np.zeros((0, 0)), K=np.zeros((0, 0)),
+        D=np.zeros((0, 0)), outboard=np.zeros((3, 0)), outboard_point=np.array([0.3, 0.0]),
+    )  # fmt: skip
+    mechanism = Mechanism((rigid, beam_body(0.7)), 0.5, 0.0, (0.0, 0.0), joint_height=0.0)
+    t = np.linspace(0.0, 0.1, count)
+    angle = 80.0 * t
+    desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
+    q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
+    closure = slider(0.0, 1.0)
+    actual = loops.close_loop(mechanism, closure, desired, q_e)
+    assert actual is not None
+    return views, mechanism, closure, [t, desired, actual, q_e]
+
+
+@pytest.mark.parametrize("kind", ["slider", "pin"])
+def test_a_drawn_loop_is_closed_by_its_last_joints(kind):
+    mechanism = manipulator(3)[1]
+    q_r = np.array([[0.2, 0.5, -0.9, 0.7], [0.2, 0.48, -0.9, 0.8]])
+    q_e = 0.02 * np.sin(np.arange(12.0)).reshape(2, 6)
+    rigid_end = shapes.chain(mechanism, q_r[:1], 0.0 * q_e[:1])[0][0, -1]
+    closure = pin(rigid_end) if kind == "pin" else slider(rigid_end, 1.0 + 0.5j)
+    closed = loops.close_loop(mechanism, closure, q_r, q_e)
+    end = shapes.chain(mechanism, closed, q_e)[0][:, -1]
+    assert np.abs(closure.gap(end)).max() < 3e-6
+    free = 4 - closure.count
+    np.testing.assert_array_equal(closed[:, :free], q_r[:, :free])
+    assert loops.close_loop(mechanism, pin(5.0), q_r, q_e) is None  # out of reach
+    assert loops.close_loop(mechanism, None, q_r, q_e) is q_r
+
+
+def test_magnified_loops_stay_closed():
+    views, mechanism, closure, (t, desired, actual, q_e) = slider_crank()
+    for asked in (1.0, 20.0, 1e4):
+        film = animation.make_film(
+            views, mechanism, t, actual, q_e, asked, 9, desired=desired, closure=closure
+        )
+        assert film.magnification == asked
+        assert np.abs(film.place[:, -1].imag).max() < 2e-6
+        assert np.abs(film.rigid[:, -1].imag).max() < 1e-12
+
+
+def test_magnification_is_less_where_the_loop_does_not_reach_its_pin():
+    views, mechanism = manipulator(3)
+    t, desired = np.arange(2.0), np.array([[0.0, 0.5, -0.6, 0.8], [0.0, 0.52, -0.6, 0.8]])
+    shortened = np.tile([-0.01, 0.0], (2, 3))
+    closure = pin(shapes.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
+    actual = loops.close_loop(mechanism, closure, desired, shortened)
+    film = animation.make_film(
+        views, mechanism, t, actual, shortened, 50.0, 2, desired=desired, closure=closure
+    )
+    assert 1.0 <= film.magnification < 50.0
+    assert np.abs(closure.gap(film.place[:, -1])).max() < 3e-6
+
+
+def test_control_errors_are_magnified_like_deformations():
+    views, mechanism = manipulator(2)
+    t, desired, q_e = swinging(2)
+    actual = desired + 0.01 * np.cos(t)[:, None]
+    film = animation.make_film(views, mechanism, t, actual, q_e, 3.0, 5, desired=desired)
+    wanted = end_effector(mechanism, still(desired + 3.0 * (actual - desired)), 3.0 * q_e)
+    np.testing.assert_allclose(film.trace, wanted, atol=1e-14)
+    np.testing.assert_allclose(
+        film.desired, end_effector(mechanism, still(desired), 0.0 * q_e), atol=1e-14
+    )
+
+
+@pytest.mark.serial
+def test_stage_of_a_loop_shows_slider_and_guide():
+    views, mechanism, closure, (t, desired, actual, q_e) = slider_crank()
+    film = animation.make_film(
+        views, mechanism, t, actual, q_e, None, 5, desired=desired, closure=closure
+    )
+    stage = animation.Stage(film, mechanism, 0.5)
+    for frame in range(5):
+        stage.draw(frame)
+        middle = stage.slider.get_xy()[:4].mean(axis=0)
+        np.testing.assert_allclose(middle, [film.place[frame, -1].real, 0.0], atol=2e-6)
+    assert [text.get_text() for text in stage.figure.legends[0].texts] == [
+        "rigid mechanism",
+        "slider 0.5 kg",
+    ]
+    heights = [np.ptp(view.corners[..., 1]) for view in film.views]
+    np.testing.assert_allclose(heights, [shapes.BAR, 0.06])  # a rigid crank is a thin bar
+    assert_inside(stage.figure)
+
+
+@pytest.mark.serial
+def test_machine_shows_one_turn_of_a_loop():
+    views, mechanism, closure, (t, desired, actual, _) = slider_crank()
+    figure = machine.machine_figure(
+        views, mechanism, t, actual, "slider-crank", desired=desired, closure=closure
+    )
+    axes = figure.axes[0]
+    named = [float(text.get_text().removesuffix(" s")) for text in axes.texts]
+    np.testing.assert_allclose(80.0 * np.array(named), np.pi / 4 * np.array([1, 3, 5, 7]), atol=0.2)
+    # Every pose ends on the line, whatever the deformation that is not drawn.
+    drawn = [line for line in axes.lines if line.get_markerfacecolor() == style.ORANGE]
+    ends = [line.get_xydata()[0] for line in drawn if len(line.get_xydata()) == 1]
+    assert len(ends) == 4
+    np.testing.assert_allclose(np.array(ends)[:, 1], 0.0, atol=2e-6)
+    assert_inside(figure)

@@ -1,0 +1,140 @@
+"""What controlled machines and closed loops leave in their folders."""
+
+import json
+
+import numpy as np
+import pytest
+from machines import controlled, loop
+from mpi4py import MPI
+
+import dolfinopt as do
+from dolfinopt.output.run_folder import Simulated, write_simulation
+
+WORLD = MPI.COMM_WORLD
+
+
+def left_by(scene, folder):
+    """Return trajectory.npz, trajectory.csv and summary.json of a simulation, on the root."""
+    partition, profile = do.partition_arms(WORLD, scene.cell_counts), do.Profile()
+    arms = do.build_arms(scene, partition, profile)
+    x = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
+    one = Simulated(scene, partition, arms, x, evaluation, trajectory, profile)
+    if write_simulation(folder, one, 0.0, paraview=False) is None:
+        return None
+    with np.load(folder / "trajectory.npz") as data:
+        arrays = {name: data[name] for name in data.files}
+    table = np.genfromtxt(folder / "trajectory.csv", delimiter=",", names=True)
+    return arrays, table, json.loads((folder / "summary.json").read_text()), trajectory
+
+
+def check_tables(arrays, table, summary):
+    """Every array and column has its unit, and both files hold the same."""
+    named = dict(text.split(": ", 1) for text in arrays["units"].tolist())
+    assert set(named) == set(arrays) - {"units"} and all(named.values())
+    assert list(summary["units"]["trajectory.csv"]) == list(table.dtype.names)
+    np.testing.assert_allclose(table["t"], arrays["t"], atol=1e-12)
+
+
+def test_control_leaves_desired_and_actual_coordinates_and_its_forces(shared_tmp_path):
+    scene = controlled()
+    left = left_by(scene, shared_tmp_path)
+    if left is None:
+        return
+    arrays, table, summary, trajectory = left
+    check_tables(arrays, table, summary)
+    error = arrays["q_r"] - arrays["q_r_desired"]
+    assert 0.0 < np.abs(error[:, 0]).max() < 1e-3  # m
+    np.testing.assert_allclose(table["q_r_desired_arm2"], arrays["q_r_desired"][:, 2], rtol=1e-9)
+    # u = u_ff - Kp e - Kd ed, with the feed-forward of the problem itself.
+    rate = trajectory.unknowns[1][:, :3]
+    ahead = trajectory.problem.at(arrays["t"]).ahead
+    u = ahead - np.array([2e5, 2e4, 2e4]) * error - np.array([2e4, 600.0, 600.0]) * rate
+    np.testing.assert_allclose(arrays["joint_forces"], u, rtol=1e-9, atol=1e-6)
+    assert summary["units"]["drive_error_peak"] == {"cart": "m", "arm1": "rad", "arm2": "rad"}
+    for k, name in enumerate(("cart", "arm1", "arm2")):
+        peak = np.abs(arrays["joint_forces"][:, k]).max()
+        assert summary["drive_peak"][name] == pytest.approx(peak, rel=1e-12)
+        assert summary["drive_error_peak"][name] == pytest.approx(np.abs(error[:, k]).max())
+    assert "closure_force_peak" not in summary and "closure_force" not in arrays
+    # The real end-effector from the desired path, the semicircle of 1 m: at rest in the end.
+    place = trajectory.end - arrays["deviation"]
+    np.testing.assert_allclose(np.hypot(*place.T), 1.0, atol=1e-12)
+    assert summary["max_deviation"] == pytest.approx(np.hypot(*arrays["deviation"].T).max())
+    assert summary["settling"] < summary["max_deviation"]
+
+
+def test_slider_leaves_its_place_and_the_force_of_its_guide(shared_tmp_path):
+    left = left_by(loop(), shared_tmp_path)
+    if left is None:
+        return
+    arrays, table, summary, _ = left
+    check_tables(arrays, table, summary)
+    assert arrays["closure_force"].shape == (101, 1)
+    np.testing.assert_allclose(table["closure_force_normal"], arrays["closure_force"][:, 0])
+    np.testing.assert_allclose(table["slider_position"], arrays["slider_position"], rtol=1e-9)
+    assert list(summary["drive_peak"]) == list(summary["drive_rms"]) == ["crank"]
+    assert summary["units"]["drive_peak"] == {"crank": "N m"}
+    assert not np.any(arrays["joint_forces"][:, 2])  # the rod's joint follows
+    # Deviation is along the line alone: position less that of rigid arms.
+    crank = arrays["q_r"][:, 1]
+    rigid = 0.15 * np.cos(crank) + np.sqrt(0.3**2 - (0.15 * np.sin(crank)) ** 2)
+    np.testing.assert_allclose(
+        arrays["deviation"][:, 0], arrays["slider_position"] - rigid, atol=1e-12
+    )
+    assert np.abs(arrays["deviation"][:, 1]).max() < 1e-8
+    peak = np.abs(arrays["closure_force"]).max()
+    assert summary["closure_force_peak"] == pytest.approx(peak, rel=1e-12)
+
+
+def test_force_of_the_guide_is_positive_on_the_side_that_is_documented(shared_tmp_path):
+    """A standing slider-crank under gravity: the guide holds up part of the slider's weight."""
+    still = {"speed": 1e-3, "start_angle": 1.0, "gravity": [0.0, -9.81]}
+    for direction, sign in (([1.0, 0.0], 1.0), ([-1.0, 0.0], -1.0)):
+        closure = {"kind": "slider", "direction": direction, "side": -1}
+        scene = loop(motion=still, closure=closure)
+        folder = shared_tmp_path / f"side{sign:+.0f}"
+        if WORLD.rank == 0:
+            folder.mkdir()
+        WORLD.barrier()
+        left = left_by(scene, folder)
+        if left is None:
+            continue
+        force, rod = left[0]["closure_force"][:, 0], left[2]["mass"]["rod"]
+        # Moments about the crank pin: the slider's weight, and half the rod's.
+        expected = sign * 9.81 * (0.5 + 0.5 * rod)
+        np.testing.assert_allclose(force, expected, rtol=2e-3)
+        assert np.sign(left[0]["slider_position"][0]) == sign
+
+
+def test_pin_leaves_its_force_along_x_and_y(shared_tmp_path):
+    left = left_by(loop("pin"), shared_tmp_path)
+    if left is None:
+        return
+    arrays, table, summary, _ = left
+    check_tables(arrays, table, summary)
+    assert arrays["closure_force"].shape == (101, 2)
+    np.testing.assert_allclose(table["closure_force_y"], arrays["closure_force"][:, 1])
+    assert "slider_position" not in arrays
+    assert list(summary["drive_peak"]) == ["crank"]
+    largest = np.hypot(*arrays["closure_force"].T).max()
+    assert summary["closure_force_peak"] == pytest.approx(largest, rel=1e-12)
+    assert summary["max_deviation"] < 1e-7  # m: the end is pinned
+    assert summary["stiffening"]["on"] in (True, False)
+
+
+def test_prescribed_motion_leaves_what_it_left(shared_tmp_path):
+    scene = do.load_scene(
+        "demos/two_arm.toml", ["arms.cells=[16,2]", "motion.base=fixed", "motion.radius=0.4"]
+    )
+    left = left_by(scene, shared_tmp_path)
+    if left is None:
+        return
+    arrays, table, summary, _ = left
+    assert "q_r_desired" not in arrays and "closure_force" not in arrays
+    assert arrays["joint_forces"].shape[1] == 3
+    assert [name for name in table.dtype.names if name.startswith("joint_force")] == [
+        "joint_force_arm1",
+        "joint_force_arm2",
+    ]  # a fixed base is no drive
+    assert list(summary["units"]["drive_peak"]) == ["arm1", "arm2"]
