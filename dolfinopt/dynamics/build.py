@@ -99,7 +99,8 @@ def _drives(scene: Scene) -> Drives:
     control, driven = scene.control, slice(first, last)
     if control is not None:
         free[driven] = True
-        stiffness[driven], damping[driven] = control.stiffness, control.damping
+        stiffness[driven] = control.stiffness_factor * np.array(control.stiffness)
+        damping[driven] = control.damping_factor * np.array(control.damping)
         if control.limits is not None:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)

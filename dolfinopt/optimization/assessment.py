@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +27,8 @@ class Assessment:
 
     Attributes:
         evaluation: of the design, with the motion.
-        crisp: of the design cut at x_phys = 1/2; None without a projection.
+        crisp: of the design cut at x_phys = 1/2; None without a projection, or where the motion
+            of what is left cannot be simulated.
         initial: trajectory of the uniform initial design where the iterations had no motion.
         selection: of the coordinates, with the error that they make of this design's motion.
     """
@@ -75,8 +77,9 @@ def assess(
         initial = evaluator.trajectory
     if scene.design.projection:
         cut = {k: np.where(x > 0.5, 1.0, 0.0) for k, x in x_phys.items()}
-        crisp = evaluator.evaluate_densities(cut, simulated=True)
-    if crisp is not None or not moves:
+        with suppress(ConvergenceError):  # on all ranks: a grey design, cut, may fall apart
+            crisp = evaluator.evaluate_densities(cut, simulated=True)
+    if scene.design.projection or not moves:
         for k, arm in arms.items():
             arm.initial_vectors = vectors[k]
         evaluation = evaluator.evaluate_densities(x_phys, simulated=True)

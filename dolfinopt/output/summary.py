@@ -48,6 +48,10 @@ SMALL = 0.1
 SMALL_TURN = 0.2  # rad
 # Radius of the filter in cells from which on no chains of cells that touch in corners remain.
 FILTER_CELLS = 2.0
+FALLS_APART = (
+    "the motion of the design cut at a density of one half cannot be simulated: what is left is "
+    "too weak; let the optimisation go on (optimizer.max_iterations) until the design is crisp"
+)
 
 
 def summarise(run: Simulated, wall: float) -> dict[str, Any]:
@@ -169,6 +173,11 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
         *(filter_warnings(run.scene, sizes) if run.iterations else ()),
+        *(
+            [FALLS_APART]
+            if run.iterations and run.scene.design.projection and run.crisp is None
+            else ()
+        ),
     ]
 
 

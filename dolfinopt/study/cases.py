@@ -27,6 +27,8 @@ Action = Literal["optimize", "simulate", "compare", "sample"]
 # and factorised once.
 SCENARIO = (
     "motion",
+    "control",
+    "closure",
     "payload",
     "damping",
     "reduction",

@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 
 NAME = "uncertainty"
 # Tables and keys that do not change what a given design does, or that no given design outlives.
-TABLES = ("motion", "payload", "damping", "material", "arms", "interpolation")
+TABLES = (
+    "motion", "control", "closure", "payload", "damping", "material", "arms", "interpolation",
+)  # fmt: skip
 SIZES = ("length", "height", "mesh_size", "passive")
 LEAST = 10  # samples: fewer tell nothing of the scatter
 CHUNK = 25  # samples that an interruption may cost

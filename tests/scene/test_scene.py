@@ -1159,7 +1159,10 @@ def test_import_needs_no_mpi_nor_numpy():
         ({"changes": [], "weight": 0}, "scenarios.0.weight = 0: expected a number >= 1e-09"),
         ({"weight": 1.0}, "missing key scenarios.0.changes"),
         ({"changes": [], "wait": 1.0}, "unknown key scenarios.0.wait; did you mean scenarios.0.w"),
-        ({"changes": ["arms.length=2"]}, "expected keys of motion, payload, damping or material"),
+        (
+            {"changes": ["arms.length=2"]},
+            "expected keys of motion, control, closure, payload, damping or material",
+        ),
         ({"changes": ["material.poisson_ratio=0.2"]}, "expected no material.poisson_ratio"),
         ({"changes": ["payload.mas=2"]}, "with --set payload.mas=2: unknown key payload.mas"),
         ({"changes": ["payload.mass=-2"]}, "payload.mass = -2: expected a number >= 0"),

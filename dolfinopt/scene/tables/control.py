@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 FeedForward = Literal["rigid", "none"]
 Gain = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; N s/m, N m s/rad
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
+Factor = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class Control(Table):
@@ -31,6 +32,10 @@ class Control(Table):
     damping: tuple[Gain, ...] = Field(
         description="derivative gain of every driven coordinate [N s/m, N m s/rad]"
     )
+    stiffness_factor: Factor = Field(
+        default=1.0, description="factor on all of control.stiffness, to be varied in studies [-]"
+    )
+    damping_factor: Factor = Field(default=1.0, description="factor on all of control.damping [-]")
     limits: tuple[Force, ...] | None = Field(
         default=None,
         description="largest force of every drive, approached smoothly; default: none [N, N m]",

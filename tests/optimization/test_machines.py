@@ -1,0 +1,111 @@
+"""Optimised machines: the demos' results, and all that goes with control and closed loops."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import ROOT, overrides, run
+
+import dolfinopt as do
+
+WORLD = MPI.COMM_WORLD
+CONTROLLED, SLIDER_CRANK, FOUR_BAR = (
+    ROOT / "demos" / f"{name}.toml" for name in ("controlled_two_arm", "slider_crank", "four_bar")
+)
+COARSE = {
+    CONTROLLED: ["arms.cells=[30,4]", "design.filter_radius=0.03", "motion.horizon=2.2"],
+    SLIDER_CRANK: ["arms.rod.cells=[40,6]", "design.filter_radius=0.008"],
+    FOUR_BAR: ["arms.coupler.cells=[40,6]", "arms.rocker.cells=[36,6]",
+               "design.filter_radius=0.008"],
+}  # fmt: skip
+DEMOS = pytest.mark.parametrize("path", COARSE, ids=lambda path: path.stem)
+
+
+def coarse(path: Path, *changes: str, iterations: int = 3):
+    changes = (*COARSE[path], f"optimizer.max_iterations={iterations}", *changes)
+    return do.load_scene(path, changes)
+
+
+# Objective at the start and after 15 iterations; largest deviation in mm after them.
+RESULTS = {
+    CONTROLLED: (0.0420621, 0.0105270, 12.3234),
+    SLIDER_CRANK: (0.0124941, 0.00576952, 0.0801108),
+    FOUR_BAR: (0.000240081, 6.04769e-05, 0.0),
+}
+
+
+@DEMOS
+def test_demo(path):
+    """What a demo ends with, on few cells: the figures of this version."""
+    result = do.optimize(coarse(path, iterations=15))
+    if WORLD.rank == 0:
+        before, after, deviation = RESULTS[path]
+        first, last = result.history[0], result.history[-1]
+        assert first.objective == pytest.approx(before, rel=1e-4)
+        assert last.objective == pytest.approx(after, rel=1e-2)
+        assert 1e3 * last.max_deviation == pytest.approx(deviation, rel=2e-2, abs=1e-6)
+        assert last.volume_fraction <= 0.5 + 1e-3
+
+
+@DEMOS
+def test_resumes_in_the_same_bits(path, shared_tmp_path):
+    whole = do.optimize(coarse(path))
+    do.optimize(coarse(path, iterations=1), shared_tmp_path)
+    resumed = do.optimize(coarse(path), shared_tmp_path, resume=True)
+    for k in whole.x_phys:
+        np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
+    rows = [replace(row, seconds=0.0) for row in resumed.history]
+    assert rows == [replace(row, seconds=0.0) for row in whole.history]
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
+@DEMOS
+def test_same_design_on_any_number_of_ranks(path):
+    together = do.optimize(coarse(path, iterations=2))
+    alone = do.optimize(coarse(path, iterations=2), world=MPI.COMM_SELF)
+    for k in together.x_phys:
+        np.testing.assert_allclose(together.x_phys[k], alone.x_phys[k], rtol=0, atol=1e-8)
+
+
+VARIANTS = {
+    "gains of a scenario": (
+        CONTROLLED,
+        "scenarios=[{changes=['payload.mass=3']}, {changes=['control.stiffness_factor=0.1']}]",
+    ),
+    "speed of a scenario": (
+        SLIDER_CRANK,
+        "scenarios=[{changes=['payload.mass=0.3']}, {changes=['motion.speed=100']}]",
+    ),
+    "projection under control": (CONTROLLED, "design.projection=robust", "design.sharpness=4.0"),
+    "order under control": (CONTROLLED, "reduction.coordinates=auto"),
+    "force on the slider of a scenario": (
+        SLIDER_CRANK,
+        "scenarios=[{changes=['closure.force=-200']}, {changes=['closure.force=0']}]",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_goes_with(name):
+    """The objective falls at once, with a gradient that is that of all variants together."""
+    path, *changes = VARIANTS[name]
+    result = do.optimize(coarse(path, *changes))
+    if WORLD.rank == 0:
+        objectives = [row.objective for row in result.history]
+        assert objectives[-1] < 0.95 * objectives[0], objectives
+
+
+def test_cut_design_that_falls_apart_is_told(shared_tmp_path):
+    """Cut at one half before it is crisp, a rod cannot be simulated: the result is kept."""
+    changes = ["design.projection=heaviside", "design.sharpness=4.0", "optimizer.max_iterations=3"]
+    words = [*COARSE[SLIDER_CRANK], *changes]
+    run(
+        "optimize", SLIDER_CRANK, *overrides(*words), "--no-plots", "--out", shared_tmp_path / "rod"
+    )
+    if WORLD.rank == 0:
+        summary = json.loads((shared_tmp_path / "rod" / "summary.json").read_text())
+        assert "crisp" not in summary
+        assert any("cut at a density of one half" in one for one in summary["warnings"])
