@@ -28,6 +28,8 @@ TABLES = {
     "arms": "An array of tables, one `[[arms]]` an arm, from the base outwards. "
     "A key that an arm leaves out has the value of the arm before it.",
     "motion": "What the machine does.",
+    "control": "Drives with feed-forward and feedback; without this table joints are prescribed.",
+    "closure": "What closes the chain: a slider or a pin at the end of the last arm.",
     "payload": "What the end of the last arm carries.",
     "damping": "Damping of the arms.",
     "reduction": "The reduced model of every arm.",
