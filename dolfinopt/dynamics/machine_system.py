@@ -246,13 +246,18 @@ class MachineSystem:
 
     @cached_property
     def _softness(self) -> float:
-        """The largest static deflection of an arm's end by a unit force across it, m/N."""
-        found = [
-            float(body.outboard[1] @ np.linalg.solve(body.K, body.outboard[1]))
-            for body in self.mechanism.bodies
-            if body.num_modes
-        ]
-        return max(found, default=1e-6)
+        """The largest static deflection of an arm by a unit force across it, m/N.
+
+        That of its end; or a third of the arm's length squared times the end's rotation by a unit
+        moment, which is the same of a cantilever, and not zero of an arm whose frame is its chord.
+        """
+        found = [0.0]
+        for body in self.mechanism.bodies:
+            if body.num_modes:
+                soft = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
+                square = float(body.outboard_point @ body.outboard_point)
+                found += [float(soft[1, 1]), float(soft[2, 2]) * square / 3.0]
+        return max(found) or 1e-6
 
     @cached_property
     def rigid_scale(self) -> np.ndarray:

@@ -1,0 +1,55 @@
+"""The two-arm machine under feedback control: against geometrically exact beams, and limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from reference_machines import (
+    GAINS,
+    HALF,
+    Tree,
+    apart,
+    bending_corrected,
+    machine,
+    reference,
+    simulated,
+    two_arm,
+    with_keys,
+)
+
+from dolfinopt.model import SimulationResult
+
+pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
+
+
+@pytest.fixture(scope="module")
+def controlled() -> Tree:
+    """Return the scene of `reference/control_half_1.9s.csv`."""
+    tree = two_arm("arms.cells=[50,4]", "reduction.coordinates=6", control=GAINS)
+    simulation = {"stiffening": True, "sample": 1e-2, "tolerance": 1e-5}
+    return bending_corrected(with_keys(tree, {"simulation": simulation}), HALF)
+
+
+@pytest.fixture(scope="module")
+def moved(controlled: Tree) -> SimulationResult:
+    """Return its simulation."""
+    return simulated(controlled)
+
+
+def test_deviation_and_forces_of_exact_beams(moved: SimulationResult) -> None:
+    """Exudyn's beams with the same controller, and a second code: `reference/README.md`."""
+    expected, (trajectory, _) = reference("control_half_1.9s"), machine(moved)
+    assert np.allclose(trajectory.t, expected["t"])
+    path = np.stack([expected["dev_x"], expected["dev_y"]], axis=1)
+    largest = np.hypot(*path.T).max()
+    assert np.hypot(*(trajectory.deviation - path).T).max() < 3e-3 * largest  # measured 1.4e-3
+    assert moved.max_deviation == pytest.approx(55.161e-3, rel=1e-3)  # 4e-4
+    assert trajectory.max_deviation[1] == pytest.approx(0.814, abs=5e-3)
+    for k, name in enumerate(("x", "shoulder", "elbow")):
+        wanted = expected[f"qdes_{name}"]
+        assert np.abs(trajectory.desired.q[:, k] - wanted).max() < 1e-6  # the table's digits
+        # Against how far the coordinates leave the desired motion: 5e-3, of which 5e-4 are digits.
+        away = np.abs(expected[f"q_{name}"] - wanted).max()
+        assert np.abs(trajectory.q_r[:, k] - expected[f"q_{name}"]).max() < 1e-2 * away
+    for k, name in enumerate(("cart", "shoulder", "elbow")):
+        assert apart(trajectory.joint_forces[:, k], expected[f"u_{name}"]) < 4e-3  # 2e-3

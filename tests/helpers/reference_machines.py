@@ -1,0 +1,149 @@
+"""Scenes of machines, and what `tests/reference` says of them: control, slider-crank, four-bar."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from runs import scene
+
+from dolfinopt import Model
+from dolfinopt.arms.arm import build_arms
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.model import SimulationResult
+from dolfinopt.multibody.end_effector import outboard
+from dolfinopt.parallel import partition_arms
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import scene_from_dict
+
+Tree = dict[str, Any]
+REFERENCE = Path(__file__).parents[1] / "reference"
+GAINS = {"stiffness": [2e5, 2e4, 2e4], "damping": [2e4, 600.0, 600.0]}
+HALF = 70e9 * (1e-6 + 0.125 * (1.0 - 1e-6))  # Young's modulus of density 0.5, Pa
+
+
+def reference(name: str) -> dict[str, np.ndarray]:
+    """Return the columns of a table of `tests/reference` by name, without units."""
+    file = REFERENCE / f"{name}.csv"
+    with file.open(encoding="ascii") as lines:
+        names = [column.split("[")[0].strip() for column in next(lines).split(",")]
+    return dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1).T, strict=True))
+
+
+def with_keys(tree: Tree, changes: Mapping[str, Any]) -> Tree:
+    """Return a scene with other keys; those of a table beside what it has."""
+    new = copy.deepcopy(tree)
+    for key, value in changes.items():
+        new[key] = {**(new.get(key) or {}), **value} if isinstance(value, Mapping) else value
+    return new
+
+
+def two_arm(*overrides: str, **changes: Any) -> Tree:
+    """Return the two-arm scene with keys changed, then tables."""
+    return with_keys(scene(*overrides).to_tree(), changes)
+
+
+def slider_crank(height: float, cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
+    """Return the slider-crank of `tests/reference`: steel rod of `height`, m, 2 turns in 0.1 s."""
+    tree = {
+        "name": "slider-crank",
+        "material": {"young_modulus": 210e9, "poisson_ratio": 0.3, "density": 7850.0},
+        "interpolation": {"law": "two-material", "penalty": 3.0, "floor": 1e-3},
+        "arms": [
+            {
+                "name": "crank", "length": 0.15, "height": 0.02, "thickness": 0.01,
+                "rigid": True, "mass": 0.0, "inertia": 0.0,
+            },
+            {
+                "name": "rod", "length": 0.30, "height": height, "thickness": 0.01,
+                "cells": list(cells), "passive": 0.0,
+            },
+        ],
+        "motion": {
+            "path": "rotation", "base": "fixed", "joint_height": 0.0, "speed": 150.0,
+            "duration": 0.05, "horizon": 0.1,
+        },
+        "payload": {"mass": 0.5},
+        "damping": {"stiffness_proportional": 2e-5},
+        "closure": {"kind": "slider", "side": 1},
+        "reduction": {"coordinates": 8},
+        "simulation": {"stiffening": True, "sample": 2e-4, "tolerance": 1e-4},
+        "design": {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0},
+        "objective": {"kind": "compliance"},
+    }  # fmt: skip
+    return with_keys(tree, changes)
+
+
+def four_bar(cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
+    """Return the four-bar of `tests/reference`, of aluminium."""
+    tree = slider_crank(0.010, cells)
+    crank, bar = tree["arms"]
+    tree["name"] = "four-bar"
+    tree["material"] = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
+    tree["arms"] = [
+        dict(crank, length=0.1),
+        dict(bar, name="coupler", length=0.28, joint_mass=0.05),
+        dict(bar, name="rocker", length=0.25),
+    ]
+    tree["motion"] |= {"speed": 100.0, "duration": 0.08, "horizon": 0.2}
+    tree["simulation"] |= {"sample": 4e-4}
+    tree["closure"] = {"kind": "pin", "point": [0.25, 0.0], "side": -1}
+    tree["payload"] = {"mass": 0.0}
+    return with_keys(tree, changes)
+
+
+def bending_corrected(tree: Tree, young: float) -> Tree:
+    """Return the scene with Young's modulus such that the last arm's tip bends as a beam's does.
+
+    Bilinear cells are too stiff in bending, by 1 % and more where they are long; the references
+    are beams of Young's modulus `young`, Pa, with shear, 5/6 G A. What is left is the axial
+    stiffness, as much too low, which matters little.
+    """
+    made = scene_from_dict(tree)
+    arm, material = made.arms[-1], made.material
+    partition = partition_arms(Model(made)._world, made.cell_counts)
+    owned = build_arms(made, partition, Profile())
+    last = owned[max(owned)]
+    body = last.reduce(last.uniform(made.design.initial))
+    tip = (body.outboard @ np.linalg.solve(body.K, body.outboard.T))[1, 1]
+    area = arm.thickness * arm.height
+    inertia, shear = area * arm.height**2 / 12.0, 0.5 * young / (1.0 + material.poisson_ratio)
+    beam = arm.length**3 / (3.0 * young * inertia) + arm.length / (5.0 / 6.0 * shear * area)
+    factor = float(tip / beam)
+    return with_keys(tree, {"material": {"young_modulus": material.young_modulus * factor}})
+
+
+def simulated(tree: Tree) -> SimulationResult:
+    """Return the simulation of a scene's initial design."""
+    return Model(scene_from_dict(tree)).simulate()
+
+
+def machine(result: SimulationResult) -> tuple[Trajectory, MachineSystem]:
+    """Return trajectory and system of a simulated machine."""
+    assert result.trajectory is not None
+    assert isinstance(result.trajectory.problem, MachineSystem)
+    return result.trajectory, result.trajectory.problem
+
+
+def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
+    """Return an arm's deflection halfway (n,), m: left normal of the chord between its joints."""
+    trajectory, _ = machine(result)
+    mechanism = trajectory.mechanism
+    view = result.views[[one.name for one in result.views].index(result.scene.arms[arm].name)]
+    corners, modes = view.corners.reshape(-1, 2), view.modes.reshape(-1, 2, view.modes.shape[-1])
+    middle = 0.5 * mechanism.bodies[arm].outboard_point
+    node = int(np.argmin(np.hypot(*(corners - middle).T)))
+    assert np.allclose(corners[node], middle)
+    q = trajectory.q_e[:, mechanism.slices[arm]]
+    place = complex(*middle) + q @ (modes[node, 0] + 1j * modes[node, 1])
+    chord = outboard(mechanism.modal_constants[arm], q)[0]
+    return (np.conj(chord / np.abs(chord)) * place).imag
+
+
+def apart(found: np.ndarray, expected: np.ndarray) -> float:
+    """Return the largest difference over time, of the largest value expected."""
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
