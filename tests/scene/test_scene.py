@@ -154,6 +154,7 @@ def test_demo_states_every_other_key():
         *("joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio"),
         *("joint_stiffness", "joint_damping"),
         *("feed_forward", "stiffness", "damping", "limits", "forces"),
+        *("stiffness_factor", "damping_factor"),
         *("point", "direction", "side", "force"),
         "design",
         "rigid",
