@@ -127,39 +127,19 @@ def place_gradient(
         return place_gradient(*few)
     origins, rotations, shifts = _frames(mechanism, motion, q)
     first = 1 + len(mechanism.bodies)
-    turns, shifted = [], [moved[:, 0].astype(complex)]  # of frames and origins, by `moved`
-    turn = np.zeros(len(q))
-    for k, part in enumerate(mechanism.slices):
-        B, rotation = shifts[k]
-        v = moved[:, first + part.start : first + part.stop]
-        turn = turn + moved[:, 1 + k]
-        turns.append(turn)
-        bend = np.einsum("nk,nk->n", np.broadcast_to(B, v.shape), v)
-        arm = origins[k + 1] - origins[k]
-        shifted.append(shifted[-1] + 1j * turn * arm + rotations[k] * bend)
-        turn = turn + np.einsum("nk,nk->n", rotation, v)
+    virtual = [moved[:, first + part.start : first + part.stop] for part in mechanism.slices]
+    turns, swept = _virtual_motion(origins, rotations, shifts, moved[:, :first], virtual)
     found = []
-    for k, part in enumerate(mechanism.slices):
-        e, v = q[:, part], moved[:, first + part.start : first + part.stop]
-        lever, swept = origins[-1] - origins[k + 1], shifted[-1] - shifted[k + 1]
-        back = np.conj(rotations[k])
-        here, there = back * weights, back * pull
-        # What a shift along the frame's axes and a rotation of all that is outboard are worth.
-        static = [here.real, here.imag, (np.conj(weights) * 1j * lever).real]
-        static = [
-            a + b
-            for a, b in zip(
-                static,
-                (
-                    (-1j * turns[k] * there).real,
-                    (-1j * turns[k] * there).imag,
-                    (np.conj(pull) * 1j * swept).real,
-                ),
-                strict=True,
-            )
-        ]
-        virtual = [there.real, there.imag, (np.conj(pull) * 1j * lever).real]
-        pairs = list(zip(static, virtual, strict=True))
+    for k, (part, v) in enumerate(zip(mechanism.slices, virtual, strict=True)):
+        e, back = q[:, part], np.conj(rotations[k])
+        lever, change = origins[-1] - origins[k + 1], swept[-1] - swept[k + 1]
+        # What a shift along the frame's axes, and a rotation of all that is outboard, are worth:
+        # of the place itself and as the frame turns by `moved`, and of the modes' variation.
+        turned = weights - 1j * turns[k] * pull
+        spin = (np.conj(weights) * 1j * lever + np.conj(pull) * 1j * change).real
+        values = ((back * turned).real, (back * turned).imag, spin)
+        rates = ((back * pull).real, (back * pull).imag, (np.conj(pull) * 1j * lever).real)
+        pairs = list(zip(values, rates, strict=True))
         by = {"outboard": np.stack([a @ e + b @ v for a, b in pairs])}
         if mechanism.modal_constants[k].K0 is not None:
             by["K0_outboard"] = -np.stack(
@@ -167,3 +147,29 @@ def place_gradient(
             )
         found.append(by)
     return found
+
+
+def _virtual_motion(
+    origins: list[np.ndarray],
+    rotations: list[np.ndarray],
+    shifts: list[tuple[np.ndarray, np.ndarray]],
+    rigid: np.ndarray,
+    virtual: list[np.ndarray],
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return how far virtual displacements turn every frame, and shift every origin (complex).
+
+    Args:
+        origins, rotations, shifts: see `_frames`.
+        rigid: (n, 1 + arms) virtual displacements of the rigid coordinates.
+        virtual: (n, q) of every arm's elastic coordinates.
+    """
+    turns, swept = [], [rigid[:, 0].astype(complex)]
+    turn = np.zeros(len(rigid))
+    for k, ((B, rotation), v) in enumerate(zip(shifts, virtual, strict=True)):
+        turn = turn + rigid[:, 1 + k]
+        turns.append(turn)
+        bend = np.einsum("nk,nk->n", np.broadcast_to(B, v.shape), v)
+        arm = origins[k + 1] - origins[k]
+        swept.append(swept[-1] + 1j * turn * arm + rotations[k] * bend)
+        turn = turn + np.einsum("nk,nk->n", rotation, v)
+    return turns, swept
