@@ -11,7 +11,7 @@ from scipy.interpolate import make_interp_spline
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.drives import Closure, Drives, pin, slider
+from dolfinopt.multibody.drives import Closure, Drives, Springs, pin, slider
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
 from dolfinopt.multibody.motion import CART, RigidMotion, breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -40,7 +40,12 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
 
 def reflected_inertia(arm: Arm) -> float:
     """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
-    return 0.0 if arm.joint_stiffness > 0.0 else arm.rotor_inertia * arm.gear_ratio**2
+    return 0.0 if arm.joint_stiffness > 0.0 else rotor_inertia(arm)
+
+
+def rotor_inertia(arm: Arm) -> float:
+    """Return the inertia of the rotor that drives an arm's inboard joint, geared, kg m2."""
+    return arm.rotor_inertia * arm.gear_ratio**2
 
 
 def is_machine(scene: Scene) -> bool:
@@ -104,6 +109,13 @@ def _drives(scene: Scene) -> Drives:
         if control.limits is not None:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
+    soft = [k for k, arm in enumerate(scene.arms) if arm.joint_stiffness > 0.0 and control]
+    springs = Springs(
+        joints=np.searchsorted(rows, 1 + np.array(soft, dtype=int)),
+        stiffness=np.array([scene.arms[k].joint_stiffness for k in soft]),
+        damping=np.array([scene.arms[k].joint_damping for k in soft]),
+        rotor=np.array([rotor_inertia(scene.arms[k]) for k in soft]),
+    )
     table = _table_of_forces(scene)
     return Drives(
         free=rows,
@@ -113,6 +125,7 @@ def _drives(scene: Scene) -> Drives:
         driven=(rows >= first) & (rows < last),
         rigid_feed_forward=control is not None and control.feed_forward == "rigid",
         table=None if table is None else lambda t: table(t)[:, rows],
+        springs=springs,
     )
 
 

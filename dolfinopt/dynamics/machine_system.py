@@ -1,10 +1,11 @@
 """A machine with free rigid coordinates, feedback control and closed loops, as a `System`.
 
-Unknowns are y = (e, q, mu): the deviation e of the free rigid coordinates from the desired motion,
-the elastic coordinates q, and for every constraint a coordinate whose second derivative is its
-multiplier. Equations are those of the free rigid coordinates, forces of inverse dynamics less
-drives less what the closure does; of the elastic coordinates; and the constraints themselves at
-every stage: Radau IIA of index 3, of which positions have order 2 s - 1, velocities s and
+Unknowns are y = (e, q, mu, s): the deviation e of the free rigid coordinates from the desired
+motion, the elastic coordinates q, for every constraint a coordinate whose second derivative is its
+multiplier, and the deviation s of motors that drive their arms through springs. Equations are those
+of the free rigid coordinates, forces of inverse dynamics less drives less what the closure does; of
+the elastic coordinates; the constraints themselves at every stage; and of the motors. With
+constraints this is Radau IIA of index 3, of which positions have order 2 s - 1, velocities s and
 multipliers s - 1. Source: Hairer, Lubich & Roche (1989), doi:10.1007/BFb0093947.
 """
 
@@ -98,8 +99,27 @@ class MachineInstants:
 
     def split(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (n, R), (n, N), (n, m) of coordinates or their derivatives (n, S)."""
-        a, b, _ = self.machine.ends
-        return y[:, :a], y[:, a:b], y[:, b:]
+        a, b, c = self.machine.ends
+        return y[:, :a], y[:, a:b], y[:, b:c]
+
+    def motors(self, y: np.ndarray) -> np.ndarray:
+        """Return the part (n, M) of motors behind springs."""
+        return y[:, self.machine.ends[2] :]
+
+    def at_drives(self, y: np.ndarray) -> np.ndarray:
+        """Return the free coordinates (n, R) where the drives are: of soft joints the motors'."""
+        here = y[:, : self.machine.ends[0]]
+        joints = self.machine.drives.springs.joints
+        if len(joints):
+            here = here.copy()
+            here[:, joints] = self.motors(y)
+        return here
+
+    def spring_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
+        """Return the moments (n, M) with which arms pull on their motors' springs, N m."""
+        springs = self.machine.drives.springs
+        apart, rate = (x[:, springs.joints] - self.motors(x) for x in (y, yd))
+        return springs.stiffness * apart + springs.damping * rate
 
     def motion(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> RigidMotion:
         """Return the rigid coordinates as they move."""
@@ -115,8 +135,7 @@ class MachineInstants:
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
-        R = self.machine.ends[0]
-        return self.machine.drives.force(self.ahead, y[:, :R], yd[:, :R])
+        return self.machine.drives.force(self.ahead, self.at_drives(y), self.at_drives(yd))
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return the forces of all drives (n, 1 + arms), N and N m.
@@ -146,8 +165,13 @@ class MachineInstants:
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         rows, forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)
-        rigid = forces[:, machine.drives.free] - self.drive_forces(y, yd)
-        out = np.concatenate([rigid, rows, np.zeros_like(multipliers)], axis=1)
+        drives, springs = self.drive_forces(y, yd), machine.drives.springs
+        rigid = forces[:, machine.drives.free] - drives
+        pulled = self.spring_forces(y, yd)
+        rigid[:, springs.joints] += drives[:, springs.joints] + pulled
+        wanted = self.desired.qdd[:, machine.drives.free[springs.joints]]
+        motors = springs.rotor * (wanted + self.motors(ydd)) - pulled - drives[:, springs.joints]
+        out = np.concatenate([rigid, rows, np.zeros_like(multipliers), motors], axis=1)
         if machine.closure is None:
             return out
         here = interface_place(machine.mechanism, motion, q)
@@ -155,7 +179,8 @@ class MachineInstants:
         out[:, : machine.ends[1]] -= (
             np.conj(pull)[:, None] * here.jacobian[:, machine.columns]
         ).real
-        out[:, machine.ends[1] :] = machine.gap_scale * machine.closure.gap(here.place)
+        gaps = slice(*machine.ends[1:])
+        out[:, gaps] = machine.gap_scale * machine.closure.gap(here.place)
         return out
 
     def linearise(
@@ -166,16 +191,24 @@ class MachineInstants:
             every = repeated(len(y))
             return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
-        (R, moving, S), count = machine.ends, len(y)
+        (R, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
         motion = self.motion(y, yd, ydd)
-        (e, q, _), (ed, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
+        (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         matrix = np.zeros((count, S, 3, S))
         tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, machine.drives.free)
         matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
-        passing = machine.drives.passing(self.ahead, e, ed)
+        passing = machine.drives.passing(self.ahead, self.at_drives(y), self.at_drives(yd))
+        springs = machine.drives.springs
+        motors = last + np.arange(len(springs.joints))
         every = np.arange(R)
+        every[springs.joints] = motors
         matrix[:, every, 0, every] += passing * machine.drives.stiffness
         matrix[:, every, 1, every] += passing * machine.drives.damping
+        for order, value in enumerate((springs.stiffness, springs.damping)):
+            for rows, sign in ((springs.joints, 1.0), (motors, -1.0)):
+                matrix[:, rows, order, springs.joints] += sign * value
+                matrix[:, rows, order, motors] -= sign * value
+        matrix[:, motors, 2, motors] += springs.rotor
         if machine.closure is not None:
             here = interface_place(machine.mechanism, motion, q, second=True)
             assert here.hessian is not None
@@ -183,8 +216,8 @@ class MachineInstants:
             H = here.hessian[:, machine.columns[:, None], machine.columns]
             pull = np.conj(machine.ground_force(multipliers))
             matrix[:, :moving, 0, :moving] -= (pull[:, None, None] * H).real
-            matrix[:, :moving, 2, moving:] -= J.swapaxes(1, 2)
-            matrix[:, moving:, 0, :moving] += machine.gap_scale * J
+            matrix[:, :moving, 2, moving:last] -= J.swapaxes(1, 2)
+            matrix[:, moving:last, 0, :moving] += machine.gap_scale * J
         return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
 
 
@@ -208,7 +241,7 @@ class MachineSystem:
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
-        """Ends R, R + N, S = R + N + m of the three kinds of unknowns."""
+        """Ends R, R + N, R + N + m of three kinds of unknowns; M motors follow."""
         moving = len(self.drives.free) + self.mechanism.num_coordinates
         constraints = 0 if self.closure is None else self.closure.count
         return len(self.drives.free), moving, moving + constraints
@@ -221,8 +254,8 @@ class MachineSystem:
 
     @property
     def num_coordinates(self) -> int:
-        """Number S of unknowns."""
-        return self.ends[2]
+        """Number S = R + N + m + M of unknowns."""
+        return self.ends[2] + len(self.drives.springs.joints)
 
     @property
     def elastic_columns(self) -> slice:
@@ -281,6 +314,9 @@ class MachineSystem:
         ahead = np.zeros((len(t), self.ends[0]))
         if self.drives.rigid_feed_forward:
             ahead += feed_forward(self.rigid, desired, self.drives, self.closure)
+            springs = self.drives.springs
+            wanted = desired.qdd[:, self.drives.free[springs.joints]]
+            ahead[:, springs.joints] += springs.rotor * wanted
         if self.drives.table is not None:
             ahead += self.drives.table(t)
         return MachineInstants(self, desired, ahead)
@@ -313,22 +349,22 @@ class MachineSystem:
 
     def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
-        instants, moving = self.at(np.zeros(1)), self.ends[1]
+        instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
         rest, ydd = np.zeros_like(y), np.zeros_like(y)
         for _ in range(MAX_NEWTON):
             residual = instants.residual(y, rest, ydd)[0]
             if not residual.any():
-                return y, ydd[0, moving:]
-            by_q, _, by_a = np.split(instants.linearise(y, rest, ydd).dense()[0], 3, axis=1)
-            matrix = np.concatenate([by_q[:, :moving], by_a[:, moving:]], axis=1)
+                return y, ydd[0, ground]
+            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])
             try:
                 step = np.linalg.solve(matrix, -residual)
             except np.linalg.LinAlgError:
                 break
-            y = y + np.concatenate([step[:moving], np.zeros(len(step) - moving)])
-            ydd[0, moving:] += step[moving:]
-            if np.abs(step[:moving]).max() <= ROUNDING * max(1.0, np.abs(y).max()):
-                return y, ydd[0, moving:]
+            ydd[0, ground] += step[ground]
+            step[ground] = 0.0
+            y = y + step
+            if np.abs(step).max() <= ROUNDING * max(1.0, np.abs(y).max()):
+                return y, ydd[0, ground]
         raise ConvergenceError(
             "the machine finds no equilibrium at t = 0: the drives are too soft for gravity, or "
             "the loop cannot be closed; raise control.stiffness or material.young_modulus, or "
@@ -351,15 +387,20 @@ class MachineSystem:
         """
         instants, moving = self.at(t), self.ends[1]
         motion = instants.motion(y, yd, ydd)
-        (e, q, _), (ed, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
+        (_, q, _), (_, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
         of_forces = np.zeros_like(motion.q)
         of_forces[:, self.drives.free] = of_rigid
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
         if self.drives.rigid_feed_forward:
-            passing = self.drives.passing(instants.ahead, e, ed)
+            at_drives = instants.at_drives
+            passing = self.drives.passing(instants.ahead, at_drives(y), at_drives(yd))
             weights = feed_forward_weights(
-                self.rigid, instants.desired, self.drives, self.closure, -passing * of_rigid
+                self.rigid,
+                instants.desired,
+                self.drives,
+                self.closure,
+                -passing * at_drives(multipliers),
             )
             none = np.zeros((len(t), 0))
             rigid = body_gradient(self.rigid, instants.desired, none, none, none, none, weights)
@@ -383,14 +424,21 @@ class MachineSystem:
         if self.is_held.any():
             return self.elastic.start_gradient(y[R:moving], by_y[R:moving])
         rest, ydd = np.zeros((1, len(y))), np.zeros((1, len(y)))
-        _, ydd[0, moving:] = self._rest(y[None])
-        by_q, _, by_a = np.split(
-            self.at(np.zeros(1)).linearise(y[None], rest, ydd).dense()[0], 3, 1
-        )
-        matrix = np.concatenate([by_q[:, :moving], by_a[:, moving:]], axis=1)
-        right = np.concatenate([by_y[:moving], np.zeros(len(y) - moving)])
-        multipliers = np.linalg.solve(matrix.T, -right)
+        ground = slice(*self.ends[1:])
+        _, ydd[0, ground] = self._rest(y[None])
+        tangent = self.at(np.zeros(1)).linearise(y[None], rest, ydd).dense()[0]
+        right = by_y.copy()
+        right[ground] = 0.0
+        multipliers = np.linalg.solve(self._at_rest(tangent).T, -right)
         return self.body_gradient(np.zeros(1), y[None], rest, ydd, multipliers[None])
+
+    def _at_rest(self, tangent: np.ndarray) -> np.ndarray:
+        """Return the derivative (S, S) by coordinates and multipliers of a tangent (S, 3 S)."""
+        by_q, _, by_a = np.split(tangent, 3, axis=1)
+        ground = slice(*self.ends[1:])
+        matrix = by_q.copy()
+        matrix[:, ground] = by_a[:, ground]
+        return matrix
 
     def norm(self, y: np.ndarray) -> np.ndarray:
         """Return the largest norm over n instants (..., groups): free coordinates, then arms.
@@ -401,7 +449,10 @@ class MachineSystem:
         arms = self.mechanism.norm(y[..., R:moving])
         if R == 0:
             return arms
-        rigid = np.sqrt(np.square(self.rigid_scale * y[..., :R]).sum(axis=-1)).max(axis=-1)
+        scale, joints = self.rigid_scale, self.drives.springs.joints
+        squares = np.square(scale * y[..., :R]).sum(axis=-1)
+        squares += np.square(scale[joints] * y[..., self.ends[2] :]).sum(axis=-1)
+        rigid = np.sqrt(squares).max(axis=-1)
         return np.concatenate([rigid[..., None], arms], axis=-1)
 
     def slowest_frequency(self) -> float:
@@ -422,7 +473,7 @@ class MachineSystem:
             return Unchanged(self)
         arms = self.elastic.preconditioner()
         changed = replace(self, mechanism=arms.system.mechanism)
-        R, moving, size = self.ends
+        (R, moving, _), size = self.ends, self.num_coordinates
         frequencies = np.zeros((1, size))
         frequencies[:, R:moving] = arms.frequencies
         k, d, m = np.ones((1, size)), np.zeros((1, size)), np.ones((1, size))

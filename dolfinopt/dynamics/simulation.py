@@ -132,7 +132,7 @@ class Trajectory:
         """
         if not isinstance(self.problem, MachineSystem) or self.problem.closure is None:
             return None
-        return self.unknowns[2][:, self.problem.ends[1] :]
+        return self.unknowns[2][:, slice(*self.problem.ends[1:])]
 
     @cached_property
     def end(self) -> np.ndarray:

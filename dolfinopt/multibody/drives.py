@@ -10,6 +10,25 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
+class Springs:
+    """Springs and dampers between motors and arms, whose motors have coordinates of their own.
+
+    Attributes:
+        joints: (M,) places of their joints among the free rigid coordinates.
+        stiffness, damping: (M,) N m/rad, N m s/rad.
+        rotor: (M,) inertia of the motors as the joints feel it, kg m2.
+    """
+
+    joints: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    rotor: np.ndarray
+
+
+NO_SPRINGS = Springs(np.zeros(0, dtype=int), *np.zeros((3, 0)))
+
+
+@dataclass(frozen=True, eq=False)
 class Drives:
     """Feed-forward plus proportional and derivative feedback of the free rigid coordinates.
 
@@ -24,6 +43,7 @@ class Drives:
         driven: (R,) True where a drive acts; others follow from a closed loop.
         rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
         table: of instants t (n,), s, forces (n, R) that are added; or None.
+        springs: between drives and arms, where a drive is controlled.
     """
 
     free: np.ndarray
@@ -33,6 +53,7 @@ class Drives:
     driven: np.ndarray
     rigid_feed_forward: bool = False
     table: Callable[[np.ndarray], np.ndarray] | None = None
+    springs: Springs = NO_SPRINGS
 
     def force(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return u (n, R) from u_ff, q - q_d and its rate, each (n, R)."""

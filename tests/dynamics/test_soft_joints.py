@@ -1,0 +1,83 @@
+"""Springs between controlled motors and arms: the stiff limit, tangents and exact gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from runs import scene
+
+from dolfinopt import Model
+from dolfinopt.dynamics.build import build_system
+from dolfinopt.dynamics.machine_system import MachineSystem
+
+pytestmark = pytest.mark.serial  # one rank shows all there is
+
+SMALL = ("arms.cells=[16,3]", "motion.horizon=1.9", "simulation.tolerance=1e-5")
+CONTROL = "control={stiffness=[2e5, 2e4, 2e4], damping=[2e4, 600.0, 600.0]}"
+ROTORS = ("arms.rotor_inertia=2e-5", "arms.gear_ratio=100.0")
+GRAVITY = "motion.gravity=[0.0, -9.81]"
+
+
+def simulated(*changes: str):
+    model = Model(scene(*SMALL, CONTROL, *ROTORS, *changes))
+    return model.simulate().trajectory
+
+
+def test_stiff_springs_are_rigid_drives() -> None:
+    """The motors' inertia acts on the joints then; the rest falls with the spring's softness."""
+    rigid = simulated(GRAVITY)
+    left = []
+    for stiffness in (2e6, 2e7):
+        soft = simulated(
+            GRAVITY, f"arms.joint_stiffness={stiffness}", f"arms.joint_damping={1e-3 * stiffness}"
+        )
+        assert soft.problem.num_coordinates == rigid.problem.num_coordinates + 2
+        left.append(np.abs(soft.deviation - rigid.deviation).max() / np.abs(rigid.deviation).max())
+    assert left[0] / left[1] == pytest.approx(10.0, rel=0.05)
+    assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
+
+
+def test_tangent() -> None:
+    """The derivative of the residual by coordinates and rates, by central differences."""
+    options = ("arms.joint_stiffness=1e5", "arms.joint_damping=100.0", "simulation.stiffening=true")
+    limits = CONTROL.replace("}", ", limits=[300.0, 300.0, 200.0]}")
+    model = Model(scene(*SMALL, limits, *ROTORS, GRAVITY, *options))
+    trajectory = model.simulate().trajectory
+    system = build_system(trajectory.scene, list(trajectory.mechanism.bodies))
+    assert isinstance(system, MachineSystem)
+    instants = system.at(np.array([0.3, 0.9]))
+    rng = np.random.default_rng(4)
+    scale = np.abs(trajectory.unknowns[0]).max(axis=0) + 1e-6
+    state = [rng.normal(size=(2, system.num_coordinates)) * s * scale for s in (1.0, 20.0, 400.0)]
+    matrix = instants.linearise(*state).dense().reshape(2, len(scale), 3, len(scale))
+    for order in range(3):
+        for i, size in enumerate(scale):
+            ahead, back = ([x.copy() for x in state] for _ in range(2))
+            step = 1e-4 * size * (1.0, 20.0, 400.0)[order]
+            ahead[order][:, i] += step
+            back[order][:, i] -= step
+            found = (instants.residual(*ahead) - instants.residual(*back)) / (2.0 * step)
+            # Second-order terms of size step^2 and rounding of residuals of a thousand newtons.
+            size_of = np.abs(matrix[:, :, order]).max(axis=(0, 2)) + 1e-6
+            assert (np.abs(found - matrix[:, :, order, i]) < 1e-5 * size_of).all()
+
+
+def test_exact_gradient() -> None:
+    """Taylor: what is left of the deviation falls with the square of the step."""
+    soft = ("arms.joint_stiffness=3e4", "arms.joint_damping=30.0")
+    objective = (
+        "objective.kind=deviation",
+        "objective.gradient=exact",
+        "simulation.tolerance=1e-6",
+    )
+    model = Model(scene(*SMALL, CONTROL, *ROTORS, GRAVITY, *soft, *objective))
+    x = {k: 0.5 + 0.3 * np.sin(1.7 * np.arange(len(v))) for k, v in model.uniform(0.5).items()}
+    direction = {k: 0.1 * np.cos(2.3 * np.arange(len(v))) for k, v in x.items()}
+    gradient = model.gradient(x)
+    slope = sum(gradient[k] @ direction[k] for k in x)
+    at = [
+        model.simulate({k: x[k] + h * direction[k] for k in x}).evaluation.objective
+        for h in (0.0, 0.1, 0.01)
+    ]
+    left = [abs(f - at[0] - h * slope) for f, h in zip(at[1:], (0.1, 0.01), strict=True)]
+    assert np.log10(left[0] / left[1]) == pytest.approx(2.0, abs=0.05)
