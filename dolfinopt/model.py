@@ -30,6 +30,7 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body
 from dolfinopt.disk import write_arrays
+from dolfinopt.dynamics.build import check_forces
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
@@ -484,6 +485,7 @@ def _load(
     else:
         loaded = load_scene(scene, overrides)
     check_motion(loaded)
+    check_forces(loaded)
     for index, arm in enumerate(loaded.arms):
         if arm.sid is not None:
             fixed_body(loaded, index)

@@ -44,11 +44,13 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
+        from dolfinopt.dynamics.build import check_forces
         from dolfinopt.multibody.motion import check_motion
         from dolfinopt.scene.plausibility import implausible
 
         scene = load_scene(path, overrides)
         check_motion(scene)
+        check_forces(scene)
         for index, arm in enumerate(scene.arms):
             if arm.sid is not None:
                 from dolfinopt.arms.arm import fixed_body
@@ -195,10 +197,20 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         ending = f"{summary['iterations']} iterations ({ending}), minimised"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
-        f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
-        f"at {summary['max_deviation_time']:.3f} s, "
+        f"{_largest(summary)}, "
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
+    )
+
+
+def _largest(summary: Mapping[str, Any]) -> str:
+    """Return the largest deviation and when; of a pinned end, which has none, the pin's force."""
+    closure = summary["scene"]["closure"]
+    if closure is not None and closure["kind"] == "pin" and "closure_force_peak" in summary:
+        return f"largest force of the pin {summary['closure_force_peak']:.4g} N"
+    return (
+        f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
+        f"at {summary['max_deviation_time']:.3f} s"
     )
 
 

@@ -13,11 +13,14 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.drives import Closure, Drives, Springs, pin, slider
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
-from dolfinopt.multibody.motion import CART, RigidMotion, breakpoints, rigid_motion
+from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
+from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.load import Arm, Scene
 
+MAX_ROWS = 50  # of a table of forces whose rows begin steps; more are fine as a curve
+SAME_TIME = 1e-6  # share of the horizon within which two instants are one
 Motion = Callable[[np.ndarray], RigidMotion]
 
 
@@ -71,7 +74,8 @@ def build_system(
     if not is_machine(scene):
         return elastic
     closure = closure_of(scene)
-    return MachineSystem(mechanism, motion, elastic.breakpoints, _drives(scene), closure)
+    instants = _with_rows(elastic.breakpoints, scene)
+    return MachineSystem(mechanism, motion, instants, _drives(scene), closure)
 
 
 def closure_of(scene: Scene) -> Closure | None:
@@ -133,22 +137,51 @@ def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return the scene's table of forces as a function of time (n, 1 + arms), or None."""
     if scene.control is None or scene.control.forces is None:
         return None
-    times, curve = _spline(scene.control.forces, scene.driven)
-    first = 1 if scene.driven[0] != CART else 0
+    times, curve = _forces(scene.control.forces, scene.driven)
+    first = 1 if scene.motion.base == "fixed" else 0
 
     def forces(t: np.ndarray) -> np.ndarray:
         out = np.zeros((len(t), 1 + len(scene.arms)))
-        inside = t <= times
+        inside = t <= times[-1]
         out[inside, first : first + len(scene.driven)] = curve(t[inside])
         return out
 
     return forces
 
 
+def check_forces(scene: Scene) -> None:
+    """Raise `InputError` when the scene's table of forces cannot be read, or lacks a column."""
+    _table_of_forces(scene)
+
+
+def _with_rows(instants: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
+    """Return the breakpoints, s, and among them those of a table of forces that is not long.
+
+    Its slope jumps at every row, and at the last one the force itself.
+    """
+    if scene.control is None or scene.control.forces is None:
+        return instants
+    times = _forces(scene.control.forces, scene.driven)[0]
+    times = times if len(times) <= MAX_ROWS else times[-1:]
+    apart = SAME_TIME * scene.motion.horizon
+    found = list(instants)
+    for t in times[(times > 0.0) & (times < scene.motion.horizon)].tolist():
+        if min(abs(t - other) for other in found) > apart:
+            found.append(t)
+    return tuple(sorted(found))
+
+
+def _forces(file: str, columns: tuple[str, ...]) -> tuple[np.ndarray, Callable[..., np.ndarray]]:
+    """Return the instants of a table of forces (n,), s, and the line through its rows."""
+    return _read_forces(file, columns, stamp(file))
+
+
 @lru_cache(maxsize=16)
-def _spline(file: str, columns: tuple[str, ...]) -> tuple[float, Callable[..., np.ndarray]]:
-    """Return the last instant of a table of forces, s, and the line through its rows."""
+def _read_forces(
+    file: str, columns: tuple[str, ...], written: int
+) -> tuple[np.ndarray, Callable[..., np.ndarray]]:
+    """Return what `_forces` does; `written` tells versions of the file apart."""
     table = read_table(file, columns)
     if table.t is None:
         raise InputError(f"{file}: expected a column {TIME} besides {', '.join(columns)}")
-    return float(table.t[-1]), make_interp_spline(table.t, table.rows, k=1)
+    return table.t, make_interp_spline(table.t, table.rows, k=1)

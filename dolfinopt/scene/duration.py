@@ -84,7 +84,12 @@ def _chords(file: str, stamp: int) -> float:
 
 def file_stamp(motion: Motion) -> int:
     """Return when the scene's table was last written: a changed one is read anew."""
+    return stamp(motion.file or "")
+
+
+def stamp(file: str) -> int:
+    """Return when a file was last written, ns; 0 where there is none."""
     try:
-        return os.stat(motion.file or "").st_mtime_ns
+        return os.stat(file).st_mtime_ns
     except (OSError, ValueError):
         return 0

@@ -134,7 +134,8 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _check_tables(self) -> Scene:
-        for key in type(self).model_fields:
+        # The closure first: which joints are driven depends on it.
+        for key in sorted(type(self).model_fields, key=lambda name: name != "closure"):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):

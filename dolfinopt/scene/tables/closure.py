@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 ClosureKind = Literal["slider", "pin"]
 Component = Annotated[float, Field(ge=-1e6, le=1e6)]
+# Responses of the deviation at the end of the chain, which a pin leaves none.
+OF_THE_END = ("deviation", "settling")
 DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the last ones
 
 
@@ -53,12 +55,13 @@ class Closure(Table):
         return DEPENDENT[self.kind]
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse a loop of too few arms, or a motion that does not prescribe joints."""
+        """Refuse a loop of too few arms, and what a closed loop cannot be combined with."""
         if len(scene.arms) <= self.dependent:
             raise Refusal(
                 f'expected kind = "{self.kind}" with at least {self.dependent + 1} arms, found '
                 f"{len(scene.arms)}",
                 (*at, "kind"),
+                ("arms",),
             )
         if scene.motion.base != "fixed":
             raise Refusal('expected "fixed" with [closure]', ("motion", "base"), (*at, "kind"))
@@ -69,3 +72,38 @@ class Closure(Table):
                 ("motion", "path"),
                 (*at, "kind"),
             )
+        if scene.simulation.integrator != "radau":
+            raise Refusal(
+                'expected "radau" with [closure]: its stages keep the loop closed',
+                ("simulation", "integrator"),
+                (*at, "kind"),
+            )
+        self._check_springs(scene, at)
+        if self.kind == "pin":
+            self._check_end(scene, at)
+
+    def _check_springs(self, scene: Scene, at: Loc) -> None:
+        """Refuse springs between drive and arm at joints that have no drive."""
+        first = len(scene.arms) - self.dependent
+        for index in range(first, len(scene.arms)):
+            if scene.arms[index].joint_stiffness > 0.0:
+                raise Refusal(
+                    f"expected 0: the joint of {scene.arms[index].name} follows from the others in "
+                    "the closed loop and has no drive",
+                    ("arms", index, "joint_stiffness"),
+                    (*at, "kind"),
+                )
+
+    def _check_end(self, scene: Scene, at: Loc) -> None:
+        """Refuse responses of the deviation of an end that a pin holds."""
+        for key in OF_THE_END:
+            if scene.objective.kind == key or getattr(scene.constraints, key, None) is not None:
+                where = (
+                    ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
+                )
+                raise Refusal(
+                    'expected another response with closure.kind = "pin": the end of the last arm '
+                    "is held, it deviates from nothing; take the compliance",
+                    where,
+                    (*at, "kind"),
+                )

@@ -160,7 +160,7 @@ class Motion(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         independent = len(scene.arms) - scene.dependent_joints
-        if self.path == "rotation" and independent != 1:
+        if self.path == "rotation" and independent > 1:
             raise Refusal(
                 f'expected "joints" with {independent} independent joints: a rotation prescribes '
                 "one",

@@ -1,0 +1,112 @@
+"""The commands on controlled machines and closed loops."""
+
+import json
+
+import numpy as np
+import pytest
+from machines import controlled, loop
+from mpi4py import MPI
+from runs import run
+
+from dolfinopt.errors import InputError
+
+WORLD = MPI.COMM_WORLD
+QUICK = ["--set", "simulation.tolerance=1e-3"]
+
+
+def toml(value) -> str:
+    """Return a value as TOML; JSON is, but for tables inside arrays, which scenes have none of."""
+    return json.dumps(value)
+
+
+def write_scene(scene, folder):
+    """Write a scene's file on the root; return its path."""
+    path = folder / "machine.toml"
+    if WORLD.rank == 0:
+        lines = [f"name = {toml(scene.name)}"]
+        for table, keys in scene.to_tree().items():
+            rows = keys if table == "arms" else [keys]
+            if not isinstance(rows[0], dict) or table == "scenarios":
+                continue
+            for row in rows:
+                lines.append(f"[[{table}]]" if table == "arms" else f"[{table}]")
+                lines += [f"{k} = {toml(v)}" for k, v in row.items() if v is not None]
+        path.write_text("\n".join(lines) + "\n")
+    WORLD.barrier()
+    return path
+
+
+SCENES = {"slider": loop, "pin": lambda: loop("pin"), "control": controlled}
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
+    path, out = write_scene(SCENES[kind](), shared_tmp_path), shared_tmp_path / "out"
+    run("simulate", path, *QUICK, "--out", out, "--animation")
+    WORLD.barrier()
+    pictures = {"design.png", "machine.png", "drives.png", "motion.gif"}
+    pictures |= set() if kind == "pin" else {"deviation.png"}
+    drawn = {one.name for one in out.iterdir() if one.suffix in (".png", ".gif")}
+    assert drawn == pictures
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["converged"] and summary["ranks"] == WORLD.size
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        (out / "drives.png").unlink()
+    WORLD.barrier()
+    run("plot", out)
+    WORLD.barrier()
+    assert (out / "drives.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_optimisation_goes_on_to_the_same_bits(kind, shared_tmp_path):
+    path = write_scene(SCENES[kind](), shared_tmp_path)
+    whole, parts = shared_tmp_path / "whole", shared_tmp_path / "parts"
+    options = [*QUICK, "--no-plots", "--set"]
+    run("optimize", path, *options, "optimizer.max_iterations=3", "--out", whole)
+    run("optimize", path, *options, "optimizer.max_iterations=1", "--out", parts)
+    run("optimize", path, *options, "optimizer.max_iterations=3", "--out", parts, "--resume")
+    WORLD.barrier()
+    for name in ("design.npz", "trajectory.npz"):
+        with np.load(whole / name) as one, np.load(parts / name) as other:
+            assert set(one.files) == set(other.files)
+            for key in one.files:
+                np.testing.assert_array_equal(one[key], other[key], err_msg=key)
+    WORLD.barrier()
+
+
+def test_bodies_of_a_loop_are_exported(shared_tmp_path):
+    path = write_scene(loop("pin"), shared_tmp_path)
+    run("export", path, "--out", shared_tmp_path / "bodies")
+    WORLD.barrier()
+    written = {one.name for one in (shared_tmp_path / "bodies").iterdir()}
+    arms, kinds = ("coupler", "rocker"), (".sid", ".sid.npz", ".fem")
+    assert written == {arm + kind for arm in arms for kind in kinds}
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_gradient_of_machines_is_checked(kind, shared_tmp_path, capsys):
+    scene = SCENES[kind]()
+    path = write_scene(scene, shared_tmp_path)
+    tight = ["--set", "simulation.tolerance=1e-6", "--set", "objective.kind=compliance"]
+    out = shared_tmp_path / "gradient.npz"
+    run("gradient", path, *tight, "--kind", "exact", "--check", "--out", out)
+    WORLD.barrier()
+    if WORLD.rank == 0:
+        table = [line for line in capsys.readouterr().out.splitlines() if "e-" in line]
+        rates = [float(line.split()[-1]) for line in table if line.split()[-1][0].isdigit()]
+        assert len(rates) >= 4
+        np.testing.assert_allclose(rates, 2.0, atol=0.05)
+
+
+def test_a_table_without_a_column_leaves_no_folder(shared_tmp_path):
+    path = write_scene(controlled(), shared_tmp_path)
+    if WORLD.rank == 0:
+        (shared_tmp_path / "drive.csv").write_text("t,cart\n0,0\n1,1\n")
+    WORLD.barrier()
+    out = shared_tmp_path / "out"
+    with pytest.raises(InputError, match=r"drive\.csv: line 1: missing column 'arm1'"):
+        run("simulate", path, "--set", "control.forces=drive.csv", "--out", out)
+    WORLD.barrier()
+    assert not out.exists()
