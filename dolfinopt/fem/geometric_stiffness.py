@@ -45,11 +45,9 @@ class UnitLoads:
 
     @cached_property
     def stresses(self) -> np.ndarray:
-        """Stress xx, yy, xy times t dA at the quadrature points, unit E, (3, 7, n_cells p)."""
+        """Stress xx, yy, xy times t dA at the quadrature points (3, 7, n_cells p), N."""
         quadrature = self.arm.substructure.quadrature
-        values = self.fields[self.arm.operators.cells].reshape(
-            len(quadrature.stress), -1, NUM_LOADS
-        )
+        values = self._cell_values(slice(None)) * self.arm.young[:, None, None]
         stress = (quadrature.stress @ values).reshape(-1, 3, NUM_LOADS)
         return np.ascontiguousarray(np.moveaxis(stress, 0, 2))
 
@@ -58,22 +56,28 @@ class UnitLoads:
         q = V.shape[2]
         i, j = np.triu_indices(q)
         packed = np.zeros((NUM_LOADS, len(i)))
-        for _, points, E, H in self._parts(V):
+        for _, points, H in self._parts(V):
             for stress, pairs in zip(self.stresses[:, :, points], _pairs(H), strict=True):
-                packed += (stress * E) @ pairs.T
+                packed += stress @ pairs.T
         packed = self.arm.comm.allreduce(packed)
         K0 = np.empty((NUM_LOADS, q, q))
         K0[:, i, j] = K0[:, j, i] = packed
         return K0
 
-    def gradient(self, V: np.ndarray, by_K0: np.ndarray) -> GeometricGradient:
+    def gradient(
+        self, V: np.ndarray, by_K0: np.ndarray, *, static: bool = False
+    ) -> GeometricGradient:
         """Differentiate a function of K0 by modes and material (collective on the arm's ranks).
 
-        The stresses' part goes through one static solve a load, the adjoint of u_p.
+        The stresses' part goes through one static solve a load, the adjoint of u_p. Those of the
+        interface's loads are not needed where the constraint modes Psi have an adjoint anyway:
+        u_F = Psi S^-1 with S = Psi'K Psi.
 
         Args:
             V: (n_nodes, 2, q) as given to `geometric_stiffness`.
             by_K0: (7, q, q) derivatives.
+            static: whether V begins with the constraint modes, by which `by_modes` then
+                differentiates u_F, too, and `by_stiffness` by S.
         """
         arm, q = self.arm, V.shape[2]
         quadrature, (count, n) = arm.substructure.quadrature, arm.operators.cells.shape
@@ -81,30 +85,43 @@ class UnitLoads:
         by_pairs = by_K0[:, i, j] + np.where(i == j, 0.0, by_K0[:, j, i])
         by_young = np.empty(count)
         by_modes, by_fields = np.empty((count, n, 2, q)), np.empty((count, n, 2, NUM_LOADS))
-        for cells, points, E, H in self._parts(V):
-            stress = self.stresses[:, :, points]
-            by_stress = by_pairs @ _pairs(H)
+        for cells, points, H in self._parts(V):
             size = cells.stop - cells.start
-            by_young[cells] = (stress * by_stress).sum(axis=(0, 1)).reshape(size, -1).sum(axis=1)
-            by_stress *= E
-            forces = np.moveaxis(by_stress, 2, 0).reshape(size, -1, NUM_LOADS)
+            forces = np.moveaxis(by_pairs @ _pairs(H), 2, 0).reshape(size, -1, NUM_LOADS)
             nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
+            by_young[cells] = np.einsum("ekp,ekp->e", self._cell_values(cells), nodal)
+            nodal *= arm.young[cells, None, None]
             by_fields[cells] = nodal.reshape(size, n, 2, NUM_LOADS)
-            by_H = _pairs_transposed(H, by_pairs.T @ (stress * E))
+            by_H = _pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points])
             by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, 2 * q)
             nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
             by_modes[cells] = nodal.reshape(size, n, 2, q)
-        nodal_forces = sum_at_nodes(arm.operators, by_fields)
-        adjoint = static_response(arm, *arm.restrict(nodal_forces))
-        by_young -= arm.cell_stiffness_products(adjoint, self.fields)
+        forces = sum_at_nodes(arm.operators, by_fields)
+        by_V, by_stiffness = sum_at_nodes(arm.operators, by_modes), np.zeros((3, 3))
+        solved = slice(0, NUM_LOADS)
+        if static:
+            solved = slice(0, NUM_INERTIAL)
+            modes, outboard = arm.constraint_modes(), forces[:, :, NUM_INERTIAL:]
+            compliance = np.linalg.inv(modes.stiffness)
+            by_V[:, :, :3] += outboard @ compliance
+            work = arm.comm.allreduce(np.tensordot(modes.field, outboard, ((0, 1), (0, 1))))
+            by_stiffness = 0.0 - compliance @ work @ compliance
+        adjoint = static_response(arm, *arm.restrict(forces[:, :, solved]))
+        by_young -= arm.cell_stiffness_products(adjoint, self.fields[:, :, solved])
         return GeometricGradient(
-            by_modes=sum_at_nodes(arm.operators, by_modes),
+            by_modes=by_V,
             by_young=by_young,
             by_density=arm.cell_mass_products(adjoint[:, :, :NUM_INERTIAL], accelerations(arm)),
+            by_stiffness=by_stiffness,
         )
 
-    def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray, np.ndarray]]:
-        """Yield runs of cells: cells, points, Young's modulus (points,), modes' gradients there.
+    def _cell_values(self, cells: slice) -> np.ndarray:
+        """Return the fields at the nodes of these cells (cells, 2n, 7)."""
+        nodes = self.arm.operators.cells[cells]
+        return self.fields[nodes].reshape(len(nodes), -1, NUM_LOADS)
+
+    def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
+        """Yield runs of cells: cells, points, modes' gradients there.
 
         The gradients are d_a phi_c as (2, 2, q, points).
         """
@@ -117,8 +134,7 @@ class UnitLoads:
             values = V[self.arm.operators.cells[cells]]
             H = derivatives[cells] @ values.reshape(*values.shape[:2], 2 * q)
             H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, 2, 2, q), 0, 3))
-            points = slice(p * cells.start, p * cells.stop)
-            yield cells, points, np.repeat(self.arm.young[cells], p), H
+            yield cells, slice(p * cells.start, p * cells.stop), H
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,11 +145,13 @@ class GeometricGradient:
         by_modes: (n_nodes, 2, q) by the modes, contributions of this rank's cells.
         by_young: (n_cells,) by Young's modulus, modes held.
         by_density: (n_cells,) by mass density, modes held.
+        by_stiffness: (3, 3) by S of the constraint modes; zero where they were not to be used.
     """
 
     by_modes: np.ndarray
     by_young: np.ndarray
     by_density: np.ndarray
+    by_stiffness: np.ndarray
 
 
 def unit_loads(arm: ElasticArm) -> UnitLoads:
@@ -183,11 +201,10 @@ def _pairs(H: np.ndarray) -> np.ndarray:
     q, points = H.shape[2:]
     out, term = np.empty((3, q * (q + 1) // 2, points)), np.empty(points)
     for place, (i, j) in enumerate(zip(*np.triu_indices(q), strict=True)):
-        for one, terms in zip(out[:, place], _TERMS, strict=True):
-            one[:] = 0.0
+        for one, ((a, b, c), *terms) in zip(out[:, place], _TERMS, strict=True):
+            np.multiply(H[a, c, i], H[b, c, j], out=one)
             for a, b, c in terms:
-                np.multiply(H[a, c, i], H[b, c, j], out=term)
-                one += term
+                one += np.multiply(H[a, c, i], H[b, c, j], out=term)
     return out
 
 

@@ -66,8 +66,11 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
         geometric = None
         if cotangents.is_stiffened:
             by_K0 = np.concatenate([cotangents.K0, cotangents.K0_outboard])
-            geometric = state.unit_loads.gradient(V, by_K0)
+            static = state.scene.reduction.method == "craig-bampton"
+            geometric = state.unit_loads.gradient(V, by_K0, static=static)
             by_V += geometric.by_modes
+            if static:  # K's first block is S; the constraint modes' interior is in equilibrium
+                by_K[:3, :3] += geometric.by_stiffness
         interior, outboard = elastic.restrict(by_V)
         method = METHODS[state.scene.reduction.method]
         assert method.adjoint is not None  # the scene refuses the others
