@@ -153,7 +153,7 @@ def _outboard_gradient(
         _Weights(phi, outer.w, outer.wd, outer.moment),
     )
     modes = np.stack([one.linear(rates, multipliers) for one in weights])
-    K0 = _stacked(frame, [one.quadratic(rates, multipliers) for one in weights])
+    K0 = _by_K0(frame, weights, rates, multipliers)
     inner = _Outer(
         force=force,
         moment=outer.moment + (np.conj(frame.d) * force).imag,
@@ -196,9 +196,13 @@ class _Weights:
         return -(q.T @ other + (self.second[:, None] * qd).T @ qd)
 
 
-def _stacked(frame: Frame, by_K0: list[np.ndarray]) -> np.ndarray:
+def _by_K0(
+    frame: Frame, weights: tuple[_Weights, ...], rates: Rates, multipliers: np.ndarray
+) -> np.ndarray:
     """Return the derivatives by K0 (k, q, q); (0, q, q) of a linear body."""
-    return np.stack(by_K0) if frame.bent is not None else np.zeros((0, *by_K0[0].shape))
+    if frame.bent is None:
+        return np.zeros((0, multipliers.shape[1], multipliers.shape[1]))
+    return np.stack([one.quadratic(rates, multipliers) for one in weights])
 
 
 def _integral_gradient(
@@ -249,7 +253,7 @@ def _by_geometric_stiffness(frame: Frame, rates: Rates, virtual: Rates) -> np.nd
         _Weights(zero, zero, rotation, wd),  # the angular momentum of the relative motion
         _Weights(2.0 * rotation * wd, 2.0 * rotation * w, zero, -w * w),  # half the inertia
     )
-    return _stacked(frame, [one.quadratic(rates, multipliers) for one in weights])
+    return _by_K0(frame, weights, rates, multipliers)
 
 
 def _with_body(frame: Frame, rates: Rates, virtual: Rates, outer: _Outer) -> _Outer:

@@ -37,7 +37,8 @@ class SecondOrder:
     Attributes:
         K0: (7, q, q).
         q, qd, qdd: (n, 7, q) K0_p times the coordinates and their rates.
-        value, rate, second: (n, 7) -1/2 q'K0_p q and its time derivatives.
+        value, rate, second: (n, 6) -1/2 q'K0_p q and its time derivatives in the columns of
+            `ModalConstants.kinematics`: p = a_x, a_y, F_x, F_y, T; 0.
     """
 
     K0: np.ndarray
@@ -53,9 +54,18 @@ def _second_order(K0: np.ndarray, rates: Rates) -> SecondOrder:
     flat = K0.transpose(1, 0, 2).reshape(K0.shape[1], -1)  # K0_p is symmetric
     shape = (len(rates[0]), *K0.shape[:2])
     e, ed, edd = ((x @ flat).reshape(shape) for x in rates)
-    value, rate, bent = (-np.einsum("npk,nk->np", e, x) for x in rates)
-    second = bent - np.einsum("npk,nk->np", ed, rates[1])
-    return SecondOrder(K0, e, ed, edd, 0.5 * value, rate, second)
+    value, rate, second = (_work(e, x) for x in rates)
+    value *= 0.5
+    second += _work(ed, rates[1])
+    return SecondOrder(K0, e, ed, edd, value, rate, second)
+
+
+def _work(forces: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return -forces_p . x (n, 6) of a_x, a_y, F_x, F_y, T; 0, for (n, 7, q) and (n, q)."""
+    out = np.zeros((len(x), 6))
+    np.einsum("npk,nk->np", forces[:, :2], x, out=out[:, :2])
+    np.einsum("npk,nk->np", forces[:, 4:], x, out=out[:, 2:5])
+    return np.negative(out, out=out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,15 +152,15 @@ def outward_pass(
     ):
         e = q[:, part]
         # One real product for C q, B q and the rotation: of complex matrices all q would be copied.
-        s, d, rotation = (e @ constants.kinematics).view(complex).T
-        sd, dd, rotation_d = (qd[:, part] @ constants.kinematics).view(complex).T
-        sdd, ddd, rotation_dd = (qdd[:, part] @ constants.kinematics).view(complex).T
+        moved = [x @ constants.kinematics for x in (e, qd[:, part], qdd[:, part])]
         bent = None
         if constants.K0 is not None:
             bent = _second_order(constants.K0, (e, qd[:, part], qdd[:, part]))
-            s, d, rotation = _bent((s, d, rotation), bent.value)
-            sd, dd, rotation_d = _bent((sd, dd, rotation_d), bent.rate)
-            sdd, ddd, rotation_dd = _bent((sdd, ddd, rotation_dd), bent.second)
+            for linear, more in zip(moved, (bent.value, bent.rate, bent.second), strict=True):
+                linear += more
+        (s, d, rotation), (sd, dd, rotation_d), (sdd, ddd, rotation_dd) = (
+            one.view(complex).T for one in moved
+        )
         joint_rotation = np.exp(1j * rotation.real)
         if k < last:  # behind the last arm the payload's frame has no joint of its own
             joint_rotation *= motion.joint_rotations[k + 1]
@@ -180,16 +190,6 @@ def outward_pass(
         if k < last:
             w, wd = w + joints_d[:, k + 1], wd + joints_dd[:, k + 1]
     return frames, (a, w, wd)
-
-
-def _bent(
-    linear: tuple[np.ndarray, np.ndarray, np.ndarray], second: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return first moment, outboard displacement and rotation with what `second` (n, 7) adds."""
-    s, d, rotation = linear
-    s = s + (second[:, 0] + 1j * second[:, 1])
-    d = d + (second[:, 4] + 1j * second[:, 5])
-    return s, d, rotation + second[:, 6]
 
 
 def inverse_dynamics(

@@ -130,7 +130,7 @@ class Tangent:
                 rows[:, :, columns[1]] += d * D
             rows[:, :, columns[2]] += m * M
             if part.geometric is not None:
-                rows[:, :, columns[0]] -= part.geometric[:, part.kept][:, :, part.kept]
+                rows[:, :, columns[0]] -= part.geometric[:, part.kept[:, None], part.kept]
         return jacobian
 
     def times(
@@ -163,7 +163,7 @@ class Tangent:
             if D.any():
                 coupled += (d * ed) @ D
             if part.geometric is not None:
-                coupled -= _by_instant(e, part.geometric[:, part.kept][:, :, own])
+                coupled -= _by_instant(e, part.geometric[:, part.kept[:, None], own])
             out.append(coupled)
         return np.concatenate(out, axis=1)
 
