@@ -13,7 +13,7 @@ doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -29,6 +29,7 @@ NUM_INERTIAL = 4  # loads by the arm's own inertia come first; the others act on
 NUM_LOADS = 7
 # Entries of the products of gradients that are held at a time, so that they stay in the cache.
 CHUNK = 200_000
+STRESS_CELLS = 1000  # likewise, at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +47,14 @@ class UnitLoads:
     @cached_property
     def stresses(self) -> np.ndarray:
         """Stress xx, yy, xy times t dA at the quadrature points (3, 7, n_cells p), N."""
-        quadrature = self.arm.substructure.quadrature
-        values = self._cell_values(slice(None)) * self.arm.young[:, None, None]
-        stress = (quadrature.stress @ values).reshape(-1, 3, NUM_LOADS)
-        return np.ascontiguousarray(np.moveaxis(stress, 0, 2))
+        operator, young = self.arm.substructure.quadrature.stress, self.arm.young
+        count, p = len(operator), operator.shape[1] // 3
+        out = np.empty((3 * NUM_LOADS, count * p))
+        for cells in _runs(count, STRESS_CELLS):
+            stress = operator[cells] @ self._cell_values(cells)
+            stress *= young[cells, None, None]
+            out[:, p * cells.start : p * cells.stop] = stress.reshape(-1, 3 * NUM_LOADS).T
+        return out.reshape(3, NUM_LOADS, -1)
 
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (7, q, q) in modes V (n_nodes, 2, q) (collective on the arm's ranks)."""
@@ -57,8 +62,9 @@ class UnitLoads:
         i, j = np.triu_indices(q)
         packed = np.zeros((NUM_LOADS, len(i)))
         for _, points, H in self._parts(V):
-            for stress, pairs in zip(self.stresses[:, :, points], _pairs(H), strict=True):
-                packed += stress @ pairs.T
+            pairs = np.empty((len(i), H.shape[3]))
+            for stress, terms in zip(self.stresses[:, :, points], _TERMS, strict=True):
+                packed += stress @ _pairs(H, terms, pairs).T
         packed = self.arm.comm.allreduce(packed)
         K0 = np.empty((NUM_LOADS, q, q))
         K0[:, i, j] = K0[:, j, i] = packed
@@ -86,8 +92,9 @@ class UnitLoads:
         by_young = np.empty(count)
         by_modes, by_fields = np.empty((count, n, 2, q)), np.empty((count, n, 2, NUM_LOADS))
         for cells, points, H in self._parts(V):
-            size = cells.stop - cells.start
-            forces = np.moveaxis(by_pairs @ _pairs(H), 2, 0).reshape(size, -1, NUM_LOADS)
+            size, pairs = cells.stop - cells.start, np.empty((len(i), H.shape[3]))
+            by_stress = [by_pairs @ _pairs(H, terms, pairs) for terms in _TERMS]
+            forces = np.concatenate(by_stress).T.reshape(size, -1, NUM_LOADS)
             nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
             by_young[cells] = np.einsum("ekp,ekp->e", self._cell_values(cells), nodal)
             nodal *= arm.young[cells, None, None]
@@ -128,9 +135,7 @@ class UnitLoads:
         derivatives = self.arm.substructure.quadrature.derivatives
         count, q = len(derivatives), V.shape[2]
         p = derivatives.shape[1] // 2
-        step = max(1, CHUNK // (p * q * (q + 1)))
-        for first in range(0, count, step):
-            cells = slice(first, min(first + step, count))
+        for cells in _runs(count, max(1, CHUNK // (p * q * (q + 1)))):
             values = V[self.arm.operators.cells[cells]]
             H = derivatives[cells] @ values.reshape(*values.shape[:2], 2 * q)
             H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, 2, 2, q), 0, 3))
@@ -193,18 +198,23 @@ def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray)
     return arm.expand(particular + modes.interior @ tip, tip)
 
 
-def _pairs(H: np.ndarray) -> np.ndarray:
-    """Return d_a phi_i . d_b phi_j (3, pairs, points), what stress xx, yy and xy multiply.
+def _runs(count: int, step: int) -> Iterator[slice]:
+    """Yield slices of `step` cells each, the last one shorter, that together are all of them."""
+    for first in range(0, count, step):
+        yield slice(first, min(first + step, count))
+
+
+def _pairs(H: np.ndarray, terms: Sequence[tuple[int, int, int]], out: np.ndarray) -> np.ndarray:
+    """Return d_a phi_i . d_b phi_j (pairs, points), what one stress multiplies, in `out`.
 
     Mode by mode in place: index arrays would take ten times as long.
     """
-    q, points = H.shape[2:]
-    out, term = np.empty((3, q * (q + 1) // 2, points)), np.empty(points)
-    for place, (i, j) in enumerate(zip(*np.triu_indices(q), strict=True)):
-        for one, ((a, b, c), *terms) in zip(out[:, place], _TERMS, strict=True):
-            np.multiply(H[a, c, i], H[b, c, j], out=one)
-            for a, b, c in terms:
-                one += np.multiply(H[a, c, i], H[b, c, j], out=term)
+    (a, b, c), *others = terms
+    term = np.empty(H.shape[3])
+    for one, i, j in zip(out, *np.triu_indices(H.shape[2]), strict=True):
+        np.multiply(H[a, c, i], H[b, c, j], out=one)
+        for d, e, f in others:
+            one += np.multiply(H[d, f, i], H[e, f, j], out=term)
     return out
 
 
@@ -217,11 +227,17 @@ _TERMS = (
 
 
 def _pairs_transposed(H: np.ndarray, by_pairs: np.ndarray) -> np.ndarray:
-    """Return the derivatives (2, 2, q, points) by H, given those by `_pairs` (3, pairs, points)."""
+    """Return the derivatives (2, 2, q, points) by H, given those by `_pairs` (3, pairs, points).
+
+    The latter are scaled in place.
+    """
     by_H, term = np.zeros_like(H), np.empty(H.shape[3])
     for place, (i, j) in enumerate(zip(*np.triu_indices(H.shape[2]), strict=True)):
         for weight, terms in zip(by_pairs[:, place], _TERMS, strict=True):
+            if i == j:  # both factors are the same: once, twice as heavy
+                weight *= 2.0
             for a, b, c in terms:
                 by_H[a, c, i] += np.multiply(weight, H[b, c, j], out=term)
-                by_H[b, c, j] += np.multiply(weight, H[a, c, i], out=term)
+                if i != j:
+                    by_H[b, c, j] += np.multiply(weight, H[a, c, i], out=term)
     return by_H
