@@ -42,7 +42,6 @@ def refusal(make) -> str:
         ("control.feed_forward=flexible", 'feed_forward = "flexible"', '"rigid" | "none"'),
         ("control.forces=nothing.csv", 'forces = "nothing.csv"', "the path of a file"),
         ("control.gain=3", "control.gain", "unknown key"),
-        ("arms.0.joint_stiffness=1e4", "joint_stiffness (arm1) = 10000.0", "0 with [control]"),
         ("closure.kind=slider", 'motion.base = "cart"', '"fixed" with [closure]'),
     ],
 )

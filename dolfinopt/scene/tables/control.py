@@ -47,18 +47,10 @@ class Control(Table):
     )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse gains and limits that are not one for every driven coordinate, and springs."""
+        """Refuse gains and limits that are not one for every driven coordinate."""
         names = scene.driven
         for key in ("stiffness", "damping", "limits"):
             values = getattr(self, key)
             if values is not None and len(values) != len(names):
                 number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
                 raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
-        for index, arm in enumerate(scene.arms):
-            if arm.joint_stiffness > 0.0:
-                raise Refusal(
-                    "expected 0 with [control], which acts on the arm itself; a spring between "
-                    "drive and arm needs a drive that follows the desired motion exactly",
-                    ("arms", index, "joint_stiffness"),
-                    (*at, "stiffness"),
-                )
