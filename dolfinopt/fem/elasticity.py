@@ -165,6 +165,11 @@ class ElasticArm:
         flat = field.reshape(len(field), 2 * field.shape[2])
         return (self.M.matrix @ flat).reshape(field.shape)
 
+    @cached_property
+    def rigid_inertia(self) -> np.ndarray:
+        """M [1, X] (n_nodes, 2, 2), component by component, of this rank's cells; kg, kg m."""
+        return self.mass_times(np.stack([np.ones_like(self.points), self.points], axis=2))
+
     def energy_matrix(self, field: np.ndarray) -> np.ndarray:
         """Return field' K field (k, k), summed over the ranks.
 

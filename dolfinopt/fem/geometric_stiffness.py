@@ -164,20 +164,27 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
 
     Collective on the arm's ranks.
     """
-    interior, outboard = arm.restrict(arm.mass_times(accelerations(arm)))
-    forces = np.zeros((len(interior), NUM_LOADS - NUM_INERTIAL))
-    return UnitLoads(
-        arm,
-        static_response(arm, np.hstack([interior, forces]), np.hstack([outboard, np.eye(3)])),
-    )
+    modes = arm.constraint_modes()
+    ones, places = np.moveaxis(arm.rigid_inertia, 2, 0)
+    inertial = static_response(arm, *arm.restrict(_accelerations(ones, places)))
+    interface = modes.field @ np.linalg.inv(modes.stiffness)
+    return UnitLoads(arm, np.concatenate([inertial, interface], axis=2))
 
 
 def accelerations(arm: ElasticArm) -> np.ndarray:
     """Return the fields (n_nodes, 2, 4) whose inertia loads the body: 1_x, 1_y, S X and X."""
-    fields = np.zeros((len(arm.points), 2, NUM_INERTIAL))
-    fields[:, 0, 0] = fields[:, 1, 1] = 1.0
-    fields[:, 0, 2], fields[:, 1, 2] = -arm.points[:, 1], arm.points[:, 0]
-    fields[:, :, 3] = arm.points
+    return _accelerations(np.ones_like(arm.points), arm.points)
+
+
+def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return 1_x, 1_y, S X and X (n, 2, 4) of (n, 2) each, or M times them: M knows no direction.
+
+    M (-y, x) is (-(M X)_y, (M X)_x), as M treats the components alike.
+    """
+    fields = np.zeros((*ones.shape, NUM_INERTIAL))
+    fields[:, 0, 0], fields[:, 1, 1] = ones.T
+    fields[:, 0, 2], fields[:, 1, 2] = -places[:, 1], places[:, 0]
+    fields[:, :, 3] = places
     return fields
 
 

@@ -269,7 +269,7 @@ def shape_integrals(
     X, V, MV = arm.points, basis.V, basis.MV
     d, q = X.shape[1], V.shape[2]
     E = generators(d)
-    rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))  # M [1, X], per component
+    rigid = arm.rigid_inertia  # M [1, X], per component
     MX, MV_flat = rigid[:, :, 1], MV.reshape(-1, q)
     EX, EV = _applied(E, X), _applied(E, V).reshape(len(E), -1, q)
     parts = (

@@ -98,7 +98,7 @@ def spatial_moments(arm: ElasticArm, basis: Basis, thickness: float) -> SpatialM
     """
     X, V, MV = arm.points, basis.V, basis.MV
     q = V.shape[2]
-    rigid = arm.mass_times(np.stack([np.ones_like(X), X], axis=2))
+    rigid = arm.rigid_inertia
     # The mass matrix treats x and y alike: its product with (x, y) has M x and M y as components.
     parts = (
         rigid[:, 0, 0].sum(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -440,3 +440,27 @@ def test_arms_under_another_scene_keep_their_own_design() -> None:
     evaluate(*place, other, weak, do.Profile())
     for k, slope in built.gradient().items():
         np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize(("gradient", "more"), [("esl", 4), ("exact", 8)])
+def test_solves_of_geometric_stiffness(gradient, more):
+    """Four static solves an arm and design, four more for the exact gradient; none without it.
+
+    The interface's unit loads are constraint modes, in the basis and in its adjoint already. Three
+    coordinates: searches for modes take as many solves as they need.
+    """
+    spent = {}
+    for on in ("true", "false"):
+        options = ("reduction.coordinates=3", f'objective.gradient="{gradient}"')
+        built = build(f"simulation.stiffening={on}", *options)
+        built.evaluate(built.fields(lambda k, x, y: np.full_like(x, 0.5)))  # and the decision
+        counts = built.profile.counts
+        before = replace(counts)
+        _, trajectory = built.evaluate(built.fields(wave))
+        built.gradient(trajectory)
+        spent[on] = {name: getattr(counts, name) - value for name, value in asdict(before).items()}
+    assert spent["true"]["solves"] - spent["false"]["solves"] == more * len(built.arms)
+    # What is left is the constraint modes, and their adjoint.
+    assert spent["false"]["solves"] == (3 if gradient == "esl" else 6) * len(built.arms)
+    for name in ("assemblies", "factorisations", "reductions", "eigenproblems", "simulations"):
+        assert spent["true"][name] == spent["false"][name], name
