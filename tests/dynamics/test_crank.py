@@ -1,0 +1,193 @@
+"""The flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices.
+
+Source: Simeon (1996), doi:10.1080/13873959608837026; Mazzia & Magherini, Test Set for Initial Value
+Problem Solvers. A rigid crank turns with 150 rad/s, a rod with two sine modes and a quadratic axial
+element in the frame of its chord drives a slider; no damping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
+from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.multibody.drives import Drives, slider
+from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
+
+CRANK, ROD = 0.15, 0.30  # m
+CRANK_MASS, ROD_MASS, SLIDER_MASS = 0.36, 0.151104, 0.075552  # kg
+CRANK_INERTIA, ROD_INERTIA = 0.002727, 0.0045339259  # about their first joints, kg m2
+YOUNG, HEIGHT, DENSITY = 2e11, 0.008, 7870.0  # Pa, m, kg/m3
+SPEED, END = 150.0, 0.1  # rad/s, s
+PI = np.pi
+
+# Its solution at 0.1 s: positions, velocities, accelerations of (phi2, q), multipliers of the
+# closure across and along the line and of the crank's angle.
+PHI2, SLIDER = -0.3311734988256260, 0.1697373328427860
+Q = np.array([1.893192899613509e-4, 2.375751249879e-5, -5.32389677e-6, -8.36331328e-6])
+FORCES = np.array([-62.32935833, -163.7920993, 25.29857947])
+# The state of another solver, with all that belongs to it.
+STATE = {
+    "place": (-3.311734987910881e-01, 1.893192460247178e-04, 2.375751865617931e-05,
+              -5.323907988763734e-06, -8.363283141616840e-06),
+    "rate": (6.025346682645789e01, -3.005536801092212e-02, -5.500488291932075e-03,
+             4.978243404809343e-04, 1.104933470696396e-03),
+    "acceleration": (6.488722210234531e03, 3.391435115267547e01, 1.699107480197843e-01,
+                     -1.415799354959001e00, 9.903251655235532e-01),
+    "forces": (-6.232893262533717e01, -1.637910131687472e02, 2.529853213732781e01),
+}  # fmt: skip
+
+
+def rod() -> ShapeIntegrals:
+    """Return the rod; its axial mass is the file's, which is 15 times that of the element."""
+    area, mass = HEIGHT**2, DENSITY * HEIGHT**2 * ROD
+    M, K, G = np.zeros((3, 4, 4))
+    M[0, 0] = M[1, 1] = 0.5
+    M[2:, 2:] = [[8.0, 1.0], [1.0, 2.0]]
+    K[0, 0], K[1, 1] = np.array([1.0 / 24.0, 2.0 / 3.0]) * PI**4 * (HEIGHT / ROD) ** 2
+    K[2:, 2:] = np.array([[16.0, -8.0], [-8.0, 7.0]]) / 3.0
+    G[0, 2], G[0, 3], G[1, 3] = 16.0 / PI**3, 1.0 / PI - 8.0 / PI**3, -0.5 / PI
+    return plane_body(
+        mass=ROD_MASS,
+        moment=np.array([0.5 * ROD_MASS * ROD, 0.0]),
+        inertia=ROD_INERTIA,
+        C=mass * np.array([[0.0, 0.0, 2.0 / 3.0, 1.0 / 6.0], [2.0 / PI, 0.0, 0.0, 0.0]]),
+        j=mass * ROD * np.array([0.0, 0.0, 1.0 / 3.0, 1.0 / 6.0]),
+        r=mass * ROD * np.array([1.0 / PI, -0.5 / PI, 0.0, 0.0]),
+        M=mass * M,
+        G=mass * (G - G.T),
+        K=YOUNG * area / ROD * K,
+        D=np.zeros((4, 4)),
+        outboard=np.array([[0.0, 0.0, 0.0, 1.0], np.zeros(4), [-PI / ROD, 2.0 * PI / ROD, 0, 0]]),
+        outboard_point=np.array([ROD, 0.0]),
+    )
+
+
+def stiffened(body: ShapeIntegrals) -> ShapeIntegrals:
+    """Return the rod with K0 = int N w_i' w_j' dx, N the axial force by every unit load."""
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    x, weights = 0.5 * ROD * (nodes + 1.0), 0.5 * ROD * weights
+    slopes = np.stack([k * PI / ROD * np.cos(k * PI * x / ROD) for k in (1, 2)])
+    line = DENSITY * HEIGHT**2
+
+    def by(force: np.ndarray) -> np.ndarray:
+        return np.pad((slopes * (weights * force)) @ slopes.T, (0, 2))
+
+    none = np.zeros((4, 4))
+    K0 = [by(line * (ROD - x)), none, none, by(0.5 * line * (ROD**2 - x**2))]
+    return replace(body, K0=np.stack(K0), K0_outboard=np.stack([by(np.ones(40)), none, none]))
+
+
+def desired(t: np.ndarray) -> RigidMotion:
+    """Return crank and rigid rod (n, 3): cart, angle of the crank, angle between both."""
+    angle, zero = SPEED * t, np.zeros_like(t)
+    sine = -CRANK / ROD * np.sin(angle)
+    cosine = np.sqrt(1.0 - sine**2)
+    rate = -CRANK * SPEED * np.cos(angle) / (ROD * cosine)
+    growth = (CRANK * SPEED**2 * np.sin(angle) + ROD * sine * rate**2) / (ROD * cosine)
+    return RigidMotion(
+        np.stack([zero, angle, np.arcsin(sine) - angle], axis=1),
+        np.stack([zero, zero + SPEED, rate - SPEED], axis=1),
+        np.stack([zero, zero, growth], axis=1),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Crank(MachineSystem):
+    """A machine that begins with a given motion."""
+
+    start: State = (np.zeros(0), np.zeros(0))
+
+    def initial_state(self) -> State:
+        """Return it."""
+        return self.start
+
+    def preconditioner(self) -> MachineModes | Unchanged:
+        """Return the rod's vibrations, the start in their coordinates."""
+        modes = super().preconditioner()
+        q, qd = (modes.to_modes(x) for x in self.start)
+        assert isinstance(modes, MachineModes)
+        return replace(modes, system=replace(modes.system, start=(q, qd)))
+
+
+def crank(body: ShapeIntegrals) -> Crank:
+    """Return the machine with its "smooth" start; unknowns: the joint's deviation, q, mu."""
+    q = np.array([0.0, 0.0, 1.03339863e-5, 1.69327969e-5])
+    qd = np.array([0.444896105, 0.463434311e-2, -0.178591076e-5, -0.268938672e-5])
+    slower = CRANK * SPEED * (1.0 / ROD - 1.0 / (ROD + q[3]))  # by the closure
+    arms = rigid_bar(CRANK, HEIGHT, CRANK_MASS, CRANK_INERTIA - 0.25 * CRANK_MASS * CRANK**2), body
+    none = np.zeros(1)
+    drives = Drives(np.array([2]), none, none, np.full(1, np.inf), np.array([False]))
+    return Crank(
+        Mechanism(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
+        desired,
+        (0.0, END),
+        drives,
+        slider(0j, 1.0 + 0j),
+        start=(np.array([[0.0, *q, 0.0]]), np.array([[slower, *qd, 0.0]])),
+    )
+
+
+def solved(system: Crank, steps: int, stages: int) -> Solution:
+    """Return the motion on equal steps."""
+    return radau.on_grid(system, np.linspace(0.0, END, steps + 1), 1e-8, stages)
+
+
+def unknowns(system: Crank, solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return them and their derivatives at the end, each (1, 6)."""
+    return tuple(solution.sample(np.array([END]), k) for k in range(3))
+
+
+def test_forces_of_its_state() -> None:
+    """Its end state fulfils the equations to rounding, with its multipliers, to all its digits.
+
+    The ground's force on the rod is -lambda_1 of the closure's -G' lambda; the crank's moment
+    -lambda_3.
+    """
+    system, t = crank(rod()), np.array([END])
+    rigid = desired(t)
+    parts = []
+    for key, of in (("place", rigid.q), ("rate", rigid.qd), ("acceleration", rigid.qdd)):
+        value = np.array(STATE[key])
+        parts.append(np.array([[value[0] - of[0, 1:].sum(), *value[1:], 0.0]]))
+    y, yd, ydd = parts
+    ydd[0, 5] = -STATE["forces"][0]
+    instants = system.at(t)
+    left = np.abs(instants.residual(y, yd, ydd)[0])
+    assert left[0] < 1e-10  # N m, of 35
+    assert left[1:5].max() < 1e-9  # N, of 160
+    assert left[5] < 1e-9 * system.gap_scale
+    moment = instants.forces(y, yd, ydd)[0, 1]
+    assert moment == pytest.approx(-STATE["forces"][2], rel=1e-9)
+
+
+def test_motion() -> None:
+    """Positions to the reference's digits; multipliers as far as axial vibrations let them be.
+
+    The start is smooth to 9 digits only: what vibrates undamped with 2e4 rad/s moves positions by
+    1e-10 m, forces by 1e-3 N.
+    """
+    system = crank(rod())
+    solution = solved(system, 800, 5)
+    y, yd, ydd = unknowns(system, solution)
+    instants = system.at(np.array([END]))
+    motion = instants.motion(y, yd, ydd)
+    angle = motion.q[0, 1:].sum()
+    assert angle == pytest.approx(PHI2, abs=1e-9)  # rad; measured 8e-11
+    place = end_effector(system.mechanism, motion, y[:, 1:5])[0]
+    assert place == pytest.approx([SLIDER, 0.0], abs=1e-9)  # m; 1.3e-10
+    assert y[0, 1:5] == pytest.approx(Q, abs=5e-10)  # m; 7e-11
+    assert -ydd[0, 5] == pytest.approx(FORCES[0], rel=1e-4)  # 2e-5
+    assert -instants.forces(y, yd, ydd)[0, 1] == pytest.approx(FORCES[2], rel=1e-4)  # 5e-6
+    t = np.linspace(0.0, END, 4001)
+    bending = np.abs(solution.sample(t)[:, 1])
+    assert bending.max() == pytest.approx(1.6515e-3, abs=5e-8)
+    assert t[bending.argmax()] == pytest.approx(0.04756, abs=3e-5)

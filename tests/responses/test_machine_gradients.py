@@ -1,0 +1,131 @@
+"""Exact gradients of machines: stiffening, control, closed loops, hardware at the joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from reference_machines import GAINS, Tree, four_bar, slider_crank, two_arm, with_keys
+from remainders import rates
+
+from dolfinopt import Model
+from dolfinopt.scene.load import scene_from_dict
+
+pytestmark = pytest.mark.serial  # designs belong to one rank
+
+COMPLIANCE = {"kind": "compliance", "gradient": "exact"}
+DEVIATION = {"kind": "deviation", "gradient": "exact"}
+GRAVITY = {"gravity": [0.0, -9.81]}
+
+
+def arms(objective: Tree, stiffening: bool, **changes: Any) -> Tree:
+    """Return the two-arm scene on few cells."""
+    tree = two_arm("arms.cells=[20,3]", "motion.horizon=2.2", objective=objective)
+    simulation = {"stiffening": stiffening, "tolerance": 1e-6}
+    return with_keys(with_keys(tree, {"simulation": simulation}), changes)
+
+
+def loop(tree: Tree, **changes: Any) -> Tree:
+    """Return a closed loop at 60 rad/s, of half density."""
+    keys = {
+        "objective": COMPLIANCE,
+        "design": {"initial": 0.5},
+        "motion": {"speed": 60.0, "duration": 0.05, "horizon": 0.1},
+        "reduction": {"coordinates": 4},
+        "simulation": {"tolerance": 1e-6},
+    }
+    return with_keys(with_keys(tree, keys), changes)
+
+
+def with_hardware(tree: Tree, **keys: float) -> Tree:
+    """Return the scene with keys of the joints changed in its last arm."""
+    new = with_keys(tree, {})
+    new["arms"][-1] |= keys
+    return new
+
+
+def scenes(folder: Path) -> dict[str, Tree]:
+    """Return a small scene of every kind."""
+    table = folder / "drive.csv"
+    table.write_text("t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n")
+    limited = {**GAINS, "limits": [150.0, 200.0, 150.0]}
+    rod = slider_crank(0.008, (24, 3))
+    drive = {"stiffness": [2e3], "damping": [20.0]}
+    joints = {"joint_mass": 0.5, "joint_inertia": 0.01}
+    return {
+        "stiffened": arms(COMPLIANCE, True),
+        "stiffened-deviation": arms(DEVIATION, True),
+        "control": arms(DEVIATION, False, control=GAINS),
+        "control-limits-gravity": arms(DEVIATION, True, control=limited, motion=GRAVITY),
+        "control-alone": arms(
+            COMPLIANCE, False, control={**GAINS, "feed_forward": "none"}, motion=GRAVITY
+        ),
+        "control-table": arms(
+            COMPLIANCE, False, control={**GAINS, "feed_forward": "none", "forces": str(table)}
+        ),
+        "hardware": with_hardware(
+            arms(COMPLIANCE, False, control=GAINS, motion={"cart_mass": 2.0}),
+            **joints,
+            rotor_inertia=1e-4,
+            gear_ratio=30.0,
+        ),
+        "soft-joint": with_hardware(
+            arms(DEVIATION, False), **joints, joint_stiffness=2e4, joint_damping=50.0
+        ),
+        "slider": loop(rod),
+        "slider-deviation": loop(rod, objective=DEVIATION, motion=GRAVITY),
+        "slider-control": loop(rod, control=drive, motion=GRAVITY),
+        "pin": loop(four_bar((24, 3))),
+    }
+
+
+# Cosine between the gradient by ESL and the exact one, at least. ESL hold the elastic coordinates
+# and the loop's joints: of where a slider ends up nothing is left that would tell.
+COSINE = {"slider-deviation": -1.0, "pin": 0.9}
+SLOW = ("control-limits-gravity", "hardware", "pin")
+KINDS = (
+    "stiffened",
+    "stiffened-deviation",
+    "control",
+    "control-limits-gravity",
+    "control-alone",
+    "control-table",
+    "hardware",
+    "soft-joint",
+    "slider",
+    "slider-deviation",
+    "slider-control",
+    "pin",
+)
+
+
+def slope(gradient: dict[str, np.ndarray], direction: dict[str, np.ndarray]) -> float:
+    """Return the product over all arms."""
+    return float(sum(gradient[name] @ direction[name] for name in direction))
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else ()) for k in KINDS]
+)
+def test_exact_gradient(kind: str, tmp_path: Path) -> None:
+    """The remainder of Taylor's formula has order 2; the gradient by ESL points the same way."""
+    model = Model(scene_from_dict(scenes(tmp_path)[kind]))
+    rng = np.random.default_rng(0)
+    x = {
+        name: np.clip(0.5 + 0.3 * np.sin(1.7 * np.arange(len(one))), 0.1, 1.0)
+        for name, one in model.uniform(0.5).items()
+    }
+    direction = {name: rng.uniform(-1.0, 1.0, len(one)) for name, one in x.items()}
+    exact = model.gradient(x, "exact")
+
+    def objective(h: float) -> float:
+        return model.simulate({name: x[name] + h * direction[name] for name in x}).objective
+
+    order = rates(objective, slope(exact, direction), steps=(1e-2, 1e-3))
+    assert order == pytest.approx(2.0, abs=0.06)
+    esl = model.gradient(x, "esl")
+    cosine = slope(esl, exact) / np.sqrt(slope(esl, esl) * slope(exact, exact))
+    assert np.isfinite(cosine)
+    assert cosine > COSINE.get(kind, 0.98)
