@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import Built, wave
 from runs import ROOT, overrides, run
 
 import dolfinopt as do
+from dolfinopt.optimization.gradient_check import taylor_test
 
 WORLD = MPI.COMM_WORLD
 CONTROLLED, SLIDER_CRANK, FOUR_BAR = (
@@ -81,6 +83,8 @@ VARIANTS = {
     ),
     "projection under control": (CONTROLLED, "design.projection=robust", "design.sharpness=4.0"),
     "order under control": (CONTROLLED, "reduction.coordinates=auto"),
+    # Much of a rod's load is axial, in which modes add up slowly.
+    "order of a rod": (SLIDER_CRANK, "reduction.coordinates=auto", "reduction.tolerance=0.02"),
     "force on the slider of a scenario": (
         SLIDER_CRANK,
         "scenarios=[{changes=['closure.force=-200']}, {changes=['closure.force=0']}]",
@@ -96,6 +100,28 @@ def test_goes_with(name):
     if WORLD.rank == 0:
         objectives = [row.objective for row in result.history]
         assert objectives[-1] < 0.95 * objectives[0], objectives
+
+
+@pytest.mark.parametrize(
+    ("path", "changes"),
+    [
+        (CONTROLLED, "scenarios=[{changes=['payload.mass=3']}, "
+         "{changes=['control.stiffness_factor=0.1', 'control.damping_factor=0.3']}]"),
+        (SLIDER_CRANK, "scenarios=[{changes=['closure.force=-200']}, "
+         "{changes=['motion.speed=100']}]"),
+    ],
+    ids=["gains", "force and speed"],
+)  # fmt: skip
+def test_gradient_of_scenarios(path, changes):
+    """Second-order remainders where scenarios differ in gains, load and speed."""
+    cells = "arms.cells=[12,3]" if path == CONTROLLED else "arms.rod.cells=[12,3]"
+    settings = [cells, "simulation.tolerance=1e-5", "reduction.coordinates=3", changes]
+    scene = do.load_scene(path, [*COARSE[path], *settings])
+    profile = do.Profile()
+    partition = do.partition_arms(WORLD, scene.cell_counts)
+    built = Built(scene, partition, do.build_arms(scene, partition, profile), profile)
+    test = taylor_test(scene, partition, built.arms, built.fields(wave), profile)
+    assert test.passed, [row.rate for row in test.rows]
 
 
 def test_cut_design_that_falls_apart_is_told(shared_tmp_path):
