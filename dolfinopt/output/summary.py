@@ -23,7 +23,7 @@ from dolfinopt.multibody.stiffening import WARN, Stiffening
 from dolfinopt.output.trajectory import (
     drive_units,
     driven_columns,
-    is_driven_freely,
+    free_drives,
     rigid_units,
     trajectory_units,
 )
@@ -211,9 +211,9 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         "drive_peak": by_drive(peak),
         "drive_rms": by_drive(rms),
     }
-    if is_driven_freely(scene):
-        error = np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0)
-        found["drive_error_peak"] = by_drive(error)
+    if free := free_drives(scene):
+        errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
+        found["drive_error_peak"] = {name: errors[name] for name in free}
     if trajectory.closure_force is not None:
         found["closure_force_peak"] = float(np.linalg.norm(trajectory.closure_force, axis=1).max())
     return found
@@ -224,9 +224,9 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     unit = objective_of(scene).unit
     units: dict[str, Any] = {"objective": unit, **SUMMARY}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
-    if is_driven_freely(scene):
+    if free := free_drives(scene):
         rigid = rigid_units(scene)
-        units["drive_error_peak"] = {name: rigid[name] for name in scene.driven}
+        units["drive_error_peak"] = {name: rigid[name] for name in free}
     if scene.closure is not None:
         units["closure_force_peak"] = "N"
     units["history.csv"] = {"objective": unit, **HISTORY}

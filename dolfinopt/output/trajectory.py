@@ -105,9 +105,12 @@ def driven_columns(scene: Scene) -> slice:
     return slice(first, first + len(scene.driven))
 
 
-def is_driven_freely(scene: Scene) -> bool:
-    """Return whether driven coordinates may leave the desired motion: control, or soft joints."""
-    return scene.control is not None or any(arm.joint_stiffness > 0.0 for arm in scene.arms)
+def free_drives(scene: Scene) -> tuple[str, ...]:
+    """Return the driven coordinates that may leave the desired motion: control, or soft joints."""
+    if scene.control is not None:
+        return scene.driven
+    soft = {arm.name for arm in scene.arms if arm.joint_stiffness > 0.0}
+    return tuple(name for name in scene.driven if name in soft)
 
 
 def trajectory_units(trajectory: Trajectory) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.output.trajectory import driven_columns, is_driven_freely
+from dolfinopt.output.trajectory import driven_columns, free_drives
 from dolfinopt.plots.style import BLUE, LINE_WIDTH, ORANGE, PathLike, new_figure, save
 
 if TYPE_CHECKING:
@@ -51,9 +51,10 @@ def drives_figure(trajectory: Trajectory) -> Figure:
     figure.subplots_adjust(left=0.085, right=0.965, wspace=0.22, hspace=0.32,
                            bottom=0.5 / total, top=1.0 - 0.75 / total)  # fmt: skip
     for row, quantities in zip(grid, panels, strict=True):
-        for axes, (label, unit, curves) in zip(row, quantities, strict=False):
+        # Forces stand in the last column.
+        for axes, (label, unit, curves) in zip(row[::-1], quantities[::-1], strict=False):
             _draw_panel(axes, trajectory.t, label, unit, curves)
-        for axes in row[len(quantities) :]:
+        for axes in row[: len(row) - len(quantities)]:
             axes.set_visible(False)
     for column in grid.T:
         last = [axes for axes in column if axes.get_visible()][-1]
@@ -71,12 +72,12 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
     """Return the rows of the figure: of every drive error and force, of the ground its force."""
     scene, rows = trajectory.scene, []
     places = range(*driven_columns(scene).indices(trajectory.q_r.shape[1]))
-    error = trajectory.q_r - trajectory.desired.q
+    error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
     for name, k in zip(scene.driven, places, strict=True):
         length, force = ("m", "N") if k == 0 else ("rad", "N m")
         word = "force" if k == 0 else "moment"
         row: list[Panel] = [(f"{name}: {word}", force, {"": trajectory.joint_forces[:, k]})]
-        if is_driven_freely(scene):
+        if name in free:
             row.insert(0, (f"{name}: error", length, {"": error[:, k]}))
         rows.append(row)
     forces = trajectory.closure_force

@@ -14,7 +14,7 @@ from dolfinopt.plots.style import GREY
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BLOCK = np.array([0.05, 0.028])  # half length and half height of a slider, shares of the reach
+BLOCK = np.array([0.06, 0.036])  # half length and half height of a slider, shares of the reach
 BASE = "#c9c9c9"  # carts, pedestals and sliders
 MAX_NEWTON = 30
 CLOSED = 1e-6  # share of the arms' reach: far below a pixel

@@ -134,8 +134,10 @@ def machine_figure(
         np.min([p.min(axis=0) for p in points], axis=0),
         np.max([p.max(axis=0) for p in points], axis=0),
     )
-    low = low - size * np.array([0.12, 0.04] if closure is None else [0.18, 0.1])
-    high = high + size * np.array([0.12, 0.1])
+    # Room for the instants, which stand beyond ends that may be anywhere.
+    anywhere = closure is not None or desired is not None
+    low = low - size * np.array([0.18, 0.1] if anywhere else [0.12, 0.04])
+    high = high + size * np.array([0.18 if anywhere else 0.12, 0.1])
     figure, axes = _framed(high - low)
     _draw_ground(axes, bases, stands)
     if closure is not None:

@@ -682,3 +682,53 @@ def test_machine_shows_one_turn_of_a_loop():
     assert len(ends) == 4
     np.testing.assert_allclose(np.array(ends)[:, 1], 0.0, atol=2e-6)
     assert_inside(figure)
+
+
+@pytest.mark.serial
+def test_drives_have_a_row_each_and_the_ground_one():
+    from machines import GAINS, controlled, loop
+
+    from dolfinopt.plots import drives
+
+    shown = {}
+    soft = ["arms.joint_stiffness=2e4"]
+    prescribed = controlled().to_tree() | {"control": None}
+    cases = {
+        "control": controlled(),
+        "loop": loop(control={"stiffness": [2e3], "damping": [20.0]}),
+        "pin": loop("pin"),
+        "soft": load_soft(prescribed, soft),
+    }
+    for name, scene in cases.items():
+        trajectory = simulated_alone(scene)
+        figure = drives.drives_figure(trajectory)
+        visible = [axes for axes in figure.axes if axes.get_visible()]
+        shown[name] = [axes.get_title(loc="left") for axes in visible]
+        assert_inside(figure)
+        if name == "control":
+            error = 1e6 * (trajectory.q_r - trajectory.desired.q)[:, 0]
+            np.testing.assert_allclose(visible[0].lines[0].get_ydata(), error, atol=1e-9)
+            force = trajectory.joint_forces[:, 0]
+            np.testing.assert_allclose(visible[1].lines[0].get_ydata(), force)
+            assert visible[1].get_title(loc="right") == f"largest {np.abs(force).max():.3g}"
+    assert shown["control"][:2] == ["cart: error [µm]", "cart: force [N]"]
+    assert len(shown["control"]) == 2 * len(GAINS["stiffness"])
+    assert shown["loop"][1:] == ["crank: moment [N m]", "normal force on the slider [N]"]
+    assert shown["pin"] == ["crank: moment [N m]", "force of the pin on the arm [N]"]
+    # A cart that follows the desired motion exactly has no error to be shown.
+    assert shown["soft"][0] == "cart: force [N]" and len(shown["soft"]) == 5
+
+
+def load_soft(tree, changes):
+    from dolfinopt.scene.load import scene_from_dict
+
+    return scene_from_dict({k: v for k, v in tree.items() if v is not None}, overrides=changes)
+
+
+def simulated_alone(scene):
+    import dolfinopt as do
+
+    partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), do.Profile()
+    arms = do.build_arms(scene, partition, profile)
+    x = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    return do.evaluate(scene, partition, arms, x, profile)[1]
