@@ -105,8 +105,11 @@ def test_goes_with(name):
 @pytest.mark.parametrize(
     ("path", "changes"),
     [
-        (CONTROLLED, "scenarios=[{changes=['payload.mass=3']}, "
-         "{changes=['control.stiffness_factor=0.1', 'control.damping_factor=0.3']}]"),
+        pytest.param(
+            CONTROLLED, "scenarios=[{changes=['payload.mass=3']}, "
+            "{changes=['control.stiffness_factor=0.1', 'control.damping_factor=0.3']}]",
+            marks=pytest.mark.slow,
+        ),
         (SLIDER_CRANK, "scenarios=[{changes=['closure.force=-200']}, "
          "{changes=['motion.speed=100']}]"),
     ],
