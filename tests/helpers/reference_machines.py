@@ -16,6 +16,8 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.end_effector import outboard
+from dolfinopt.multibody.interface_jacobian import interface_place
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import scene_from_dict
@@ -147,3 +149,52 @@ def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
 def apart(found: np.ndarray, expected: np.ndarray) -> float:
     """Return the largest difference over time, of the largest value expected."""
     return float(np.abs(found - expected).max() / np.abs(expected).max())
+
+
+def imbalance(result: SimulationResult) -> float:
+    """Return how much of the drives' work is not energy, of the largest energy that is stored.
+
+    Work less kinetic and strain energy and what damping took, at the steps' ends; no gravity.
+    """
+    trajectory, system = machine(result)
+    grid = trajectory.solution.time_grid
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    h = np.diff(grid)[:, None]
+    t = grid[:-1, None] + 0.5 * h * (nodes + 1.0)
+    y, yd, ydd = (trajectory.solution.sample(t.ravel(), k) for k in range(3))
+    instants = system.at(t.ravel())
+    qd = instants.split(yd)[1]
+    power = (instants.forces(y, yd, ydd) * instants.motion(y, yd, ydd).qd).sum(axis=1)
+    for part, body in zip(system.mechanism.slices, system.mechanism.bodies, strict=True):
+        power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
+    work = np.cumsum((0.5 * h * weights * power.reshape(t.shape)).sum(axis=1))
+    stored = energy(trajectory, system, grid)
+    return float(np.abs(work - (stored[1:] - stored[0])).max() / np.abs(stored).max())
+
+
+def energy(trajectory: Trajectory, system: MachineSystem, t: np.ndarray) -> np.ndarray:
+    """Return kinetic and strain energy (n,), J, the former by the mass matrix."""
+    y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
+    instants, rigid = system.at(t), np.arange(1 + len(system.mechanism.bodies))
+    motion = instants.motion(y, yd, ydd)
+    (_, q, _), (_, qd, _), (_, qdd, _) = (instants.split(x) for x in (y, yd, ydd))
+    tangent = linearise(system.mechanism, motion, q, qd, qdd, None, rigid).dense()
+    size = tangent.shape[1]
+    speeds = np.concatenate([motion.qd, qd], axis=1)
+    twice = np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
+    for part, body in zip(system.mechanism.slices, system.mechanism.bodies, strict=True):
+        twice += np.einsum("ni,ij,nj->n", q[:, part], body.K, q[:, part])
+    return 0.5 * twice
+
+
+def gaps(result: SimulationResult) -> np.ndarray:
+    """Return the violation of a loop's constraints at all stages (n, m), m."""
+    trajectory, system = machine(result)
+    assert system.closure is not None
+    grid, nodes = trajectory.solution.time_grid, trajectory.solution.nodes
+    t = (grid[:-1, None] + np.diff(grid)[:, None] * nodes).ravel()
+    y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
+    instants = system.at(t)
+    motion = instants.motion(y, yd, ydd)
+    place = interface_place(system.mechanism, motion, instants.split(y)[1]).place
+    return system.closure.gap(place)
