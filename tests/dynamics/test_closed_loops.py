@@ -12,6 +12,7 @@ from reference_machines import (
     bending_corrected,
     four_bar,
     gaps,
+    imbalance,
     machine,
     mid_deflection,
     reference,
@@ -21,6 +22,7 @@ from reference_machines import (
 
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.interface_jacobian import _frames
+from dolfinopt.multibody.tangent import linearise
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 
@@ -83,3 +85,35 @@ def test_loops_do_not_drift() -> None:
     keys = {"simulation": {"sample": 1e-2}, "reduction": {"coordinates": 3}}
     result = simulated(slider_crank(0.012, (20, 3), motion=motion, **keys))
     assert np.abs(gaps(result)).max() < 1e-10  # m; measured 2e-14
+
+
+@pytest.mark.parametrize("kind", ["slider", "pin"])
+def test_work_of_the_crank_is_energy(kind: str) -> None:
+    """What the crank's drive does is kinetic and strain energy and what damping took."""
+    keys = {"simulation": {"tolerance": 1e-5}, "reduction": {"coordinates": 3}}
+    keys["motion"] = {"horizon": 0.1}
+    result = simulated(
+        slider_crank(0.012, (20, 3), **keys) if kind == "slider" else four_bar((20, 3), **keys)
+    )
+    assert imbalance(result) < 1e-6
+    assert np.abs(gaps(result)).max() < 1e-10  # m
+
+
+@pytest.mark.parametrize("kind", ["slider", "pin"])
+def test_rigid_limit(kind: str) -> None:
+    """Bars a thousand times as stiff take the power that changes rigid ones' kinetic energy."""
+    tree = slider_crank(0.012, (20, 3)) if kind == "slider" else four_bar((20, 3))
+    tree["material"]["young_modulus"] *= 1e3
+    tree["reduction"] = {"coordinates": 3}
+    trajectory, system = machine(simulated(tree))
+    t, step = trajectory.t[10:-1], 1e-6
+
+    def kinetic(t: np.ndarray) -> np.ndarray:
+        motion, none = system.motion(t), np.zeros((len(t), 0))
+        size = motion.q.shape[1]
+        parts = linearise(system.rigid, motion, none, none, none, None, np.arange(size)).dense()
+        return 0.5 * np.einsum("ni,nij,nj->n", motion.qd, parts[:, :, 2 * size :], motion.qd)
+
+    power = (kinetic(t + step) - kinetic(t - step)) / (2.0 * step)
+    torque = power / system.motion(t).qd[:, 1]
+    assert apart(trajectory.joint_forces[10:-1, 1], torque) < 1e-4  # measured 5e-6

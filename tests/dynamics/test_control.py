@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from reference_machines import (
@@ -10,6 +12,7 @@ from reference_machines import (
     Tree,
     apart,
     bending_corrected,
+    imbalance,
     machine,
     reference,
     simulated,
@@ -18,6 +21,7 @@ from reference_machines import (
 )
 
 from dolfinopt.model import SimulationResult
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 
@@ -53,3 +57,27 @@ def test_deviation_and_forces_of_exact_beams(moved: SimulationResult) -> None:
         assert np.abs(trajectory.q_r[:, k] - expected[f"q_{name}"]).max() < 1e-2 * away
     for k, name in enumerate(("cart", "shoulder", "elbow")):
         assert apart(trajectory.joint_forces[:, k], expected[f"u_{name}"]) < 4e-3  # 2e-3
+
+
+def small(**changes: Any) -> Tree:
+    """Return the controlled machine on few cells."""
+    overrides = ("arms.cells=[20,3]", "reduction.coordinates=3", "motion.horizon=2.2")
+    tree = two_arm(*overrides, control=GAINS, simulation={"stiffening": True, "tolerance": 1e-5})
+    return with_keys(tree, changes)
+
+
+@pytest.mark.parametrize("stiffening", [False, True])
+def test_work_of_the_drives_is_energy(stiffening: bool) -> None:
+    """What the drives do is kinetic and strain energy and what damping took."""
+    assert imbalance(simulated(small(simulation={"stiffening": stiffening}))) < 1e-6  # 4e-9
+
+
+def test_rigid_limit() -> None:
+    """Arms a thousand times as stiff need the forces of rigid ones, and follow the path."""
+    result = simulated(small(material={"young_modulus": 70e12}))
+    trajectory, system = machine(result)
+    none = np.zeros((len(trajectory.t), 0))
+    forces = inverse_dynamics(system.rigid, trajectory.desired, none, none, none)[1]
+    for k in range(3):
+        assert apart(trajectory.joint_forces[:, k], forces[:, k]) < 2e-3  # measured 6e-4
+    assert result.max_deviation < 1e-4  # m; 3.6e-5
