@@ -165,7 +165,7 @@ def _with_rows(instants: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
     times = times if len(times) <= MAX_ROWS else times[-1:]
     apart = SAME_TIME * scene.motion.horizon
     found = list(instants)
-    for t in times[(times > 0.0) & (times < scene.motion.horizon)].tolist():
+    for t in map(float, times[(times > 0.0) & (times < scene.motion.horizon)]):
         if min(abs(t - other) for other in found) > apart:
             found.append(t)
     return tuple(sorted(found))

@@ -136,10 +136,13 @@ class _Iteration:
         self.simplified = simplified and stages.preconditioner.guided
         self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0)
         self.at = self.point(a)
-        self.active = np.arange(runs)  # those that are iterated, by index
-        self.done = np.zeros(runs, dtype=bool)  # of the active
-        self.before, self.norm_before = np.full(runs, np.inf), self.at.norm
-        self.made = np.full(runs, np.inf)  # distance from the solution where the matrix was made
+        self.active: np.ndarray = np.arange(runs)  # those that are iterated, by index
+        self.done: np.ndarray = np.zeros(runs, dtype=bool)  # of the active
+        self.before: np.ndarray = np.full(runs, np.inf)
+        self.norm_before: np.ndarray = self.at.norm
+        self.made: np.ndarray = np.full(
+            runs, np.inf
+        )  # distance from the solution where the matrix was made
 
     def point(self, a: np.ndarray) -> _Point:
         """Return the active runs at an iterate."""

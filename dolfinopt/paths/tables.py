@@ -106,7 +106,7 @@ def last_instant(file: str) -> float | None:
 def moves(rows: np.ndarray) -> list[tuple[int, int]]:
     """Return the first and last row of every move; rows in succession that are equal are a stop."""
     found: list[tuple[int, int]] = []
-    for i in np.flatnonzero((np.diff(rows, axis=0) != 0.0).any(axis=1)).tolist():
+    for i in map(int, np.flatnonzero((np.diff(rows, axis=0) != 0.0).any(axis=1))):
         if found and found[-1][1] == i:
             found[-1] = (found[-1][0], i + 1)
         else:

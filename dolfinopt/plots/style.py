@@ -176,9 +176,9 @@ def log_scale(axes: Axes, values: np.ndarray) -> None:
     axes.set_yscale("log")
     ratio = float(np.max(values)) / float(np.min(values))
     # A short axis would otherwise have one number, or none.
-    subs = (
-        tuple(np.arange(1.0, 10.0)) if ratio < 3.0 else (1.0, 2.0, 5.0) if ratio < 50.0 else (1.0,)
-    )
+    subs = [1.0, 2.0, 5.0] if ratio < 50.0 else [1.0]
+    if ratio < 3.0:
+        subs = [float(k) for k in range(1, 10)]
     axes.yaxis.set_major_locator(LogLocator(subs=subs))
     if ratio < 1e4:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

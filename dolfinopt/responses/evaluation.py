@@ -220,7 +220,7 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
         limits = bound.response.smooth_limits(analysis, bound.limit)
-        constraints += (np.array(found.smooth) / limits - 1.0).tolist()
+        constraints += [float(x) for x in np.array(found.smooth) / limits - 1.0]
         measured.append(found)
     return Evaluation(
         **vars(replace(motion, objective=measured[0].total)),

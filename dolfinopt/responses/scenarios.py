@@ -87,7 +87,7 @@ def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[floa
     if len(values) == 1 or max(values) == 0.0:
         return max(values), [1.0] * len(values)
     worst, by_values = p_norm(np.array(values), exponent)
-    return worst, by_values.tolist()
+    return worst, [float(by) for by in by_values]
 
 
 def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
