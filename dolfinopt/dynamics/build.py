@@ -41,6 +41,12 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     )
 
 
+def _rotors(scene: Scene) -> np.ndarray:
+    """Return the inertia of rotors behind springs (1 + arms,), kg m2."""
+    soft = [rotor_inertia(arm) * (arm.joint_stiffness > 0.0) for arm in scene.arms]
+    return np.array([0.0, *soft])
+
+
 def reflected_inertia(arm: Arm) -> float:
     """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
     return 0.0 if arm.joint_stiffness > 0.0 else rotor_inertia(arm)
@@ -130,6 +136,7 @@ def _drives(scene: Scene) -> Drives:
         rigid_feed_forward=control is not None and control.feed_forward == "rigid",
         table=None if table is None else lambda t: table(t)[:, rows],
         springs=springs,
+        rotors=None if control else _rotors(scene)[rows],
     )
 
 

@@ -153,7 +153,10 @@ class MachineInstants:
             jacobian = interface_place(machine.mechanism, motion, q).jacobian
             pull = machine.ground_force(multipliers)
             forces -= (np.conj(pull)[:, None] * jacobian[:, : forces.shape[1]]).real
-        forces[:, machine.drives.free] = self.drive_forces(y, yd)
+        free, rotors = machine.drives.free, machine.drives.rotors
+        forces[:, free] = self.drive_forces(y, yd)
+        if rotors is not None:
+            forces[:, free] += rotors * self.desired.qdd[:, free]
         return forces
 
     def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:

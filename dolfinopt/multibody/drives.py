@@ -44,6 +44,8 @@ class Drives:
         rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
         table: of instants t (n,), s, forces (n, R) that are added; or None.
         springs: between drives and arms, where a drive is controlled.
+        rotors: (R,) inertia of rotors on the desired motion, before springs, which their motors
+            move as well, kg m2; or None.
     """
 
     free: np.ndarray
@@ -54,6 +56,7 @@ class Drives:
     rigid_feed_forward: bool = False
     table: Callable[[np.ndarray], np.ndarray] | None = None
     springs: Springs = NO_SPRINGS
+    rotors: np.ndarray | None = None
 
     def force(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return u (n, R) from u_ff, q - q_d and its rate, each (n, R)."""

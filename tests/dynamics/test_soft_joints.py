@@ -81,3 +81,18 @@ def test_exact_gradient() -> None:
     ]
     left = [abs(f - at[0] - h * slope) for f, h in zip(at[1:], (0.1, 0.01), strict=True)]
     assert np.log10(left[0] / left[1]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_motors_on_the_desired_motion_move_their_rotors() -> None:
+    """Without control the drives give what the springs take, and what the rotors' inertia does."""
+    soft = ("arms.joint_stiffness=1e5", "arms.joint_damping=100.0", "arms.gear_ratio=100.0")
+    light, heavy = (
+        Model(scene(*SMALL, *soft, f"arms.rotor_inertia={inertia}")).simulate().trajectory
+        for inertia in (0.0, 2e-5)
+    )
+    np.testing.assert_array_equal(heavy.deviation, light.deviation)  # the arms do not feel it
+    change = heavy.joint_forces - light.joint_forces
+    expected = 2e-5 * 100.0**2 * heavy.desired.qdd
+    expected[:, 0] = 0.0  # the cart is prescribed, and moved by what the arms do
+    size = np.abs(heavy.joint_forces).max()
+    np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
