@@ -148,6 +148,22 @@ class Trajectory:
         along = self.closure.normals[0] / 1j
         return (np.conj(along) * (x + 1j * y - self.closure.point)).real
 
+    @property
+    def motor_joints(self) -> tuple[int, ...]:
+        """Arms whose motors move by themselves, behind springs and under control."""
+        if not isinstance(self.problem, MachineSystem):
+            return ()
+        drives = self.problem.drives
+        return tuple(int(k) - 1 for k in drives.free[drives.springs.joints])
+
+    @cached_property
+    def motors(self) -> np.ndarray | None:
+        """Angles of these motors as their joints would have them (n, M), rad; None without."""
+        if not isinstance(self.problem, MachineSystem) or not self.motor_joints:
+            return None
+        columns = 1 + np.array(self.motor_joints)
+        return self.desired.q[:, columns] + self.problem.at(self.t).motors(self.unknowns[0])
+
     @cached_property
     def motion(self) -> RigidMotion:
         """Rigid coordinates at the samples, as they move."""

@@ -41,6 +41,7 @@ def write_trajectory(
         "t": "s",
         "q_r": rigid,
         "q_r_desired": rigid,
+        "q_motors": ", ".join(["rad"] * len(trajectory.motor_joints)),
         "q_e": "m or rad: times V is a displacement in m",
         "deviation": "m",
         "compliance": "N m",
@@ -63,6 +64,8 @@ def _of_machine(trajectory: Trajectory) -> dict[str, np.ndarray]:
     arrays = {}
     if trajectory.is_machine:
         arrays["q_r_desired"] = trajectory.desired.q
+    if trajectory.motors is not None:
+        arrays["q_motors"] = trajectory.motors
     if trajectory.closure_force is not None:
         arrays["closure_force"] = trajectory.closure_force
     if trajectory.slider_position is not None:
@@ -126,6 +129,8 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     units |= {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
     if trajectory.is_machine:
         units |= {f"q_r_desired_{name}": unit for name, unit in rigid_units(scene).items()}
+        names = [trajectory.scene.arms[k].name for k in trajectory.motor_joints]
+        units |= {f"q_motor_{name}": "rad" for name in names}
     if scene.closure is not None:
         names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
         units |= {f"closure_force_{name}": "N" for name in names}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from runs import scene
+from runs import TWO_ARM, overrides, run, scene
 
 from dolfinopt import Model
 from dolfinopt.dynamics.build import build_system
@@ -96,3 +98,15 @@ def test_motors_on_the_desired_motion_move_their_rotors() -> None:
     expected[:, 0] = 0.0  # the cart is prescribed, and moved by what the arms do
     size = np.abs(heavy.joint_forces).max()
     np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
+
+
+def test_angles_of_motors_are_written(tmp_path: Path) -> None:
+    """At rest under gravity the drives give what the springs between motor and arm give."""
+    soft = ("arms.joint_stiffness=1e5", "arms.joint_damping=100.0", "simulation.tolerance=1e-3")
+    changes = (*SMALL[:2], CONTROL, *ROTORS, GRAVITY, *soft)
+    run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "run", *overrides(*changes))
+    found = np.load(tmp_path / "run" / "trajectory.npz")
+    apart = found["q_motors"][0] - found["q_r"][0, 1:]
+    np.testing.assert_allclose(1e5 * apart, found["joint_forces"][0, 1:], rtol=1e-9)
+    header = (tmp_path / "run" / "trajectory.csv").read_text().splitlines()[0]
+    assert "q_motor_arm1,q_motor_arm2" in header
