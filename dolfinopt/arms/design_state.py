@@ -164,6 +164,8 @@ class DesignState:
             initial,
             stiffened,
         )
+        if self.scene.objective == scene.objective:
+            other._loaded = dict(self._loaded)
         if self.num_modes == num_modes and same_basis(self.scene, scene):
             other._basis = self._basis
             if self.scene.damping == scene.damping and self.stiffened == stiffened:
