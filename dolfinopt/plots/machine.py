@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from dolfinopt.plots.shapes import (
     slender,
     thin,
 )
-from dolfinopt.plots.style import DENSITY, GREY, ORANGE, SOLID_FROM, PathLike, new_figure, save
+from dolfinopt.plots.style import DENSITY, GREY, ORANGE, SOLID_FROM, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,39 +37,8 @@ PALE = 0.3  # share of its colour
 LEANING = np.exp(0.25j * np.pi)  # the words lie beside the next arm, which may go straight on
 
 
-def draw_machine(
-    path: PathLike,
-    views: Sequence[ArmView],
-    mechanism: Mechanism,
-    t: np.ndarray,
-    q_r: np.ndarray,
-    title: str,
-    desired: np.ndarray | None = None,
-    end: np.ndarray | None = None,
-    closure: Closure | None = None,
-) -> Path:
-    """Draw the assembled machine with its designs in a few poses along the path (PNG).
-
-    Args:
-        path: of the picture.
-        views: of all arms, from the cart outwards.
-        mechanism: that moves.
-        t: (n,) s.
-        q_r: (n, 1 + arms) rigid coordinates; m, rad.
-        title: above the picture.
-        desired: (n, 1 + arms) rigid coordinates that q_r may leave; default: q_r.
-        end: (n, 2) m, places of the end-effector as it moves, of which `desired` tells where they
-            should be; default: not drawn.
-        closure: what holds the last interface of a closed loop; of it one turn is shown.
-
-    Returns:
-        The path.
-    """
-    return save(machine_figure(views, mechanism, t, q_r, title, desired, end, closure), path)
-
-
 def figure_of(views: Sequence[ArmView], trajectory: Trajectory, title: str) -> Figure:
-    """Return the figure of `draw_machine` of a simulated motion."""
+    """Return the figure of `machine_figure` of a simulated motion."""
     one = trajectory
     known = (one.desired.q, one.end, one.closure) if one.is_machine else (None, None, None)
     return machine_figure(views, one.mechanism, one.t, one.q_r, title, *known)
@@ -110,7 +78,21 @@ def machine_figure(
     end: np.ndarray | None = None,
     closure: Closure | None = None,
 ) -> Figure:
-    """Return the figure of `draw_machine`: arms undeformed, void left open."""
+    """Draw the assembled machine with its designs in a few poses along the path.
+
+    Arms are undeformed, void is left open.
+
+    Args:
+        views: of all arms, from the cart outwards.
+        mechanism: that moves.
+        t: (n,) s.
+        q_r: (n, 1 + arms) rigid coordinates; m, rad.
+        title: above the picture.
+        desired: (n, 1 + arms) rigid coordinates that q_r may leave; default: q_r.
+        end: (n, 2) m, places of the end-effector as it moves, of which `desired` tells where they
+            should be; default: not drawn.
+        closure: what holds the last interface of a closed loop; of it one turn is shown.
+    """
     rigid = np.zeros((len(t), mechanism.slices[-1].stop))
     closed = close_loop(mechanism, closure, q_r, rigid)
     place, swing = chain(mechanism, q_r if closed is None else closed, rigid)

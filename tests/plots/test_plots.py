@@ -561,9 +561,8 @@ def test_machine_is_drawn(tmp_path):
 
     views, mechanism = manipulator(2)
     t, q_r, _ = swinging(2)
-    image = imread(
-        machine.draw_machine(tmp_path / "machine.png", views, mechanism, t, q_r, "title")
-    )
+    figure = machine.machine_figure(views, mechanism, t, q_r, "title")
+    image = imread(style.save(figure, tmp_path / "machine.png"))
     assert [p.name for p in tmp_path.iterdir()] == ["machine.png"]
     solid = np.abs(image[..., :3] - np.array([8, 29, 88]) / 255.0).max(axis=2) < 0.05
     assert solid.sum() > 5000
