@@ -8,7 +8,9 @@ import pytest
 from runs import ROOT
 
 from dolfinopt.density.interpolation import LAWS
+from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.reduction import METHODS
+from dolfinopt.scene.tables.arms import ElementName
 from dolfinopt.scene.tables.constraints import Constraints
 from dolfinopt.scene.tables.interpolation import Law
 from dolfinopt.scene.tables.objective import ObjectiveKind
@@ -53,4 +55,5 @@ def test_words_of_the_scene_are_those_of_the_code():
     """A method is known to the scene by the word under which its room lists it."""
     assert set(get_args(ReductionMethod)) == METHODS.keys()
     assert set(get_args(Law)) == LAWS.keys()
+    assert set(get_args(ElementName)) == ELEMENTS.keys()
     assert {*get_args(ObjectiveKind), *Constraints.model_fields} == NEEDS.keys()

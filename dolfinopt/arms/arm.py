@@ -20,7 +20,7 @@ from dolfinopt.density.projection import Projected, preserving_threshold, projec
 from dolfinopt.density.symmetry import AxisSymmetry
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.elements import element_of
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
@@ -77,9 +77,11 @@ class Arm:
             self.mesh = arm_mesh(comm, arm)
             self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
         with profile.phase("element operators"):
-            operators = ELEMENTS["linear"].operators(
-                self.mesh, arm.thickness, self.solid.poisson_ratio
-            )
+            try:
+                element = element_of(self.mesh, arm.element)
+            except InputError as error:
+                raise InputError(f"{scene.source}: {error}") from None
+            operators = element.operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
             self.substructure = Substructure(self.mesh, operators, profile)
             design = scene.design
             # A member along an edge would be half as thin if the filter mirrored it there.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from mpi4py import MPI
 from dolfinopt.bench.common import Diagram, Plan, Row, Tell, curves, tidy, timed
 from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ElementOperators, LagrangeElement, plane_stress, strains
+from dolfinopt.fem.elements import ElementOperators, IncompatibleElement, LagrangeElement
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.compat import cell_coordinates, local_cell_counts
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency, shape_integrals
@@ -102,64 +102,6 @@ def grid_arm(
     )
 
 
-@dataclass(frozen=True)
-class IncompatibleModes(LagrangeElement):
-    """Bilinear quadrilaterals with Wilson's incompatible modes, condensed: QM6.
-
-    1 - xi^2 and 1 - eta^2 in both components let an element bend without shear; their gradients
-    are those at its centre, which keeps the patch test on any quadrilateral. Source: Taylor,
-    Beresford & Wilson (1976), doi:10.1002/nme.1620100602.
-    """
-
-    def operators(self, mesh: ArmMesh, thickness: float, poisson_ratio: float) -> ElementOperators:
-        """Return the condensed matrices, see `fem.elements.Element`."""
-        plain = super().operators(mesh, thickness, poisson_ratio)
-        corners = plain.points[plain.cells]  # tensor-product order
-        law = plane_stress(poisson_ratio)
-        total = np.zeros((len(corners), 12, 12))
-        gauss = 1.0 / np.sqrt(3.0)
-        for xi in (-gauss, gauss):
-            for eta in (-gauss, gauss):
-                jacobian = _jacobian(corners, xi, eta)
-                weight = np.abs(np.linalg.det(jacobian))
-                nodal = _shape_gradients(xi, eta) @ np.linalg.inv(jacobian)
-                B = strains(np.concatenate([nodal, _inner(corners, xi, eta)], axis=1))
-                total += weight[:, None, None] * (B.transpose(0, 2, 1) @ law @ B)
-        coupling = total[:, 8:, :8]
-        recovery = -np.linalg.solve(total[:, 8:, 8:], coupling)
-        stiffness = total[:, :8, :8] + coupling.transpose(0, 2, 1) @ recovery
-        return replace(plain, stiffness=thickness * stiffness, recovery=recovery)
-
-    def strain_operator(
-        self, mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
-    ) -> np.ndarray:
-        """Return B, the condensed modes' strains included, see `fem.elements.Element`."""
-        B = super().strain_operator(mesh, operators, points)
-        corners = operators.points[operators.cells]
-        for k, (xi, eta) in enumerate(2.0 * points - 1.0):
-            B[:, k] += strains(_inner(corners, xi, eta)) @ operators.recovery
-        return B
-
-
-def _inner(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
-    """Return the gradients (n, 2, 2) of the incompatible modes."""
-    centre = _jacobian(corners, 0.0, 0.0)
-    ratio = np.linalg.det(centre) / np.linalg.det(_jacobian(corners, xi, eta))
-    return np.diag([-2.0 * xi, -2.0 * eta]) @ np.linalg.inv(centre) * ratio[:, None, None]
-
-
-def _shape_gradients(xi: float, eta: float) -> np.ndarray:
-    """Return the derivatives (4, 2) of the bilinear shape functions on [-1, 1]^2."""
-    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
-    a, b = signs.T
-    return 0.25 * np.stack([a * (1.0 + b * eta), b * (1.0 + a * xi)], axis=1)
-
-
-def _jacobian(corners: np.ndarray, xi: float, eta: float) -> np.ndarray:
-    """Return dX_i/dxi_k (n, 2, 2)."""
-    return np.einsum("eni,nk->eik", corners, _shape_gradients(xi, eta))
-
-
 Operators = Callable[[ArmMesh, float, float], ElementOperators]
 
 
@@ -179,7 +121,7 @@ class Element:
 
 ELEMENTS = (
     Element("Q1", False, LagrangeElement(1).operators),
-    Element("QM6, incompatible modes", False, IncompatibleModes().operators),
+    Element("QM6, incompatible modes", False, IncompatibleElement().operators),
     Element("Q2", False, LagrangeElement(2).operators),
     Element("P1 triangles", True, LagrangeElement(1).operators),
     Element("P2 triangles", True, LagrangeElement(2).operators),

@@ -87,7 +87,10 @@ class InteriorMatrix:
                 cols,
                 row_ids.astype(PETSc.IntType),
             )
-            self.mat = PETSc.Mat().createAIJ(((owned, None), (owned, None)), nnz=40, comm=comm)
+            # Where ranks meet a row is put together of theirs; PETSc allocates what is more.
+            longest = comm.allreduce(int(np.diff(self._kept[0]).max(initial=1)), op=MPI.MAX)
+            sizes = (owned, None), (owned, None)
+            self.mat = PETSc.Mat().createAIJ(sizes, nnz=longest, comm=comm)
             self.mat.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
 
     def update(self, data: np.ndarray) -> None:

@@ -17,7 +17,8 @@ from dolfinopt.scene.tables.arms import Arm
 # quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm (`_bytes`, `_seconds`):
 #   n =   9 600:  265 MB,  0.38 s;      n =  38 400:  648 MB,  2.4 s
 #   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
-# Fill-in of a nested dissection makes both grow faster than n.
+# Fill-in of a nested dissection makes both grow faster than n. Quadratic elements have the
+# nodes, and the entries of element matrices, of four times as many linear quadrilaterals.
 PROCESS = 0.2e9  # bytes of a rank without cells
 CELL, FILL, AT = 6.9e3, 0.2e3, 38_400  # bytes a cell, more for every doubling, measured at
 CELL_SECONDS, GROWTH = 32e-6, 0.33  # s a cell at AT, and the power of n with which it grows
@@ -34,11 +35,12 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     at the same time are not seen.
     """
     cells = {index: estimated_cells(scene.arms[index]) for index in scene.cell_counts}
-    if sum(cells.values()) <= FEW:
+    size = {k: count * max(1.0, scene.arms[k].nodes_per_cell) for k, count in cells.items()}
+    if sum(size.values()) <= FEW:
         return
     partition = partition_arms(world, scene.cell_counts)
-    mine = sum(_bytes(cells[k]) for k in partition.arms) / partition.comm.size + PROCESS
-    seconds = sum(_seconds(cells[k]) for k in partition.arms) / partition.comm.size
+    mine = sum(_bytes(size[k]) for k in partition.arms) / partition.comm.size + PROCESS
+    seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
     partition.comm.Free()
     ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
     needed: dict[str, float] = defaultdict(float)
@@ -115,11 +117,11 @@ def _left(folder: Path, limit: str, usage: str, reclaimable: str) -> float:
         return math.inf
 
 
-def _bytes(cells: int) -> float:
+def _bytes(cells: float) -> float:
     return cells * (CELL + FILL * max(math.log2(max(cells, 1) / AT), 0.0))
 
 
-def _seconds(cells: int) -> float:
+def _seconds(cells: float) -> float:
     return CELL_SECONDS * cells * (cells / AT) ** GROWTH
 
 

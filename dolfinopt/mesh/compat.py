@@ -83,10 +83,14 @@ def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
     return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
 
 
+def cell_corner_count(mesh: Any) -> int:
+    """Return the corners of a cell, 3 or 4; cells have straight sides."""
+    return int(mesh.geometry.cmap.create_dof_layout().num_dofs)  # a rank may have no cell
+
+
 def cell_geometry_nodes(mesh: Any, num_cells: int) -> np.ndarray:
     """Return the geometry's node numbers (num_cells, points a cell) of the first cells, local."""
-    points = mesh.geometry.cmap.create_dof_layout().num_dofs  # as above
-    return _rows(mesh.geometry.dofmap, points)[:num_cells]
+    return _rows(mesh.geometry.dofmap, cell_corner_count(mesh))[:num_cells]
 
 
 def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:
@@ -104,8 +108,7 @@ def cell_facets(mesh: Any, num_cells: int) -> np.ndarray:
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim, dim - 1)
     links = mesh.topology.connectivity(dim, dim - 1)
-    columns = 3 if cell_geometry_nodes(mesh, 0).shape[1] == 3 else 4
-    return _rows(links, columns)[:num_cells].astype(np.int32)
+    return _rows(links, cell_corner_count(mesh))[:num_cells].astype(np.int32)
 
 
 def local_cell_counts(mesh: Any) -> tuple[int, int]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.arms.arm import fixed_body
+from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_cells, together
 from dolfinopt.scene.load import Scene
@@ -50,15 +51,18 @@ def gather_views(
             mine = {index: values(index, arm) for index, arm in arms.items()}
         return gather_cells(partition, mine)
 
+    def corner_nodes(arm: Arm) -> np.ndarray:
+        operators = arm.substructure.operators  # also of arms that no design was set for
+        return operators.cells[:, : compat.cell_corner_count(arm.mesh.mesh)]
+
     def modes(index: int, arm: Arm) -> np.ndarray:
-        cells = arm.substructure.operators.cells
+        cells = corner_nodes(arm)
         if arm.basis is None:
             return np.zeros((*cells.shape, 2, 0))
         return arm.basis.V[cells]
 
     def points(index: int, arm: Arm) -> np.ndarray:
-        operators = arm.substructure.operators  # also of arms that no design was set for
-        return operators.points[operators.cells]
+        return arm.substructure.operators.points[corner_nodes(arm)]
 
     corners = collect(points)
     centroids = collect(lambda _, arm: arm.mesh.centroid)

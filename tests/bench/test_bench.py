@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_matrix
 
 from dolfinopt.bench import Plan, bench, common, diagrams, peers, whole
 from dolfinopt.bench import mesh as meshes
@@ -20,7 +19,6 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import modes_of
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import InputError
-from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.paper.reproduction import load_paper
@@ -48,34 +46,6 @@ def reference(problem):
 
 
 # -- elements --------------------------------------------------------------------------------
-
-
-def test_incompatible_modes_pass_the_patch_test():
-    """Skewed cells under constant strain: nodal forces are those of bilinear cells."""
-    grid = meshes.grid_arm(1.0, 0.5, (3, 2))
-    x = grid.mesh.geometry.x
-    inside = (x[:, 0] > 0.1) & (x[:, 0] < 0.9) & (np.abs(x[:, 1]) < 0.1)
-    x[inside, :2] += [0.08, -0.06]
-    plain = LagrangeElement().operators(grid, 0.01, 0.3)
-    better = meshes.IncompatibleModes().operators(grid, 0.01, 0.3)
-    linear = plain.points @ np.array([[0.3, -0.2], [0.7, 0.4]])
-    u = linear[plain.cells].reshape(len(plain.cells), 8, 1)
-
-    def assembled(stiffness):
-        rows = (2 * plain.cells[:, :, None] + np.arange(2)).ravel()
-        forces = (stiffness @ u).ravel()
-        size = 2 * len(plain.points)
-        return csr_matrix((forces, (rows, np.zeros_like(rows))), shape=(size, 1)).toarray()[:, 0]
-
-    free = np.abs(plain.points[:, 0] - 0.5) < 0.45
-    free &= np.abs(plain.points[:, 1]) < 0.2
-    assert free.sum() == 2  # the two that were moved
-    force, other = assembled(better.stiffness), assembled(plain.stiffness)
-    # Rounding of element matrices of size 0.01.
-    assert np.abs(force.reshape(-1, 2)[free]).max() < 1e-15
-    np.testing.assert_allclose(force, other, atol=1e-15)
-    stretched = np.linalg.eigvalsh(better.stiffness)
-    assert (stretched[:, :3] < 1e-15).all() and (stretched[:, 3] > 1e-5).all()
 
 
 def test_elements_that_do_not_lock():

@@ -53,6 +53,18 @@ def test_estimate_is_what_was_measured(monkeypatch, free, fits):
         check_budget(COMM, scene)
 
 
+@pytest.mark.parametrize(("free", "fits"), [(2.6e9, True), (2.0e9, False)])
+def test_quadratic_elements_count_their_nodes(monkeypatch, free, fits):
+    """As many nodes as of four times the cells."""
+    monkeypatch.setattr(budget, "free_memory", lambda: free + budget.PROCESS * (COMM.size - 1))
+    scene = load_scene(TWO_ARM, ["arms.cells=[800,48]", "arms.element=quadratic"])
+    if fits:
+        check_budget(COMM, scene)
+        return
+    with pytest.raises(InputError, match=re.escape("about 7.68e+04 cells need 2.")):
+        check_budget(COMM, scene)
+
+
 def test_cells_of_files_are_estimated():
     keys = {"name": "a", "length": 1.0, "height": 0.06, "thickness": 0.01}
     assert estimated_cells(Arm(**keys, mesh="a.step")) == 2400  # a twelfth of the height

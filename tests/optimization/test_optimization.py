@@ -169,6 +169,8 @@ ROBUST = "design.projection=robust"
 SMALLEST = ["motion.horizon=1.9", "simulation.tolerance=1e-2", "arms.cells=[24,3]"]
 # One line an option of which the next iteration remembers something.
 REMEMBERED = [
+    ["arms.element=incompatible", "simulation.stiffening=true"],
+    ["arms.element=quadratic"],
     ["reduction.method=modal"],
     ["reduction.method=modal", "arms.arm2.design=arm1"],
     ["reduction.method=krylov", "reduction.coordinates=3"],

@@ -11,6 +11,7 @@ from reference_machines import GAINS, Tree, four_bar, slider_crank, two_arm, wit
 from remainders import rates
 
 from dolfinopt import Model
+from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial  # designs belong to one rank
@@ -25,6 +26,14 @@ def arms(objective: Tree, stiffening: bool, **changes: Any) -> Tree:
     tree = two_arm("arms.cells=[20,3]", "motion.horizon=2.2", objective=objective)
     simulation = {"stiffening": stiffening, "tolerance": 1e-6}
     return with_keys(with_keys(tree, {"simulation": simulation}), changes)
+
+
+def of_element(name: str, stiffening: bool) -> Tree:
+    """Return the two-arm scene on few cells of this element."""
+    tree = arms(COMPLIANCE, stiffening)
+    for arm in tree["arms"]:
+        arm |= {"element": name, "cells": [12, 2]}
+    return tree
 
 
 def loop(tree: Tree, **changes: Any) -> Tree:
@@ -56,6 +65,8 @@ def scenes(folder: Path) -> dict[str, Tree]:
     joints = {"joint_mass": 0.5, "joint_inertia": 0.01}
     return {
         "stiffened": arms(COMPLIANCE, True),
+        **{name: of_element(name, False) for name in ELEMENTS},
+        **{f"stiffened-{name}": of_element(name, True) for name in ELEMENTS},
         "stiffened-deviation": arms(DEVIATION, True),
         "control": arms(DEVIATION, False, control=GAINS),
         "control-limits-gravity": arms(DEVIATION, True, control=limited, motion=GRAVITY),
@@ -82,10 +93,14 @@ def scenes(folder: Path) -> dict[str, Tree]:
 
 
 # Cosine between the gradient by ESL and the exact one, at least. ESL hold the elastic coordinates
-# and the loop's joints: of where a slider ends up nothing is left that would tell.
+# and the loop's joints: of where a slider ends up nothing is left that would tell. Arms of few
+# cells that do not lock follow their loads more.
 COSINE = {"slider-deviation": -1.0, "pin": 0.9}
+COSINE |= {f"{kind}{name}": 0.9 for kind in ("", "stiffened-") for name in ELEMENTS}
 SLOW = ("control-limits-gravity", "hardware", "pin")
 KINDS = (
+    *ELEMENTS,
+    *(f"stiffened-{name}" for name in ELEMENTS),
     "stiffened",
     "stiffened-deviation",
     "control",

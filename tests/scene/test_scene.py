@@ -148,6 +148,7 @@ def test_demo_states_every_other_key():
         "mesh",
         "mesh_size",
         "cell_shape",
+        "element",
         "symmetric",
         "stiffening",
         *("speed", "start_angle", "cart_mass"),
@@ -275,6 +276,9 @@ def test_reducible_dofs():
     # 3 x 2 cells: 2 columns of interior nodes with 3 nodes of 2 dofs, and the outboard interface.
     assert Arm(**ARM, cells=(3, 2)).n_reducible == 2 * 3 * 2 + 3
     assert Arm(**ARM, cells=(1, 9)).n_reducible == 3
+    assert Arm(**ARM, cells=(3, 2), element="incompatible").n_reducible == 2 * 3 * 2 + 3
+    # Nodes halfway, too: 5 columns of 5.
+    assert Arm(**ARM, cells=(3, 2), element="quadratic").n_reducible == 2 * 5 * 5 + 3
 
 
 @pytest.mark.parametrize("n_along", [1, 2, 3, 7, 200])
@@ -501,6 +505,7 @@ BAD_VALUES = [
     ("arms.0.mesh_size", 0.01, "0.01", "only with mesh"),
     ("arms.0.cell_shape", "hexagon", '"hexagon"', '"quadrilateral" | "triangle"'),
     ("arms.0.cell_shape", "triangle", '"triangle"', "only with mesh"),
+    ("arms.0.element", "cubic", '"cubic"', '"incompatible" | "linear" | "quadratic"'),
     ("arms.0.symmetric", 1, "1", "true or false"),
     ("arms.0.passive", -0.01, "-0.01", "a number >= 0"),
     ("arms.0.passive", 0.5, "0.5", "less than half of length = 1.0 [m]"),
@@ -682,6 +687,11 @@ def test_a_mesh_excludes_cells():
         (".msh", {"mesh_size": 0.01}, "a .msh file has its cells"),
         (".msh", {"cell_shape": "triangle"}, "a .msh file has its cells"),
         (".geo", {"mesh_size": 0.07}, "at most height = 0.06 [m]: a cell must fit into the arm"),
+        (
+            ".geo",
+            {"cell_shape": "triangle", "element": "incompatible"},
+            '= "incompatible": expected "linear" or "quadratic" with triangles',
+        ),
     ],
 )
 def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
 CellShape = Literal["quadrilateral", "triangle"]
+ElementName = Literal["incompatible", "linear", "quadratic"]
+DEFAULT_ELEMENT: dict[CellShape, ElementName] = {"quadrilateral": "linear", "triangle": "linear"}
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MESH_FILES = (".geo", ".msh", ".step", ".stp")
@@ -67,6 +69,11 @@ class Arm(Table):
     )
     cell_shape: CellShape | None = Field(
         default=None, description="cell shape for a .geo or .step file [-]"
+    )
+    element: ElementName | None = Field(
+        default=None,
+        description="finite element: bilinear quadrilaterals with incompatible modes, linear, or "
+        "quadratic; default: linear [-]",
     )
     passive: float | None = Field(
         default=None,
@@ -225,6 +232,10 @@ class Arm(Table):
                 raise Refusal(
                     "expected only with .geo or .step: a .msh file has its cells", (key,), ("mesh",)
                 )
+        if self.element == "incompatible" and self.cell_shape == "triangle":
+            raise Refusal(
+                'expected "linear" or "quadratic" with triangles', ("element",), ("cell_shape",)
+            )
         return self
 
     @property
@@ -236,6 +247,17 @@ class Arm(Table):
             return 0
         squares = self.length * self.height / self.mesh_size**2
         return round(2.0 * squares if self.cell_shape == "triangle" else squares)
+
+    @property
+    def nodes_per_cell(self) -> float:
+        """Nodes of a large mesh over its cells, which are quadrilaterals unless `cell_shape` says.
+
+        Four of them meet at a corner, or six triangles.
+        """
+        shape = self.cell_shape or "quadrilateral"
+        element = self.element or DEFAULT_ELEMENT[shape]
+        corners = 0.5 if shape == "triangle" else 1.0
+        return 4.0 * corners if element == "quadratic" else corners
 
     @property
     def solid_ends(self) -> float:
@@ -280,6 +302,8 @@ class Arm(Table):
         if self.cells is None:
             return None
         n_along, n_across = self.cells
+        if self.nodes_per_cell == 4.0:  # also halfway
+            n_along, n_across = 2 * n_along, 2 * n_across
         return 2 * (n_along - 1) * (n_across + 1) + 3
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:

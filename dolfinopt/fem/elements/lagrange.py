@@ -1,0 +1,80 @@
+"""Lagrange elements: quadrilaterals and triangles with polynomial displacements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from dolfinopt.fem.elements.base import ElementOperators, strains
+from dolfinopt.fem.elements.geometry import cell_corners, jacobian, shape_derivatives
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.parallel import together
+
+
+@dataclass(frozen=True)
+class LagrangeElement:
+    """Quadrilaterals or triangles with straight sides and polynomial displacements.
+
+    Attributes:
+        degree: polynomial degree of the displacement.
+    """
+
+    degree: int = 1
+
+    def operators(self, mesh: ArmMesh, thickness: float, poisson_ratio: float) -> ElementOperators:
+        """Tabulate the element matrices with FFCx's own kernels, see `Element`.
+
+        k_e = int B' C B t dA with E = 1,  m_e = int N' N t dA.
+        """
+        vector = compat.lagrange_space(mesh.mesh, self.degree, components=2)
+        k_form = compat.compile_form(stiffness_form(vector))
+        m_form = mass_form(mesh, self.degree)
+        with together(mesh.comm):
+            coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
+            return ElementOperators(
+                space=vector,
+                cells=compat.cell_nodes(vector, mesh.num_cells),
+                points=vector.tabulate_dof_coordinates()[:, :2].copy(),
+                stiffness=compat.tabulate_cells(k_form, [thickness, poisson_ratio], coordinates),
+                mass=compat.tabulate_cells(m_form, [thickness], coordinates),
+                element=self,
+                thickness=thickness,
+                poisson_ratio=poisson_ratio,
+            )
+
+    def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
+        """Return those in the reference cell times the inverse Jacobian, see `Element`."""
+        corners = cell_corners(mesh)
+        local = shape_derivatives(corners.shape[1], self.degree, points)
+        return local @ np.linalg.inv(jacobian(corners, points))
+
+    def strain_operator(
+        self, mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
+    ) -> np.ndarray:
+        """Return B from the derivatives of the shape functions, see `Element`."""
+        return strains(self.derivatives(mesh, points))
+
+
+def stiffness_form(space: Any) -> ufl.Form:
+    """Return int B' C B t dA of unit Young's modulus; constants t and nu, in this order."""
+    mesh = space.mesh
+    u, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+    t, nu = fem.Constant(mesh, 1.0), fem.Constant(mesh, 0.0)
+
+    def strain(a: object) -> object:
+        return ufl.sym(ufl.grad(a))
+
+    stress = t / (1 - nu**2) * ((1 - nu) * strain(u) + nu * ufl.tr(strain(u)) * ufl.Identity(2))
+    return ufl.inner(stress, strain(v)) * ufl.dx
+
+
+def mass_form(mesh: ArmMesh, degree: int) -> Any:
+    """Compile int N' N t dA of one component; its constant is t (collective)."""
+    scalar = compat.lagrange_space(mesh.mesh, degree)
+    p, w = ufl.TrialFunction(scalar), ufl.TestFunction(scalar)
+    return compat.compile_form(fem.Constant(mesh.mesh, 1.0) * ufl.inner(p, w) * ufl.dx)
