@@ -49,13 +49,14 @@ def trajectory_gradient(
     Args:
         system, solution: as solved by `radau.integrate`.
         t: (m,) instants at which J looks at the coordinates, s.
-        by_q: (m, N) dJ/dq there.
+        by_q: (m, N) dJ/dq there; or (k, m, N), k <= 3, by q, qd and qdd in this order.
     """
+    by_rates = by_q if by_q.ndim == 3 else by_q[None]
     method, modes = radau_iia(len(solution.nodes)), system.preconditioner()
     stages = stages_of(modes, method, solution.time_grid)
     z, zd, a = (modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
     z_s, zd_s = stage_values(stages, z, zd, a)
-    by_a, by_y = _sampled(solution, t, modes.gradient_to_modes(by_q))
+    by_a, by_y = _sampled(solution, t, modes.gradient_to_modes(by_rates))
     multipliers, first = _backwards(stages, z_s, zd_s, a, by_a, by_y)
     q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
     size = q.shape[2]
@@ -74,16 +75,29 @@ def add_gradients(
     return [a + b for a, b in zip(first, second, strict=True)]
 
 
-def _sampled(solution: Solution, t: np.ndarray, by_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return dJ by the steps' accelerations (n, s, N) and states (n, 2, N); undoes `sample`."""
+def _sampled(
+    solution: Solution, t: np.ndarray, by_rates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return dJ by the steps' accelerations (n, s, N) and states (n, 2, N); undoes `sample`.
+
+    Args:
+        solution: with the time grid.
+        t: (m,) instants, s.
+        by_rates: (k, m, N) dJ by q, qd and qdd there, or by the first k of them.
+    """
     step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(solution.a) - 1)
     h = np.diff(solution.time_grid)[step]
     tau = (t - solution.time_grid[step]) / h
-    weights = lagrange_integrals(solution.nodes, tau)[2] * (h * h)[:, None]
+    integrals = lagrange_integrals(solution.nodes, tau)
     by_a = np.zeros_like(solution.a)
-    by_y = np.zeros((len(solution.a), 2, by_q.shape[1]))
-    np.add.at(by_a, step, weights[:, :, None] * by_q[:, None])
-    np.add.at(by_y, step, np.stack([by_q, (h * tau)[:, None] * by_q], axis=1))
+    by_y = np.zeros((len(solution.a), 2, by_rates.shape[2]))
+    for derivative, by in enumerate(by_rates):
+        weights = integrals[2 - derivative] * (h ** (2 - derivative))[:, None]
+        np.add.at(by_a, step, weights[:, :, None] * by[:, None])
+        if derivative == 0:
+            np.add.at(by_y, step, np.stack([by, (h * tau)[:, None] * by], axis=1))
+        elif derivative == 1:
+            np.add.at(by_y[:, 1], step, by)
     return by_a, by_y
 
 

@@ -28,7 +28,7 @@ from dolfinopt.multibody.interface_jacobian import interface_place, place_gradie
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, padded, rigid_part
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, padded, rigid_part
 from dolfinopt.multibody.tangent import linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
@@ -194,17 +194,15 @@ class MachineInstants:
             every = repeated(len(y))
             return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
-        (R, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
+        (_, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         matrix = np.zeros((count, S, 3, S))
         tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, machine.drives.free)
         matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
         passing = machine.drives.passing(self.ahead, self.at_drives(y), self.at_drives(yd))
-        springs = machine.drives.springs
-        motors = last + np.arange(len(springs.joints))
-        every = np.arange(R)
-        every[springs.joints] = motors
+        springs, every = machine.drives.springs, machine.drive_columns
+        motors = every[springs.joints]
         matrix[:, every, 0, every] += passing * machine.drives.stiffness
         matrix[:, every, 1, every] += passing * machine.drives.damping
         for order, value in enumerate((springs.stiffness, springs.damping)):
@@ -254,6 +252,13 @@ class MachineSystem:
         """Places of the free and the elastic coordinates among all of the mechanism's."""
         rigid = 1 + len(self.mechanism.bodies)
         return np.concatenate([self.drives.free, rigid + np.arange(self.mechanism.num_coordinates)])
+
+    @cached_property
+    def drive_columns(self) -> np.ndarray:
+        """Places (R,) among the unknowns of what the drives act on: of soft joints the motors."""
+        places, joints = np.arange(self.ends[0]), self.drives.springs.joints
+        places[joints] = self.ends[2] + np.arange(len(joints))
+        return places
 
     @property
     def num_coordinates(self) -> int:
@@ -395,19 +400,10 @@ class MachineSystem:
         of_forces = np.zeros_like(motion.q)
         of_forces[:, self.drives.free] = of_rigid
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
-        if self.drives.rigid_feed_forward:
-            at_drives = instants.at_drives
-            passing = self.drives.passing(instants.ahead, at_drives(y), at_drives(yd))
-            weights = feed_forward_weights(
-                self.rigid,
-                instants.desired,
-                self.drives,
-                self.closure,
-                -passing * at_drives(multipliers),
-            )
-            none = np.zeros((len(t), 0))
-            rigid = body_gradient(self.rigid, instants.desired, none, none, none, none, weights)
-            total = [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
+        at_drives = instants.at_drives
+        passing = self.drives.passing(instants.ahead, at_drives(y), at_drives(yd))
+        pushed = -passing * at_drives(multipliers)
+        total = self.with_feed_forward(total, instants.desired, pushed)
         if self.closure is None:
             return total
         # -J' f . multipliers, by which the interface moves in their direction, and the gap's part.
@@ -416,10 +412,24 @@ class MachineSystem:
         pull = -self.ground_force(ground)
         along_gap = self.gap_scale * (of_gap @ self.closure.normals)
         parts = place_gradient(self.mechanism, motion, q, along_gap, moved, pull)
-        return [
-            replace(a, **{key: getattr(a, key) + value for key, value in part.items()})
-            for a, part in zip(total, parts, strict=True)
-        ]
+        return [add_integrals(a, part) for a, part in zip(total, parts, strict=True)]
+
+    def with_feed_forward(
+        self, total: list[ShapeIntegrals], desired: RigidMotion, weights: np.ndarray
+    ) -> list[ShapeIntegrals]:
+        """Add the derivative of sum_n weights_n . u_ff_n by every body's integrals.
+
+        Args:
+            total: to which it is added.
+            desired: motion at n instants.
+            weights: (n, R) of the feed-forward forces of the free coordinates.
+        """
+        if not self.drives.rigid_feed_forward:
+            return total
+        of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
+        none = np.zeros((len(weights), 0))
+        rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
+        return [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
 
     def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:
         """Return the derivative by every body of J through the state y (S,) at t = 0."""

@@ -14,6 +14,7 @@ Source: Wallrapp (1994), doi:10.1080/08905459408905214; Schwertassek & Wallrapp 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -182,6 +183,16 @@ def scaled(body: ShapeIntegrals, mass: float, stiffness: float, damping: float) 
     factors = {"mass": mass, "stiffness": stiffness, "damping": damping}
     changed = {i.name: factors[i.scale] * getattr(body, i.name) for i in TABLE if i.scale}
     return replace(body, **changed)
+
+
+def integrals_of(body: ShapeIntegrals) -> dict[str, Any]:
+    """Return all integrals, or derivatives by them, under their names."""
+    return {one.name: getattr(body, one.name) for one in TABLE}
+
+
+def add_integrals(body: ShapeIntegrals, more: Mapping[str, Any]) -> ShapeIntegrals:
+    """Return derivatives by a body's integrals plus those by some of them, under their names."""
+    return replace(body, **{name: getattr(body, name) + value for name, value in more.items()})
 
 
 def of_material(

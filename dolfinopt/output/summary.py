@@ -22,7 +22,6 @@ from dolfinopt.mesh import compat
 from dolfinopt.multibody.stiffening import WARN, Stiffening
 from dolfinopt.output.trajectory import (
     drive_units,
-    driven_columns,
     free_drives,
     rigid_units,
     trajectory_units,
@@ -198,7 +197,7 @@ def _cost(run: Simulated, wall: float) -> dict[str, Any]:
 
 def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     """Return masses, drives and residual vibration; of machines control errors and reactions."""
-    columns = driven_columns(scene)
+    columns = scene.driven_columns
 
     def by_drive(values: np.ndarray) -> dict[str, float]:
         return dict(zip(scene.driven, map(float, values[columns]), strict=True))

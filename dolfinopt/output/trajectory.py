@@ -84,7 +84,7 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
         trajectory.q_r,
         trajectory.q_e,
         trajectory.compliance,
-        trajectory.joint_forces[:, driven_columns(trajectory.scene)],
+        trajectory.joint_forces[:, trajectory.scene.driven_columns],
         *arrays.values(),
     ]
 
@@ -97,15 +97,6 @@ def rigid_units(scene: Scene) -> dict[str, str]:
 def drive_units(scene: Scene) -> dict[str, str]:
     """Return the unit of every drive by the name of its coordinate, see `Scene.driven`."""
     return {name: "N" if name == CART else "N m" for name in scene.driven}
-
-
-def driven_columns(scene: Scene) -> slice:
-    """Return where the drives stand among all rigid coordinates: cart, then the arms.
-
-    A fixed base is no drive, and neither are joints that follow from the others in a closed loop.
-    """
-    first = 0 if scene.motion.base == CART else 1
-    return slice(first, first + len(scene.driven))
 
 
 def free_drives(scene: Scene) -> tuple[str, ...]:

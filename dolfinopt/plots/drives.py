@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.output.trajectory import driven_columns, free_drives
+from dolfinopt.output.trajectory import free_drives
 from dolfinopt.plots.style import BLUE, LINE_WIDTH, ORANGE, PathLike, new_figure, save
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ Panel = tuple[str, str, dict[str, np.ndarray]]  # label, SI unit, curves (n,) by
 def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
     """Return the rows of the figure: of every drive error and force, of the ground its force."""
     scene, rows = trajectory.scene, []
-    places = range(*driven_columns(scene).indices(trajectory.q_r.shape[1]))
+    places = range(*scene.driven_columns.indices(trajectory.q_r.shape[1]))
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
     for name, k in zip(scene.driven, places, strict=True):
         length, force = ("m", "N") if k == 0 else ("rad", "N m")

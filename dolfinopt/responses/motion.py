@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from dolfinopt.dynamics.adjoint import trajectory_gradient
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.response import (
     Analysis,
@@ -87,8 +87,9 @@ class MotionResponse(Response):
         """Return the derivatives of `value` at held instants.
 
         Returns:
-            By the system's coordinates at the instants (n, S), and of every body by the fields of
-            its `ShapeIntegrals` on which it depends directly.
+            By the system's coordinates at the instants (n, S), or by them, their rates and their
+            accelerations (3, n, S); and of every body by the fields of its `ShapeIntegrals` on
+            which it depends directly.
         """
 
     def cotangents(self, trajectory: Trajectory) -> list[ShapeIntegrals]:
@@ -102,10 +103,7 @@ class MotionResponse(Response):
         followed = trajectory_gradient(
             trajectory.problem, trajectory.solution, trajectory.t[cases.indices], by_q
         )
-        return [
-            replace(whole, **{key: getattr(whole, key) + part for key, part in fields.items()})
-            for whole, fields in zip(followed, own, strict=True)
-        ]
+        return [add_integrals(a, fields) for a, fields in zip(followed, own, strict=True)]
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.

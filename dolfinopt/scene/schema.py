@@ -98,6 +98,15 @@ class Scene(Table):
         names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
         return names if self.motion.base == "fixed" else ("cart", *names)
 
+    @property
+    def driven_columns(self) -> slice:
+        """Where the drives stand among all rigid coordinates: cart, then the arms.
+
+        A fixed base is no drive, and neither are joints that follow from the others in a loop.
+        """
+        first = 1 if self.motion.base == "fixed" else 0
+        return slice(first, first + len(self.driven))
+
     def material_of(self, index: int) -> Material:
         """Return the material of arm number `index`: its own values, or else the scene's."""
         arm = self.arms[index]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, plane_body
+
+# By which integrals a function of a body is differentiated.
+CONSTANTS = [one.name for one in TABLE if one.name != "outboard_point"]
 
 
 @dataclass(frozen=True)
@@ -353,3 +356,24 @@ def assert_close(
     size = float(np.abs(expected).max()) if size is None else size
     here, there = np.asarray(found), np.asarray(expected)
     np.testing.assert_allclose(here, there, rtol=0.0, atol=relative * size)
+
+
+def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
+    """Yield changes that span all an integral can do: int N'N, K, D symmetric, int N'SN skew."""
+    shape = np.shape(getattr(body, name))
+    for index in np.ndindex(shape):
+        change = np.zeros(shape)
+        change[index] = 1.0
+        if name in ("K", "D", "K0_outboard"):
+            change = change + change.swapaxes(-1, -2)
+        elif name == "W":
+            change[0] += change[0].T
+            change[1] -= change[1].T
+        yield change
+
+
+def changed(model: Mechanism, arm: int, name: str, change: np.ndarray) -> Mechanism:
+    """Return the mechanism with one constant of one arm increased."""
+    bodies = list(model.bodies)
+    bodies[arm] = replace(bodies[arm], **{name: getattr(bodies[arm], name) + change})
+    return replace(model, bodies=tuple(bodies))

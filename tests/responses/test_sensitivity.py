@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,7 +13,17 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
+from bodies import (
+    CONSTANTS,
+    Chain,
+    Cloud,
+    assert_close,
+    beam,
+    changed,
+    derivative,
+    random_cloud,
+    unit_changes,
+)
 from mpi4py import MPI
 from runs import ROOT, TWO_ARM, environment, overrides, run
 from scipy.optimize import brentq
@@ -21,7 +31,8 @@ from scipy.optimize import brentq
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.adjoint import trajectory_gradient
+from dolfinopt.dynamics.adjoint import add_gradients, trajectory_gradient
+from dolfinopt.dynamics.drive_forces import drive_force_gradient
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.time_grid import even_steps
@@ -31,7 +42,7 @@ from dolfinopt.multibody.end_effector import end_effector, end_effector_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion, check_motion
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, scaled
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, scaled
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.reduction import METHODS, AdjointFields, Basis, Method
@@ -39,7 +50,6 @@ from dolfinopt.scene.load import Scene
 
 WORLD = MPI.COMM_WORLD
 
-CONSTANTS = [one.name for one in TABLE if one.name != "outboard_point"]
 ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
 
@@ -73,27 +83,6 @@ def random_instants(
     """Return a motion and q, qd, qdd, multipliers (4, count, N)."""
     rigid = rng.normal(scale=0.7, size=(3, count, 1 + len(model.bodies)))
     return RigidMotion(*rigid), rng.normal(scale=0.7, size=(4, count, model.num_coordinates))
-
-
-def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
-    """Yield changes that span all an integral can do: int N'N, K, D symmetric, int N'SN skew."""
-    shape = np.shape(getattr(body, name))
-    for index in np.ndindex(shape):
-        change = np.zeros(shape)
-        change[index] = 1.0
-        if name in ("K", "D", "K0_outboard"):
-            change = change + change.swapaxes(-1, -2)
-        elif name == "W":
-            change[0] += change[0].T
-            change[1] -= change[1].T
-        yield change
-
-
-def changed(model: Mechanism, arm: int, name: str, change: np.ndarray) -> Mechanism:
-    """Return the mechanism with one constant of one arm increased."""
-    bodies = list(model.bodies)
-    bodies[arm] = replace(bodies[arm], **{name: getattr(bodies[arm], name) + change})
-    return replace(model, bodies=tuple(bodies))
 
 
 @ARMS
@@ -171,29 +160,56 @@ def orthonormal(cloud: Cloud) -> Cloud:
     return replace(cloud, modes=cloud.modes @ T, K=K, D=D, outboard=cloud.outboard @ T)
 
 
+def seen(problem: ElasticSystem, solution: Solution, t: np.ndarray, what: str) -> np.ndarray:
+    """Return what a function looks at, (k, n, m): coordinates, these with rates, or forces."""
+    rates = np.stack([solution.sample(t, k) for k in range(3)])
+    if what == "coordinates":
+        return rates[:1]
+    if what == "rates":
+        return rates
+    return inverse_dynamics(problem.mechanism, problem.motion(t), *rates)[1][None]
+
+
+def seen_gradient(
+    problem: ElasticSystem, solution: Solution, t: np.ndarray, what: str, by: np.ndarray
+) -> list[ShapeIntegrals]:
+    """Return the gradient by the bodies of a function of `seen`, by its derivative (k, n, m)."""
+    if what != "forces":
+        return trajectory_gradient(problem, solution, t, by[0] if len(by) == 1 else by)
+    rates = (solution.sample(t, 0), solution.sample(t, 1), solution.sample(t, 2))
+    by_rates, bodies = drive_force_gradient(problem, t, rates, by[0])
+    return add_gradients(trajectory_gradient(problem, solution, t, by_rates), bodies)
+
+
 @pytest.mark.serial  # ranks have no part in it
+@pytest.mark.parametrize("what", ["coordinates", "rates", "forces"])
 @pytest.mark.parametrize(
     ("arms", "gravity", "stages"),
     [(1, (1.0, -9.81), 3), (2, (0.0, 0.0), 3), (3, (1.0, -9.81), 2)],
 )
 def test_trajectory_slopes(
-    rng: np.random.Generator, arms: int, gravity: tuple[float, float], stages: int
+    rng: np.random.Generator, arms: int, gravity: tuple[float, float], stages: int, what: str
 ) -> None:
-    """A quadratic function of the coordinates at instants on and between the steps' ends."""
+    """A quadratic function of the motion, or of drives, on and between the steps' ends."""
     arm = orthonormal(beam(axial=300.0, damping=1e-3))
     chain = Chain((arm,) * arms, 0.5, 0.01, gravity, 0.0)
     problem = ElasticSystem(chain.mechanism(), swing(arms), (0.0, 0.1, 0.25))
     edges = even_steps(problem, 15)
     t = np.linspace(0.0, 0.25, 18)
-    weights = rng.uniform(0.5, 1.5, size=(len(t), problem.mechanism.num_coordinates))
 
     base = radau.on_grid(problem, edges, 1e-12, stages)
+    here = seen(problem, base, t, what)
+    # Coordinates, rates and accelerations count as much.
+    weights = rng.uniform(0.5, 1.5, size=here.shape) * (here[0] ** 2).sum()
+    weights /= (here**2).sum(axis=(1, 2), keepdims=True)
 
-    def solve(model: Mechanism) -> Solution:
-        return radau.on_grid(replace(problem, mechanism=model), edges, 1e-12, stages, base)
+    def solve(model: Mechanism) -> float:
+        changed_problem = replace(problem, mechanism=model)
+        solution = radau.on_grid(changed_problem, edges, 1e-12, stages, base)
+        return 0.5 * np.sum(weights * seen(changed_problem, solution, t, what) ** 2)
 
-    slopes = trajectory_gradient(problem, base, t, weights * base.sample(t))
-    value = 0.5 * np.sum(weights * base.sample(t) ** 2)
+    slopes = seen_gradient(problem, base, t, what, weights * here)
+    value = 0.5 * np.sum(weights * here**2)
     for arm, body in enumerate(problem.mechanism.bodies):
         for name in CONSTANTS:
             changes = list(unit_changes(body, name))
@@ -207,11 +223,11 @@ def test_trajectory_slopes(
             change = size * sum(rng.uniform(-1.0, 1.0) * c for c in changes)
 
             def function(t_: float, arm: int = arm, name: str = name, c: np.ndarray = change):
-                model = changed(problem.mechanism, arm, name, t_ * c)
-                return 0.5 * np.sum(weights * solve(model).sample(t) ** 2)
+                return solve(changed(problem.mechanism, arm, name, t_ * c))
 
-            # Newton leaves 1e-12 of the value, of which this step makes 1e-8.
-            expected = derivative(function, 2e-4)
+            # Newton leaves 1e-12 of the value, of which this step makes 1e-8. Squares of rates and
+            # accelerations are less smooth in the bodies.
+            expected = derivative(function, 1e-4 if what == "rates" else 2e-4)
             found = np.sum(getattr(slopes[arm], name) * change)
             assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * value), name
 
