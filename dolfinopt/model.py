@@ -35,6 +35,7 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.motion import check_motion
+from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.design import read_design
 from dolfinopt.output.run import optimize
@@ -173,6 +174,7 @@ class OptimizationResult(SimulationResult):
         violated: the constraints that are not met, "" if all are.
         rows: one a design, the initial one first; rank 0.
         initial_deviation: (n, 2) of the initial design, m; rank 0.
+        certificate: what the exact gradient says of the design.
     """
 
     iterations: int = 0
@@ -181,6 +183,7 @@ class OptimizationResult(SimulationResult):
     violated: str = ""
     rows: list[HistoryRow] = field(default_factory=list)
     initial_deviation: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
+    certificate: Certificate = field(default_factory=Certificate)
 
     @property
     def history(self) -> DataFrame | None:
@@ -336,6 +339,7 @@ class Model:
             found.violated,
             found.history,
             found.initial_deviation,
+            found.certificate,
         )
 
     def study(

@@ -24,6 +24,14 @@ SUMMARY = {
     "peak_memory_mb": "MB",
 }
 
+CERTIFICATE = {
+    "kkt": "-",
+    "gradient_angle": "degree",
+    "gradient_ratio": "-",
+    "excess": "-",
+    "seconds": "s",
+}
+
 HISTORY = {
     "max_deviation": "m",
     "grayness": "-",

@@ -201,6 +201,8 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
     )
+    if summary["certificate"] is not None:
+        click.echo(f"certificate: {summary['certificate']['sentence']}")
 
 
 def _largest(summary: Mapping[str, Any]) -> str:

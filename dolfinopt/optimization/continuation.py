@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,18 +32,25 @@ class Continuation:
         """Begin with the gentlest projection."""
         self.scene, self.partition, self.arms = scene, partition, arms
         self.beta = 1.0
+        self._held = False
         self.thresholds: dict[int, float] = dict.fromkeys(arms, 0.5)
 
     @property
     def complete(self) -> bool:
         """Whether beta has reached its final value."""
         design = self.scene.design
-        return not design.projection or self.beta >= design.sharpness
+        return self._held or not design.projection or self.beta >= design.sharpness
 
     @property
     def move(self) -> float:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
         return self.scene.optimizer.move * min(1.0, (GENTLE / self.beta) ** 0.5)
+
+    def held(self) -> Continuation:
+        """Return one that stays as this one is now."""
+        other = copy(self)
+        other._held = True
+        return other
 
     def physical_designs(
         self, x: Mapping[int, np.ndarray]

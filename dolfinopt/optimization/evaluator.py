@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,9 +60,32 @@ class Evaluator:
         self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
         # Gradients at once, with the design's factorisation at hand.
         return [
-            self._differentiated(design, self.evaluate_densities(densities(design)))
+            self.differentiated(design, self.evaluate_densities(densities(design)))
             for design in self.physical_designs(x)
         ]
+
+    def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:
+        """Evaluate the last x again, from the same initial guesses: in the same bits (collective).
+
+        Args:
+            x: (n,) the design variables of the last `evaluate`, whatever the arms have since.
+        """
+        self.solutions = self.initial_solutions
+        for k, vectors in self.initial_vectors.items():
+            self.arms[k].initial_vectors = vectors
+        return self.evaluate(x)
+
+    def with_gradient(self, kind: str) -> Evaluator:
+        """Return an evaluator of the same arms for another `objective.gradient`.
+
+        It goes its own way from here: this one keeps its trajectory and initial guesses, and the
+        projection stays as it is.
+        """
+        other = copy(self)
+        objective = self.scene.objective.model_copy(update={"gradient": kind})
+        other.scene = self.scene.model_copy(update={"objective": objective})
+        other.continuation = self.continuation.held()
+        return other
 
     def evaluate_densities(
         self, x_phys: Mapping[int, np.ndarray], simulated: bool = False
@@ -78,7 +102,7 @@ class Evaluator:
         )
         return evaluation
 
-    def _differentiated(
+    def differentiated(
         self, design: Mapping[int, PhysicalDesign], evaluation: Evaluation
     ) -> EvaluatedDesign:
         """Add the gradients by x of the design evaluated last (collective)."""

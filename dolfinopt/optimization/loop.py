@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.optimization.assessment import assess, initial_selection
+from dolfinopt.optimization.certificate import certify
 from dolfinopt.optimization.convergence import Ending, ending, stop_reason
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
@@ -185,6 +186,7 @@ class _Run:
     def _result(self) -> Result:
         """Assess the final design (collective)."""
         counts = replace(self.profile.counts)
+        certificate = certify(self.evaluator, self.x, self.nominal, self.problem, self._further)
         final = assess(self.evaluator, self.nominal.x_phys, self.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
@@ -204,11 +206,34 @@ class _Run:
                 self.scene, self.finished, self.change, self.kkt, violated(limits), self.grayness
             ),
             kkt=self.kkt,
+            certificate=certificate,
             limits=limits,
             profile=self.profile,
             counts=counts,
             choice=final.selection,
         )
+
+    def _further(self, problem: Problem, count: int) -> Iterator[Problem]:
+        """Go on from x with the exact gradient, until converged; yield what it comes to.
+
+        Collective. It is a run of its own: this one and its design stay as they are.
+
+        Args:
+            problem: at x, with exact gradients.
+            count: of iterations, at most.
+        """
+        other = _Run(self.evaluator.with_gradient("exact"), None, None)
+        other.x, other.state = self.x, initial_state(self.x)
+        try:
+            for _ in range(count):
+                other._update(problem)
+                other._evaluate()
+                problem, other.kkt = other.problem, other._residual()
+                yield problem
+                if other._finished() and other.finished != "limit":
+                    return
+        finally:
+            self.evaluator.evaluate_again(self.x)
 
     # -- history -----------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.parallel import Partition
 from dolfinopt.profiling import Counts, Profile
@@ -36,7 +37,8 @@ class Result:
         converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
             within their tolerances and every constraint is met.
         stop_reason: in words.
-        kkt: the residual of the final design, see `optimality.kkt_residual`.
+        kkt: the residual of the final design by the gradient in use, see `optimality.kkt_residual`.
+        certificate: what the exact gradient says of the final design.
         limits: every constraint and its value.
         profile: seconds and counts of this rank.
         counts: those of the iterations alone, on this rank.
@@ -56,6 +58,7 @@ class Result:
     converged: bool
     stop_reason: str
     kkt: float
+    certificate: Certificate
     limits: tuple[Limit, ...]
     profile: Profile
     counts: Counts

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 NAME = CHECKPOINT
 # A solution's arrays: name in the file, field.
 SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
-# Keys a resumed run may change: they say when to stop, not what is computed.
-MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance")
+# Keys a resumed run may change: they say when to stop, not what design is computed.
+MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
 
 
 def _scene_text(scene: Scene) -> str:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.result import Result
 from dolfinopt.output.design import write_design
 from dolfinopt.output.fields import write_fields
@@ -46,6 +47,7 @@ class Simulated:
         counts: this rank's, where not all of the profile's belong to the run.
         crisp: evaluation of the design cut at one half.
         iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
+        certificate: of the optimised design.
         limits: the constraints; by default those of `evaluation` and `x_phys`.
         initial_deviation: (n, 2) m, of the initial design, kept for the picture.
     """
@@ -64,6 +66,7 @@ class Simulated:
     converged: bool = True
     stop_reason: str = "simulated"
     kkt: float | None = None
+    certificate: Certificate | None = None
     limits: Sequence[Limit] | None = None
     initial_deviation: np.ndarray | None = None
 
@@ -148,6 +151,7 @@ def write_result(
         converged=result.converged,
         stop_reason=result.stop_reason,
         kkt=result.kkt if np.isfinite(result.kkt) else None,
+        certificate=result.certificate,
         limits=result.limits,
         initial_deviation=result.initial_deviation,
     )

@@ -34,7 +34,7 @@ from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.plausibility import implausible
-from dolfinopt.units import HISTORY, SUMMARY
+from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ def summarise(run: Simulated, wall: float) -> dict[str, Any]:
             "converged": run.converged,
             "stop_reason": run.stop_reason,
             "kkt": run.kkt,
+            "certificate": None if run.certificate is None else run.certificate.to_dict(),
             **cost,
             "units": _units(scene, run.trajectory),
             "versions": versions(),
@@ -222,6 +223,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
     unit = objective_of(scene).unit
     units: dict[str, Any] = {"objective": unit, **SUMMARY}
+    units["certificate"] = {**CERTIFICATE, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
         rigid = rigid_units(scene)

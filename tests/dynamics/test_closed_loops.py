@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from reference_machines import (
+    Tree,
     apart,
     bending_corrected,
     four_bar,
@@ -18,8 +19,11 @@ from reference_machines import (
     reference,
     simulated,
     slider_crank,
+    with_keys,
 )
+from rigid_loops import Bar, four_bar_forces, slider_crank_forces
 
+from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.interface_jacobian import _frames
 from dolfinopt.multibody.tangent import linearise
@@ -117,3 +121,31 @@ def test_rigid_limit(kind: str) -> None:
     power = (kinetic(t + step) - kinetic(t - step)) / (2.0 * step)
     torque = power / system.motion(t).qd[:, 1]
     assert apart(trajectory.joint_forces[10:-1, 1], torque) < 1e-4  # measured 5e-6
+
+
+@pytest.mark.parametrize("gravity", [0.0, -98.1])
+def test_closure_forces_of_rigid_loops(gravity: float) -> None:
+    """Bars a thousand times as stiff need the ground's force of rigid ones, by Newton and Euler."""
+    changes = {"reduction": {"coordinates": 3}, "motion": {"gravity": [0.0, gravity]}}
+
+    def stiff(tree: Tree) -> Trajectory:
+        tree["material"]["young_modulus"] *= 1e3
+        trajectory, _ = machine(simulated(with_keys(tree, changes)))
+        return trajectory
+
+    g = 1j * gravity
+    slider = stiff(slider_crank(0.012, (20, 3)))
+    t = slider.t[10:-1]
+    rod = Bar(0.30, 0.012, 0.30 * 0.012 * 0.01 * 7850.0)
+    guide, torque = slider_crank_forces(t, 150.0, 0.05, 0.15, rod, 0.5, g)
+    assert slider.closure_force is not None
+    assert apart(slider.closure_force[10:-1, 0], guide) < 1e-4
+    assert apart(slider.joint_forces[10:-1, 1], torque) < 1e-4
+
+    pin = stiff(four_bar((20, 3)))
+    t = pin.t[10:-1]
+    bars = [Bar(one, 0.010, one * 0.010 * 0.01 * 2700.0) for one in (0.28, 0.25)]
+    force, torque = four_bar_forces(t, 100.0, 0.08, 0.1, *bars, 0.05, 0.25, g)
+    assert pin.closure_force is not None
+    assert apart(pin.closure_force[10:-1] @ [1.0, 1.0j], force) < 1e-4
+    assert apart(pin.joint_forces[10:-1, 1], torque) < 1e-4

@@ -16,7 +16,9 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.end_effector import outboard
-from dolfinopt.multibody.interface_jacobian import interface_place
+from dolfinopt.multibody.interface_jacobian import _frames, interface_place
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -89,7 +91,7 @@ def four_bar(cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
     tree["arms"] = [
         dict(crank, length=0.1),
         dict(bar, name="coupler", length=0.28, joint_mass=0.05),
-        dict(bar, name="rocker", length=0.25),
+        dict(bar, name="rocker", length=0.25, joint_mass=0.0),  # not the arm's before
     ]
     tree["motion"] |= {"speed": 100.0, "duration": 0.08, "horizon": 0.2}
     tree["simulation"] |= {"sample": 4e-4}
@@ -154,37 +156,65 @@ def apart(found: np.ndarray, expected: np.ndarray) -> float:
 def imbalance(result: SimulationResult) -> float:
     """Return how much of the drives' work is not energy, of the largest energy that is stored.
 
-    Work less kinetic and strain energy and what damping took, at the steps' ends; no gravity.
+    Work less what damping took, and less kinetic and strain energy and gravity's potential, at the
+    steps' ends; of a prescribed motion, a machine or a closed loop.
     """
-    trajectory, system = machine(result)
-    grid = trajectory.solution.time_grid
+    trajectory = result.trajectory
+    assert trajectory is not None
+    grid, mechanism = trajectory.solution.time_grid, trajectory.mechanism
     nodes, weights = np.polynomial.legendre.leggauss(6)
     h = np.diff(grid)[:, None]
     t = grid[:-1, None] + 0.5 * h * (nodes + 1.0)
-    y, yd, ydd = (trajectory.solution.sample(t.ravel(), k) for k in range(3))
-    instants = system.at(t.ravel())
-    qd = instants.split(yd)[1]
-    power = (instants.forces(y, yd, ydd) * instants.motion(y, yd, ydd).qd).sum(axis=1)
-    for part, body in zip(system.mechanism.slices, system.mechanism.bodies, strict=True):
+    motion, _, qd, _, forces = states(trajectory, t.ravel())
+    power = (forces * motion.qd).sum(axis=1)
+    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
         power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
     work = np.cumsum((0.5 * h * weights * power.reshape(t.shape)).sum(axis=1))
-    stored = energy(trajectory, system, grid)
+    stored = sum(energies(trajectory, grid))
     return float(np.abs(work - (stored[1:] - stored[0])).max() / np.abs(stored).max())
 
 
-def energy(trajectory: Trajectory, system: MachineSystem, t: np.ndarray) -> np.ndarray:
-    """Return kinetic and strain energy (n,), J, the former by the mass matrix."""
+def states(
+    trajectory: Trajectory, t: np.ndarray
+) -> tuple[RigidMotion, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return rigid motion, elastic coordinates with derivatives, and the drives' forces at t."""
     y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
-    instants, rigid = system.at(t), np.arange(1 + len(system.mechanism.bodies))
-    motion = instants.motion(y, yd, ydd)
+    if not isinstance(trajectory.problem, MachineSystem):
+        motion = trajectory.problem.motion(t)
+        forces = inverse_dynamics(trajectory.mechanism, motion, y, yd, ydd)[1]
+        return motion, y, yd, ydd, forces
+    instants = trajectory.problem.at(t)
     (_, q, _), (_, qd, _), (_, qdd, _) = (instants.split(x) for x in (y, yd, ydd))
-    tangent = linearise(system.mechanism, motion, q, qd, qdd, None, rigid).dense()
+    return instants.motion(y, yd, ydd), q, qd, qdd, instants.forces(y, yd, ydd)
+
+
+def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return kinetic and strain energy and gravity's potential, (n,) each, J.
+
+    The first by the mass matrix; the last by where masses are, arms that shorten as they bend
+    included.
+    """
+    motion, q, qd, qdd, _ = states(trajectory, t)
+    mechanism = trajectory.mechanism
+    rigid = np.arange(1 + len(mechanism.bodies))
+    tangent = linearise(mechanism, motion, q, qd, qdd, None, rigid).dense()
     size = tangent.shape[1]
     speeds = np.concatenate([motion.qd, qd], axis=1)
-    twice = np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
-    for part, body in zip(system.mechanism.slices, system.mechanism.bodies, strict=True):
-        twice += np.einsum("ni,ij,nj->n", q[:, part], body.K, q[:, part])
-    return 0.5 * twice
+    kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
+    strain = np.zeros(len(t))
+    origins, rotations, _ = _frames(mechanism, motion, q)
+    moment = mechanism.payload_mass * origins[-1]  # first moment of all masses, complex
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        e = q[:, part]
+        strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
+        own = body.moment + e @ body.C.T
+        if body.is_stiffened:
+            own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:2], e)
+        moment = moment + body.mass * origins[k] + rotations[k] * (own[:, 0] + 1j * own[:, 1])
+    for k, joint in enumerate(mechanism.joints):
+        moment = moment + joint.mass * origins[1 + k]
+    potential = -(np.conj(complex(*mechanism.gravity)) * moment).real
+    return kinetic, strain, potential
 
 
 def gaps(result: SimulationResult) -> np.ndarray:

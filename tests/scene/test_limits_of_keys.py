@@ -34,6 +34,7 @@ USED = {
     "design.erosion": ["design.projection=robust"],
     "objective.exponent": ["objective.kind=deviation", "objective.gradient=exact"],
     "optimizer.max_iterations": ["optimizer.tolerance=1", "optimizer.kkt_tolerance=1e6"],
+    "optimizer.exact_iterations": ["optimizer.tolerance=1", "optimizer.kkt_tolerance=1e6"],
     "objective.modes": ["objective.kind=eigenfrequency"],
     "objective.elbow_angle": ["objective.kind=eigenfrequency"],
     "constraints.tip_deflection": ["objective.kind=static"],

@@ -122,6 +122,7 @@ def test_demo_states_every_other_key():
         "shared_volume",
         "minimum_member",
         "kkt_tolerance",
+        "exact_iterations",
         "exponent",
         "acceleration_share",
         "max_speed",

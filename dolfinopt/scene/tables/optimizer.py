@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from pydantic import Field
 
-from dolfinopt.scene.tables.base import MAX_ITERATIONS, Table
+from dolfinopt.scene.tables.base import MAX_ITERATIONS, Loc, Refusal, Table
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
 
 
 class Optimizer(Table):
@@ -28,3 +33,30 @@ class Optimizer(Table):
         le=1e6,
         description="largest Karush-Kuhn-Tucker residual of a converged design [-]",
     )
+    exact_iterations: int = Field(
+        default=0,
+        ge=0,
+        le=MAX_ITERATIONS,
+        description="further iterations with the exact gradient, which tell how far the finished "
+        "design is from the optimum; it stays as it is [-]",
+    )
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse further iterations where there is no exact gradient to iterate with."""
+        if not self.exact_iterations or not scene.objective.needs("motion"):
+            return
+        own = ("optimizer", "exact_iterations")
+        if scene.reduction.method == "balanced":
+            raise Refusal(
+                'expected "craig-bampton", "modal" or "krylov" with optimizer.exact_iterations: '
+                "the Gramian's basis has no adjoint",
+                ("reduction", "method"),
+                own,
+            )
+        if scene.simulation.integrator != "radau":
+            raise Refusal(
+                'expected "radau" with optimizer.exact_iterations: only its trajectory has an '
+                "adjoint",
+                ("simulation", "integrator"),
+                own,
+            )

@@ -1,0 +1,251 @@
+"""How far an optimised design is from an optimum of the problem as it was posed.
+
+Equivalent static loads leave out that the loads follow the design: where their iterations come to
+rest need not be an optimum. Source: Stolpe, Verbart & Rojas-Labanda (2018),
+doi:10.1007/s00158-017-1884-0.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.optimality import Sum, kkt_residual
+from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
+from dolfinopt.parallel import sum_over_arms
+from dolfinopt.reduction import METHODS
+from dolfinopt.responses.constraints import violated
+from dolfinopt.responses.response import needs, objective_of
+from dolfinopt.scene.load import Scene
+
+# Variables nearer to a bound than this part of their range count as held by it.
+AT_BOUND = 1e-3
+
+
+@dataclass(frozen=True)
+class Further:
+    """What iterations with the exact gradient made of a design, and what they started from.
+
+    Attributes:
+        iterations: how many there were; fewer than asked for where a motion could not be simulated.
+        begun: objective of the design.
+        objective: the least of those designs, this one included, that keep all constraints; if
+            none does, that of the last one.
+        feasible: whether it keeps them.
+    """
+
+    iterations: int
+    begun: float
+    objective: float
+    feasible: bool
+
+    @property
+    def excess(self) -> float:
+        """By how much the design is above the best one found, relative to that."""
+        return (self.begun - self.objective) / abs(self.objective) if self.objective else 0.0
+
+    @property
+    def sentence(self) -> str:
+        """E.g. "5.1 % above the best of 20 further iterations with the exact gradient"."""
+        how = f"{self.iterations} further iterations with the exact gradient"
+        if self.excess > 0.0:
+            worst = "" if self.feasible else ", which does not keep all constraints"
+            return f"{100.0 * self.excess:.2g} % above the best of {how}{worst}"
+        return f"{how} found nothing better"
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What the exact gradient says of a design.
+
+    Attributes:
+        kkt: Karush-Kuhn-Tucker residual under it, see `optimality.kkt_residual`; nan if unknown.
+        angle, ratio: of the objective's gradient with frozen loads beside the exact one, over the
+            variables that no bound holds: degrees, and length over length. nan where nothing is
+            frozen, or no variable is free.
+        missing: why there is no exact gradient, "" if there is one.
+        violated: the constraints that the design does not keep, "" if it keeps all.
+        further: of more iterations, where they were asked for.
+        seconds: that the exact gradient took, without further iterations, s; the root's.
+    """
+
+    kkt: float = np.nan
+    angle: float = np.nan
+    ratio: float = np.nan
+    missing: str = ""
+    violated: str = ""
+    further: Further | None = None
+    seconds: float = 0.0
+
+    @property
+    def sentence(self) -> str:
+        """All of it in one line."""
+        if self.missing:
+            return f"no exact gradient to judge the design by: {self.missing}"
+        parts = [f"residual {self.kkt:.2g} under the exact gradient"]
+        if np.isfinite(self.angle):
+            parts.append(f"that with frozen loads points {self.angle:.3g} degrees off it")
+        if self.further is not None:
+            parts.append(self.further.sentence)
+        return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry of summary.json; what is unknown is None."""
+        further = self.further
+        return {
+            "kkt": _known(self.kkt),
+            "gradient_angle": _known(self.angle),
+            "gradient_ratio": _known(self.ratio),
+            "feasible": not self.violated,
+            "missing": self.missing,
+            "exact_iterations": 0 if further is None else further.iterations,
+            "exact_objective": None if further is None else further.objective,
+            "exact_feasible": None if further is None else further.feasible,
+            "excess": None if further is None else further.excess,
+            "seconds": self.seconds,
+            "sentence": self.sentence,
+        }
+
+
+def judge(
+    x: np.ndarray,
+    xmin: np.ndarray,
+    xmax: np.ndarray,
+    exact: Problem,
+    frozen: np.ndarray | None,
+    parts: Mapping[int, slice],
+    total: Sum,
+) -> Certificate:
+    """Return the certificate of x from gradients (collective).
+
+    Args:
+        x, xmin, xmax: (n,) this rank's variables.
+        exact: the problem at x with its exact gradients.
+        frozen: (n,) the objective's gradient with frozen loads; None where nothing is frozen.
+        parts, total: as for `kkt_residual`.
+    """
+    where = x, xmin, xmax
+    residual, _ = kkt_residual(*where, exact.df0dx, exact.f, exact.dfdx, parts, total)
+    angle = ratio = np.nan
+    if frozen is not None:
+        angle, ratio = _compared(*where, exact.df0dx, frozen, parts, total)
+    return Certificate(residual, angle, ratio, violated=violated(exact.limits))
+
+
+def _compared(
+    x: np.ndarray,
+    xmin: np.ndarray,
+    xmax: np.ndarray,
+    exact: np.ndarray,
+    frozen: np.ndarray,
+    parts: Mapping[int, slice],
+    total: Sum,
+) -> tuple[float, float]:
+    """Return angle, degrees, and ratio of lengths over the free variables; nan if there is none."""
+    width = xmax - xmin
+    room = np.minimum(x - xmin, xmax - x)
+    free = (width > 0.0) & (room > AT_BOUND * width)
+    g, h = np.where(free, exact * width, 0.0), np.where(free, frozen * width, 0.0)
+    gg, gh, hh = total(
+        {k: np.array([g[p] @ g[p], g[p] @ h[p], h[p] @ h[p]]) for k, p in parts.items()}
+    )
+    if not (gg > 0.0 and hh > 0.0):
+        return np.nan, np.nan
+    cosine = np.clip(gh / np.sqrt(gg * hh), -1.0, 1.0)
+    return float(np.degrees(np.arccos(cosine))), float(np.sqrt(hh / gg))
+
+
+def without_exact_gradient(scene: Scene) -> str:
+    """Return why the scene has no exact gradient, in words; "" if it has one."""
+    if not needs(scene, "motion"):
+        return ""
+    method, integrator = scene.reduction.method, scene.simulation.integrator
+    if METHODS[method].adjoint is None:
+        return f'reduction.method = "{method}" has no adjoint'
+    if integrator != "radau":
+        return f'simulation.integrator = "{integrator}" has no adjoint'
+    return ""
+
+
+def certify(
+    evaluator: Evaluator,
+    x: np.ndarray,
+    nominal: EvaluatedDesign,
+    problem: Problem,
+    further: Callable[[Problem, int], Iterable[Problem]],
+) -> Certificate:
+    """Return the certificate of the design that was evaluated last (collective).
+
+    The exact gradient of a motion is one adjoint integration more; robust designs, three at a
+    time, are evaluated again, in the same bits. Afterwards the arms have the same design.
+
+    Args:
+        evaluator: of the iterations.
+        x: (n,) this rank's design variables.
+        nominal, problem: at x.
+        further: iterates from x with the exact problem given first, and yields those that follow;
+            the arms may end with another design.
+    """
+    scene, comm = evaluator.scene, evaluator.partition.world
+    if missing := without_exact_gradient(scene):
+        return Certificate(missing=missing, violated=violated(problem.limits))
+    begun = time.perf_counter()
+    exact, frozen = problem, None
+    if needs(scene, "motion"):
+        used = scene.objective.gradient
+        other = _problem_by(evaluator, x, nominal, "exact" if used == "esl" else "esl")
+        exact, with_frozen_loads = (other, problem) if used == "esl" else (problem, other)
+        if "motion" in objective_of(scene).needs:
+            frozen = with_frozen_loads.df0dx
+    variables, total = evaluator.variables, partial(sum_over_arms, evaluator.partition)
+    bounds = variables.xmin, variables.xmax
+    found = judge(x, *bounds, exact, frozen, variables.slices, total)
+    found = replace(found, seconds=comm.bcast(time.perf_counter() - begun, root=0))
+    count = scene.optimizer.exact_iterations
+    return replace(found, further=best_of(exact, further(exact, count))) if count else found
+
+
+def best_of(first: Problem, others: Iterable[Problem]) -> Further:
+    """Return the best of the problems at a row of designs that keeps all constraints.
+
+    A simulation that fails ends the row.
+    """
+    best, count, last = first, 0, first
+    try:
+        for last in others:
+            count += 1
+            if _rank(last) < _rank(best):
+                best = last
+    except ConvergenceError:  # of a design on the way; on all ranks
+        pass
+    if violated(best.limits):
+        best = last
+    return Further(count, first.f0, best.f0, not violated(best.limits))
+
+
+def _rank(problem: Problem) -> tuple[bool, float]:
+    """Return what is smaller for a better design: feasible ones come first."""
+    return bool(violated(problem.limits)), problem.f0
+
+
+def _problem_by(
+    evaluator: Evaluator, x: np.ndarray, nominal: EvaluatedDesign, gradient: str
+) -> Problem:
+    """Return the problem at x with the other gradient (collective)."""
+    other = evaluator.with_gradient(gradient)
+    if evaluator.scene.design.projection == "robust":
+        designs = other.evaluate_again(x)
+    else:
+        designs = [other.differentiated(nominal.physical, nominal.evaluation)]
+    return problem_of(other.scene, designs)
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,357 @@
+"""What the certificate says of designs by equivalent static loads: closed forms, and scenes.
+
+Stolpe, Verbart & Rojas-Labanda (2018), doi:10.1007/s00158-017-1884-0, show by two-bar trusses that
+iterations with equivalent static loads may come to rest where the dynamic problem has no optimum.
+Their data were not at hand: the truss here is another one, whose points of rest have a closed form.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import TWO_ARM, overrides, run, shell
+
+import dolfinopt as do
+from dolfinopt.optimization.certificate import Certificate, best_of, judge
+from dolfinopt.optimization.mma import initial_state, mma_step
+from dolfinopt.optimization.problem import Problem
+from dolfinopt.parallel import Partition, sum_over_arms
+from dolfinopt.responses.constraints import Limit
+
+WORLD = MPI.COMM_WORLD
+ALONE = partial(sum_over_arms, Partition(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
+
+# -- two bars ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TwoBars:
+    """Two bars at right angles hold a mass; a harmonic force F cos(w t) works along each of them.
+
+    The bars' stiffnesses k are the design, k_1 + k_2 <= 2 the material; the mass is 1 without them.
+    In steady state the displacements have the amplitudes u_i = F_i / (k_i - w2) and are largest at
+    once; the objective is the compliance u' K u then, c = sum_i k_i u_i^2. So
+
+        exact:         dc/dk_i = -u_i^2 (k_i + w2) / (k_i - w2),
+        frozen loads:  dc/dk_i = -u_i^2.
+
+    With the loads k_i u_i held the least compliance has k_i in proportion to them. That rests where
+    u_1 = u_2, k_i = w2 + (2 - 2 w2) F_i / (F_1 + F_2); there the exact derivatives differ.
+
+    Attributes:
+        force: F_i.
+        w2: square of the frequency.
+    """
+
+    force: np.ndarray
+    w2: float
+
+    def amplitudes(self, k: np.ndarray) -> np.ndarray:
+        """Return u."""
+        return self.force / (k - self.w2)
+
+    def compliance(self, k: np.ndarray) -> float:
+        """Return c."""
+        return float(k @ self.amplitudes(k) ** 2)
+
+    def exact(self, k: np.ndarray) -> np.ndarray:
+        """Return dc/dk."""
+        return -(self.amplitudes(k) ** 2) * (k + self.w2) / (k - self.w2)
+
+    def frozen(self, k: np.ndarray) -> np.ndarray:
+        """Return dc/dk with the loads held."""
+        return -(self.amplitudes(k) ** 2)
+
+    def rest(self) -> np.ndarray:
+        """Return where iterations with frozen loads rest."""
+        return self.w2 + (2.0 - 2.0 * self.w2) * self.force / self.force.sum()
+
+    def problem(self, k: np.ndarray, gradient: np.ndarray) -> Problem:
+        """Return the problem at k."""
+        return Problem(
+            self.compliance(k), gradient, np.array([0.5 * k.sum() - 1.0]), np.full((1, 2), 0.5), ()
+        )
+
+    def iterated(self, k: np.ndarray, count: int) -> np.ndarray:
+        """Return what `count` optima for the loads of the design before lead to."""
+        for _ in range(count):
+            loads = np.abs(k * self.amplitudes(k))
+            k = 2.0 * loads / loads.sum()
+        return k
+
+    def certificate(self, k: np.ndarray, gradient: np.ndarray | None = None) -> Certificate:
+        """Return that of k, by the exact gradient or another one."""
+        problem = self.problem(k, self.exact(k) if gradient is None else gradient)
+        bounds = np.full(2, 0.1), np.full(2, 1.9)
+        return judge(k, *bounds, problem, self.frozen(k), {0: slice(0, 2)}, ALONE)
+
+    def improved(self, k: np.ndarray, count: int) -> list[tuple[np.ndarray, Problem]]:
+        """Return the designs of `count` steps with the exact gradient."""
+        state, found = initial_state(k), []
+        for _ in range(count):
+            at = self.problem(k, self.exact(k))
+            k, state = mma_step(k, at.df0dx, at.f, at.dfdx, 0.1, 1.9, state, move=0.05)
+            found.append((k, self.problem(k, self.exact(k))))
+        return found
+
+
+FORCE = np.array([2.0, 1.0])
+
+
+def test_derivatives_of_two_bars():
+    bars, k, h = TwoBars(FORCE, 0.3), np.array([1.2, 0.7]), 1e-6
+    for i, unit in enumerate(np.eye(2)):
+        ends = bars.compliance(k + h * unit), bars.compliance(k - h * unit)
+        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(bars.exact(k)[i], rel=1e-8)
+        # Static loads: c = sum k u^2 with u = load / k.
+        loads = k * bars.amplitudes(k)
+        ends = [float(np.sum(loads**2 / (k + step * unit))) for step in (h, -h)]
+        assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(bars.frozen(k)[i], rel=1e-8)
+
+
+@pytest.mark.parametrize("w2", [0.1, 0.3, 0.4])
+def test_two_bars_rest_where_no_optimum_is(w2):
+    """Frozen loads converge, and by their own gradient to an optimum; it is none."""
+    bars = TwoBars(FORCE, w2)
+    k = bars.iterated(np.array([1.1, 0.9]), 200)
+    np.testing.assert_allclose(k, bars.rest(), rtol=1e-9)
+    assert bars.certificate(k, bars.frozen(k)).kkt < 1e-9
+    # u_1 = u_2 there: the exact derivatives are as g_i = (k_i + w2) / (k_i - w2).
+    g = (k + w2) / (k - w2)
+    found = bars.certificate(k)
+    assert found.kkt == pytest.approx(abs(g[0] - g[1]) / np.sqrt(2.0 * g @ g), rel=1e-7)
+    assert found.kkt > 0.03
+    slope = np.degrees(np.arctan2(g[1], g[0]))
+    assert found.angle == pytest.approx(abs(slope - 45.0), rel=1e-7)
+    assert found.ratio == pytest.approx(np.sqrt(2.0 / (g @ g)), rel=1e-7)
+    # Going on with the exact gradient ends in an optimum, which the certificate confirms.
+    steps = bars.improved(k, 60)
+    assert bars.certificate(steps[-1][0]).kkt < 1e-6
+    further = best_of(bars.problem(k, bars.exact(k)), (one for _, one in steps))
+    assert further.iterations == 60 and further.feasible
+    grid = np.linspace(w2 + 0.01, 2.0 - w2 - 0.01, 20001)
+    least = min(bars.compliance(np.array([one, 2.0 - one])) for one in grid)
+    assert further.objective == pytest.approx(least, rel=1e-6)
+    assert further.excess == pytest.approx(bars.compliance(k) / least - 1.0, rel=1e-3, abs=1e-6)
+    assert further.excess > 1e-3
+
+
+def test_two_bars_in_slow_motion():
+    """Without inertia nothing is lost by freezing the loads."""
+    bars = TwoBars(FORCE, 1e-9)
+    found = bars.certificate(bars.rest())
+    assert found.kkt < 1e-8 and found.angle < 1e-6
+    assert found.ratio == pytest.approx(1.0, abs=1e-6)
+    assert found.sentence.startswith("residual ")
+
+
+def test_two_bars_above_resonance():
+    """Stiffness brings the bars nearer to resonance: frozen loads ask for what is worst."""
+    bars = TwoBars(FORCE, 1.5)
+    k = bars.rest()
+    np.testing.assert_allclose(k, [5.0 / 6.0, 7.0 / 6.0])
+    found = bars.certificate(k)
+    assert found.angle == pytest.approx(180.0 - (np.degrees(np.arctan2(8.0, 3.5)) - 45.0))
+    # The step goes to the lower bounds.
+    assert found.kkt == pytest.approx(np.sqrt(np.mean(((k - 0.1) / 1.8) ** 2)), rel=1e-9)
+    assert bars.certificate(k, bars.frozen(k)).kkt < 1e-9
+    steps = bars.improved(k, 60)
+    np.testing.assert_allclose(steps[-1][0], 0.1, atol=1e-6)
+    further = best_of(bars.problem(k, bars.exact(k)), (one for _, one in steps))
+    assert further.excess > 1.0  # the optimum is less than half as compliant
+
+
+def test_variables_at_bounds_have_no_part_in_the_angle():
+    exact, frozen = np.array([1.0, 0.0, 5.0, 7.0]), np.array([1.0, 1.0, -5.0, -7.0])
+    x, low, high = np.array([0.5, 0.5, 0.0, 1.0]), np.zeros(4), np.ones(4)
+    problem = Problem(1.0, exact, np.zeros(0), np.zeros((0, 4)), ())
+    found = judge(x, low, high, problem, frozen, {0: slice(0, 4)}, ALONE)
+    assert found.angle == pytest.approx(45.0) and found.ratio == pytest.approx(np.sqrt(2.0))
+    held = judge(x, x, x, problem, frozen, {0: slice(0, 4)}, ALONE)
+    assert np.isnan(held.angle) and held.kkt == 0.0
+    alone = judge(x, low, high, problem, None, {0: slice(0, 4)}, ALONE)
+    assert np.isnan(alone.angle) and alone.kkt == found.kkt
+
+
+def test_best_of_what_keeps_the_constraints():
+    def at(f0, met=True):
+        limit = Limit("mass", "", 1.0 if met else 2.0, 1.0, "kg")
+        return Problem(f0, np.zeros(1), np.zeros(1), np.zeros((1, 1)), (limit,))
+
+    found = best_of(at(3.0), [at(1.0, met=False), at(2.0), at(2.5)])
+    assert (found.objective, found.iterations, found.feasible) == (2.0, 3, True)
+    assert found.excess == pytest.approx(0.5)
+    assert found.sentence == "50 % above the best of 3 further iterations with the exact gradient"
+    worse = best_of(at(3.0), [at(4.0)])
+    assert worse.excess == 0.0 and worse.sentence.endswith("found nothing better")
+    none = best_of(at(3.0, met=False), [at(2.0, met=False)])
+    assert not none.feasible and "does not keep all constraints" in none.sentence
+
+    def failing():
+        yield at(2.0)
+        raise do.ConvergenceError("too weak")
+
+    assert best_of(at(3.0), failing()).iterations == 1
+
+
+# -- scenes ------------------------------------------------------------------------------------
+
+QUICK = ["arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9"]
+QUICK += ["simulation.tolerance=1e-3"]
+LIGHT = "payload.mass=0.2"
+
+
+def scene(*changes, iterations=0):
+    settings = [*QUICK, f"optimizer.max_iterations={iterations}", *changes]
+    return do.load_scene(TWO_ARM, settings)
+
+
+POSED = {
+    "plain": [],
+    "deviation": ["objective.kind=deviation"],
+    "frequency": ["constraints.first_frequency=20"],
+    "shared volume": ["design.shared_volume=true"],
+    # Denser than one half: cut there, nothing is left of a uniform design.
+    "heaviside": ["design.projection=heaviside", "design.initial=0.6"],
+    "robust": ["design.projection=robust", "design.initial=0.6"],
+    "robust member": [
+        "design.projection=robust",
+        "design.initial=0.6",
+        "arms.cells=[160,10]",
+        "design.filter_radius=0.0075",
+        "design.minimum_member=0.02",
+    ],
+    "scenarios": ["scenarios=[{changes=['payload.mass=1']}, {changes=['payload.mass=3']}]"],
+    "worst": [
+        "scenarios=[{changes=['payload.mass=1']}, {changes=['payload.mass=3']}]",
+        "objective.scenarios=worst",
+    ],
+    "control": ["control.stiffness=[2e5, 2e4, 2e4]", "control.damping=[2e4, 600.0, 600.0]"],
+}
+
+
+@pytest.mark.parametrize("posed", POSED)
+def test_residual_is_of_the_problem_as_posed(posed):
+    """The certificate of frozen loads is the exact run's residual; both tell the same angle."""
+    esl = do.optimize(scene(LIGHT, *POSED[posed]))
+    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", *POSED[posed]))
+    # The design has the same bits, so its motion has; adjoints come from the same solution.
+    assert esl.certificate.kkt == pytest.approx(exact.kkt, rel=1e-9)
+    assert exact.certificate.kkt == pytest.approx(exact.kkt, rel=1e-12)
+    assert abs(esl.kkt - exact.kkt) > 1e-4
+    assert esl.certificate.angle == pytest.approx(exact.certificate.angle, rel=1e-7)
+    assert 1.0 < esl.certificate.angle < 180.0
+    assert esl.certificate.ratio == pytest.approx(exact.certificate.ratio, rel=1e-7)
+    assert esl.certificate.further is None and esl.certificate.seconds > 0.0
+
+
+@pytest.mark.parametrize("kind", ["static", "eigenfrequency"])
+def test_without_motion_the_gradient_is_exact(kind):
+    result = do.optimize(scene(f"objective.kind={kind}", iterations=2))
+    assert result.certificate.kkt == result.kkt
+    assert np.isnan(result.certificate.angle)
+    assert result.certificate.sentence == f"residual {result.kkt:.2g} under the exact gradient"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("reduction.method=balanced", 'reduction.method = "balanced" has no adjoint'),
+        (
+            "simulation.integrator=generalized-alpha",
+            'simulation.integrator = "generalized-alpha" has no adjoint',
+        ),
+    ],
+)
+def test_no_exact_gradient_is_told(change, reason):
+    result = do.optimize(scene(change))
+    found = result.certificate
+    assert np.isnan(found.kkt) and found.missing == reason and reason in found.sentence
+    assert found.to_dict()["kkt"] is None
+    # Of objectives without motion it is there all the same.
+    assert do.optimize(scene(change, "objective.kind=static")).certificate.missing == ""
+    with pytest.raises(do.InputError, match=f"{change.split('=')[0]}.*exact_iterations"):
+        scene(change, "optimizer.exact_iterations=1")
+
+
+def test_light_payload_pays_for_frozen_loads():
+    """With 0.2 kg the loads are the arms' own: frozen, they end twice as compliant.
+
+    The design stays as it is, whatever is learnt of it.
+    """
+    plain = do.optimize(scene(LIGHT, iterations=25))
+    result = do.optimize(scene(LIGHT, "optimizer.exact_iterations=30", iterations=25))
+    for k, x in plain.x_phys.items():
+        np.testing.assert_array_equal(result.x_phys[k], x)
+    assert result.evaluation == plain.evaluation
+    assert (result.kkt, result.iterations) == (plain.kkt, plain.iterations)
+    found, further = result.certificate, result.certificate.further
+    assert replace(found, further=None, seconds=0.0) == replace(plain.certificate, seconds=0.0)
+    assert found.kkt > 0.1 and found.angle > 20.0
+    assert further.iterations == 30 and further.feasible
+    assert further.begun == pytest.approx(result.evaluation.objective, rel=1e-12)
+    assert further.excess > 0.3
+    assert "above the best of 30 further iterations" in found.sentence
+    # It is no worse than what the exact gradient finds by itself.
+    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", iterations=55))
+    assert further.objective < 1.1 * exact.evaluation.objective
+
+
+def test_heavy_payload_loses_little():
+    result = do.optimize(scene("optimizer.exact_iterations=20", iterations=40))
+    assert result.certificate.further.excess < 0.05
+
+
+def test_projection_goes_on_from_where_it_is():
+    """An unfinished continuation is held; what comes after the certificate is not changed."""
+    changes = ["design.projection=robust", LIGHT]
+    plain = do.optimize(scene(*changes, iterations=2))
+    result = do.optimize(scene(*changes, "optimizer.exact_iterations=3", iterations=2))
+    for k, x in plain.x_phys.items():
+        np.testing.assert_array_equal(result.x_phys[k], x)
+    assert result.crisp == plain.crisp and result.evaluation == plain.evaluation
+    assert result.certificate.further.iterations == 3
+
+
+def test_finished_run_is_judged_later(shared_tmp_path):
+    """--resume of a finished run adds what was not asked for before, and interrupts nothing."""
+    asked = "optimizer.exact_iterations=4"
+    whole = do.optimize(scene(LIGHT, asked, iterations=3))
+    do.optimize(scene(LIGHT, iterations=3), shared_tmp_path)
+    later = do.optimize(scene(LIGHT, asked, iterations=3), shared_tmp_path, resume=True)
+    assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
+    for k, x in whole.x_phys.items():
+        np.testing.assert_array_equal(later.x_phys[k], x)
+
+
+def test_summary_and_screen(shared_tmp_path):
+    words = overrides(*QUICK, LIGHT, "optimizer.max_iterations=1", "optimizer.exact_iterations=2")
+    if WORLD.size > 1:
+        run("optimize", TWO_ARM, *words, "--no-plots", "--out", shared_tmp_path / "out")
+        return
+    done = shell("optimize", TWO_ARM, *words, "--no-plots", "--out", shared_tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((shared_tmp_path / "out" / "summary.json").read_text())
+    found = summary["certificate"]
+    assert f"certificate: {found['sentence']}\n" in done.stdout
+    assert found["feasible"] and found["missing"] == "" and found["exact_iterations"] == 2
+    assert 0.0 < found["kkt"] < 10.0 and found["kkt"] != summary["kkt"]
+    excess = summary["objective"] / found["exact_objective"] - 1.0
+    assert found["excess"] == pytest.approx(excess, rel=1e-12)
+    units = summary["units"]["certificate"]
+    assert units["gradient_angle"] == "degree" and units["exact_objective"] == "N m"
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
+def test_same_certificate_on_any_number_of_ranks():
+    asked = scene(LIGHT, "optimizer.exact_iterations=2", iterations=1)
+    together, alone = do.optimize(asked), do.optimize(asked, world=MPI.COMM_SELF)
+    found, expected = together.certificate, alone.certificate
+    assert found.kkt == pytest.approx(expected.kkt, rel=1e-7)
+    assert found.angle == pytest.approx(expected.angle, rel=1e-7)
+    assert found.further.objective == pytest.approx(expected.further.objective, rel=1e-7)
