@@ -42,6 +42,7 @@ from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
+from dolfinopt.responses.constraints import limits_by_column
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
@@ -205,7 +206,10 @@ class OptimizationResult(SimulationResult):
 
         minimised = objective_of(self.scene)
         label = f"{minimised.label} [{minimised.unit}]"
-        return history_figure(self.rows, label) if self.rows else None
+        if not self.rows:
+            return None
+        limits = limits_by_column(self.scene, self.rows[0].constraints)
+        return history_figure(self.rows, label, limits)
 
     def _initial(self) -> np.ndarray | None:
         return self.initial_deviation if len(self.initial_deviation) else None

@@ -384,6 +384,9 @@ def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, A
 
     Collective on `partition.world`.
     """
+    limit, least = scene.design.volume_fraction, scene.design.minimum
+    if limit is None:
+        return
     owners = list(scene.cell_counts)
     parts = {}
     for k, arm in arms.items():
@@ -397,7 +400,6 @@ def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, A
     names = [f"arm {scene.arms[k].name!r}" for k in owners]
     if scene.design.shared_volume:
         volumes, names = volumes.sum(axis=0, keepdims=True), ["all arms together"]
-    limit, least = scene.design.volume_fraction, scene.design.minimum
     for name, (solid, total) in zip(names, volumes, strict=True):
         fraction = solid / total
         if fraction + (1.0 - fraction) * least > limit:

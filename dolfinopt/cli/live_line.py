@@ -22,6 +22,7 @@ def _words(row: HistoryRow, iterations: int) -> str:
         f"{row.iteration}/{iterations} objective {row.objective:.4g} "
         f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
         f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
+        + (f", {row.tightest}" if row.tightest else "")
     )
 
 

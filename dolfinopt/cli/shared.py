@@ -157,18 +157,21 @@ def draw(
     from dolfinopt.plots.drives import draw_drives
     from dolfinopt.plots.machine import figure_of
     from dolfinopt.plots.style import save
+    from dolfinopt.responses.constraints import deviation_limits, limits_by_column
     from dolfinopt.responses.response import objective_of
 
     minimised = objective_of(scene)
     label = f"{minimised.label} [{minimised.unit}]"
     draw_design(folder / "design.png", designed(views), scene.name)
     if history:
-        draw_history(folder / "history.png", history, label)
+        limits = limits_by_column(scene, history[0].constraints)
+        draw_history(folder / "history.png", history, label, limits)
     mechanism, t, q_r = trajectory.mechanism, trajectory.t, trajectory.q_r
     desired, closure = trajectory.desired.q if trajectory.is_machine else None, trajectory.closure
     if closure is None or closure.count == 1:  # a pinned end stays where it is
         title = deviation_title(trajectory)
-        draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title)
+        of_end = deviation_limits(scene)
+        draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title, of_end)
     if trajectory.is_machine:
         draw_drives(folder / "drives.png", trajectory)
     save(figure_of(views, trajectory, scene.name), folder / "machine.png")
@@ -194,7 +197,7 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
     optimised = summary["kkt"] is not None
     if optimised:
-        ending = f"{summary['iterations']} iterations ({ending}), minimised"
+        ending = f"{summary['iterations']} iterations ({ending}), {_sought(summary)}"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
         f"{_largest(summary)}, "
@@ -203,6 +206,16 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     )
     if summary["certificate"] is not None:
         click.echo(f"certificate: {summary['certificate']['sentence']}")
+
+
+def _sought(summary: Mapping[str, Any]) -> str:
+    """Return what was done with the objective: "minimised" or "maximised"."""
+    from dolfinopt.responses.response import find
+
+    # Of frequencies the squared period is shown, which becomes least.
+    options = summary["scene"]["objective"]
+    turned = options["direction"] not in (None, find(options["kind"]).natural)
+    return "maximised" if turned else "minimised"
 
 
 def _largest(summary: Mapping[str, Any]) -> str:

@@ -211,9 +211,15 @@ class Trajectory:
         With a horizon that ends with the motion, the deviation at its end.
         """
         distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
-        after = self.t >= self.scene.motion.duration - 1e-9 * self.scene.motion.horizon
+        return float(distance[self.after_motion].max())
+
+    @property
+    def after_motion(self) -> np.ndarray:
+        """Which samples are not before the motion's end (n,); the last one is in any case."""
+        motion = self.scene.motion
+        after: np.ndarray = self.t >= motion.duration - 1e-9 * motion.horizon
         after[-1] = True
-        return float(distance[after].max())
+        return after
 
     @property
     def drives(self) -> tuple[np.ndarray, np.ndarray]:

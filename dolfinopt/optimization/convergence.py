@@ -47,7 +47,8 @@ def stop_reason(
     """Say in words why the iterations ended, and which constraints are not met.
 
     Args:
-        scene, change, kkt, violated: as for `ending`.
+        scene, change, kkt: as for `ending`.
+        violated: as for `ending`, and what conflicts with them.
         end: what that returned.
         grayness: of the design.
     """

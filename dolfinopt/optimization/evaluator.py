@@ -109,7 +109,8 @@ class Evaluator:
         if self.trajectory is not None:
             self.solutions = self.trajectory.solutions
         analysed = self.scene, self.partition, self.arms, self.trajectory, self.profile
-        objective, rows = gradient(*analysed), constraint_gradients(*analysed)
+        objective = gradient(*analysed)
+        rows = constraint_gradients(*analysed, measured=evaluation.responses)
         with together(self.partition.world):
             by_x = [self.variables.by_x(row.smooth, design) / row.limit for row in rows]
             return EvaluatedDesign(

@@ -21,7 +21,8 @@ class HistoryRow:
         change: largest change of a design variable in the update that led here.
         seconds: wall-clock time since the run's beginning, earlier parts included.
         kkt: Karush-Kuhn-Tucker residual of this design, see `optimality.kkt_residual`.
-        constraints: value of every constraint, by its name, see `limits.Limit`.
+        constraints: value of every constraint, by its name, see `constraints.Limit`.
+        tightest: how far limits are kept, in words; of the live line, not kept in history.csv.
     """
 
     iteration: int
@@ -33,21 +34,22 @@ class HistoryRow:
     seconds: float
     kkt: float = np.nan
     constraints: Mapping[str, float] = field(default_factory=dict)
+    tightest: str = field(default="", compare=False)
 
     @property
     def columns(self) -> list[str]:
         """Names of `values`, the header of history.csv."""
-        return [f.name for f in fields(self)][:-1] + list(self.constraints)
+        return [f.name for f in fields(self)][:-2] + list(self.constraints)
 
     @property
     def values(self) -> list[float]:
         """The row of history.csv."""
-        return [*astuple(self)[:-1], *self.constraints.values()]
+        return [*astuple(self)[:-2], *self.constraints.values()]
 
     @classmethod
     def from_values(cls, columns: Sequence[str], values: Sequence[float]) -> HistoryRow:
         """Return the row of which `columns` and `values` are."""
-        own = len(fields(cls)) - 1
+        own = len(fields(cls)) - 2
         pairs = zip(columns[own:], map(float, values[own:]), strict=True)
         iteration, *figures = values[:own]
         # Columns by name: one by one they would hide what mypy can check.

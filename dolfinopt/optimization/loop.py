@@ -14,6 +14,7 @@ from mpi4py import MPI
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.optimization.assessment import assess, initial_selection
 from dolfinopt.optimization.certificate import certify
+from dolfinopt.optimization.conflicts import conflict_sentences
 from dolfinopt.optimization.convergence import Ending, ending, stop_reason
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
@@ -24,7 +25,7 @@ from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.optimization.result import Result
 from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.constraints import violated
+from dolfinopt.responses.constraints import tightest, violated
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.volume_fraction import cell_volumes
@@ -190,7 +191,8 @@ class _Run:
         final = assess(self.evaluator, self.nominal.x_phys, self.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        limits = self.problem.limits
+        limits, conflicts = self.problem.limits, self._conflicts()
+        not_met = "; ".join(filter(None, [violated(limits), conflicts]))
         return Result(
             partition=self.partition,
             arms=self.arms,
@@ -203,11 +205,12 @@ class _Run:
             iterations=self.iteration,
             converged=self.finished == "converged",
             stop_reason=stop_reason(
-                self.scene, self.finished, self.change, self.kkt, violated(limits), self.grayness
+                self.scene, self.finished, self.change, self.kkt, not_met, self.grayness
             ),
             kkt=self.kkt,
             certificate=certificate,
             limits=limits,
+            conflicts=conflicts,
             profile=self.profile,
             counts=counts,
             choice=final.selection,
@@ -267,6 +270,12 @@ class _Run:
             partial(sum_over_arms, self.partition),
         )[0]
 
+    def _conflicts(self) -> str:
+        """Return what holds back the limits that x does not meet (collective)."""
+        one = self.variables
+        total = partial(sum_over_arms, self.partition)
+        return conflict_sentences(self.problem, self.x, one.xmin, one.xmax, one.slices, total)
+
     def _add_row(self, volume_fraction: float) -> None:
         """Make the history's next row, write and report it (root only)."""
         row = HistoryRow(
@@ -279,6 +288,7 @@ class _Run:
             seconds=self.seconds_before + time.perf_counter() - self.begun,
             kkt=self.kkt,
             constraints={one.name: one.value for one in self.problem.limits},
+            tightest=tightest(self.problem.limits),
         )
         self.history.append(row)
         if self.recorder is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
 from dolfinopt.responses.evaluation import Evaluation
+from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
 
@@ -46,10 +47,11 @@ class Problem:
     """min f0, f <= 0 at one x.
 
     Attributes:
-        f0: value of the objective.
-        df0dx: (n,) its gradient by this rank's variables.
+        f0: value of the objective, as reports show it: where it is maximised, not turned round.
+        df0dx: (n,) gradient by this rank's variables of what is minimised.
         f, dfdx: (m,) relative constraints and (m, n) their gradients.
         limits: the constraints by name, as reports show them.
+        rows: (m,) index in `limits` of every constraint: robust designs share a limit.
     """
 
     f0: float
@@ -57,14 +59,15 @@ class Problem:
     f: np.ndarray
     dfdx: np.ndarray
     limits: tuple[Limit, ...]
+    rows: np.ndarray
 
 
 def problem_of(scene: Scene, designs: Sequence[EvaluatedDesign]) -> Problem:
     """Return the problem of one design; or of the eroded, dilated and nominal one together.
 
-    Their worst objective is minimised. Every one keeps the limits, but for the volume: that is
-    the nominal one's. With a minimum member its gradient is that of the dilated one, scaled to
-    the nominal volume: f = V_dilated / V* - 1 with V* = V_dilated / V_nominal times the limit,
+    Their worst objective is minimised. Every one keeps the limits, but for volume and mass: those
+    are the nominal one's. With a minimum member their gradient is that of the dilated one, scaled
+    to the nominal volume: f = V_dilated / V* - 1 with V* = V_dilated / V_nominal times the limit,
     chosen anew in every step and held in the gradient.
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
     """
@@ -77,11 +80,28 @@ def problem_of(scene: Scene, designs: Sequence[EvaluatedDesign]) -> Problem:
         ratio = (1.0 + f) / (1.0 + np.array(dilated.evaluation.constraints)[own])
         dfdx = ratio[:, None] * dilated.constraints[own]
     everywhere = [np.array(one.evaluation.constraints)[~own] for one in designs]
-    f0, weights = worst_of([one.evaluation.objective for one in designs], scene.objective.exponent)
+    f0, df0dx = _objective(scene, designs)
     return Problem(
         f0,
-        np.sum([w * one.objective for w, one in zip(weights, designs, strict=True)], axis=0),
+        df0dx,
         np.concatenate([f, *everywhere]),
         np.vstack([dfdx, *(one.constraints[~own] for one in designs)]),
         worst_limits([limits_of(scene, one.evaluation) for one in designs]),
+        np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(designs)]),
     )
+
+
+def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float, np.ndarray]:
+    """Return the objective's value, and the gradient of what is minimised."""
+    response, nominal = objective_of(scene), designs[-1]
+    turned = -1.0 if response.turned else 1.0
+    if response.of_nominal and len(designs) > 1:
+        value, by_x = nominal.evaluation.objective, nominal.objective
+        if scene.design.minimum_member:
+            dilated = designs[1]
+            by_x = value / dilated.evaluation.objective * dilated.objective
+        return value, turned * by_x
+    values = [one.evaluation.objective for one in designs]
+    f0, weights = worst_of(values, scene.objective.exponent, response.turned)
+    parts = [w * one.objective for w, one in zip(weights, designs, strict=True)]
+    return f0, turned * np.sum(parts, axis=0)

@@ -40,6 +40,7 @@ class Result:
         kkt: the residual of the final design by the gradient in use, see `optimality.kkt_residual`.
         certificate: what the exact gradient says of the final design.
         limits: every constraint and its value.
+        conflicts: what holds those back that are not met, see `conflicts.conflict_sentences`.
         profile: seconds and counts of this rank.
         counts: those of the iterations alone, on this rank.
         choice: of the coordinates, and the error that they make of the final design's motion;
@@ -60,11 +61,12 @@ class Result:
     kkt: float
     certificate: Certificate
     limits: tuple[Limit, ...]
+    conflicts: str
     profile: Profile
     counts: Counts
     choice: OrderSelection | None = None
 
     @property
     def violated(self) -> str:
-        """Which constraints the final design does not meet, in one line; "" if it meets all."""
-        return violated(self.limits)
+        """Which constraints the final design does not meet, and why; "" if it meets all."""
+        return "; ".join(filter(None, [violated(self.limits), self.conflicts]))

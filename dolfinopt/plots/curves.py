@@ -33,24 +33,33 @@ if TYPE_CHECKING:
 DEVIATION = "Deviation of the end-effector from the rigid path"
 OF_CONTROL = "Deviation of the end-effector from the desired path"
 OF_SLIDER = "Deviation of the slider from that of rigid arms"
+LIMIT = "0.35"  # colour of limits
 FEW = 40  # points a line that get markers
 
 
-def draw_history(path: PathLike, rows: Sequence[HistoryRow], objective_label: str) -> Path:
+def draw_history(
+    path: PathLike,
+    rows: Sequence[HistoryRow],
+    objective_label: str,
+    limits: Mapping[str, float] | None = None,
+) -> Path:
     """Draw what history.csv holds against the iteration (PNG).
 
     Args:
         path: of the picture.
         rows: at least one.
         objective_label: name and unit of the objective.
+        limits: of constraints by their column, see `constraints.limits_by_column`.
 
     Returns:
         The path.
     """
-    return save(history_figure(rows, objective_label), path)
+    return save(history_figure(rows, objective_label, limits), path)
 
 
-def history_figure(rows: Sequence[HistoryRow], objective_label: str) -> Figure:
+def history_figure(
+    rows: Sequence[HistoryRow], objective_label: str, limits: Mapping[str, float] | None = None
+) -> Figure:
     """Return the figure of `draw_history`: panels in two columns that share the iteration."""
     from matplotlib.ticker import MaxNLocator
 
@@ -63,9 +72,10 @@ def history_figure(rows: Sequence[HistoryRow], objective_label: str) -> Figure:
     figure.subplots_adjust(left=0.075, right=0.985, wspace=0.17, hspace=0.32,
                            bottom=0.5 / total, top=1.0 - 0.75 / total)  # fmt: skip
     iteration = np.array([row.iteration for row in rows])
+    bounds = {constraint_label(name): limit for name, limit in (limits or {}).items()}
     ordered = grid.T.ravel()  # down the first column, then down the second
     for axes, (label, values) in zip(ordered, panels.items()):
-        _draw_history_panel(axes, iteration, values, label)
+        _draw_history_panel(axes, iteration, values, label, bounds.get(label))
     for axes in ordered[len(panels) :]:
         axes.set_visible(False)
     for column in (grid[:, 0], grid[:, 1]):
@@ -115,8 +125,10 @@ def _numbers(values: Sequence[float | None]) -> np.ndarray:
     return np.array([np.nan if value is None else float(value) for value in values])
 
 
-def _draw_history_panel(axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str) -> None:
-    """Draw one quantity; first and last value stand above it."""
+def _draw_history_panel(
+    axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str, limit: float | None = None
+) -> None:
+    """Draw one quantity, and its limit as a broken line; first and last value stand above it."""
     linear = label.startswith(SHARES)
     positive = values > 0.0
     if not linear:  # nothing has changed yet at the first row; zero has no logarithm
@@ -125,10 +137,14 @@ def _draw_history_panel(axes: Axes, iteration: np.ndarray, values: np.ndarray, l
     axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, lw=LINE_WIDTH, clip_on=False)
     axes.set_title(label, loc="left", y=1.0, fontsize=10, parse_math=False)
     finite = values[np.isfinite(values)]
+    if limit is not None:
+        axes.axhline(limit, color=LIMIT, ls="--", lw=1.0)
     if len(finite):
         ends = f"{finite[0]:.4g}" if len(finite) == 1 else f"{finite[0]:.4g} → {finite[-1]:.4g}"
         axes.set_title(ends, loc="right", y=1.0, fontsize=10)
     axes.grid(True, alpha=0.3)
+    if limit is not None and len(finite):
+        finite = np.append(finite, limit)
     if linear:
         axes.set_ylim(0.0, 1.05 * max(1e-3, *finite))
     elif len(finite) and finite.min() > 0.0:
@@ -144,6 +160,7 @@ def draw_deviation(
     deviation: np.ndarray,
     initial_deviation: np.ndarray | None = None,
     title: str = DEVIATION,
+    limits: Sequence[tuple[float, float]] = (),
 ) -> Path:
     """Draw the end-effector's distance from its rigid or desired path against time (PNG).
 
@@ -153,11 +170,12 @@ def draw_deviation(
         deviation: (n, 2) m.
         initial_deviation: (n, 2) m, of the initial design, or None.
         title: above the picture, of what from what.
+        limits: m, and the instant from which each holds, s.
 
     Returns:
         The path.
     """
-    return save(deviation_figure(t, deviation, initial_deviation, title), path)
+    return save(deviation_figure(t, deviation, initial_deviation, title, limits), path)
 
 
 def deviation_title(trajectory: Trajectory) -> str:
@@ -172,6 +190,7 @@ def deviation_figure(
     deviation: np.ndarray,
     initial_deviation: np.ndarray | None,
     title: str = DEVIATION,
+    limits: Sequence[tuple[float, float]] = (),
 ) -> Figure:
     """Return the figure of `draw_deviation`; what a curve is stands at its peak."""
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
@@ -180,7 +199,8 @@ def deviation_figure(
     if initial_deviation is not None:
         curves = [(INITIAL, initial_deviation), (OPTIMISED, deviation)]
     distances = [1e3 * np.hypot(*vectors.T) for _, vectors in curves]
-    top = 1.1 * max(float(d.max()) for d in distances) or 1.0
+    largest = [float(d.max()) for d in distances] + [1e3 * limit for limit, _ in limits]
+    top = 1.1 * max(largest) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)
     # A curve alone looks like the optimised design's.
     numbers = look_numbers([[label for label, _ in curves]]) if len(curves) > 1 else {"": 0}
@@ -200,6 +220,8 @@ def deviation_figure(
             color=style["color"],
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
         )
+    for limit, since in limits:
+        axes.hlines(1e3 * limit, since, t[-1], color=LIMIT, ls="--", lw=1.0)
     axes.set(xlim=(t[0], t[-1]), ylim=(0.0, top), xlabel="time [s]")
     axes.set_ylabel("deviation [mm]")
     axes.set_title(title, loc="left", fontsize=12)

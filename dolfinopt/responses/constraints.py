@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import constraints_of, find
+from dolfinopt.responses.response import constraints_of, find_limited
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.constraints import Constraints
 
-# Relative violation up to which a constraint counts as met: MMA meets an active one to a fraction
-# of its last change, which optimizer.tolerance leaves at 1e-3.
+# Relative violation of the true value up to which a constraint counts as met: MMA meets an active
+# one to a fraction of its last change, which optimizer.tolerance leaves at 1e-3.
 EXCESS = 1e-3
 
 
@@ -54,11 +56,21 @@ class Limit:
     @property
     def sentence(self) -> str:
         """E.g. "first frequency of arm2: 60.4 Hz, at least 80 Hz required"."""
-        what = self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
         unit = "" if self.unit == "-" else f" {self.unit}"
         value, limit = distinct(self.value, self.limit)
         bound = "at least" if self.least else "at most"
-        return f"{what}: {value}{unit}, {bound} {limit}{unit} required"
+        return f"{self.words}: {value}{unit}, {bound} {limit}{unit} required"
+
+    @property
+    def words(self) -> str:
+        """E.g. "first frequency of arm2"."""
+        return self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
+
+    @property
+    def bound(self) -> str:
+        """E.g. "first frequency of arm2 >= 80 Hz"."""
+        unit = "" if self.unit == "-" else f" {self.unit}"
+        return f"{self.words} {'>=' if self.least else '<='} {self.limit:g}{unit}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of summary.json."""
@@ -93,8 +105,8 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
         response = bound.response
         unit = response.limit_unit or response.unit
         limits += [
-            Limit(response.name, arm, float(value), bound.limit, unit, response.lower)
-            for arm, value in zip(found.arms, found.values, strict=True)
+            Limit(bound.name, arm, float(value), float(limit), unit, response.lower)
+            for arm, value, limit in zip(found.arms, found.values, bound.limits(found), strict=True)
         ]
     return tuple(limits)
 
@@ -102,11 +114,28 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
 def constraint_label(name: str) -> str:
     """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
     for quantity in ("volume_fraction", *Constraints.model_fields):
-        if name.startswith(quantity):
-            unit = find(quantity).limit_unit or find(quantity).unit
+        if name == quantity or name.startswith(f"{quantity}_"):
+            unit = find_limited(quantity).limit_unit or find_limited(quantity).unit
             arm = name[len(quantity) + 1 :]
             return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
     return name
+
+
+def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
+    """Return the limit of every column of history.csv that is a constraint's."""
+    found: dict[str, float] = {}
+    for one in constraints_of(scene):
+        own = [c for c in columns if c == one.name or c.startswith(f"{one.name}_")]
+        limits = np.broadcast_to(one.limit, len(own)).tolist()
+        found.update(zip(own, limits, strict=True))
+    return found
+
+
+def deviation_limits(scene: Scene) -> list[tuple[float, float]]:
+    """Return the limits of the deviation, m, and the instants from which they hold, s."""
+    limits = scene.constraints
+    since = ((limits.deviation, 0.0), (limits.settling, scene.motion.duration))
+    return [(limit, begin) for limit, begin in since if limit is not None]
 
 
 def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
@@ -118,7 +147,7 @@ def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
     for limit, *others in zip(*reversed(variants), strict=True):
         values = [limit.value, *(one.value for one in others)]
         extreme = min(values) if limit.least else max(values)
-        kept = limit.value if find(limit.quantity).of_nominal else extreme
+        kept = limit.value if find_limited(limit.quantity).of_nominal else extreme
         worst.append(replace(limit, value=kept))
     return tuple(worst)
 
@@ -126,6 +155,20 @@ def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
 def violated(limits: Sequence[Limit]) -> str:
     """Return the sentences of all constraints that are not met, in one line; "" if all are."""
     return "; ".join(one.sentence for one in limits if not one.met)
+
+
+def tightest(limits: Sequence[Limit]) -> str:
+    """Return how far the limits besides the volume are kept, in a few words; "" without any.
+
+    E.g. "limits met" or "settling 12 % over limit".
+    """
+    asked = [one for one in limits if one.quantity != "volume_fraction"]
+    if not asked:
+        return ""
+    worst = max(asked, key=lambda one: one.excess)
+    if worst.met:
+        return "limits met"
+    return f"{worst.words} {100.0 * worst.excess:.2g} % {'below' if worst.least else 'over'} limit"
 
 
 def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:

@@ -19,6 +19,10 @@ class Deviation(MotionResponse):
 
     name, label, unit = "deviation", "p-mean of the deviation", "m"
 
+    def extreme(self, trajectory: Trajectory) -> float:
+        """Return the largest deviation of the samples, m."""
+        return trajectory.max_deviation[0]
+
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
         """Return the p-mean."""
         return self._mean(trajectory, cases)[0]
@@ -32,4 +36,5 @@ class Deviation(MotionResponse):
 
     def _mean(self, trajectory: Trajectory, cases: LoadCases) -> tuple[float, np.ndarray]:
         weights = cases.weights / cases.weights.sum()
-        return p_norm_of_lengths(trajectory.deviation, self.options.exponent, weights)
+        deviation = trajectory.deviation[cases.indices]
+        return p_norm_of_lengths(deviation, self.options.exponent, weights)

@@ -50,6 +50,7 @@ class Eigenfrequency(Response):
     name, label, unit = "eigenfrequency", "squared longest periods", "s2"
     limit_unit = "Hz"
     lower = True
+    natural = "maximize"
     needs = NEEDS[name]
     stands_for = "first frequency"
 
@@ -105,9 +106,11 @@ class Eigenfrequency(Response):
                 rows.append(row)
         return rows
 
-    def smooth_limits(self, analysis: Analysis, limit: float) -> float:
-        """Return the squared period of the least frequency, s2."""
-        return 1.0 / limit**2
+    def smooth_limits(
+        self, analysis: Analysis, measured: Measured, limits: np.ndarray
+    ) -> np.ndarray:
+        """Return the squared periods of the least frequencies, scaled like the smooth ones, s2."""
+        return np.array(measured.smooth) * (np.array(measured.values) / limits) ** 2
 
 
 def _chain(analysis: Analysis) -> Chain:

@@ -7,6 +7,7 @@ import numpy as np
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.responses.motion import ComplianceResponse, LoadCases, worst_instants
 from dolfinopt.responses.response import register
+from dolfinopt.scene.load import WorstBy
 
 
 @register
@@ -20,5 +21,10 @@ class EquivalentStaticLoads(ComplianceResponse):
 
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
         """Return the worst instant of each interval."""
-        indices = worst_instants(trajectory, self.options.load_cases, self.options.worst)
+        indices = worst_instants(trajectory, self.options.load_cases, self.worst)
         return LoadCases(indices, np.ones(len(indices)))
+
+    @property
+    def worst(self) -> WorstBy:
+        """What decides which instant is the worst."""
+        return self.options.worst

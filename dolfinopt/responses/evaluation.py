@@ -30,7 +30,7 @@ from dolfinopt.responses.response import (
     needs,
     objective_of,
 )
-from dolfinopt.responses.scenarios import bodies_in, combined
+from dolfinopt.responses.scenarios import bodies_in
 from dolfinopt.responses.stiffening import decide_stiffening
 from dolfinopt.scene.load import Scene, pose_scenarios
 
@@ -209,17 +209,12 @@ def _check_densities(partition: Partition, arms: Mapping[int, Arm], x_phys: Cell
 
 
 def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
-    """Add the responses of the scene that are no motion's objective (collective)."""
-    objective = objective_of(analysis.scene)
-    if "motion" in objective.needs:  # known since the simulation
-        one = (motion.objective,)
-        measured = [Measured(objective.name, ("",), one, one)]
-    else:
-        measured = [objective.measure(analysis)]
+    """Add the responses that the scene asks for (collective)."""
+    measured = [objective_of(analysis.scene).measure(analysis)]
     constraints: list[float] = []
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
-        limits = bound.response.smooth_limits(analysis, bound.limit)
+        limits = bound.smooth_limits(analysis, found)
         constraints += [float(x) for x in np.array(found.smooth) / limits - 1.0]
         measured.append(found)
     return Evaluation(
@@ -252,7 +247,9 @@ def gradient(
 
 @dataclass(frozen=True, eq=False)
 class ConstraintGradient:
-    """One entry of `Evaluation.constraints`, smooth value / limit - 1, differentiated.
+    """One entry of `Evaluation.constraints`, smooth value / smooth limit - 1, differentiated.
+
+    The limit is held: its scale follows the design, see `response`.
 
     Attributes:
         response: whose value it is.
@@ -277,18 +274,21 @@ def constraint_gradients(
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None = None,
     profile: Profile | None = None,
+    measured: Sequence[Measured] = (),
 ) -> list[ConstraintGradient]:
     """Return the gradients of `Evaluation.constraints` (collective).
 
     Args:
         scene, partition, arms, trajectory, profile: as for `gradient`; the last two are for
             constraints of the motion alone.
+        measured: `Evaluation.responses` of the design; measured anew if not given.
     """
     analysis = _analysis(scene, partition, arms, trajectory, profile or Profile())
     found = []
-    for bound in constraints_of(scene):
+    for k, bound in enumerate(constraints_of(scene), 1):
         rows = bound.response.gradients(analysis)
-        limits = np.broadcast_to(bound.response.smooth_limits(analysis, bound.limit), len(rows))
+        values = measured[k] if measured else bound.response.measure(analysis)
+        limits = bound.smooth_limits(analysis, values)
         found += [
             ConstraintGradient(bound.response, row, float(limit))
             for row, limit in zip(rows, limits, strict=True)
@@ -374,17 +374,16 @@ def _motion(trajectory: Trajectory) -> Motion:
     motion = _figures(trajectory)
     if not trajectory.scenarios:
         return motion
-    others = tuple(_figures(one) for one in trajectory.scenarios)
-    value, _ = combined(trajectory.scene, [one.objective for one in others])
-    return replace(motion, objective=value, scenarios=others)
+    return replace(motion, scenarios=tuple(_figures(one) for one in trajectory.scenarios))
 
 
 def _figures(trajectory: Trajectory) -> Motion:
     scene, response = trajectory.scene, motion_objective(trajectory)
+    parts = [] if response is None else response.parts(scene)
     worst = worst_instants(trajectory, scene.objective.load_cases)
     distance, when = trajectory.max_deviation
     return Motion(
-        objective=np.nan if response is None else response.of_motion(trajectory),
+        objective=sum(one.of_motion(trajectory) for _, one in parts) if parts else np.nan,
         compliance=float(trajectory.compliance[worst].sum()),
         max_deviation=distance,
         max_deviation_time=when,

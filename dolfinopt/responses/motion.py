@@ -21,9 +21,9 @@ from dolfinopt.responses.response import (
     by_owner,
     find,
 )
-from dolfinopt.responses.scenarios import combined, cotangents_of_scene, factors
+from dolfinopt.responses.scenarios import combined, cotangents_of_scene, factors, worst_of
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
-from dolfinopt.scene.load import WorstBy
+from dolfinopt.scene.load import Scene, WorstBy
 from dolfinopt.scene.tables.responses import MOTION, Need
 
 
@@ -68,9 +68,20 @@ def all_samples(trajectory: Trajectory) -> LoadCases:
 
 
 class MotionResponse(Response):
-    """A response of the motion: one value of the machine, of all scenarios together."""
+    """A response of the motion: one value of the machine, of all scenarios together.
+
+    As objective scenarios count as `objective.scenarios` says; a limit holds for every one of
+    them: the p-norm of their values, whose true one is the largest.
+    """
 
     needs: ClassVar[frozenset[Need]] = MOTION
+
+    def parts(self, scene: Scene) -> Sequence[tuple[str, MotionResponse]]:
+        """Return the values that it has, as responses of one value each, by their names.
+
+        By default itself, without a name; a response with a value for every drive has several.
+        """
+        return [("", self)]
 
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
         """Return the instants that make it up; by default all samples."""
@@ -79,6 +90,10 @@ class MotionResponse(Response):
     @abstractmethod
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
         """Return the value of one motion at given instants."""
+
+    def extreme(self, trajectory: Trajectory) -> float:
+        """Return the true value of one motion, where `value` is a smooth stand-in."""
+        return self.of_motion(trajectory)
 
     @abstractmethod
     def derivatives(
@@ -123,27 +138,49 @@ class MotionResponse(Response):
         """Return the value of one motion, at the instants that it chooses (root only)."""
         return self.value(trajectory, self.load_cases(trajectory))
 
-    def of_trajectory(self, trajectory: Trajectory) -> float:
-        """Return the value of a motion, or of its scenarios together (root only)."""
-        if not trajectory.scenarios:
-            return self.of_motion(trajectory)
-        return combined(trajectory.scene, self._of_scenarios(trajectory.scenarios))[0]
+    def combine(self, scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
+        """Return the value of all scenarios from their own, and its derivatives by them."""
+        if self.limited:
+            return worst_of(values, self.options.exponent)
+        return combined(scene, values, self.turned)
+
+    def of_trajectory(self, trajectory: Trajectory) -> tuple[float, float]:
+        """Return true and smooth value of a motion, or of its scenarios together (root only)."""
+        scenarios = trajectory.scenarios
+        if not scenarios:
+            return self.extreme(trajectory), self.of_motion(trajectory)
+        smooth = self.combine(trajectory.scene, self._of_scenarios(scenarios))[0]
+        true = [self.extreme(one) for one in scenarios]
+        if self.limited:
+            return max(true), smooth
+        if trajectory.scene.objective.scenarios == "sum":
+            return combined(trajectory.scene, true)[0], smooth
+        weighted = [s.weight * f for s, f in zip(trajectory.scene.scenarios, true, strict=True)]
+        return min(weighted) if self.turned else max(weighted), smooth
 
     def _of_scenarios(self, scenarios: Sequence[Trajectory]) -> list[float]:
         return [self.of_motion(one) for one in scenarios]
 
     def measure(self, analysis: Analysis) -> Measured:
-        """Return the value of the analysis's motion (collective)."""
+        """Return the values of the analysis's motion (collective)."""
+        parts = self.parts(analysis.scene)
 
-        def value() -> float:
+        def values() -> list[tuple[float, float]]:
             assert analysis.trajectory is not None
-            return self.of_trajectory(analysis.trajectory)
+            return [one.of_trajectory(analysis.trajectory) for _, one in parts]
 
-        found = on_root(analysis.partition.world, value)
-        return Measured(self.name, ("",), (found,), (found,))
+        true, smooth = zip(*on_root(analysis.partition.world, values), strict=True)
+        return Measured(self.name, tuple(name for name, _ in parts), true, smooth)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the gradient by the physical densities, see `objective.gradient` (collective)."""
+        """Return the gradient of every value by the physical densities (collective).
+
+        See `objective.gradient`.
+        """
+        return [one.gradient(analysis) for _, one in self.parts(analysis.scene)]
+
+    def gradient(self, analysis: Analysis) -> CellGradient:
+        """Return the gradient of the one value of this response (collective)."""
         scene, partition, designs = analysis.scene, analysis.partition, analysis.designs
         profile, trajectory = analysis.profile, analysis.trajectory
 
@@ -160,10 +197,10 @@ class MotionResponse(Response):
         if self.options.gradient == "esl":
             A = on_root(partition.world, moments)
             with together(partition.world):
-                return [{k: esl_gradient(one, A[k]) for k, one in designs.items()}]
+                return {k: esl_gradient(one, A[k]) for k, one in designs.items()}
         by_body = on_root(partition.world, cotangents)
         with together(partition.world):
-            return [{k: exact_gradient(one, by_body[k]) for k, one in designs.items()}]
+            return {k: exact_gradient(one, by_body[k]) for k, one in designs.items()}
 
 
 class ComplianceResponse(MotionResponse):
@@ -200,7 +237,7 @@ def _load_case_moments(response: MotionResponse, trajectory: Trajectory) -> list
     scene, others = trajectory.scene, trajectory.scenarios
     if not others:
         return response.load_case_moments(trajectory)
-    _, weights = combined(scene, response._of_scenarios(others))
+    _, weights = response.combine(scene, response._of_scenarios(others))
     total: list[np.ndarray] = []
     for weight, one in zip(weights, others, strict=True):
         parts = [
@@ -217,7 +254,7 @@ def _cotangents(response: MotionResponse, trajectory: Trajectory) -> list[ShapeI
     scene, others = trajectory.scene, trajectory.scenarios
     if not others:
         return response.cotangents(trajectory)
-    _, weights = combined(scene, response._of_scenarios(others))
+    _, weights = response.combine(scene, response._of_scenarios(others))
     total: list[ShapeIntegrals] = []
     for weight, one in zip(weights, others, strict=True):
         parts = [

@@ -3,8 +3,15 @@
 Objective and constraints of a scene are responses: `objective.kind = "deviation"`, every key of
 [constraints] and `design.volume_fraction` name one. To add one, write `responses/NAME.py` with a
 subclass of `Response` under `@register`; add NAME to the literal of `objective.kind` in
-scene/tables/objective.py or to the keys in scene/tables/constraints.py, and what it needs to
+scene/tables/objective.py and to the keys in scene/tables/constraints.py, and what it needs to
 scene/tables/responses.py.
+
+The one rule of aggregation: an extreme over instants, modes, load cases or scenarios has a true
+value, which reports show and limits hold for, and a smooth one, its p-mean or p-norm with
+`objective.exponent`, which is differentiated. A constraint is the true value over its limit less
+1; its gradient is that of smooth value / smooth limit, where the smooth limit is the limit times
+smooth / true value of the same design, held: a scale that follows the design and has no memory.
+Source: Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y.
 """
 
 from __future__ import annotations
@@ -24,7 +31,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
-    from dolfinopt.scene.tables.objective import Objective
+    from dolfinopt.scene.tables.objective import Direction, Objective
     from dolfinopt.scene.tables.responses import Need
 
 T = TypeVar("T")
@@ -85,10 +92,12 @@ class Response(ABC):
         limit_unit: of the true values and of a limit; "" where it is `unit`.
         lower: whether a limit is a lower one.
         of_nominal: whether a limit holds for the nominal one of robust designs alone.
+        natural: what is sought of the true value as objective, if the scene does not say.
         needs: what must be known beside the densities: the stiffness matrix, the mass matrix, a
             simulated motion, an eigenproblem.
         stands_for: what the true values are, where they are another quantity than the objective.
         options: the scene's [objective], which has the options of all responses.
+        limited: whether it is a constraint: scenarios count by the worst one then.
     """
 
     name: ClassVar[str]
@@ -97,11 +106,18 @@ class Response(ABC):
     limit_unit: ClassVar[str] = ""
     lower: ClassVar[bool] = False
     of_nominal: ClassVar[bool] = False
+    natural: ClassVar[Direction] = "minimize"
     needs: ClassVar[frozenset[Need]] = frozenset()
     stands_for: ClassVar[str] = ""
 
-    def __init__(self, options: Objective):
-        self.options = options
+    def __init__(self, options: Objective, limited: bool = False):
+        self.options, self.limited = options, limited
+
+    @property
+    def turned(self) -> bool:
+        """Whether as objective it is sought the other way round: its smooth value maximised."""
+        asked = self.options.direction
+        return not self.limited and asked is not None and asked != self.natural
 
     @abstractmethod
     def measure(self, analysis: Analysis) -> Measured:
@@ -111,9 +127,20 @@ class Response(ABC):
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of every smooth value by the physical densities (collective)."""
 
-    def smooth_limits(self, analysis: Analysis, limit: float) -> np.ndarray | float:
-        """Return the limit of every smooth value, in their unit (collective)."""
-        return limit
+    def smooth_limits(
+        self, analysis: Analysis, measured: Measured, limits: np.ndarray
+    ) -> np.ndarray:
+        """Return the limit of every smooth value, in their unit (collective).
+
+        The true limits, times smooth over true value of this design.
+
+        Args:
+            analysis: of the design.
+            measured: what `measure` returned of it.
+            limits: (values,) of the true values.
+        """
+        true, smooth = np.array(measured.values), np.array(measured.smooth)
+        return limits * np.divide(smooth, true, out=np.ones_like(true), where=true > 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +148,28 @@ class Constraint:
     """A response and its limit, in the response's `limit_unit`.
 
     As the optimiser sees it: smooth value / smooth limit - 1 <= 0.
+
+    Attributes:
+        name: the key of the scene.
+        response: what is limited.
+        limit: of all its values, or one for each.
     """
 
+    name: str
     response: Response
-    limit: float
+    limit: float | tuple[float, ...]
 
+    def limits(self, measured: Measured) -> np.ndarray:
+        """Return the limit of every true value (values,)."""
+        return np.broadcast_to(np.array(self.limit), len(measured.values))
+
+    def smooth_limits(self, analysis: Analysis, measured: Measured) -> np.ndarray:
+        """Return the limit of every smooth value (values,), see there (collective)."""
+        return self.response.smooth_limits(analysis, measured, self.limits(measured))
+
+
+# Limits whose word means another response as objective: the compliance of the whole horizon.
+LIMITED = {"compliance": "load_case_compliance"}
 
 _known: dict[str, type[Response]] = {}
 
@@ -143,16 +187,24 @@ def find(name: str) -> type[Response]:
     return _known[name]
 
 
+def find_limited(key: str) -> type[Response]:
+    """Return the response that a key of [constraints] limits."""
+    return find(LIMITED.get(key, key))
+
+
 def objective_of(scene: Scene) -> Response:
-    """Return what the scene minimises."""
+    """Return what the scene minimises, or maximises."""
     return find(scene.objective.kind)(scene.objective)
 
 
 def constraints_of(scene: Scene) -> list[Constraint]:
     """Return what the scene limits: the volume, then [constraints] in the order of its keys."""
-    limits = {"volume_fraction": scene.design.volume_fraction}
-    limits |= {key: limit for key, limit in vars(scene.constraints).items() if limit is not None}
-    return [Constraint(find(key)(scene.objective), limit) for key, limit in limits.items()]
+    volume = scene.design.volume_fraction
+    limits = ({} if volume is None else {"volume_fraction": volume}) | scene.constraints.limits
+    return [
+        Constraint(key, find_limited(key)(scene.objective, limited=True), limit)
+        for key, limit in limits.items()
+    ]
 
 
 def asked_of(scene: Scene) -> list[Response]:

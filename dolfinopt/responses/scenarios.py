@@ -77,8 +77,12 @@ def cotangents_of_scene(cotangents: ShapeIntegrals, f: Factors, weight: float) -
     return scaled(back, weight * f.mass, weight * f.stiffness, 1.0)
 
 
-def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[float]]:
+def worst_of(
+    values: Sequence[float], exponent: float, least: bool = False
+) -> tuple[float, list[float]]:
     """Return (sum f^p)^(1/p) of positive values and its derivatives; a single value is itself.
+
+    With `least` the smallest one made smooth, (sum f^-p)^(-1/p).
 
     The largest, made smooth; with p = 20 it is 6 % above the largest of three equal ones:
     Kreisselmeier and Steinhauser's function of the logarithms.
@@ -86,18 +90,26 @@ def worst_of(values: Sequence[float], exponent: float) -> tuple[float, list[floa
     """
     if len(values) == 1 or max(values) == 0.0:
         return max(values), [1.0] * len(values)
-    worst, by_values = p_norm(np.array(values), exponent)
+    if least and min(values) == 0.0:
+        return 0.0, [0.0] * len(values)
+    f = 1.0 / np.array(values) if least else np.array(values)
+    worst, by_values = p_norm(f, exponent)
+    if least:  # of 1 / worst by 1 / f
+        worst, by_values = 1.0 / worst, by_values * (f / worst) ** 2
     return worst, [float(by) for by in by_values]
 
 
-def combined(scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
+def combined(
+    scene: Scene, values: Sequence[float], least: bool = False
+) -> tuple[float, list[float]]:
     """Return the objective of all scenarios from their own, and its derivatives.
 
-    "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`.
+    "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`; or with `least`,
+    of what is maximised, the smooth smallest.
     """
     weights = [one.weight for one in scene.scenarios]
     if scene.objective.scenarios == "sum":
         return sum(w * f for w, f in zip(weights, values, strict=True)), weights
     scaled_values = [w * f for w, f in zip(weights, values, strict=True)]
-    worst, by_values = worst_of(scaled_values, scene.objective.exponent)
+    worst, by_values = worst_of(scaled_values, scene.objective.exponent, least)
     return worst, [s * w for s, w in zip(by_values, weights, strict=True)]

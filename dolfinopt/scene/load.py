@@ -116,7 +116,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
     _resolve_files(tree, source, changes)
     _measure_bodies(tree, inherited)
-    derived = _time_motion(tree, source, changes)
+    derived = (*_time_motion(tree, source, changes), *_limit_volume(tree))
     try:
         scene = Scene.model_validate(tree)
     except ValidationError as error:
@@ -255,6 +255,24 @@ def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
         f"{key} = {shown(value)}: expected the path of a file, from the scene's folder or the "
         f"working directory; found {tried}",
     )
+
+
+def _limit_volume(tree: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Leave out the limit of the volume where mass is asked for and none is stated.
+
+    Returns:
+        Its key, as (table, key), where it is not stated.
+    """
+    tables = {key: tree.get(key) for key in ("design", "objective", "constraints")}
+    design, objective, limits = (one if isinstance(one, dict) else {} for one in tables.values())
+    if design.get("volume_fraction") is not None:
+        return ()
+    design.pop("volume_fraction", None)
+    if objective.get("kind") == "mass" or limits.get("mass") is not None:
+        if tables["design"] is None:
+            tree["design"] = design
+        design["volume_fraction"] = None
+    return (("design", "volume_fraction"),)
 
 
 def _read_toml(source: str) -> dict[str, Any]:

@@ -166,7 +166,8 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
         rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
         return _allowed_type(args[0], rules, plural)
     if origin in (Union, UnionType):
-        return " | ".join(_allowed_type(one, metadata) for one in args)
+        kinds = [kind for kind in args if kind is not type(None)]
+        return " | ".join(_allowed_type(kind, metadata) for kind in kinds)
     if origin is Literal:
         return " | ".join(shown(value) for value in args)
     if origin is tuple and table_in(annotation):

@@ -7,6 +7,7 @@ and any machine, so that what lies outside is most likely a wrong unit or a slip
 from __future__ import annotations
 
 from dolfinopt.scene.schema import Scene
+from dolfinopt.scene.tables.responses import need_of
 
 # From soft foam and rubber to beyond diamond (1.2e12 Pa); from aerogel to beyond osmium
 # (2.26e4 kg/m3).
@@ -72,7 +73,7 @@ def _sizes(scene: Scene) -> list[str]:
 def _motion(scene: Scene) -> list[str]:
     found = []
     damping, motion = scene.damping.stiffness_proportional, scene.motion
-    if scene.objective.needs("motion") and damping > motion.duration:
+    if need_of(scene, "motion") and damping > motion.duration:
         found.append(
             f"damping.stiffness_proportional = {damping:g} s: deflections relax in that time, "
             f"longer than motion.duration = {motion.duration:g} s, so that the arms hardly "

@@ -216,9 +216,9 @@ def test_robust_designs_take_the_scene_s_exponent(monkeypatch):
     asked = []
     original = scenarios.worst_of
 
-    def noted(values, exponent):
+    def noted(values, exponent, least):
         asked.append((len(values), exponent))
-        return original(values, exponent)
+        return original(values, exponent, least)
 
     monkeypatch.setattr("dolfinopt.optimization.problem.worst_of", noted)
     robust = ["design.projection=robust", "objective.exponent=7", "objective.kind=static"]

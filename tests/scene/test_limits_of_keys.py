@@ -63,7 +63,7 @@ def limits():
             text = f"{value:.0f}" if "integer" in info.allowed else repr(value)
             if "two" in info.allowed:
                 text = f"[{text}, {text}]"
-            elif "array" in info.allowed:
+            elif info.allowed.startswith("an array"):
                 text = f"[{text}]"
             found.append((info.key, text))
     return found

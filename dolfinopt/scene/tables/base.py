@@ -67,11 +67,12 @@ class Table(BaseModel):
     def _check_type(cls, value: Any, info: ValidationInfo) -> Any:
         """Turn a TOML array into a tuple; keep 1, 1.0 and true apart where choices are listed."""
         annotation = without_none(cls.model_fields[str(info.field_name)].annotation)
-        if get_origin(annotation) is tuple and isinstance(value, list):
+        kinds = (annotation, *get_args(annotation))
+        if isinstance(value, list) and any(get_origin(kind) is tuple for kind in kinds):
             return tuple(tuple(item) if isinstance(item, list) else item for item in value)
         # Literal compares with ==, for which True, 1 and 1.0 are the same.
-        kinds = map(type, get_args(annotation))
-        if get_origin(annotation) is Literal and value is not None and type(value) not in kinds:
+        types = map(type, get_args(annotation))
+        if get_origin(annotation) is Literal and value is not None and type(value) not in types:
             raise ValueError
         return value
 

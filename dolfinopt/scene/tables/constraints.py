@@ -2,25 +2,68 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Annotated
+
 from pydantic import Field
 
-from dolfinopt.scene.tables.base import Table
+from dolfinopt.scene.tables.base import Loc, Refusal, Table
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
+Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
+Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
+Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
+Limit = float | tuple[float, ...]
 
 
 class Constraints(Table):
-    """Limits of a design besides its volume, arm by arm."""
+    """Limits of a design besides its volume: true extremes, of the worst scenario."""
 
-    first_frequency: float | None = Field(
-        default=None,
-        ge=1e-6,
-        le=1e9,
-        description="lower limit of each arm's first natural frequency with what it carries "
-        "(objective.attached) [Hz]",
+    mass: Mass | None = Field(
+        default=None, description="upper limit of the mass of all arms together [kg]"
     )
-    tip_deflection: float | None = Field(
+    compliance: Energy | None = Field(
         default=None,
-        ge=1e-15,
-        le=1e4,
-        description="upper limit of the static deflection of each arm's outboard interface "
-        "under objective.loads [m]",
+        description="upper limit of the compliance of the load cases, as summary.json has it [N m]",
     )
+    esl: Energy | None = Field(
+        default=None,
+        description="the same for the instants that objective.worst chooses [N m]",
+    )
+    deviation: Distance | None = Field(
+        default=None,
+        description="upper limit of the largest deviation of the end-effector [m]",
+    )
+    settling: Distance | None = Field(
+        default=None,
+        description="upper limit of the largest deviation from motion.duration on [m]",
+    )
+    first_frequency: Frequency | tuple[Frequency, ...] | None = Field(
+        default=None,
+        description="lower limit of the first natural frequency of every flexible arm with what "
+        "it carries (objective.attached), one for all or one for each [Hz]",
+    )
+    tip_deflection: Distance | tuple[Distance, ...] | None = Field(
+        default=None,
+        description="upper limit of the static deflection of the outboard interface of every "
+        "designed arm under objective.loads, one for all or one for each [m]",
+    )
+
+    @property
+    def limits(self) -> dict[str, Limit]:
+        """What is limited, in the order of the keys."""
+        return {key: limit for key, limit in vars(self).items() if limit is not None}
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse arrays that are not one limit for everything that has a value."""
+        owners = {
+            "first_frequency": [arm.name for arm in scene.arms if arm.flexible],
+            "tip_deflection": [scene.arms[i].name for i in scene.cell_counts],
+        }
+        for key, limit in self.limits.items():
+            names = owners.get(key, [])
+            if isinstance(limit, tuple) and len(limit) != len(names):
+                number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
+                raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))

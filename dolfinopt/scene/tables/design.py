@@ -19,8 +19,12 @@ MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell mor
 class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
 
-    volume_fraction: float = Field(
-        default=0.5, ge=1e-6, le=1, description="upper limit of the volume fraction of each arm [-]"
+    volume_fraction: float | None = Field(
+        default=0.5,
+        ge=1e-6,
+        le=1,
+        description="upper limit of the volume fraction of each arm; where mass is objective or "
+        "limited: none unless stated [-]",
     )
     shared_volume: bool = Field(
         default=False, description="one volume limit for all arms together [-]"
@@ -104,7 +108,7 @@ class Design(Table):
             raise Refusal(
                 f"expected less than initial = {self.initial} [-]", ("minimum",), ("initial",)
             )
-        if self.minimum > self.volume_fraction:
+        if self.volume_fraction is not None and self.minimum > self.volume_fraction:
             raise Refusal(
                 f"expected at most volume_fraction = {self.volume_fraction} [-]",
                 ("minimum",),
@@ -149,6 +153,8 @@ class Design(Table):
 
     def _check_volume(self, scene: Scene) -> None:
         limit = self.volume_fraction
+        if limit is None:
+            return
         flexible = {i: arm for i, arm in enumerate(scene.arms) if arm.flexible}
         shares = {i: arm.passive_share for i, arm in flexible.items()}
         if self.shared_volume:

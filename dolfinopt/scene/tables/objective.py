@@ -8,12 +8,23 @@ from pydantic import Field, field_validator
 
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import Loc, Refusal, Table
-from dolfinopt.scene.tables.responses import NEEDS, Need
+from dolfinopt.scene.tables.responses import NEEDS, Need, need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
-ObjectiveKind = Literal["esl", "compliance", "deviation", "static", "eigenfrequency"]
+ObjectiveKind = Literal[
+    "esl",
+    "compliance",
+    "deviation",
+    "settling",
+    "mass",
+    "static",
+    "eigenfrequency",
+    "first_frequency",
+    "tip_deflection",
+]
+Direction = Literal["minimize", "maximize"]
 GradientKind = Literal["esl", "exact"]
 Attached = Literal["rigid-body", "point-mass", "none"]
 Combination = Literal["sum", "worst"]
@@ -28,7 +39,12 @@ class Objective(Table):
     kind: ObjectiveKind = Field(
         default="esl",
         description='minimised response, "esl" being the compliance of the load cases; or '
-        "eigenfrequency, maximised [-]",
+        "frequency, maximised [-]",
+    )
+    direction: Direction | None = Field(
+        default=None,
+        description="minimize or maximize the response; default: maximize frequencies, minimize "
+        "everything else [-]",
     )
     load_cases: int = Field(
         default=30,
@@ -49,11 +65,13 @@ class Objective(Table):
         default=20.0,
         ge=2,
         le=200,
-        description="exponent p of the p-means: deviation over time, squared periods over "
-        "modes, worst scenario, robust designs [-]",
+        description="exponent p of the p-means that stand for extremes: over time, modes, load "
+        "cases, scenarios, robust designs [-]",
     )
     scenarios: Combination = Field(
-        default="sum", description="how scenarios are combined: weighted sum, or smooth maximum [-]"
+        default="sum",
+        description="how scenarios are combined in the objective: weighted sum, or smooth maximum "
+        "[-]",
     )
     loads: tuple[Load, ...] = Field(
         default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -104,14 +122,15 @@ class Objective(Table):
         """Refuse what this objective, its gradient or the scenarios cannot have."""
         self._check_attached(scene)
         self._check_load_cases(scene)
-        if not self.needs("motion"):
+        self._check_lightest(scene)
+        if not need_of(scene, "motion"):
             if scene.scenarios:
                 moving = [
                     shown(kind) for kind in get_args(ObjectiveKind) if "motion" in NEEDS[kind]
                 ]
                 raise Refusal(
-                    f"expected {', '.join(moving[:-1])} or {moving[-1]} with [[scenarios]]: the "
-                    "others do not simulate the motion",
+                    f"expected {', '.join(moving[:-1])} or {moving[-1]}, or a limit of one under "
+                    "[constraints], with [[scenarios]]: the others do not simulate the motion",
                     ("objective", "kind"),
                     ("scenarios", 0, "changes"),
                 )
@@ -143,9 +162,17 @@ class Objective(Table):
                 ("motion", "horizon"),
             )
 
+    def _check_lightest(self, scene: Scene) -> None:
+        limited = set(scene.constraints.limits) - {"mass"}
+        if self.kind == "mass" and self.direction != "maximize" and not limited:
+            raise Refusal(
+                "expected a limit under [constraints] with it, for example deviation: without "
+                "one the lightest design is an empty one",
+                ("objective", "kind"),
+            )
+
     def _check_attached(self, scene: Scene) -> None:
-        vibrates = self.kind == "eigenfrequency" or scene.constraints.first_frequency
-        if not vibrates or self.attached != "none":
+        if not need_of(scene, "eigenproblem") or self.attached != "none":
             return
         for i in scene.cell_counts:
             if scene.arms[i].solid_ends == 0.0:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
 
 # What must be known beside the densities.
 Need = Literal["stiffness", "mass", "motion", "eigenproblem"]
@@ -11,11 +14,23 @@ MOTION: frozenset[Need] = frozenset({"stiffness", "mass", "motion"})
 VIBRATION: frozenset[Need] = frozenset({"stiffness", "mass", "eigenproblem"})
 STATICS: frozenset[Need] = frozenset({"stiffness"})
 NEEDS: Mapping[str, frozenset[Need]] = {
+    "mass": frozenset(),
     "esl": MOTION,
     "compliance": MOTION,
     "deviation": MOTION,
+    "settling": MOTION,
     "static": STATICS,
     "eigenfrequency": VIBRATION,
     "first_frequency": VIBRATION,
     "tip_deflection": STATICS,
 }
+
+
+def asked(scene: Scene) -> list[str]:
+    """Return the words of the objective and of everything under [constraints]."""
+    return [scene.objective.kind, *scene.constraints.limits]
+
+
+def need_of(scene: Scene, what: Need) -> list[str]:
+    """Return those of `asked` that need that."""
+    return [name for name in asked(scene) if what in NEEDS[name]]
