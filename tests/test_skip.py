@@ -268,7 +268,7 @@ def test_a_trajectory_starts_from_the_last_designs(run: Run) -> None:
     ids=" ".join,
 )
 def test_modes_start_from_the_last_designs(run: Run, overrides: tuple[str, ...]) -> None:
-    """22 solves against 26, 42 against 48, 39 against 46; see `reduction.basis._searches`."""
+    """Residuals are looked at after every step of a search from the last design's modes."""
     warm, cold = warm_and_cold(run, *overrides)
     assert warm["factorisations"] == cold["factorisations"] == ARMS
     assert 3 * ARMS < warm["solves"] < cold["solves"]

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.solver import direct_solver
+from dolfinopt.solver import BandCholesky, direct_solver
 
 COMM = MPI.COMM_WORLD
 
@@ -34,3 +34,34 @@ def test_direct_solver(ordering):
     assert np.abs(found.array_r - x.array_r).max(initial=0.0) < 1e-14 * 9.0  # the condition
     kind = solver.getPC().getFactorSolverType()
     assert kind == ("petsc" if COMM.size == 1 else "mumps")
+
+
+@pytest.mark.parametrize("bandwidth", [0, 1, 4, 70])
+def test_band_cholesky(bandwidth):
+    """One matrix after the other in the same band, one right side or many: as NumPy solves them."""
+    size = 90
+    rng = np.random.default_rng(bandwidth)
+    rows, columns = np.nonzero(
+        np.abs(np.subtract.outer(np.arange(size), np.arange(size))) <= bandwidth
+    )
+    band = BandCholesky(rows, columns, size)
+    assert band.bandwidth == bandwidth
+    for _ in range(2):
+        dense = np.zeros((size, size))
+        dense[rows, columns] = rng.normal(size=len(rows))
+        dense = dense + dense.T + 10.0 * (bandwidth + 1) * np.eye(size)
+        assert band.factorise(dense[rows, columns])
+        for right in (rng.normal(size=size), rng.normal(size=(size, 3))):
+            kept = right.copy()
+            expected = np.linalg.solve(dense, right)
+            assert np.abs(band.solve(right) - expected).max() < 1e-13
+            assert np.array_equal(right, kept)
+    dense[size // 2, size // 2] = -1.0
+    assert not band.factorise(dense[rows, columns])  # not positive definite
+
+
+def test_an_empty_band():
+    none = np.empty(0, dtype=int)
+    band = BandCholesky(none, none, 0)
+    assert band.factorise(np.empty(0))
+    assert band.solve(np.empty((0, 3))).shape == (0, 3)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import lowest_eigenpairs
+from dolfinopt.reduction.eigenproblem import lowest_eigenpairs
 from dolfinopt.reduction.free_arm import FreeArm, FreeOperators
 
 # -- what an arm carries ---------------------------------------------------------------------
@@ -196,15 +196,10 @@ def loaded_modes(
     """
     operator = FreeOperators(arm, carried.matrix())
     count = min(count, arm.num_dofs)
-    values, vectors = lowest_eigenpairs(
-        arm, operator.stiffness, operator.mass, operator.solve, count, start
-    )
+    values, vectors = lowest_eigenpairs(operator.pencil, count, start)
     followed = 0
     if start is not None and start.shape[1] > 0:
-        x, y = operator.mass.createVecs()
-        x.array = start[:, 0]
-        operator.mass.mult(x, y)
-        overlap = arm.comm.allreduce(vectors.T @ y.array_r)
+        overlap = arm.comm.allreduce(vectors.T @ operator.mass_times(start[:, 0]))
         followed = int(np.argmax(overlap**2))
     interior, outboard = operator.split(vectors)
     order = [followed, *(k for k in range(count) if k != followed)]

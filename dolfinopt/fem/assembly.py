@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
@@ -41,37 +43,53 @@ class AffineMatrix:
         return sp.csr_matrix((values, pattern.indices, pattern.indptr), pattern.shape)
 
 
+@dataclass(frozen=True, eq=False)
+class InteriorEntries:
+    """The entries of a local CSR matrix in interior rows and columns, sorted by these.
+
+    Attributes:
+        rows, columns: (nnz,) global interior numbers.
+        source: (nnz,) places in the data array of the local matrix.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    source: np.ndarray
+
+
+def interior_entries(
+    pattern: sp.csr_matrix, components: int, numbers: np.ndarray
+) -> InteriorEntries:
+    """Select the interior entries of a pattern.
+
+    Args:
+        pattern: of the matrix over local dofs, or over local nodes when `components` is 2
+            and the matrix acts on both displacement components alike.
+        components: 1 or 2, see `pattern`.
+        numbers: (n_local_dofs,) global interior number of each local dof, -1 for others.
+    """
+    rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+    spread = [components * rows + c for c in range(components)]
+    rows = numbers[np.concatenate(spread)]
+    cols = numbers[np.concatenate([components * pattern.indices + c for c in range(components)])]
+    source = np.tile(np.arange(pattern.nnz), components)
+    keep = np.flatnonzero((rows >= 0) & (cols >= 0))
+    keep = keep[np.lexsort((cols[keep], rows[keep]))]
+    return InteriorEntries(rows[keep], cols[keep].astype(PETSc.IntType), source[keep])
+
+
 class InteriorMatrix:
     """The interior rows and columns of a local CSR matrix as a PETSc matrix."""
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        pattern: sp.csr_matrix,
-        components: int,
-        numbers: np.ndarray,
-        owned: int,
-    ):
-        """Select the pattern.
+    def __init__(self, comm: MPI.Comm, entries: InteriorEntries, owned: int):
+        """Lay down the pattern.
 
         Args:
             comm: the arm's ranks.
-            pattern: of the matrix over local dofs, or over local nodes when `components` is 2
-                and the matrix acts on both displacement components alike.
-            components: 1 or 2, see `pattern`.
-            numbers: (n_local_dofs,) global interior number of each local dof, -1 for others.
+            entries: of this rank.
             owned: number of interior dofs this rank owns.
         """
-        rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
-        spread = [components * rows + c for c in range(components)]
-        rows = numbers[np.concatenate(spread)]
-        cols = numbers[
-            np.concatenate([components * pattern.indices + c for c in range(components)])
-        ]
-        source = np.tile(np.arange(pattern.nnz), components)
-        keep = np.flatnonzero((rows >= 0) & (cols >= 0))
-        keep = keep[np.lexsort((cols[keep], rows[keep]))]
-        rows, cols, self._source = rows[keep], cols[keep].astype(PETSc.IntType), source[keep]
+        rows, cols, self._source = entries.rows, entries.columns, entries.source
         self._serial = comm.size == 1
         if self._serial:
             indptr = np.searchsorted(rows, np.arange(owned + 1)).astype(PETSc.IntType)

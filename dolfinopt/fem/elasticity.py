@@ -25,6 +25,7 @@ from dolfinopt.fem.interior import InteriorSystem
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
 from dolfinopt.profiling import Profile
+from dolfinopt.solver import Factor
 
 
 class Substructure:
@@ -54,7 +55,7 @@ class Substructure:
             self._stiffness = AffineMatrix(dofs, operators.stiffness, 2 * size)
             self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        self.interior = InteriorSystem(self.T, profile)
+        self.interior = InteriorSystem(self.T, self._stiffness.pattern, self._mass.pattern, profile)
         self._last: ElasticArm | None = None
 
     @cached_property
@@ -201,13 +202,13 @@ class ElasticArm:
 
     # -- the interior ------------------------------------------------------------------------
 
-    def factorise(self) -> PETSc.KSP:
-        """Return the solver of K_II with this design's factor, see `InteriorSystem`."""
+    def factorise(self) -> Factor:
+        """Return the factor of K_II of this design, see `InteriorSystem`."""
         return self.substructure.interior.factorise(self.K.matrix)
 
     def interior_stiffness(self) -> PETSc.Mat:
-        """Return K_II, valid until another design of the arm is factorised."""
-        return self.factorise().getOperators()[0]
+        """Return K_II, valid until another design of the arm asks for its own or is factorised."""
+        return self.substructure.interior.stiffness(self.K.matrix)
 
     def interior_mass(self) -> PETSc.Mat:
         """Return M_II, valid until another design of the arm asks for its own."""
@@ -219,17 +220,11 @@ class ElasticArm:
         Raises:
             ConvergenceError: K_II is singular but for rounding.
         """
-        ksp = self.factorise()
-        b, x = ksp.getOperators()[0].createVecs()
-        out = np.empty_like(right)
-        failed = False
+        factor = self.factorise()
         with self.profile.phase("solves"):
-            for k in range(right.shape[1]):
-                b.array = right[:, k]
-                self.solve_vector(b, x)
-                out[:, k] = x.array_r
-                failed = failed or ksp.getConvergedReason() < 0
-        if failed:  # the same on all ranks
+            out = factor.solve(right)
+        self.profile.counts.solves += right.shape[1]
+        if factor.failed:  # the same on all ranks
             raise ConvergenceError(
                 f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is too "
                 "soft for double precision beside solid; raise "
@@ -237,10 +232,21 @@ class ElasticArm:
             )
         return out
 
-    def solve_vector(self, right: PETSc.Vec, solution: PETSc.Vec) -> None:
-        """Solve K_II u = right for PETSc vectors of owned interior dofs."""
-        self.factorise().solve(right, solution)
+    def interior_inverse(self, right: np.ndarray) -> np.ndarray:
+        """Return K_II^-1 right for one right side (num_interior,) of owned rows."""
         self.profile.counts.solves += 1
+        return self.factorise().solve(right)
+
+    def interior_mass_times(self, vector: np.ndarray) -> np.ndarray:
+        """Return M_II times a vector (num_interior,) of owned rows."""
+        if self.comm.size > 1:
+            x, y = self.interior_mass().createVecs()
+            x.array = vector
+            self.interior_mass().mult(x, y)
+            return y.array_r
+        field = np.zeros((len(self.points), 2))
+        field[self.interior_nodes] = vector.reshape(-1, 2)
+        return (self.M.matrix @ field)[self.interior_nodes].ravel()
 
     @cached_property
     def _constraint_modes(self) -> ConstraintModes:

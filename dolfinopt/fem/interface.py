@@ -15,6 +15,8 @@ from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 
+SAME_PLACE = 1e9  # places along an arm that are told apart
+
 
 class InterfaceTransformation:
     """u = T [interior dofs; u_x, u_y, theta]: inboard clamped, outboard rigid.
@@ -74,14 +76,11 @@ class InterfaceTransformation:
         return mask
 
     def _number_interior(self, graph: sp.csr_matrix) -> None:
-        """Number interior nodes: Cuthill-McKee on one rank, owners' ranges on several.
-
-        Across the short side of a slender arm this keeps the band narrow.
-        """
+        """Number interior nodes for a narrow band on one rank, in owners' ranges on several."""
         owned = self._space.dofmap.index_map.size_local
         nodes = np.flatnonzero(~(self.inboard | self.outboard)[:owned])
         if len(nodes):
-            nodes = nodes[reverse_cuthill_mckee(graph[nodes][:, nodes], symmetric_mode=True)]
+            nodes = nodes[_narrow_order(graph[nodes][:, nodes], self.points[nodes])]
         self.interior_nodes = nodes
         self.num_interior = 2 * len(nodes)
         first = self.comm.exscan(len(nodes)) or 0
@@ -146,3 +145,29 @@ class InterfaceTransformation:
             compat.scatter_reverse_add(self._ghosted)
             out[:, :, k] = self._ghosted.x.array.reshape(-1, 2)
         return out
+
+
+def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> np.ndarray:
+    """Return the order of nodes with the narrower band: along the arm, or Cuthill and McKee's.
+
+    On the grid of a slender arm the first is row by row across it, half as wide as the other one,
+    which begins at a corner.
+
+    Args:
+        graph: (n, n) with an entry where two nodes share a cell.
+        points: (n, 2) m.
+    """
+    x = points[:, 0]
+    along = np.round((x - x.min()) / max(np.ptp(x), np.finfo(float).tiny) * SAME_PLACE)
+    orders = (
+        np.lexsort((points[:, 1], along)),
+        reverse_cuthill_mckee(graph, symmetric_mode=True),
+    )
+    rows, columns = graph.nonzero()
+
+    def bandwidth(order: np.ndarray) -> int:
+        number = np.empty(len(order), dtype=np.int64)
+        number[order] = np.arange(len(order))
+        return int(np.abs(number[rows] - number[columns]).max(initial=0))
+
+    return min(orders, key=bandwidth)

@@ -1,14 +1,24 @@
-"""The interior block of one arm in PETSc: its matrices and its one factorisation."""
+"""The interior block of one arm: its matrices and its one factorisation."""
 
 from __future__ import annotations
+
+from functools import cached_property
 
 import scipy.sparse as sp
 from petsc4py import PETSc
 
-from dolfinopt.fem.assembly import InteriorMatrix
+from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_entries
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.profiling import Profile
-from dolfinopt.solver import direct_solver, obeying_options
+from dolfinopt.solver import (
+    NESTED_ROWS,
+    BandCholesky,
+    Factor,
+    PetscFactor,
+    direct_solver,
+    has_options,
+    obeying_options,
+)
 
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 
@@ -20,40 +30,90 @@ class InteriorSystem:
     overwritten when another one asks; the first one then pays, and counts, another factorisation.
     """
 
-    def __init__(self, T: InterfaceTransformation, profile: Profile):
-        self._T = T
-        self._profile = profile
-        self._stiffness: InteriorMatrix | None = None
-        self._mass: InteriorMatrix | None = None
-        self._ksp: PETSc.KSP | None = None
+    def __init__(
+        self,
+        T: InterfaceTransformation,
+        stiffness: sp.csr_matrix,
+        mass: sp.csr_matrix,
+        profile: Profile,
+    ):
+        """Set up for matrices of these patterns; nothing is selected before it is asked for.
+
+        Args:
+            T: numbers the interior dofs.
+            stiffness: over local dofs.
+            mass: over local nodes.
+            profile: of this rank.
+        """
+        self._T, self._profile = T, profile
+        self._patterns = stiffness, mass
+        self._factor: Factor | None = None
         self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
+        self._stiffness_of: sp.csr_matrix | None = None
         self._mass_of: sp.csr_matrix | None = None
 
-    def factorise(self, K: sp.csr_matrix) -> PETSc.KSP:
-        """Return the solver of K_II; nothing is done if K was the last one (collective)."""
-        if self._ksp is not None and self._factorised is K:
-            return self._ksp
+    @cached_property
+    def _entries(self) -> InteriorEntries:
+        return interior_entries(self._patterns[0], 1, self._T.numbers)
+
+    @cached_property
+    def _stiffness(self) -> InteriorMatrix:
+        return InteriorMatrix(self._T.comm, self._entries, self._T.num_interior)
+
+    @cached_property
+    def _mass(self) -> InteriorMatrix:
+        T = self._T
+        return InteriorMatrix(
+            T.comm, interior_entries(self._patterns[1], 2, T.numbers), T.num_interior
+        )
+
+    @cached_property
+    def _band(self) -> BandCholesky | None:
+        """LAPACK's factor, where one rank owns a band that is narrow enough."""
+        T = self._T
+        if T.comm.size > 1 or T.num_interior >= NESTED_ROWS or has_options(OPTIONS):
+            return None
+        return BandCholesky(self._entries.rows, self._entries.columns, T.num_interior)
+
+    @cached_property
+    def _ksp(self) -> PETSc.KSP:
+        # Natural: the interior dofs are numbered for it.
+        return direct_solver(self._stiffness.mat, "natural", OPTIONS)
+
+    def factorise(self, K: sp.csr_matrix) -> Factor:
+        """Return the factor of K_II; nothing is done if K was the last one (collective)."""
+        if self._factor is not None and self._factorised is K:
+            return self._factor
         self._factorised = None
-        if self._stiffness is None:
-            T = self._T
-            self._stiffness = InteriorMatrix(T.comm, K, 1, T.numbers, T.num_interior)
-        if self._ksp is None:
-            # Natural: the interior dofs are numbered for it.
-            self._ksp = direct_solver(self._stiffness.mat, "natural", OPTIONS)
+        band = self._band
         with self._profile.phase("factorisation"):
-            self._stiffness.update(K.data)
-            self._ksp.setOperators(self._stiffness.mat)
-            with obeying_options(OPTIONS):
-                self._ksp.setUp()
+            # What rounding has made indefinite PETSc factorises all the same; whether the result
+            # is worth anything is judged by it.
+            if band is not None and band.factorise(K.data[self._entries.source]):
+                self._factor = band
+            else:
+                self._factor = self._petsc(K)
         self._profile.counts.factorisations += 1
         self._factorised = K
-        return self._ksp
+        return self._factor
+
+    def _petsc(self, K: sp.csr_matrix) -> PetscFactor:
+        self._ksp.setOperators(self.stiffness(K))
+        with obeying_options(OPTIONS):
+            self._ksp.setUp()
+        return PetscFactor(self._ksp)
+
+    def stiffness(self, K: sp.csr_matrix) -> PETSc.Mat:
+        """Return K_II, owned by this object (collective)."""
+        if self._stiffness_of is not K:
+            if isinstance(self._factor, PetscFactor):  # it would follow the matrix
+                self._factorised = None
+            self._stiffness.update(K.data)
+            self._stiffness_of = K
+        return self._stiffness.mat
 
     def mass(self, M: sp.csr_matrix) -> PETSc.Mat:
         """Return M_II, owned by this object (collective); M acts on nodes."""
-        if self._mass is None:
-            T = self._T
-            self._mass = InteriorMatrix(T.comm, M, 2, T.numbers, T.num_interior)
         if self._mass_of is not M:
             self._mass.update(M.data)
             self._mass_of = M

@@ -8,14 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import (
-    AdjointFields,
-    Basis,
-    Options,
-    complement_solve,
-    lowest_eigenpairs,
-    orient,
-)
+from dolfinopt.reduction.basis import AdjointFields, Basis, Options, orient
+from dolfinopt.reduction.eigenproblem import complement_solve, interior_pencil, lowest_eigenpairs
 
 
 def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
@@ -34,8 +28,7 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
     static = arm.constraint_modes()
     modes = np.empty((arm.num_interior, 0))
     if normal > 0:
-        K, M = arm.interior_stiffness(), arm.interior_mass()
-        _, modes = lowest_eigenpairs(arm, K, M, arm.solve_vector, normal, start)
+        _, modes = lowest_eigenpairs(interior_pencil(arm), normal, start)
     outboard = np.hstack([np.eye(3), np.zeros((3, normal))])
     V = arm.expand(np.hstack([static.interior, modes]), outboard)
     MV = arm.mass_times(V)
@@ -69,10 +62,8 @@ def craig_bampton_adjoint(
     mu = arm.solve(interior[:, :3])
     values = np.concatenate([np.zeros(3), np.diag(basis.stiffness)[3:]])
     if interior.shape[1] > 3:
-        K, M = arm.interior_stiffness(), arm.interior_mass()
-        normal = complement_solve(
-            arm, K, M, arm.solve_vector, basis.start, values[3:], interior[:, 3:]
-        )
+        pencil = interior_pencil(arm)
+        normal = complement_solve(pencil, basis.start, values[3:], interior[:, 3:])
         mu = np.hstack([mu, normal])
     field = arm.expand(mu, np.zeros_like(outboard))
     return AdjointFields(field, field * values)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from petsc4py import PETSc
 
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.reduction.eigenproblem import Pencil
 
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (3, k) outboard rows
 
@@ -62,34 +65,20 @@ def frame_fields(arm: ElasticArm) -> np.ndarray:
 
 
 class FreeOperators:
-    """T'KT, T'MT and the inverse of the former, as PETSc operators that are never assembled.
+    """T'KT, T'MT and the inverse of the former as operators that are never assembled.
 
-    The three outboard coordinates follow the interior dofs of the last rank.
+    Vectors are the owned interior dofs; the three outboard coordinates follow those of the last
+    rank.
     """
 
     def __init__(self, arm: ElasticArm, carried: np.ndarray | None = None):
         """Set up; `carried` (3, 3) is the inertia of what is fixed to the outboard interface."""
         self.arm = arm
         self.last = arm.comm.rank == arm.comm.size - 1
-        rows = arm.num_interior + (3 if self.last else 0)
-        free = FreeArm(arm)
-        self.psi, self.schur_inverse = free.psi, free.schur_inverse
-        m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
-        if carried is not None:
-            m_corner = m_corner + carried
-        size = ((rows, None), (rows, None))
-        self.stiffness = PETSc.Mat().createPython(
-            size,
-            _Bordered(self, arm.interior_stiffness(), free.coupling, free.corner),
-            comm=arm.comm,
-        )
-        self.mass = PETSc.Mat().createPython(
-            size, _Bordered(self, arm.interior_mass(), m_coupling, m_corner), comm=arm.comm
-        )
-        for mat in (self.stiffness, self.mass):
-            mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            mat.setUp()
-        self.b, self.x = arm.interior_stiffness().createVecs()
+        self.free = FreeArm(arm)
+        self._m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
+        self._m_corner = m_corner if carried is None else m_corner + carried
+        self.pencil = Pencil(arm, self.solve, self.mass_times, self._matrices)
 
     def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the interior rows and the outboard coordinates (3, ...), the latter everywhere."""
@@ -99,38 +88,54 @@ class FreeOperators:
         assert outboard is not None
         return rows[: self.arm.num_interior], outboard
 
-    def join(self, y: PETSc.Vec, interior: np.ndarray, outboard: np.ndarray) -> None:
-        """Write both parts into the PETSc vector."""
-        target = y.array_w
-        target[: self.arm.num_interior] = interior
-        if self.last:
-            target[self.arm.num_interior :] = outboard
+    def _joined(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+        return np.concatenate([interior, outboard]) if self.last else interior
 
-    def solve(self, right: PETSc.Vec, solution: PETSc.Vec) -> None:
-        """solution = (T'KT)^-1 right."""
-        f_interior, f_outboard = self.split(right.array_r)
-        lift = self.arm.comm.allreduce(self.psi.T @ f_interior)
-        outboard = self.schur_inverse @ (f_outboard + lift)
-        self.b.array = f_interior
-        self.arm.solve_vector(self.b, self.x)
-        self.join(solution, self.x.array_r + self.psi @ outboard, outboard)
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Return (T'KT)^-1 right."""
+        interior, outboard = self.split(right)
+        lift = self.arm.comm.allreduce(self.free.psi.T @ interior)
+        tip = self.free.schur_inverse @ (outboard + lift)
+        return self._joined(self.arm.interior_inverse(interior) + self.free.psi @ tip, tip)
+
+    def stiffness_times(self, rows: np.ndarray) -> np.ndarray:
+        """Return T'KT times a vector."""
+        x, y = self.arm.interior_stiffness().createVecs()
+        x.array = self.split(rows)[0]
+        self.arm.interior_stiffness().mult(x, y)
+        return self._bordered(y.array_r, rows, self.free.coupling, self.free.corner)
+
+    def mass_times(self, rows: np.ndarray) -> np.ndarray:
+        """Return T'MT times a vector."""
+        inner = self.arm.interior_mass_times(self.split(rows)[0])
+        return self._bordered(inner, rows, self._m_coupling, self._m_corner)
+
+    def _bordered(
+        self, inner: np.ndarray, rows: np.ndarray, coupling: np.ndarray, corner: np.ndarray
+    ) -> np.ndarray:
+        """Return [A_II, A_Ib; A_Ib', A_bb] times a vector, given A_II times its interior."""
+        interior, outboard = self.split(rows)
+        lower = self.arm.comm.allreduce(coupling.T @ interior)
+        return self._joined(inner + coupling @ outboard, lower + corner @ outboard)
+
+    def _matrices(self) -> tuple[PETSc.Mat, PETSc.Mat]:
+        """Return T'KT and T'MT as PETSc's Python matrices."""
+        rows = self.arm.num_interior + (3 if self.last else 0)
+        size, found = ((rows, None), (rows, None)), []
+        for times in (self.stiffness_times, self.mass_times):
+            mat = PETSc.Mat().createPython(size, _Product(times), comm=self.arm.comm)
+            mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            mat.setUp()
+            found.append(mat)
+        return found[0], found[1]
 
 
-class _Bordered:
-    """[A_II, A_Ib; A_Ib', A_bb] as the context of a PETSc Python matrix."""
+class _Product:
+    """A product with a vector as the context of a PETSc Python matrix."""
 
-    def __init__(
-        self, layout: FreeOperators, inner: PETSc.Mat, coupling: np.ndarray, corner: np.ndarray
-    ):
-        self.layout, self.inner, self.coupling, self.corner = layout, inner, coupling, corner
-        self.x, self.y = inner.createVecs()
+    def __init__(self, times: Callable[[np.ndarray], np.ndarray]):
+        self.times = times
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = A x, called by PETSc."""
-        interior, outboard = self.layout.split(x.array_r)
-        self.x.array = interior
-        self.inner.mult(self.x, self.y)
-        lower = self.layout.arm.comm.allreduce(self.coupling.T @ interior)
-        self.layout.join(
-            y, self.y.array_r + self.coupling @ outboard, lower + self.corner @ outboard
-        )
+        y.array = self.times(x.array_r)

@@ -5,14 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import (
-    AdjointFields,
-    Basis,
-    Options,
-    complement_solve,
-    lowest_eigenpairs,
-    orient,
-)
+from dolfinopt.reduction.basis import AdjointFields, Basis, Options, orient
+from dolfinopt.reduction.eigenproblem import complement_solve, lowest_eigenpairs
 from dolfinopt.reduction.free_arm import FreeOperators
 
 
@@ -26,9 +20,7 @@ def modal(arm: ElasticArm, options: Options, start: np.ndarray | None = None) ->
     """
     arm.profile.counts.reductions += 1
     operator = FreeOperators(arm)
-    _, vectors = lowest_eigenpairs(
-        arm, operator.stiffness, operator.mass, operator.solve, options.coordinates, start
-    )
+    _, vectors = lowest_eigenpairs(operator.pencil, options.coordinates, start)
     interior, outboard = operator.split(vectors)
     V = arm.expand(interior, outboard)
     MV = arm.mass_times(V)
@@ -54,8 +46,6 @@ def modal_adjoint(
     operator = FreeOperators(arm)
     values = np.diag(basis.stiffness)
     right = np.vstack([interior, outboard]) if operator.last else interior
-    mu = complement_solve(
-        arm, operator.stiffness, operator.mass, operator.solve, basis.start, values, right
-    )
+    mu = complement_solve(operator.pencil, basis.start, values, right)
     field = arm.expand(*operator.split(mu))
     return AdjointFields(field, field * values)

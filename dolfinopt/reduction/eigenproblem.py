@@ -1,0 +1,385 @@
+"""The lowest modes of an arm, and the linear systems of their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from petsc4py import PETSc
+from slepc4py import SLEPc
+
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.solver import has_options, obeying_options
+
+OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
+# Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
+# equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
+EIGEN_TOLERANCE = 1e-12
+# Relative distance of eigenvalues up to which there may be more of the same: with the tolerance
+# above, vectors of values that close are known to 1e-6 of one another only.
+REPEATED = 1e-6
+# Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
+# to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
+WIDE = 1e6
+# Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
+# which leaves more digits than an optimiser can use.
+ADJOINT_TOLERANCE = 1e-8
+MAX_ADJOINT = 500  # steps of conjugate gradients for one mode
+# Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
+# finds modes of another symmetry, up to 1e-4 it is not slower.
+RAMP_SHARE = 1e-6
+
+
+# Steps of a search from nearby modes, beyond two for each that is wanted: at rough designs of an
+# optimisation four to seven are enough; a search that takes more begins anew in SLEPc.
+MOST_STEPS = 16
+
+Pairs = tuple[np.ndarray, np.ndarray]  # eigenvalues (k,) ascending, vectors (owned rows, k)
+
+
+@dataclass(frozen=True, eq=False)
+class Pencil:
+    """K phi = lambda M phi with the inverse of K at hand; vectors are (owned rows,).
+
+    Attributes:
+        arm: for its communicator and profile.
+        inverse: K^-1 times a vector.
+        mass: M times a vector.
+        matrices: K and M for SLEPc, made when they are asked for.
+    """
+
+    arm: ElasticArm
+    inverse: Callable[[np.ndarray], np.ndarray]
+    mass: Callable[[np.ndarray], np.ndarray]
+    matrices: Callable[[], tuple[PETSc.Mat, PETSc.Mat]]
+
+    def total(self, part: np.ndarray) -> np.ndarray:
+        """Return the sum over the arm's ranks."""
+        return part if self.arm.comm.size == 1 else self.arm.comm.allreduce(part)
+
+
+def interior_pencil(arm: ElasticArm) -> Pencil:
+    """Return that of the interior: the arm with both interfaces held."""
+    return Pencil(
+        arm,
+        arm.interior_inverse,
+        arm.interior_mass_times,
+        lambda: (arm.interior_stiffness(), arm.interior_mass()),
+    )
+
+
+def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> Pairs:
+    """Return the `count` smallest eigenvalues of K phi = lambda M phi and their vectors.
+
+    From the modes of a nearby problem by `modes_from`, otherwise or where that gives up by SLEPc's
+    Krylov-Schur on K^-1 M; both with the factorisation at hand and to the same residual.
+
+    Args:
+        pencil: K and M, symmetric positive definite.
+        count: number of eigenpairs.
+        start: (rows, k) vectors of a nearby problem, or None.
+
+    Returns:
+        Eigenvalues (count,) ascending, rad2/s2, and M-orthonormal vectors (owned rows, count).
+
+    Raises:
+        ConvergenceError: SLEPc found fewer than `count` eigenpairs.
+    """
+    arm = pencil.arm
+    with arm.profile.phase("eigenproblem"):
+        pairs = None
+        if start is not None and start.shape[1] > 0 and not has_options(OPTIONS):
+            pairs = modes_from(pencil, count, start)
+        if pairs is None or _is_dense(pairs, count):
+            pairs = _Eigenproblem(pencil).lowest(count, start)
+    arm.profile.counts.eigenproblems += 1
+    if len(pairs[0]) < count:
+        raise ConvergenceError(
+            f"arm {arm.mesh.name!r}: only {len(pairs[0])} of {count} eigenmodes converged; "
+            "ask for fewer reduction.coordinates or raise interpolation.floor"
+        )
+    return pairs
+
+
+def _is_dense(pairs: Pairs, count: int) -> bool:
+    """Return whether a search may have passed over modes: some are missing, or nearly equal."""
+    values = pairs[0]
+    return len(values) < count or bool((np.diff(values) <= REPEATED * values[1:]).any())
+
+
+# -- from the modes of a nearby design ---------------------------------------------------------
+
+
+def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
+    """Return the lowest modes by Lanczos' method from the sum of nearby ones, None if it gives up.
+
+    K^-1 M in the inner product of M, with full orthogonalisation; it looks at its residuals after
+    every step, so that none is made in vain. Eigenvalues of slender bodies grow with the fourth
+    power of their number: each step takes two digits more than the one before.
+
+    Args:
+        pencil: K and M.
+        count: number of eigenpairs.
+        start: (rows, k) vectors of a nearby problem.
+    """
+    most = MOST_STEPS + 2 * count
+    Q, MQ = np.empty((most, len(start))), np.empty((most, len(start)))
+    T = np.zeros((most, most))
+    w = _initial(pencil, start)
+    Mw = pencil.mass(w)
+    length = np.sqrt(float(pencil.total(w @ Mw)))
+    for m in range(most):
+        if not length > 0.0:  # neither of zero nor of nan
+            return None
+        np.divide(w, length, out=Q[m])
+        np.divide(Mw, length, out=MQ[m])
+        w = pencil.inverse(MQ[m])
+        for _ in range(2):
+            overlap = pencil.total(MQ[: m + 1] @ w)
+            w -= overlap @ Q[: m + 1]
+            T[: m + 1, m] += overlap
+        Mw = pencil.mass(w)
+        length = np.sqrt(max(float(pencil.total(w @ Mw)), 0.0))
+        if m + 1 < count:
+            continue
+        theta, y = np.linalg.eigh(T[: m + 1, : m + 1], UPLO="U")
+        theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
+        if (length * np.abs(y[-1]) <= EIGEN_TOLERANCE * theta).all():
+            return 1.0 / theta, (y.T @ Q[: m + 1]).T
+    return None
+
+
+def _initial(pencil: Pencil, start: np.ndarray) -> np.ndarray:
+    """Return the sum of nearby modes, with a share of the ramp.
+
+    The sum of the wanted modes spans their space in one Krylov sequence. Old modes of a symmetric
+    design stay within their symmetry for ever, even when a mode of another one has become the
+    lowest.
+    """
+    vector, up = start.sum(axis=1), _ramp(pencil, len(start))
+    norms = np.sqrt(pencil.total(np.array([vector @ vector, up @ up])))
+    return vector + RAMP_SHARE * norms[0] / norms[1] * up
+
+
+def _ramp(pencil: Pencil, rows: int) -> np.ndarray:
+    """Return values that rise from 1 to 2 over the rows of all ranks.
+
+    Rows run along the arm: the ramp has no symmetry of an arm, so that no mode is missed.
+    """
+    comm = pencil.arm.comm
+    first, size = (0, rows) if comm.size == 1 else (comm.exscan(rows) or 0, comm.allreduce(rows))
+    return 1.0 + np.arange(first, first + rows) / max(size, 1)
+
+
+def orthonormal(pencil: Pencil, vectors: np.ndarray) -> np.ndarray:
+    """Return the vectors M-orthonormal, by Gram and Schmidt: the first ones change least."""
+    weighted = np.column_stack([pencil.mass(vector) for vector in vectors.T])
+    gram = pencil.total(vectors.T @ weighted)
+    return vectors @ np.linalg.inv(np.linalg.cholesky(gram)).T
+
+
+# -- from cold, and where modes lie close together ---------------------------------------------
+
+
+def _searches(count: int, warm: bool) -> tuple[tuple[int, int], ...]:
+    """Return vectors and restarts of the searches to try in turn for `count` eigenpairs.
+
+    Few extra vectors at first, as the search looks at its residuals once a sweep: 4 from cold and
+    5 with an initial guess take the fewest solves. Bundles of modes equal to 1e-7, as equal windows
+    of nearly no material have, need more vectors, not more restarts.
+    """
+    extra = 5 if warm else 4
+    return (max(count + extra, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100)
+
+
+class _Eigenproblem:
+    """K phi = lambda M phi in SLEPc; see `lowest_eigenpairs`."""
+
+    def __init__(self, pencil: Pencil):
+        self.pencil = pencil
+        self.stiffness, self.mass = pencil.matrices()
+
+    def lowest(self, count: int, start: np.ndarray | None) -> Pairs:
+        """Return up to `count` pairs; see `lowest_eigenpairs`."""
+        warm = start is not None and start.shape[1] > 0
+        first, *others = _searches(count, warm)
+        pairs = self.search(count, *first, start)
+        dense = _is_dense(pairs, count)
+        for search in others:
+            if len(pairs[0]) < count:
+                pairs = self.search(count, *search, start)
+        if dense and len(pairs[0]) == count:
+            pairs = self.without_gaps(*pairs)
+        if len(pairs[0]) == count and pairs[0][-1] > WIDE * pairs[0][0]:
+            pairs = pairs[0], orthonormal(self.pencil, pairs[1])
+        return pairs
+
+    def search(
+        self,
+        count: int,
+        space: int,
+        restarts: int,
+        start: np.ndarray | None,
+        beside: np.ndarray | None = None,
+    ) -> Pairs:
+        """Return what a subspace of `space` vectors finds: up to `count` values and vectors.
+
+        Args:
+            count, space, restarts: as they say.
+            start: see `lowest_eigenpairs`.
+            beside: (rows, k) vectors to which the new ones are M-orthogonal.
+        """
+        eps = SLEPc.EPS().create(self.pencil.arm.comm)
+        eps.setOptionsPrefix(OPTIONS)
+        eps.setOperators(self.stiffness, self.mass)
+        eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+        eps.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_REAL)
+        eps.setTarget(0.0)
+        eps.setDimensions(count, min(self.stiffness.getSize()[0], space))
+        eps.setTolerances(EIGEN_TOLERANCE, restarts)
+        transform = eps.getST()
+        transform.setType(SLEPc.ST.Type.SINVERT)
+        transform.setShift(0.0)
+        transform.setKSP(_as_ksp(self.stiffness, self.pencil.inverse))
+        vector = self.stiffness.createVecLeft()
+        rows = vector.getLocalSize()
+        if start is None or start.shape[1] == 0:
+            first = _ramp(self.pencil, rows)
+        else:
+            first = _initial(self.pencil, start)
+        eps.setInitialSpace([_filled(vector, first)])
+        if beside is not None:
+            eps.setDeflationSpace([_filled(vector, column) for column in beside.T])
+        with obeying_options(OPTIONS):
+            eps.setFromOptions()
+            eps.solve()
+        found = min(eps.getConverged(), count)
+        values = np.empty(found)
+        vectors = np.empty((vector.getLocalSize(), found))
+        for k in range(found):
+            values[k] = eps.getEigenpair(k, vector).real
+            vectors[:, k] = vector.array
+        order = np.argsort(values, kind="stable")
+        eps.destroy()
+        return values[order], vectors[:, order]
+
+    def without_gaps(self, values: np.ndarray, vectors: np.ndarray) -> Pairs:
+        """Return as many pairs, with those in place that a search passed over.
+
+        A Krylov subspace holds one vector of every eigenvalue but for rounding. What is left is
+        searched in the M-complement of what is known, until it lies above.
+
+        Raises:
+            ConvergenceError: that search does not converge.
+        """
+        noise = np.modf(np.abs(np.sin(12.9898 * np.arange(1.0, len(vectors) + 1.0))) * 43758.5453)
+        for _ in range(len(values)):
+            if self.stiffness.getSize()[0] == len(values):
+                break  # all there are
+            for space, restarts in _searches(1, warm=False)[1:]:
+                more, vector = self.search(1, space, restarts, noise[0][:, None] - 0.5, vectors)
+                if len(more):
+                    break
+            else:
+                raise ConvergenceError(
+                    f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
+                    "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"
+                )
+            if more[0] >= (1.0 - REPEATED) * values[-1]:
+                break
+            values = np.append(values[:-1], more)
+            vectors = np.column_stack([vectors[:, :-1], vector])
+            order = np.argsort(values, kind="stable")
+            values, vectors = values[order], vectors[:, order]
+        return values, vectors
+
+
+class _Inverse:
+    """A solver as the context of a PETSc Python preconditioner."""
+
+    def __init__(self, inverse: Callable[[np.ndarray], np.ndarray]):
+        self.inverse = inverse
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = K^-1 x, called by PETSc."""
+        y.array = self.inverse(x.array_r)
+
+
+def _as_ksp(operator: PETSc.Mat, inverse: Callable[[np.ndarray], np.ndarray]) -> PETSc.KSP:
+    """Wrap a solver for SLEPc, which resets the KSP it was given and would drop its factors."""
+    ksp = PETSc.KSP().create(operator.comm)
+    ksp.setOptionsPrefix(f"{OPTIONS}st_")
+    ksp.setType(PETSc.KSP.Type.PREONLY)
+    ksp.setOperators(operator)
+    pc = ksp.getPC()
+    pc.setType(PETSc.PC.Type.PYTHON)
+    pc.setPythonContext(_Inverse(inverse))
+    return ksp
+
+
+def _filled(like: PETSc.Vec, values: np.ndarray) -> PETSc.Vec:
+    """Return a new vector with the owned rows `values`."""
+    vector = like.duplicate()
+    vector.array = values
+    return vector
+
+
+# -- derivatives -------------------------------------------------------------------------------
+
+
+def complement_solve(
+    pencil: Pencil, modes: np.ndarray, values: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    """Solve (K - lambda_k M) mu_k = right_k in the M-complement of the modes, for every k.
+
+    The adjoint of the eigenproblem, less its part within the modes' span. A reduced model depends
+    on nothing but that span, so what the modes do among themselves has no influence: neither close
+    nor repeated eigenvalues divide by zero. In the complement K - lambda_k M is positive definite,
+    and conjugate gradients with the factor of K converge as 1 - lambda_k / lambda_next allows.
+    K times a direction follows from the residual that the direction was solved for.
+
+    Args:
+        pencil: K and M.
+        modes: (rows, k) all modes below the complement, M-orthonormal.
+        values: (k,) their eigenvalues, rad2/s2.
+        right: (rows, k).
+
+    Returns:
+        mu (rows, k).
+
+    Raises:
+        ConvergenceError: the next eigenvalue is too close to the last.
+    """
+    weighted = np.column_stack([pencil.mass(mode) for mode in modes.T])
+
+    def conditioned(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return z = K^-1 r less its part in the modes, K z, and z . r."""
+        z = pencil.inverse(residual)
+        part = pencil.total(weighted.T @ z)
+        z -= modes @ part
+        return z, residual - weighted @ (values * part), float(pencil.total(residual @ z))
+
+    out = np.zeros_like(right)
+    for k, value in enumerate(values):
+        residual = right[:, k] - weighted @ pencil.total(modes.T @ right[:, k])
+        step, K_step, energy = conditioned(residual)
+        image = K_step - value * pencil.mass(step)
+        goal = ADJOINT_TOLERANCE**2 * energy
+        for _ in range(MAX_ADJOINT):
+            if energy <= goal:
+                break
+            length = energy / float(pencil.total(step @ image))
+            out[:, k] += length * step
+            residual -= length * image
+            previous = energy
+            z, K_z, energy = conditioned(residual)
+            image = K_z - value * pencil.mass(z) + (energy / previous) * image
+            step = z + (energy / previous) * step
+        else:
+            raise ConvergenceError(
+                f"arm {pencil.arm.mesh.name!r}: the derivatives of mode {k + 1} do not converge, "
+                "the next mode's frequency is too close; change reduction.coordinates by one"
+            )
+    return out
