@@ -36,20 +36,23 @@ class Further:
     Attributes:
         iterations: how many there were; fewer than asked for where a motion could not be simulated.
         begun: objective of the design.
-        objective: the least of those designs, this one included, that keep all constraints; if
+        objective: the best of those designs, this one included, that keep all constraints; if
             none does, that of the last one.
         feasible: whether it keeps them.
+        maximised: whether the greatest objective is the best.
     """
 
     iterations: int
     begun: float
     objective: float
     feasible: bool
+    maximised: bool = False
 
     @property
     def excess(self) -> float:
-        """By how much the design is above the best one found, relative to that."""
-        return (self.begun - self.objective) / abs(self.objective) if self.objective else 0.0
+        """By how much the design is worse than the best one found, relative to that."""
+        worse = self.begun - self.objective
+        return (-worse if self.maximised else worse) / abs(self.objective) if worse else 0.0
 
     @property
     def sentence(self) -> str:
@@ -57,7 +60,8 @@ class Further:
         how = f"{self.iterations} further iterations with the exact gradient"
         if self.excess > 0.0:
             worst = "" if self.feasible else ", which does not keep all constraints"
-            return f"{100.0 * self.excess:.2g} % above the best of {how}{worst}"
+            where = "below" if self.maximised else "above"
+            return f"{100.0 * self.excess:.2g} % {where} the best of {how}{worst}"
         return f"{how} found nothing better"
 
 
@@ -200,7 +204,10 @@ def certify(
     exact, frozen = problem, None
     if needs(scene, "motion"):
         used = scene.objective.gradient
-        other = _problem_by(evaluator, x, nominal, "exact" if used == "esl" else "esl")
+        try:
+            other = _problem_by(evaluator, x, nominal, "exact" if used == "esl" else "esl")
+        except ConvergenceError as error:  # on all ranks; the design is not lost for it
+            return Certificate(missing=str(error), violated=violated(problem.limits))
         exact, with_frozen_loads = (other, problem) if used == "esl" else (problem, other)
         if "motion" in objective_of(scene).needs:
             frozen = with_frozen_loads.df0dx
@@ -208,31 +215,32 @@ def certify(
     bounds = variables.xmin, variables.xmax
     found = judge(x, *bounds, exact, frozen, variables.slices, total)
     found = replace(found, seconds=comm.bcast(time.perf_counter() - begun, root=0))
-    count = scene.optimizer.exact_iterations
-    return replace(found, further=best_of(exact, further(exact, count))) if count else found
+    if not (count := scene.optimizer.exact_iterations):
+        return found
+    turned = objective_of(scene).turned
+    return replace(found, further=best_of(exact, further(exact, count), maximised=turned))
 
 
-def best_of(first: Problem, others: Iterable[Problem]) -> Further:
+def best_of(first: Problem, others: Iterable[Problem], *, maximised: bool = False) -> Further:
     """Return the best of the problems at a row of designs that keeps all constraints.
 
     A simulation that fails ends the row.
     """
+
+    def rank(problem: Problem) -> tuple[bool, float]:
+        """Return what is smaller for a better design: feasible ones come first."""
+        return bool(violated(problem.limits)), -problem.f0 if maximised else problem.f0
+
     best, count, last = first, 0, first
     try:
         for last in others:
             count += 1
-            if _rank(last) < _rank(best):
-                best = last
+            best = min(best, last, key=rank)
     except ConvergenceError:  # of a design on the way; on all ranks
         pass
     if violated(best.limits):
         best = last
-    return Further(count, first.f0, best.f0, not violated(best.limits))
-
-
-def _rank(problem: Problem) -> tuple[bool, float]:
-    """Return what is smaller for a better design: feasible ones come first."""
-    return bool(violated(problem.limits)), problem.f0
+    return Further(count, first.f0, best.f0, not violated(best.limits), maximised)
 
 
 def _problem_by(

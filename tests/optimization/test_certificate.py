@@ -17,6 +17,7 @@ from mpi4py import MPI
 from runs import TWO_ARM, overrides, run, shell
 
 import dolfinopt as do
+from dolfinopt.optimization import certificate
 from dolfinopt.optimization.certificate import Certificate, best_of, judge
 from dolfinopt.optimization.mma import initial_state, mma_step
 from dolfinopt.optimization.problem import Problem
@@ -25,6 +26,8 @@ from dolfinopt.responses.constraints import Limit
 
 WORLD = MPI.COMM_WORLD
 ALONE = partial(sum_over_arms, Partition(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
+
+NO_ROWS = np.zeros(0, dtype=int)
 
 # -- two bars ----------------------------------------------------------------------------------
 
@@ -73,9 +76,8 @@ class TwoBars:
 
     def problem(self, k: np.ndarray, gradient: np.ndarray) -> Problem:
         """Return the problem at k."""
-        return Problem(
-            self.compliance(k), gradient, np.array([0.5 * k.sum() - 1.0]), np.full((1, 2), 0.5), ()
-        )
+        material = np.array([0.5 * k.sum() - 1.0]), np.full((1, 2), 0.5)
+        return Problem(self.compliance(k), gradient, *material, (), np.zeros(1, dtype=int))
 
     def iterated(self, k: np.ndarray, count: int) -> np.ndarray:
         """Return what `count` optima for the loads of the design before lead to."""
@@ -84,7 +86,7 @@ class TwoBars:
             k = 2.0 * loads / loads.sum()
         return k
 
-    def certificate(self, k: np.ndarray, gradient: np.ndarray | None = None) -> Certificate:
+    def judged(self, k: np.ndarray, gradient: np.ndarray | None = None) -> Certificate:
         """Return that of k, by the exact gradient or another one."""
         problem = self.problem(k, self.exact(k) if gradient is None else gradient)
         bounds = np.full(2, 0.1), np.full(2, 1.9)
@@ -120,10 +122,10 @@ def test_two_bars_rest_where_no_optimum_is(w2):
     bars = TwoBars(FORCE, w2)
     k = bars.iterated(np.array([1.1, 0.9]), 200)
     np.testing.assert_allclose(k, bars.rest(), rtol=1e-9)
-    assert bars.certificate(k, bars.frozen(k)).kkt < 1e-9
+    assert bars.judged(k, bars.frozen(k)).kkt < 1e-9
     # u_1 = u_2 there: the exact derivatives are as g_i = (k_i + w2) / (k_i - w2).
     g = (k + w2) / (k - w2)
-    found = bars.certificate(k)
+    found = bars.judged(k)
     assert found.kkt == pytest.approx(abs(g[0] - g[1]) / np.sqrt(2.0 * g @ g), rel=1e-7)
     assert found.kkt > 0.03
     slope = np.degrees(np.arctan2(g[1], g[0]))
@@ -131,7 +133,7 @@ def test_two_bars_rest_where_no_optimum_is(w2):
     assert found.ratio == pytest.approx(np.sqrt(2.0 / (g @ g)), rel=1e-7)
     # Going on with the exact gradient ends in an optimum, which the certificate confirms.
     steps = bars.improved(k, 60)
-    assert bars.certificate(steps[-1][0]).kkt < 1e-6
+    assert bars.judged(steps[-1][0]).kkt < 1e-6
     further = best_of(bars.problem(k, bars.exact(k)), (one for _, one in steps))
     assert further.iterations == 60 and further.feasible
     grid = np.linspace(w2 + 0.01, 2.0 - w2 - 0.01, 20001)
@@ -144,7 +146,7 @@ def test_two_bars_rest_where_no_optimum_is(w2):
 def test_two_bars_in_slow_motion():
     """Without inertia nothing is lost by freezing the loads."""
     bars = TwoBars(FORCE, 1e-9)
-    found = bars.certificate(bars.rest())
+    found = bars.judged(bars.rest())
     assert found.kkt < 1e-8 and found.angle < 1e-6
     assert found.ratio == pytest.approx(1.0, abs=1e-6)
     assert found.sentence.startswith("residual ")
@@ -155,11 +157,11 @@ def test_two_bars_above_resonance():
     bars = TwoBars(FORCE, 1.5)
     k = bars.rest()
     np.testing.assert_allclose(k, [5.0 / 6.0, 7.0 / 6.0])
-    found = bars.certificate(k)
+    found = bars.judged(k)
     assert found.angle == pytest.approx(180.0 - (np.degrees(np.arctan2(8.0, 3.5)) - 45.0))
     # The step goes to the lower bounds.
     assert found.kkt == pytest.approx(np.sqrt(np.mean(((k - 0.1) / 1.8) ** 2)), rel=1e-9)
-    assert bars.certificate(k, bars.frozen(k)).kkt < 1e-9
+    assert bars.judged(k, bars.frozen(k)).kkt < 1e-9
     steps = bars.improved(k, 60)
     np.testing.assert_allclose(steps[-1][0], 0.1, atol=1e-6)
     further = best_of(bars.problem(k, bars.exact(k)), (one for _, one in steps))
@@ -169,7 +171,7 @@ def test_two_bars_above_resonance():
 def test_variables_at_bounds_have_no_part_in_the_angle():
     exact, frozen = np.array([1.0, 0.0, 5.0, 7.0]), np.array([1.0, 1.0, -5.0, -7.0])
     x, low, high = np.array([0.5, 0.5, 0.0, 1.0]), np.zeros(4), np.ones(4)
-    problem = Problem(1.0, exact, np.zeros(0), np.zeros((0, 4)), ())
+    problem = Problem(1.0, exact, np.zeros(0), np.zeros((0, 4)), (), NO_ROWS)
     found = judge(x, low, high, problem, frozen, {0: slice(0, 4)}, ALONE)
     assert found.angle == pytest.approx(45.0) and found.ratio == pytest.approx(np.sqrt(2.0))
     held = judge(x, x, x, problem, frozen, {0: slice(0, 4)}, ALONE)
@@ -181,7 +183,7 @@ def test_variables_at_bounds_have_no_part_in_the_angle():
 def test_best_of_what_keeps_the_constraints():
     def at(f0, met=True):
         limit = Limit("mass", "", 1.0 if met else 2.0, 1.0, "kg")
-        return Problem(f0, np.zeros(1), np.zeros(1), np.zeros((1, 1)), (limit,))
+        return Problem(f0, np.zeros(1), np.zeros(1), np.zeros((1, 1)), (limit,), np.zeros(1))
 
     found = best_of(at(3.0), [at(1.0, met=False), at(2.0), at(2.5)])
     assert (found.objective, found.iterations, found.feasible) == (2.0, 3, True)
@@ -189,6 +191,9 @@ def test_best_of_what_keeps_the_constraints():
     assert found.sentence == "50 % above the best of 3 further iterations with the exact gradient"
     worse = best_of(at(3.0), [at(4.0)])
     assert worse.excess == 0.0 and worse.sentence.endswith("found nothing better")
+    most = best_of(at(3.0), [at(4.0), at(2.0)], maximised=True)
+    assert most.objective == 4.0 and most.excess == pytest.approx(0.25)
+    assert most.sentence.startswith("25 % below the best of 2 ")
     none = best_of(at(3.0, met=False), [at(2.0, met=False)])
     assert not none.feasible and "does not keep all constraints" in none.sentence
 
@@ -277,6 +282,17 @@ def test_no_exact_gradient_is_told(change, reason):
     assert do.optimize(scene(change, "objective.kind=static")).certificate.missing == ""
     with pytest.raises(do.InputError, match=f"{change.split('=')[0]}.*exact_iterations"):
         scene(change, "optimizer.exact_iterations=1")
+
+
+def test_failing_gradient_does_not_lose_the_design(monkeypatch):
+    def failing(*_):
+        raise do.ConvergenceError("the adjoint cannot be solved")
+
+    monkeypatch.setattr(certificate, "_problem_by", failing)
+    result = do.optimize(scene(iterations=1))
+    assert result.iterations == 1
+    expected = "no exact gradient to judge the design by: the adjoint cannot be solved"
+    assert result.certificate.sentence == expected
 
 
 def test_light_payload_pays_for_frozen_loads():
