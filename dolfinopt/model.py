@@ -29,6 +29,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body
+from dolfinopt.arms.patterns import uniform_design
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.build import check_forces
 from dolfinopt.dynamics.simulation import Trajectory
@@ -40,7 +41,7 @@ from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.design import read_design
 from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
-from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
+from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import limits_by_column
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
@@ -395,8 +396,7 @@ class Model:
 
     def _uniform(self, density: float) -> dict[int, np.ndarray]:
         partition, arms = self._arms()
-        with together(partition.world):
-            return {k: arm.uniform(density) for k, arm in arms.items()}
+        return uniform_design(self.scene, partition, arms, density)
 
     def _prepared(self, x: Design) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
         """Return the arms, which forget earlier designs, and the densities of this rank's cells.

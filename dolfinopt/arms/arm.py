@@ -69,12 +69,12 @@ class Arm:
 
     def __init__(self, scene: scenes.Scene, index: int, comm: MPI.Comm, profile: Profile):
         """Mesh arm number `index` on the ranks of `comm` (collective there)."""
-        arm = scene.arms[index]
+        arm, pattern = scene.arms[index], scene.patterns.get(index)
         self.scene = scene
         self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
         self.solid = scene.material_of(index)
         with profile.phase("mesh"):
-            self.mesh = arm_mesh(comm, arm)
+            self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
             self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
         with profile.phase("element operators"):
             try:
@@ -83,9 +83,10 @@ class Arm:
                 raise InputError(f"{scene.source}: {error}") from None
             operators = element.operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
             self.substructure = Substructure(self.mesh, operators, profile)
-            design = scene.design
+            # A design that is another arm's is filtered there.
+            radius = scene.filter_radius(index) if pattern is None else 0.0
             # A member along an edge would be half as thin if the filter mirrored it there.
-            self.filter = HelmholtzFilter(self.mesh, design.radius, design.minimum_member > 0.0)
+            self.filter = HelmholtzFilter(self.mesh, radius, scene.design.controls_widths)
         self.coordinates = scene.reduction.count or None
         # Of a mesh file known only now.
         if self.coordinates is not None and self.coordinates > self.substructure.T.num_dofs:
@@ -102,7 +103,7 @@ class Arm:
     # -- from design variables to physical densities, and back -------------------------------
 
     def physical(self, x: np.ndarray) -> np.ndarray:
-        """Return the physical densities of design variables x: filtered, passive cells solid."""
+        """Return the physical densities of design variables x: filtered, solid and void kept."""
         return self.filtered(x).x_phys
 
     def filtered(self, x: np.ndarray) -> PhysicalDesign:
@@ -111,7 +112,7 @@ class Arm:
         Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
         what is cut off there has no derivative, and `backward` knows.
         """
-        x = np.where(self.mesh.passive, 1.0, x)
+        x = self.mesh.keep(x)
         with self.profile.phase("filter"):
             if self.symmetry is not None:
                 x = self.symmetry.forward(x)
@@ -119,7 +120,7 @@ class Arm:
         clipped = None
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
             clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
-        x_phys = np.where(self.mesh.passive, 1.0, np.clip(x_filtered, 0.0, 1.0))
+        x_phys = self.mesh.keep(np.clip(x_filtered, 0.0, 1.0))
         return PhysicalDesign(x_phys, None, clipped)
 
     def uniform(self, density: float) -> np.ndarray:
@@ -144,12 +145,11 @@ class Arm:
             return (filtered,)
         thresholds: Sequence[float] = (threshold,)
         if kind == "robust":
-            eroded, nominal, dilated = robust_thresholds(self.scene.design.erosion)
+            eroded, nominal, dilated = robust_thresholds(*self.scene.design.erosions)
             thresholds = (eroded, dilated, nominal)
         projected = [project(filtered.x_phys, beta, eta) for eta in thresholds]
         return tuple(
-            PhysicalDesign(np.where(self.mesh.passive, 1.0, p.value), p, filtered.clipped)
-            for p in projected
+            PhysicalDesign(self.mesh.keep(p.value), p, filtered.clipped) for p in projected
         )
 
     def preserving_threshold(self, x: np.ndarray, beta: float) -> float:
@@ -180,7 +180,7 @@ class Arm:
             return self._active(gradient)
 
     def _active(self, values: np.ndarray) -> np.ndarray:
-        return np.where(self.mesh.passive, 0.0, values)
+        return np.where(self.mesh.fixed, 0.0, values)
 
     # -- designs -----------------------------------------------------------------------------
 
@@ -364,8 +364,8 @@ class Arm:
 def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> dict[int, Arm]:
     """Build this rank's arms, keyed by their index in the scene (collective on `partition.world`).
 
-    Only arms with a design of their own: those that share one, rigid arms and those from a file
-    need no mesh.
+    Only arms with a mesh of their own: those that share one, rigid arms and those from a file need
+    none.
 
     Raises:
         InputError: the meshes exceed the memory; a mesh file cannot be an arm, or holds more solid
@@ -391,18 +391,16 @@ def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, A
     parts = {}
     for k, arm in arms.items():
         weight = scene.owners.count(k) * scene.arms[k].thickness
-        parts[k] = np.zeros((len(owners), 2))
-        parts[k][owners.index(k)] = [
-            weight * arm.mesh.area @ arm.mesh.passive,
-            weight * arm.mesh.area.sum(),
-        ]
+        parts[k] = np.zeros((len(owners), 3))
+        cells = np.array([arm.mesh.passive, arm.mesh.void, np.ones(arm.mesh.num_cells)])
+        parts[k][owners.index(k)] = weight * cells @ arm.mesh.area
     volumes = sum_over_arms(partition, parts)
     names = [f"arm {scene.arms[k].name!r}" for k in owners]
     if scene.design.shared_volume:
         volumes, names = volumes.sum(axis=0, keepdims=True), ["all arms together"]
-    for name, (solid, total) in zip(names, volumes, strict=True):
+    for name, (solid, void, total) in zip(names, volumes, strict=True):
         fraction = solid / total
-        if fraction + (1.0 - fraction) * least > limit:
+        if fraction + (1.0 - fraction - void / total) * least > limit:
             raise InputError(
                 f"{scene.source}: design.volume_fraction = {limit}: the solid cells are "
                 f"{fraction:.4g} of the volume of {name}, more than that with design.minimum = "

@@ -20,6 +20,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.arms.arm import Arm, build_arms, chain_of
+from dolfinopt.arms.patterns import uniform_design
 from dolfinopt.disk import write_text
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.run import optimize
@@ -249,7 +250,7 @@ def designs(plan: Plan, tell: Tell) -> dict[str, tuple[dict[int, Arm], dict[int,
     scene = changed(plan.scene, f"optimizer.max_iterations={iterations}")
     result = optimize(scene, world=MPI.COMM_SELF)
     arms = dict(result.arms)
-    uniform = {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+    uniform = uniform_design(scene, result.partition, arms, scene.design.initial)
     return {INITIAL: (arms, uniform), OPTIMISED: (arms, dict(result.x_phys))}
 
 

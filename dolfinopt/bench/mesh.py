@@ -96,6 +96,7 @@ def grid_arm(
         centroid=points.mean(axis=1),
         area=np.ptp(points, axis=1).prod(axis=1) * (0.5 if triangles else 1.0),
         passive=np.zeros(count, dtype=bool),
+        void=np.zeros(count, dtype=bool),
         inboard_facets=at(0.0),
         outboard_facets=at(length),
         outboard_point=np.array([length, 0.0]),

@@ -130,6 +130,7 @@ def design_of(
 ) -> tuple[Partition, dict[int, Arm], dict[int, Any]]:
     """Build the arms and return them with the physical densities of a file or the initial ones."""
     from dolfinopt.arms.arm import build_arms
+    from dolfinopt.arms.patterns import uniform_design
     from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
 
@@ -137,7 +138,7 @@ def design_of(
     arms = build_arms(scene, partition, profile)
     if design is not None:
         return partition, arms, read_design(design, partition, arms)
-    return partition, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+    return partition, arms, uniform_design(scene, partition, arms, scene.design.initial)
 
 
 def draw(

@@ -55,12 +55,12 @@ def project(x: np.ndarray, beta: float, eta: float) -> Projected:
     return Projected(np.minimum(value, 1.0), slope)  # one unit of rounding above 1 at most
 
 
-def robust_thresholds(erosion: float) -> tuple[float, float, float]:
-    """Return eta of the eroded, the nominal and the dilated design: 1/2 + erosion, 1/2, 1/2 - it.
+def robust_thresholds(erosion: float, dilation: float) -> tuple[float, float, float]:
+    """Return eta of eroded, nominal and dilated design: 1/2 + erosion, 1/2, 1/2 - dilation.
 
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
     """
-    return MIDDLE + erosion, MIDDLE, MIDDLE - erosion
+    return MIDDLE + erosion, MIDDLE, MIDDLE - dilation
 
 
 def preserving_threshold(x: np.ndarray, area: np.ndarray, beta: float, comm: MPI.Comm) -> float:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import gmsh_on_root, mesh_geo
 from dolfinopt.mesh.groups import INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.regions import Cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +33,7 @@ class ArmMesh:
         centroid: (n_cells, 2) of the owned cells, m.
         area: (n_cells,) of the owned cells, m2.
         passive: (n_cells,) True where the cell stays solid.
+        void: (n_cells,) True where the cell stays void.
         inboard_facets, outboard_facets: facets of the interfaces, local numbers.
         outboard_point: (2,) reference point of the outboard interface, m.
         notes: what is doubtful about its file, a sentence each.
@@ -39,6 +45,7 @@ class ArmMesh:
     centroid: np.ndarray
     area: np.ndarray
     passive: np.ndarray
+    void: np.ndarray
     inboard_facets: np.ndarray
     outboard_facets: np.ndarray
     outboard_point: np.ndarray
@@ -49,21 +56,37 @@ class ArmMesh:
         """Number of cells this rank owns."""
         return len(self.area)
 
+    @property
+    def fixed(self) -> np.ndarray:
+        """(n_cells,) True where the cell stays what it is whatever the design."""
+        return self.passive | self.void
 
-def arm_mesh(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    def keep(self, values: np.ndarray) -> np.ndarray:
+        """Return densities (n_cells,) with solid and void cells as they stay: 1 and 0."""
+        return np.where(self.passive, 1.0, np.where(self.void, 0.0, values))
+
+
+def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None) -> ArmMesh:
     """Mesh an arm of a scene: its mesh file if it names one, a grid of `cells` otherwise.
 
     Args:
         comm: ranks that share the arm.
         arm: its keys.
+        pattern: the arm whose design it repeats, which says what stays solid and void.
 
     Raises:
-        InputError: the mesh file cannot be the arm.
+        InputError: the mesh file cannot be the arm, or the arm have its regions.
     """
+    like = arm if pattern is None else pattern
     if arm.mesh is not None:
-        return file_arm(comm, arm)
-    assert arm.cells is not None
-    return structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, arm.solid_ends)
+        mesh = file_arm(comm, arm)
+    else:
+        assert arm.cells is not None and like.cells is not None
+        ends = like.solid_ends
+        if pattern is not None:
+            ends = like.passive_columns * arm.length / arm.cells[0]
+        mesh = structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, ends)
+    return with_regions(mesh, like, [like.length / arm.length, like.height / arm.height])
 
 
 def structured_arm(
@@ -133,10 +156,52 @@ def _arm_mesh(
         centroid=corners.mean(axis=1),
         area=_cell_area(corners),
         passive=solid,
+        void=np.zeros(owned, dtype=bool),
         inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
         outboard_facets=facet_tags.indices[facet_tags.values == OUTBOARD],
         outboard_point=np.array([length, 0.0]),
     )
+
+
+def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmMesh:
+    """Return the mesh with the cells of the arm's regions solid and void (collective on it).
+
+    Args:
+        mesh: of the arm, or of one that repeats it.
+        arm: has the regions.
+        scale: factors (2,) from the mesh's coordinates to the arm's.
+
+    Raises:
+        InputError: the arm of a mesh file cannot have them; scenes know it of rectangular ones.
+    """
+    if not arm.regions:
+        return mesh
+    from dolfinopt.scene.regions import region_cells, region_problem
+
+    centroid = mesh.centroid * scale
+    if arm.mesh is not None and (problem := region_problem(arm, _all_cells(mesh))):
+        number, reason = problem
+        raise InputError(f"arm {arm.name!r}: region {number} of arms.regions: {reason}")
+    found = region_cells(arm, centroid)
+    return replace(mesh, passive=mesh.passive | found.solid, void=found.void)
+
+
+def _all_cells(mesh: ArmMesh) -> Cells:
+    """Return the cells of all ranks of the arm, on each of them (collective)."""
+    from dolfinopt.scene.regions import Cells
+
+    numbering = mesh.mesh.topology.index_map(mesh.mesh.topology.dim)
+    first, second, _, _ = interior_facets(mesh.mesh)
+    pairs = numbering.local_to_global(np.stack([first, second], axis=1).ravel().astype(np.int32))
+    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
+    mine = (
+        mesh.centroid,
+        mesh.passive,
+        np.isin(facets, mesh.inboard_facets).any(axis=1),
+        np.isin(facets, mesh.outboard_facets).any(axis=1),
+        pairs.reshape(-1, 2),
+    )
+    return Cells(*(np.concatenate(parts) for parts in zip(*mesh.comm.allgather(mine), strict=True)))
 
 
 def _distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:

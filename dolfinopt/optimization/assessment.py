@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dolfinopt.arms.patterns import uniform_design
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.parallel import together
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
 from dolfinopt.responses.response import needs
@@ -71,8 +71,7 @@ def assess(
     vectors = {k: arm.initial_vectors for k, arm in arms.items()}
     initial = crisp = None
     if not moves:
-        with together(evaluator.partition.world):
-            uniform = {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+        uniform = uniform_design(scene, evaluator.partition, arms, scene.design.initial)
         evaluator.evaluate_densities(uniform, simulated=True)
         initial = evaluator.trajectory
     if scene.design.projection:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.arm import PhysicalDesign
+from dolfinopt.arms.patterns import Patterns
 from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm, PhysicalDesign
+    from dolfinopt.arms.arm import Arm
 
 # Steepness from which on the move limit falls with its square root: up to it the projection's
 # slope, about beta / 2, moves x_phys by no more than twice what x moves.
@@ -24,8 +26,9 @@ class Continuation:
 
     Attributes:
         beta: steepness; grows from 1 to design.sharpness.
-        thresholds: eta of every arm of this rank. Held during a step: a threshold that followed x
-            would be one more way to stay grey.
+        patterns: arms that repeat another's design.
+        thresholds: eta of every arm of this rank with design variables. Held during a step: a
+            threshold that followed x would be one more way to stay grey.
     """
 
     def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
@@ -33,7 +36,9 @@ class Continuation:
         self.scene, self.partition, self.arms = scene, partition, arms
         self.beta = 1.0
         self._held = False
-        self.thresholds: dict[int, float] = dict.fromkeys(arms, 0.5)
+        self.patterns = Patterns(scene, partition, arms)
+        designed = [k for k in arms if k in scene.designed]
+        self.thresholds: dict[int, float] = dict.fromkeys(designed, 0.5)
 
     @property
     def complete(self) -> bool:
@@ -55,12 +60,24 @@ class Continuation:
     def physical_designs(
         self, x: Mapping[int, np.ndarray]
     ) -> dict[int, tuple[PhysicalDesign, ...]]:
-        """Return the designs that x stands for, the nominal one last (collective)."""
+        """Return the designs that x stands for, the nominal one last (collective).
+
+        Of all arms of this rank; those that repeat another's design have its densities.
+        """
         with together(self.partition.world):
-            return {
-                k: arm.physical_designs(x[k], self.beta, self.thresholds[k])
-                for k, arm in self.arms.items()
+            designs = {
+                k: self.arms[k].physical_designs(x[k], self.beta, eta)
+                for k, eta in self.thresholds.items()
             }
+        if not self.patterns.repeats:
+            return designs
+        count = 3 if self.scene.design.projection == "robust" else 1
+        spread = [
+            self.patterns.spread({k: variants[i].x_phys for k, variants in designs.items()})
+            for i in range(count)
+        ]
+        repeats = [k for k in self.arms if k in self.patterns.repeats]
+        return designs | {k: tuple(PhysicalDesign(x[k], None) for x in spread) for k in repeats}
 
     def advance(self, x: Mapping[int, np.ndarray]) -> None:
         """Raise beta, and move the thresholds so that the volume of x stays (collective).
@@ -74,5 +91,5 @@ class Continuation:
         self.beta = min(2.0 ** (1.0 / design.continuation) * self.beta, design.sharpness)
         with together(self.partition.world):
             self.thresholds = {
-                k: arm.preserving_threshold(x[k], self.beta) for k, arm in self.arms.items()
+                k: self.arms[k].preserving_threshold(x[k], self.beta) for k in self.thresholds
             }

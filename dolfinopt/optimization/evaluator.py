@@ -109,10 +109,15 @@ class Evaluator:
         if self.trajectory is not None:
             self.solutions = self.trajectory.solutions
         analysed = self.scene, self.partition, self.arms, self.trajectory, self.profile
-        objective = gradient(*analysed)
+        collect = self.continuation.patterns.collect
+        objective = collect(gradient(*analysed))
         rows = constraint_gradients(*analysed, measured=evaluation.responses)
+        smooth = [collect(row.smooth) for row in rows]
         with together(self.partition.world):
-            by_x = [self.variables.by_x(row.smooth, design) / row.limit for row in rows]
+            by_x = [
+                self.variables.by_x(by, design) / row.limit
+                for by, row in zip(smooth, rows, strict=True)
+            ]
             return EvaluatedDesign(
                 design,
                 evaluation,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.patterns import Patterns
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
@@ -79,27 +80,32 @@ def taylor_test(
 
     Args:
         scene, partition, arms, profile: as for `evaluate`.
-        x: (n_cells,) design variables of this rank's arms, in [0, 1].
+        x: (n_cells,) design variables of this rank's arms, in [0, 1]; arms that repeat another's
+            design have none, and what is given for them is not read.
 
     Raises:
         InputError: the scene's objective has no exact gradient.
     """
     check_exact(scene)
     exact = _with(scene, gradient="exact")
-    x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * value for k, value in x.items()}
-    x_phys = _physical(partition, arms, x)
+    designed = {k: arm for k, arm in arms.items() if k in scene.designed}
+    patterns = Patterns(scene, partition, arms)
+    x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * x[k] for k in designed}
+    x_phys = _physical(partition, arms, patterns, x)
     evaluation, base = evaluate(exact, partition, arms, x_phys, profile, simulated=False)
-    slope = _by_x(partition, arms, gradient(exact, partition, arms, base, profile), x)
+    cells = patterns.collect(gradient(exact, partition, arms, base, profile))
+    slope = _by_x(partition, designed, cells, x)
     frozen = None
     if needs(scene, "motion"):
         esl = _with(scene, gradient="esl")
-        frozen = _by_x(partition, arms, gradient(esl, partition, arms, base, profile), x)
+        cells = patterns.collect(gradient(esl, partition, arms, base, profile))
+        frozen = _by_x(partition, designed, cells, x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    value = _fixed_objective(exact, partition, arms, profile, base)
+    value = _fixed_objective(exact, partition, arms, patterns, profile, base)
     here = value(x)
     rows = []
-    for name, direction in _directions(scene, arms).items():
+    for name, direction in _directions(scene, designed).items():
         along = _dot(partition, slope, direction)
         frozen_along = np.nan if frozen is None else _dot(partition, frozen, direction)
         remainders = tuple(
@@ -142,9 +148,12 @@ def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None 
     return scene.model_copy(update=update)
 
 
-def _physical(partition: Partition, arms: Mapping[int, Arm], x: Cells) -> dict[int, np.ndarray]:
+def _physical(
+    partition: Partition, arms: Mapping[int, Arm], patterns: Patterns, x: Cells
+) -> dict[int, np.ndarray]:
     with together(partition.world):
-        return {k: arm.physical(x[k]) for k, arm in arms.items()}
+        mine = {k: arms[k].physical(values) for k, values in x.items()}
+    return patterns.spread(mine)
 
 
 def _by_x(
@@ -162,6 +171,7 @@ def _fixed_objective(
     scene: Scene,
     partition: Partition,
     arms: Mapping[int, Arm],
+    patterns: Patterns,
     profile: Profile,
     base: Trajectory | None,
 ) -> Callable[[Cells], float]:
@@ -169,7 +179,7 @@ def _fixed_objective(
     start = () if base is None else base.solutions
 
     def value(x: Cells) -> float:
-        x_phys = _physical(partition, arms, x)
+        x_phys = _physical(partition, arms, patterns, x)
         evaluation, trajectory = evaluate(
             scene, partition, arms, x_phys, profile, start, simulated=False
         )
@@ -195,7 +205,7 @@ def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np
     They are functions of the place, the same on any partition. First and last are among the arms
     with a design of their own.
     """
-    designed = list(scene.cell_counts)
+    designed = scene.designed
 
     def along(k: int) -> np.ndarray:
         return arms[k].mesh.centroid[:, 0] / arms[k].mesh.outboard_point[0]
@@ -211,7 +221,7 @@ def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np
         "tip of the last arm": lambda k: ((along(k) > 0.9) & (k == designed[-1])).astype(float),
     }
     return {
-        name: {k: np.where(arm.mesh.passive, 0.0, field(k)) for k, arm in arms.items()}
+        name: {k: np.where(arm.mesh.fixed, 0.0, field(k)) for k, arm in arms.items()}
         for name, field in chosen.items()
     }
 

@@ -106,8 +106,10 @@ class _Run:
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
         self.variables, self.continuation = evaluator.variables, evaluator.continuation
-        self.x = np.maximum(
-            np.full(self.variables.size, self.scene.design.initial), self.variables.xmin
+        self.x = np.clip(
+            np.full(self.variables.size, self.scene.design.initial),
+            self.variables.xmin,
+            self.variables.xmax,
         )
         self.state = initial_state(self.x)
         self.history: list[HistoryRow] = []

@@ -75,7 +75,7 @@ def problem_of(scene: Scene, designs: Sequence[EvaluatedDesign]) -> Problem:
     own = nominal.of_nominal
     f = np.array(nominal.evaluation.constraints)[own]
     dfdx = nominal.constraints[own]
-    if len(designs) > 1 and scene.design.minimum_member:
+    if len(designs) > 1 and scene.design.controls_widths:
         dilated = designs[1]
         ratio = (1.0 + f) / (1.0 + np.array(dilated.evaluation.constraints)[own])
         dfdx = ratio[:, None] * dilated.constraints[own]

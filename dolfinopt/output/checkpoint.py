@@ -133,8 +133,9 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
     cells: dict[int, np.ndarray] = {}
     modes: dict[int, list[np.ndarray]] = {}
     for k, arm in arms.items():
-        rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
-        cells[k] = arrays[f"arm{k}/cells"][rows]
+        if f"arm{k}/cells" in arrays:  # an arm that repeats another's design has no variables
+            rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
+            cells[k] = arrays[f"arm{k}/cells"][rows]
         rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
         rows = (2 * rows[:, None] + [0, 1]).ravel()
         last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
@@ -168,7 +169,7 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         initial_deviation=arrays["initial_deviation"],
         finished=str(arrays["finished"]),
         beta=float(arrays["sharpness"]),
-        thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in arms},
+        thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in cells},
         choice=choice,
         stiffening=stiffening,
     )

@@ -13,6 +13,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.response import objective_of
+from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -76,14 +77,30 @@ def read_views(scene: Scene, path: Path) -> list[ArmView]:
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
     """Return the physical densities of a design.npz on this rank's cells (collective).
 
-    Cells take the value of the nearest centroid in the file.
+    Cells take the value of the nearest centroid in the file. An arm with a pattern that the file
+    does not hold takes those of its pattern, scaled.
 
     Raises:
         InputError: the file is missing, damaged, or made for other arms.
     """
     arrays = on_root(partition.world, _load_design, path)
+    for index, arm in arms.items():
+        scene = arm.scene
+        if index in scene.patterns:
+            _repeat(scene.arms[index], scene.arms[scene.patterns[index]], arrays)
     with together(partition.world):
         return {index: _fit(path, arm, arrays) for index, arm in arms.items()}
+
+
+def _repeat(arm: ArmKeys, pattern: ArmKeys, arrays: dict[str, np.ndarray]) -> None:
+    """Add an arm that repeats another's design to the arrays of a file that has the latter."""
+    centroid, density = (f"{pattern.name}/{key}" for key in ("centroid", "density"))
+    points = arrays.get(centroid, np.empty(0))
+    if f"{arm.name}/density" in arrays or density not in arrays or points.ndim != 2:
+        return
+    scale = [arm.length / pattern.length, arm.height / pattern.height]
+    arrays[f"{arm.name}/centroid"] = points[:, :2] * scale
+    arrays[f"{arm.name}/density"] = arrays[density]
 
 
 def _load_design(path: Path) -> dict[str, np.ndarray]:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 
+CIRCLE = 48  # corners that stand for a circle in pictures
+
+
 @dataclass(frozen=True, eq=False)
 class ArmView:
     """One whole arm on the root, cells in the order of their centroids.
@@ -30,6 +33,7 @@ class ArmView:
         modes: (n_cells, 3 or 4, 2, q) the reduced basis at the corners; q = 0 if not reduced.
         designed: False for arms without a design: rigid ones and those from a file.
         length: from joint axis to joint axis, m; None if not known.
+        regions: what the scene keeps solid or void: kind and outline (n, 2), m, of every region.
     """
 
     name: str
@@ -39,6 +43,7 @@ class ArmView:
     modes: np.ndarray
     designed: bool = True
     length: float | None = None
+    regions: tuple[tuple[str, np.ndarray], ...] = ()
 
 
 def gather_views(
@@ -99,9 +104,30 @@ def _views(
                 densities[owner][order],
                 shapes[owner][order][:, around],
                 length=scene.arms[index].length,
+                regions=_outlines(scene, index),
             )
         )
     return views
+
+
+def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
+    """Return kind and outline of the regions of an arm, mirror images included."""
+    arm = scene.arms[index]
+    pattern = scene.arms[scene.patterns.get(index, index)]
+    scale = np.array([arm.length / pattern.length, arm.height / pattern.height])
+    found = []
+    for region in pattern.regions:
+        x0, y0, x1, y1 = region.bounds
+        if region.box is not None:
+            points = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        else:
+            turn = np.exp(2j * np.pi * np.arange(CIRCLE) / CIRCLE)
+            radius = 0.5 * (x1 - x0)
+            points = np.column_stack([x0 + radius * (1 + turn.real), y0 + radius * (1 + turn.imag)])
+        found.append((region.kind, points * scale))
+        if pattern.symmetric:
+            found.append((region.kind, points * scale * [1.0, -1.0]))
+    return tuple(found)
 
 
 def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:

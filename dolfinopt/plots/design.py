@@ -24,6 +24,7 @@ TEXT, TITLE = 26, 34  # px
 HEAD = 90.0  # title
 LABEL = 56.0  # above each arm, with its name
 FOOT = 190.0  # ruler and colour scale
+REGION = {"solid": "#d55e00", "void": "#0072b2"}  # borders of what stays solid and void
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,9 @@ def design_page(views: Sequence[ArmView], title: str) -> Page:
         corners = layout.place(index, view.corners)
         page.fill(corners, view.density)
         page.lines(outline(corners), GREY)
+        for kind, border in view.regions:
+            points = layout.place(index, _inside(border, view.corners))
+            page.lines(np.stack([points, np.roll(points, -1, axis=0)], axis=1), REGION[kind])
         if view.length is not None:
             page.mark(layout.place(index, np.array([[0.0, 0.0], [view.length, 0.0]])))
     _draw_ruler(page, layout)
@@ -258,6 +262,11 @@ def _in_space(points: np.ndarray, height: float) -> np.ndarray:
     """Return points (..., 2) as (n, 3) at one height."""
     flat = points.reshape(-1, 2)
     return np.column_stack([flat, np.full(len(flat), height)])
+
+
+def _inside(border: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return an outline (n, 2) without what lies beyond the box around the cells, m."""
+    return np.clip(border, corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
 
 
 def _caption(view: ArmView) -> str:

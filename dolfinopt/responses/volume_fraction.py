@@ -34,7 +34,7 @@ class VolumeFraction(Response):
         """Return volumes and their fractions (collective)."""
         filled, full = self._volumes(analysis).T
         scene = analysis.scene
-        designed = tuple(scene.arms[k].name for k in scene.cell_counts)
+        designed = tuple(scene.arms[k].name for k in scene.designed)
         names = ("",) if scene.design.shared_volume else designed
         return Measured(self.name, names, tuple((filled / full).tolist()), tuple(filled.tolist()))
 
@@ -74,6 +74,7 @@ def _of_cells(analysis: Analysis) -> dict[int, np.ndarray]:
 
 
 def _rows(analysis: Analysis) -> dict[int, int]:
-    """Return to which value every design belongs."""
+    """Return to which value every arm's cells belong: that of the arm whose design it has."""
     scene = analysis.scene
-    return {k: 0 if scene.design.shared_volume else row for row, k in enumerate(scene.cell_counts)}
+    row = {k: 0 if scene.design.shared_volume else row for row, k in enumerate(scene.designed)}
+    return {k: row[scene.patterns.get(k, k)] for k in scene.cell_counts}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.schema import Scene
 
 SCHEMA_FILE = "dolfinopt.schema.json"
@@ -23,6 +24,12 @@ def scene_schema() -> dict[str, Any]:
     for name, table in schema["properties"].items():
         if "$ref" in table:  # tables complete as tables; their defaults stand at their keys
             schema["properties"][name] = {"$ref": table["$ref"]}
+    # A name in place of the table, or in it, stands for its values.
+    table = schema["definitions"]["Material"]
+    table["anyOf"] = [{"required": ["name"]}, {"required": table.pop("required")}]
+    schema["properties"]["material"] = {
+        "anyOf": [{"type": "string", "enum": list(CATALOGUE)}, schema["properties"]["material"]]
+    }
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "scene of dolfinopt"}
     return head | {key: value for key, value in schema.items() if key != "title"}
 

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
+from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.messages import (
     Override,
     allowed_words,
@@ -34,9 +35,10 @@ from dolfinopt.scene.messages import (
 )
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.spelling import cut, input_error, shown
-from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, Arm
+from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, PATTERN_KEYS, Arm
 from dolfinopt.scene.tables.base import Loc, Refusal
 from dolfinopt.scene.tables.interpolation import Law
+from dolfinopt.scene.tables.material import MATERIAL_VALUES
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import WorstBy
 from dolfinopt.scene.tables.reduction import Reduction
@@ -106,6 +108,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     tree = _copy_tables(data)
     tree.setdefault("name", name)
     tree.setdefault("material", {})  # so that the message names the first key missing in it
+    _name_material(tree)
     inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
     changes = [_override(tree, text, source) for text in overrides]
     for change in changes:
@@ -114,6 +117,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
+    _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
     _measure_bodies(tree, inherited)
     derived = (*_time_motion(tree, source, changes), *_limit_volume(tree))
@@ -139,6 +143,28 @@ def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
         return ()
     plain = scene.to_tree() | {"scenarios": []}
     return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
+
+
+def _name_material(tree: dict[str, Any]) -> None:
+    """Make a name in place of the table [material] a key of the table."""
+    if isinstance(tree.get("material"), str):
+        tree["material"] = {"name": tree["material"]}
+
+
+def _fill_material(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
+    """Complete [material] by the catalogue where it names one.
+
+    Raises:
+        InputError: the catalogue has no such material.
+    """
+    _name_material(tree)
+    material = tree.get("material")
+    if not isinstance(material, dict) or not isinstance(name := material.get("name"), str):
+        return
+    if name not in CATALOGUE:
+        where = blamed(source, changes, (("material", "name"),))
+        raise input_error(where, f"material = {shown(name)}: {unknown_material(name)}")
+    tree["material"] = CATALOGUE[name].values | material
 
 
 def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
@@ -320,14 +346,16 @@ def _syntax_error(message: str, text: str) -> str:
 
 def _copy_tables(data: Mapping[str, Any]) -> dict[str, Any]:
     """Copy the scene's tables, which completion changes; values are shared with `data`."""
-    tree: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            value = dict(value)
-        elif isinstance(value, (list, tuple)):
-            value = [dict(item) if isinstance(item, Mapping) else item for item in value]
-        tree[key] = value
-    return tree
+    return {key: _copied(value) for key, value in data.items()}
+
+
+def _copied(value: Any) -> Any:
+    """Return a table, an array of tables or a plain value, with tables of its own."""
+    if isinstance(value, Mapping):
+        return _copy_tables(value)
+    if isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):
+        return [_copied(item) for item in value]
+    return value
 
 
 def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
@@ -340,12 +368,24 @@ def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
         before, arm = arms[i - 1], arms[i]
         if not (isinstance(before, dict) and isinstance(arm, dict)):
             continue
-        taken = MESH_KEYS if any(key in arm for key in MESH_KEYS[:2]) else ()
+        taken = {key for keys in _replaced(arm) for key in keys}
         for key in keys:
             if key in before and key not in arm and key not in taken:
-                arm[key] = before[key]
+                arm[key] = _copied(before[key])
                 inherited.add(("arms", i, key))
     return inherited
+
+
+def _replaced(arm: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the keys that what an arm states takes the place of."""
+    if any(key in arm for key in MESH_KEYS[:2]):
+        yield MESH_KEYS
+    if "material" in arm:
+        yield MATERIAL_VALUES
+    if "pattern" in arm:
+        yield PATTERN_KEYS
+    if arm.get("rigid") is True or "sid" in arm:
+        yield ("regions",)
 
 
 # --- overrides -------------------------------------------------------------------------------
@@ -362,6 +402,8 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
     for loc in locs:
         if loc[0] == "arms" and loc[2:] in (("cells",), ("mesh",)):
             _drop_mesh(tree, loc)
+        if loc == ("material", "name") or (loc[0] == "arms" and loc[2:] == ("material",)):
+            _drop_values(tree, loc)
         _store(tree, loc, _parse_value(value.strip()))
     return Override(text, locs)
 
@@ -374,6 +416,13 @@ def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
     others = MESH_KEYS if loc[2] == "cells" else ("cells",)
     for key in others:
         arm.pop(key, None)
+
+
+def _drop_values(tree: dict[str, Any], loc: Loc) -> None:
+    """Let the name of a material at `loc` take the place of the values stated so far."""
+    table = tree["arms"][loc[1]] if loc[0] == "arms" else tree["material"]
+    for key in MATERIAL_VALUES if isinstance(table, dict) else ():
+        table.pop(key, None)
 
 
 def _parse_value(text: str) -> Any:

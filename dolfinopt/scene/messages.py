@@ -15,6 +15,9 @@ from dolfinopt.scene.schema import Scene
 from dolfinopt.scene.spelling import cut, key_text, one_line, shown
 from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, table_in, without_none
+from dolfinopt.scene.tables.material import Material, check_material
+
+_COUNTS = {2: "two", 3: "three", 4: "four"}
 
 
 @dataclass(frozen=True)
@@ -70,10 +73,10 @@ def _is_echo(
     """Tell whether the arm before has the same problem and this one only took it over."""
     before = []
     for loc in problem.locs:
-        taken = loc in inherited or (problem.kind == "missing" and loc[-1] != "name")
+        taken = loc[:3] in inherited or (problem.kind == "missing" and loc[-1] != "name")
         if loc[0] != "arms" or len(loc) < 3 or not taken:
             return False
-        before.append(("arms", loc[1] - 1, loc[2]))
+        before.append(("arms", loc[1] - 1, *loc[2:]))
     return (problem.kind, tuple(before)) in known
 
 
@@ -85,8 +88,7 @@ def _starts(loc: Loc, above: Loc) -> bool:
 def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
     """Translate one of pydantic's errors."""
     raw: Loc = item["loc"]
-    # Below a key there are only the elements of its value, which messages show as a whole.
-    loc = raw[: 3 if raw[:1] in (("arms",), ("scenarios",)) else 2]
+    loc = _key_loc(raw)
     if item["type"] in ("extra_forbidden", "invalid_key"):
         model = model_at(loc[:-1])
         fields = model.model_fields if model else {}
@@ -104,6 +106,17 @@ def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
         allowed = allowed.replace("number", "finite number")
     text = f"{_found(loc, tree)}: expected {allowed} ({_meaning(field)})"
     return _Problem(text, (loc,), "value")
+
+
+def _key_loc(raw: Loc) -> Loc:
+    """Return the path of the key at or above `raw`.
+
+    Below a key there are only the elements of its value, which messages show as a whole.
+    """
+    for depth in range(1, len(raw)):
+        if not isinstance(raw[depth - 1], int) and model_at(raw[:depth]) is None:
+            return raw[:depth]
+    return raw
 
 
 def unknown_key(above: Loc, key: Any, known: Iterable[str], tree: dict[str, Any]) -> str:
@@ -142,8 +155,7 @@ def model_at(loc: Loc) -> type[Table] | None:
 def field_at(loc: Loc) -> FieldInfo:
     """Return the field at `loc`; an element of `arms` counts as a field of its own."""
     if isinstance(loc[-1], int):
-        one = table_in(Scene.model_fields[loc[0]].annotation)
-        return FieldInfo(annotation=one, description=f"one of {loc[0]}")
+        return FieldInfo(annotation=model_at(loc), description=f"one of {loc[-2]}")
     model = model_at(loc[:-1])
     assert model is not None, loc
     return model.model_fields[loc[-1]]
@@ -162,6 +174,10 @@ def allowed_words(field: FieldInfo) -> str:
 def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "") -> str:
     annotation = without_none(annotation)
     origin, args = get_origin(annotation), get_args(annotation)
+    if annotation is str and any(
+        getattr(rule, "func", None) is check_material for rule in metadata
+    ):
+        return "the name of a material of the catalogue"
     if origin is Annotated:
         rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
         return _allowed_type(args[0], rules, plural)
@@ -177,8 +193,12 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
     if origin is tuple:
         rows = get_origin(args[0]) is tuple
         inner = "arrays of three numbers" if rows else _allowed_type(args[0], plural="s")
-        count = "" if args[-1] is Ellipsis else "two "
+        count = "" if args[-1] is Ellipsis else f"{_COUNTS[len(args)]} "
         return f"an array of {count}{inner}"
+    if annotation is Material:
+        return (
+            f"the name of a material, or a table with the keys {', '.join(Material.model_fields)}"
+        )
     if isinstance(annotation, type) and issubclass(annotation, Table):
         return f"a table with the keys {', '.join(annotation.model_fields)}"
     nouns = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}

@@ -48,8 +48,8 @@ def _materials(scene: Scene) -> list[str]:
 
 def _sizes(scene: Scene) -> list[str]:
     found = []
-    radius = scene.design.radius
-    for arm in scene.arms:
+    for index, arm in enumerate(scene.arms):
+        radius = scene.filter_radius(index) if arm.designed else 0.0
         if not arm.own:
             continue
         if arm.height > arm.length:
@@ -103,5 +103,6 @@ def _solid_ends(scene: Scene) -> list[str]:
         f"{arm.solid_ends:.3g} m that are kept by default, so that the joint may end up in void; "
         "take more cells along the arm, or state arms.passive"
         for arm in scene.arms
-        if arm.own and arm.cells is not None and arm.passive is None and not arm.passive_columns
+        if arm.designed and arm.cells is not None and arm.passive is None
+        if not arm.passive_columns
     ]

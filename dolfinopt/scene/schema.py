@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
 
+from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.closure import Closure
@@ -18,7 +19,7 @@ from dolfinopt.scene.tables.control import Control
 from dolfinopt.scene.tables.damping import Damping
 from dolfinopt.scene.tables.design import Design
 from dolfinopt.scene.tables.interpolation import Interpolation
-from dolfinopt.scene.tables.material import Material
+from dolfinopt.scene.tables.material import MATERIAL_VALUES, Material
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import Objective
 from dolfinopt.scene.tables.optimizer import Optimizer
@@ -84,8 +85,39 @@ class Scene(Table):
 
     @property
     def cell_counts(self) -> dict[int, int]:
-        """Number of cells of every arm with a design of its own, by the arm's index."""
+        """Number of cells of every arm with a mesh of its own, by the arm's index."""
         return {i: self.arms[i].n_cells for i, owner in enumerate(self.owners) if owner == i}
+
+    @property
+    def patterns(self) -> dict[int, int]:
+        """For every arm that repeats another's design scaled the index of that arm."""
+        index = {arm.name: i for i, arm in enumerate(self.arms)}
+        return {i: index[a.pattern] for i, a in enumerate(self.arms) if a.pattern is not None}
+
+    @property
+    def designed(self) -> tuple[int, ...]:
+        """Indices of the arms with design variables of their own."""
+        return tuple(i for i, arm in enumerate(self.arms) if arm.designed)
+
+    def filter_radius(self, index: int) -> float:
+        """Return the radius of the cone filter of arm `index`, m.
+
+        With a least width of members or gaps it is larger by as much as the smallest arm that
+        repeats this one's design is smaller, so that members are wide enough there, too.
+        """
+        return self.design.radius / self.smallest_scale(index)
+
+    def smallest_scale(self, index: int) -> float:
+        """Return the least factor, at most 1, by which a width of arm `index` is scaled.
+
+        1 without a least width in [design].
+        """
+        if not self.design.controls_widths:
+            return 1.0
+        one = self.arms[index]
+        repeated = [self.arms[i] for i, pattern in self.patterns.items() if pattern == index]
+        scales = [s for a in repeated for s in (a.length / one.length, a.height / one.height)]
+        return min([1.0, *scales])
 
     @property
     def dependent_joints(self) -> int:
@@ -109,10 +141,12 @@ class Scene(Table):
 
     def material_of(self, index: int) -> Material:
         """Return the material of arm number `index`: its own values, or else the scene's."""
-        arm = self.arms[index]
-        own = {key: getattr(arm, key) for key in Material.model_fields}
+        arm, solid = self.arms[index], self.material
+        if arm.material is not None:
+            solid = Material(name=arm.material, **CATALOGUE[arm.material].values)
+        own = {key: getattr(arm, key) for key in MATERIAL_VALUES}
         given = {key: value for key, value in own.items() if value is not None}
-        return self.material.model_copy(update=given)
+        return solid.model_copy(update=given)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all resolved values as JSON-able data, from which `scene_from_dict` restores."""

@@ -207,6 +207,7 @@ def _posed(
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import build_arms
+    from dolfinopt.arms.patterns import uniform_design
     from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
 
@@ -214,7 +215,7 @@ def _posed(
     arms = build_arms(scene, partition, profile)
     if design is not None:
         return partition, arms, read_design(design, partition, arms)
-    return partition, arms, {k: arm.uniform(scene.design.initial) for k, arm in arms.items()}
+    return partition, arms, uniform_design(scene, partition, arms, scene.design.initial)
 
 
 def _clear(profile: Profile) -> None:

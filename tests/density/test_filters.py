@@ -194,7 +194,9 @@ def square(kind, cells, comm=COMM):
     area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     none = np.empty(0, dtype=np.int32)
     solid = np.zeros(owned, dtype=bool)
-    return ArmMesh("a", comm, mesh, p.mean(axis=1), area, solid, none, none, np.array([1.0, 0.0]))
+    return ArmMesh(
+        "a", comm, mesh, p.mean(axis=1), area, solid, solid, none, none, np.array([1.0, 0.0])
+    )
 
 
 DEFORMED = ["right-angled", "sheared", "graded", "random"]

@@ -111,7 +111,7 @@ def test_input_is_left_alone():
 
 
 def test_robust_designs_lie_within_one_another():
-    thresholds = robust_thresholds(0.1)
+    thresholds = robust_thresholds(0.1, 0.1)
     assert thresholds == (0.6, 0.5, 0.4)
     eroded, nominal, dilated = (project(X, 16.0, eta).value for eta in thresholds)
     inside = (X > 0.05) & (X < 0.95)

@@ -121,7 +121,8 @@ def test_demo_states_every_other_key():
         "stages",
         "sample",
         "shared_volume",
-        "minimum_member",
+        *("minimum_member", "minimum_gap"),
+        *("pattern", "box", "circle", "material", "yield_strength"),
         "kkt_tolerance",
         "exact_iterations",
         "exponent",
@@ -396,7 +397,7 @@ def test_override_finds_an_arm_by_its_new_name():
         ("arms.1.length=0", ["arms.1.length (arm2) = 0", "a number >= 1e-06", "[m]"]),
         ("arms.arm2.length=0", ["arms.1.length (arm2) = 0"]),
         ("arms=3", ["arms = 3", "an array of tables [[arms]]"]),
-        ("material=3", ["material = 3", "a table with the keys young_modulus"]),
+        ("material=3", ["material = 3", "the name of a material, or a table with"]),
         ("payload.mass", ["expected key.path=value"]),
         ("=1", ["expected key.path=value"]),
         ("payload..mass=1", ["expected key.path=value"]),
@@ -630,7 +631,13 @@ BAD_VALUES = [
     ("optimizer.move", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
     ("optimizer.move", 1.1, "1.1", "a number >= 1e-06 and <= 1"),
     ("optimizer.tolerance", -1.0, "-1.0", "a number >= 0"),
-    ("material", 5, "5", "a table with the keys young_modulus, poisson_ratio, density"),
+    ("material.name", "stone", '"stone"', "a material of the catalogue; dolfinopt keys material"),
+    ("material.yield_strength", 0.0, "0.0", "a number >= 0.001 and <= 1e+15"),
+    ("arms.0.material", "steel", '"steel"', 'did you mean "steel S235" or "steel S355"'),
+    ("arms.0.yield_strength", 0.0, "0.0", "a number >= 0.001 and <= 1e+15"),
+    ("arms.0.pattern", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
+    ("design.minimum_gap", -1e-9, "-1e-09", "a number >= 0 and <= 10000"),
+    ("material", 5, "5", "a table with the keys name, young_modulus, poisson_ratio"),
     ("motion", [1, 2], "[1, 2]", "a table with the keys path, radius"),
     ("arms", {"name": "arm1"}, '{name = "arm1"}', "an array of tables [[arms]], at least one"),
     ("arms", [], "[]", "an array of tables [[arms]], at least one"),
@@ -642,6 +649,7 @@ SHOWN_KEY = {
     ("design.initial", 1e-3): "design.minimum",
     ("arms.0.name", "ARM2"): "arms.1.name",
     ("motion.path", "joints"): "motion.file",
+    ("material.name", "stone"): "material",
 }
 
 
@@ -708,6 +716,7 @@ def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
 def test_every_key_refuses_something():
     refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
     refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
+    refused |= {f"arms.regions.{key}" for key in ("kind", "box", "circle")}  # see test_regions
     known = {info.key for info in describe_keys()}
     optional = {key for key in known if key.partition(".")[0] in ("control", "closure")}
     assert known - optional <= refused
@@ -1150,7 +1159,7 @@ def test_described_defaults():
         "name",  # of the file
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
-        "scenarios.changes",  # of every scenario there is
+        *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
     }
 
@@ -1228,7 +1237,10 @@ def test_who_owns_which_design():
     [
         ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
         ({"design": "arm1", "density": 1.0}, "arms.1.density (arm2) = 1.0: expected None as arm1"),
-        ({"design": "arm1", "rigid": True}, "only one of design, rigid and sid, found design and"),
+        (
+            {"design": "arm1", "rigid": True},
+            "only one of design, pattern, rigid and sid, found design and",
+        ),
         ({"design": "arm3"}, 'an earlier arm with a design of its own: "arm1"'),
     ],
 )

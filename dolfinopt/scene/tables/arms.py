@@ -11,7 +11,14 @@ from pydantic import AfterValidator, Field, model_validator
 
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import FileName, Length, Loc, Refusal, Table
-from dolfinopt.scene.tables.material import MassDensity, PoissonRatio, YoungModulus
+from dolfinopt.scene.tables.material import (
+    CatalogueName,
+    MassDensity,
+    PoissonRatio,
+    YieldStrength,
+    YoungModulus,
+)
+from dolfinopt.scene.tables.regions import Region
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -31,7 +38,10 @@ JOINT_KEYS = (
     "joint_damping",
 )  # fmt: skip
 MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
-OWN_KEYS = ("name", "design", "rigid", "mass", "inertia", "sid")  # never taken from the arm before
+# never taken from the arm before
+OWN_KEYS = ("name", "design", "pattern", "rigid", "mass", "inertia", "sid")
+# What an arm with a pattern has from there.
+PATTERN_KEYS = ("passive", "symmetric", "regions")
 
 
 def check_arm_name(name: str) -> str:
@@ -88,6 +98,14 @@ class Arm(Table):
     design: str | None = Field(
         default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
     )
+    pattern: str | None = Field(
+        default=None,
+        description="name of an earlier arm whose design this one repeats, scaled to its own "
+        "length and height, cell by cell [-]",
+    )
+    regions: tuple[Region, ...] = Field(
+        default=(), description="parts of the arm that stay solid or void"
+    )
     rigid: bool = Field(
         default=False, description="a rigid bar of solid material, not optimised [-]"
     )
@@ -141,6 +159,11 @@ class Arm(Table):
     sid: FileName | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
+    material: CatalogueName | None = Field(
+        default=None,
+        description='name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
+        "that of [material] [-]",
+    )
     young_modulus: YoungModulus | None = Field(
         default=None,
         description="Young's modulus of this arm; default: material.young_modulus [Pa]",
@@ -151,16 +174,27 @@ class Arm(Table):
     density: MassDensity | None = Field(
         default=None, description="mass density of this arm; default: material.density [kg/m3]"
     )
+    yield_strength: YieldStrength | None = Field(
+        default=None,
+        description="yield strength of this arm's material; default: material.yield_strength [Pa]",
+    )
 
     @model_validator(mode="after")
     def _check_kind(self) -> Arm:
-        stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
+        stated = [key for key in ("design", "pattern", "sid") if getattr(self, key) is not None]
         if self.rigid:
             stated.append("rigid")
         if len(stated) > 1:
             raise Refusal(
-                f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
+                f"expected only one of design, pattern, rigid and sid, found "
+                f"{' and '.join(stated)}",
                 *((key,) for key in stated),
+            )
+        if self.regions and not self.flexible:
+            raise Refusal(
+                f"expected none with {stated[0]}: only an arm with cells has regions",
+                ("regions",),
+                (stated[0],),
             )
         return self
 
@@ -179,8 +213,13 @@ class Arm(Table):
 
     @property
     def own(self) -> bool:
-        """Whether the arm has a design of its own."""
+        """Whether the arm has a mesh and a body of its own."""
         return self.flexible and self.design is None
+
+    @property
+    def designed(self) -> bool:
+        """Whether the arm has design variables of its own."""
+        return self.own and self.pattern is None
 
     @property
     def flexible(self) -> bool:
@@ -287,6 +326,16 @@ class Arm(Table):
         return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
 
     @property
+    def fixed_shares(self) -> tuple[float, float]:
+        """Return the shares of the arm's volume that stay solid and void; 0 for a mesh file."""
+        if self.cells is None or not self.regions:
+            return self.passive_share, 0.0
+        from dolfinopt.scene.regions import grid_shares  # NumPy, which others do not need
+
+        solid, void = grid_shares(self)
+        return self.passive_share + solid, void
+
+    @property
     def cell_size(self) -> float | None:
         """Longest side of a cell, m; None for a mesh file that does not depend on it."""
         if self.cells is None:
@@ -307,13 +356,18 @@ class Arm(Table):
         return 2 * (n_along - 1) * (n_across + 1) + 3
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse a name that is taken, and values that differ from those of a shared design."""
+        """Refuse a name that is taken, and what does not fit the arm whose design it has."""
         before = scene.arms[: at[-1]]
         # Some file systems do not tell capitals apart.
         if self.name.casefold() in (arm.name.casefold() for arm in before):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
-        if self.design is None:
-            return
+        self._check_regions(at)
+        if self.pattern is not None:
+            self._check_pattern(before, at)
+        if self.design is not None:
+            self._check_shared(before, at)
+
+    def _check_shared(self, before: tuple[Arm, ...], at: Loc) -> None:
         owners = {arm.name: arm for arm in before if arm.own}
         if self.design not in owners:
             allowed = " | ".join(map(shown, owners)) or "no arm before it has one"
@@ -323,9 +377,73 @@ class Arm(Table):
             )
         for key in Arm.model_fields:
             value = getattr(owners[self.design], key)
-            if key not in ("name", "design", *JOINT_KEYS) and getattr(self, key) != value:
+            if (
+                key not in ("name", "design", "pattern", *JOINT_KEYS)
+                and getattr(self, key) != value
+            ):
                 raise Refusal(
                     f"expected {shown(value)} as {self.design} has, whose design it shares",
                     (*at, key),
                     (*at, "design"),
                 )
+
+    def _check_pattern(self, before: tuple[Arm, ...], at: Loc) -> None:
+        """Refuse a pattern that is none, or whose cells are not this arm's one by one."""
+        designed = {arm.name: arm for arm in before if arm.designed}
+        if self.pattern not in designed:
+            others = {arm.name: arm.pattern or arm.design for arm in before}
+            allowed = " | ".join(map(shown, designed)) or "no arm before it has one"
+            origin = others.get(str(self.pattern))
+            hint = f"; {self.pattern} itself has that of {origin}" if origin else ""
+            raise Refusal(
+                f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
+                (*at, "pattern"),
+            )
+        pattern = designed[self.pattern]
+        for one, name in ((pattern, self.pattern), (self, self.name)):
+            if one.mesh is not None:
+                raise Refusal(
+                    f"expected an arm made of cells, and cells of its own: {name} has mesh = "
+                    f"{shown(one.mesh)}, whose cells have no partners in another arm",
+                    (*at, "pattern"),
+                    (*at, "mesh"),
+                )
+        if self.cells != pattern.cells:
+            raise Refusal(
+                f"expected {shown(pattern.cells)} as {self.pattern} has, whose design it repeats "
+                "cell by cell",
+                (*at, "cells"),
+                (*at, "pattern"),
+            )
+        for key in PATTERN_KEYS:
+            stated, theirs = getattr(self, key), getattr(pattern, key)
+            if stated not in (Arm.model_fields[key].default, theirs):
+                raise Refusal(
+                    f"expected none: it is that of {self.pattern}, scaled, whose design this arm "
+                    "repeats",
+                    (*at, key),
+                    (*at, "pattern"),
+                )
+
+    def _check_regions(self, at: Loc) -> None:
+        """Refuse a region outside a rectangular arm; other things the mesh must tell."""
+        for number, region in enumerate(self.regions if self.cells is not None else ()):
+            x0, y0, x1, y1 = region.bounds
+            half = 0.5 * self.height
+            if x0 >= self.length or x1 <= 0.0 or y0 >= half or y1 <= -half:
+                raise Refusal(
+                    f"expected a place in the arm, x from 0 to {self.length} and y from {-half:g} "
+                    f"to {half:g} [m]",
+                    (*at, "regions", number, region.shape),
+                    (*at, "length"),
+                    (*at, "height"),
+                )
+        if not self.regions or self.cells is None:
+            return
+        from dolfinopt.scene.regions import MOST_CELLS, grid_regions
+
+        problem = grid_regions(self)[1] if self.n_cells <= MOST_CELLS else None
+        if problem is not None:
+            number, reason = problem
+            shape = self.regions[number].shape
+            raise Refusal(reason, (*at, "regions", number, shape), (*at, "passive"), (*at, "cells"))

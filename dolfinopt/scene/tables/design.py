@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
 Projection = Literal[False, "heaviside", "robust"]
+# Largest distance of a threshold from 1/2 that is chosen for the wider one of member and gap:
+# beyond it the eroded design is hardly there, or the dilated one everywhere.
+WIDEST = 0.45
 MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell more or less decides
 
 
@@ -55,50 +58,105 @@ class Design(Table):
         default=0.1,
         ge=1e-3,
         le=0.499,
-        description="distance of the thresholds of the eroded and dilated designs from 0.5 [-]",
+        description="distance of the thresholds of the eroded and dilated designs from 0.5; with "
+        "a member and a gap of two widths that of the thinner one's [-]",
     )
     minimum_member: float = Field(
         default=0.0,
         ge=0,
         le=1e4,
-        description="smallest width of members and gaps with the robust projection; sets the "
-        "filter radius (filter_radius stays at its default); 0: no limit [m]",
+        description="smallest width of members with the robust projection; sets the filter "
+        "radius (filter_radius stays at its default); 0: no limit, or minimum_gap [m]",
+    )
+    minimum_gap: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e4,
+        description="smallest width of gaps between members alike; 0: minimum_member [m]",
     )
 
     @property
+    def controls_widths(self) -> bool:
+        """Whether members and gaps have a least width."""
+        return max(self.minimum_member, self.minimum_gap) > 0.0
+
+    @property
+    def least_widths(self) -> tuple[float, float]:
+        """Least widths of members and of gaps, m; one that is not stated is the other's."""
+        return self.minimum_member or self.minimum_gap, self.minimum_gap or self.minimum_member
+
+    @property
+    def erosions(self) -> tuple[float, float]:
+        """Distances from 1/2 of the thresholds of the eroded and of the dilated design.
+
+        Both are `erosion` where members and gaps may be equally thin. Else that is the thinner
+        one's, and the other's is what gives its width with the same filter, see `radius`.
+        """
+        member, gap = self.least_widths
+        if member == gap:
+            return self.erosion, self.erosion
+        thin, wide = min(member, gap), max(member, gap)
+        wider = 0.5 - 0.5 / math.cosh(wide / thin * math.acosh(1.0 / (1.0 - 2.0 * self.erosion)))
+        return (self.erosion, wider) if member < gap else (wider, self.erosion)
+
+    @property
     def radius(self) -> float:
-        """Radius of the cone filter: `filter_radius`, or what `minimum_member` asks for, m.
+        """Radius of the cone filter: `filter_radius`, or what the least widths ask for, m.
 
         Filtered by exp(-|s| / r) / (2 r), a strip of solid of width 2 a has the density
         1 - exp(-a / r) cosh(s / r) within. Its middle reaches the eroded design's threshold
         1/2 + erosion where exp(-a / r) = 1/2 - erosion; the nominal design is then as wide as
         2 r arcosh(1 / (1 - 2 erosion)), and no member that survives the erosion is thinner.
-        By symmetry the same holds for gaps and the dilated design. The radius is 2 sqrt(3) r.
+        By symmetry the same holds for gaps and the dilated design, with its own distance from 1/2
+        if gaps are to have another width. The radius is 2 sqrt(3) r.
         After Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y, and Trillet, Duysinx &
         Fernandez (2021), doi:10.1007/s00158-021-02998-w, for the Helmholtz filter's kernel.
         """
-        if not self.minimum_member:
+        if not self.controls_widths:
             return self.filter_radius
-        return self.minimum_member * math.sqrt(3.0) / math.acosh(1.0 / (1.0 - 2.0 * self.erosion))
+        thin = min(self.least_widths)
+        return thin * math.sqrt(3.0) / math.acosh(1.0 / (1.0 - 2.0 * self.erosion))
+
+    @property
+    def stated_widths(self) -> dict[str, float]:
+        """Least widths that the scene states, m, by their keys."""
+        keys = ("minimum_member", "minimum_gap")
+        return {key: getattr(self, key) for key in keys if getattr(self, key)}
 
     @model_validator(mode="after")
-    def _check_member(self) -> Design:
-        if not self.minimum_member:
+    def _check_widths(self) -> Design:
+        if not (stated := self.stated_widths):
             return self
+        key = next(iter(stated))
         if self.projection != "robust":
             raise Refusal(
                 'expected 0, the default, unless design.projection = "robust": the others do not '
                 "control the width",
-                ("minimum_member",),
+                (key,),
                 ("projection",),
+            )
+        # The width that `WIDEST` gives, in widths of `erosion`.
+        ratio = math.acosh(1.0 / (1.0 - 2.0 * WIDEST)) / math.acosh(
+            1.0 / (1.0 - 2.0 * self.erosion)
+        )
+        thin, wide = min(self.least_widths), max(self.least_widths)
+        if wide > max(ratio, 1.0) * thin * (1.0 + 1e-9):
+            wider = "minimum_member" if self.minimum_member > self.minimum_gap else "minimum_gap"
+            other = "minimum_gap" if wider == "minimum_member" else "minimum_member"
+            raise Refusal(
+                f"expected at most {ratio * thin:.4g} [m], {ratio:.3g} times {other} = {thin}, "
+                f"with erosion = {self.erosion}; lower erosion or widen the other",
+                (wider,),
+                (other,),
+                ("erosion",),
             )
         default = type(self).model_fields["filter_radius"].default
         if self.filter_radius not in (default, self.radius):
             raise Refusal(
-                f"expected {default}, the default, with minimum_member = {self.minimum_member}: "
+                f"expected {default}, the default, with {key} = {stated[key]}: "
                 f"the radius that gives this width is {self.radius:.6g} [m]",
                 ("filter_radius",),
-                ("minimum_member",),
+                (key,),
             )
         return self
 
@@ -134,35 +192,57 @@ class Design(Table):
         self._check_volume(scene)
 
     def _check_member_width(self, scene: Scene) -> None:
-        width = self.minimum_member
-        for i in scene.cell_counts if width else ():
-            arm, keys = scene.arms[i], (("design", "minimum_member"), ("arms", i, "height"))
-            size = arm.cell_size
-            if size is not None and width < MEMBER_CELLS * size * (1.0 - 1e-9):
-                raise Refusal(
-                    f'expected at least {MEMBER_CELLS} cells of arm "{arm.name}", '
-                    f"{MEMBER_CELLS * size:.4g} [m]; choose a wider member or finer cells",
-                    *keys,
+        for i in scene.designed if self.controls_widths else ():
+            arm, scale = scene.arms[i], scene.smallest_scale(i)
+            size, height = arm.cell_size, scale * arm.height
+            smallest = f'arm "{arm.name}"' if scale == 1.0 else f'what repeats arm "{arm.name}"'
+            for key, width in self.stated_widths.items():
+                if size is not None and width < MEMBER_CELLS * scale * size * (1.0 - 1e-9):
+                    raise Refusal(
+                        f"expected at least {MEMBER_CELLS} cells of {smallest}, "
+                        f"{MEMBER_CELLS * scale * size:.4g} [m]; choose a wider "
+                        f"{key.removeprefix('minimum_')} or finer cells",
+                        ("design", key),
+                        ("arms", i, "height"),
+                    )
+            member, gap = self.least_widths
+            if 2.0 * member + gap > height * (1.0 + 1e-9):
+                reason = (
+                    f"expected at most a third of the height of {smallest}, {height / 3.0:.4g} "
+                    "[m]: two members and a gap"
                 )
-            if 3.0 * width > arm.height * (1.0 + 1e-9):
-                raise Refusal(
-                    f'expected at most a third of the height of arm "{arm.name}", '
-                    f"{arm.height / 3.0:.4g} [m]: two members and a gap",
-                    *keys,
-                )
+                if member != gap:
+                    reason = (
+                        f"expected two members of {member} [m] and a gap of {gap} [m] within the "
+                        f"height of {smallest}, {height:.4g} [m]"
+                    )
+                keys = [("design", key) for key in self.stated_widths]
+                raise Refusal(reason, *keys, ("arms", i, "height"))
 
     def _check_volume(self, scene: Scene) -> None:
         limit = self.volume_fraction
         if limit is None:
             return
         flexible = {i: arm for i, arm in enumerate(scene.arms) if arm.flexible}
-        shares = {i: arm.passive_share for i, arm in flexible.items()}
+        like = scene.patterns
+        shares = {i: scene.arms[like.get(i, i)].fixed_shares for i in flexible}
         if self.shared_volume:
             volumes = {i: a.length * a.height * a.thickness for i, a in flexible.items()}
-            together = sum(shares[i] * volumes[i] for i in shares) / sum(volumes.values())
-            shares = dict.fromkeys(shares, together)
-        for i, share in shares.items():
-            if share + (1.0 - share) * self.minimum > limit:
+            whole = sum(volumes.values())
+            solid, void = (sum(shares[i][k] * volumes[i] for i in shares) / whole for k in (0, 1))
+            shares = dict.fromkeys(shares, (solid, void))
+        for i, (share, void) in shares.items():
+            if share + (1.0 - share - void) * self.minimum > limit:
+                if scene.arms[i].regions:
+                    raise Refusal(
+                        f"expected regions with which volume_fraction = {limit} can be met: they "
+                        f"and the solid ends are {share:.4g} of the volume, with design.minimum = "
+                        f"{self.minimum} in the rest; make them smaller or raise the volume "
+                        "fraction",
+                        ("arms", i, "regions"),
+                        ("arms", i, "passive"),
+                        ("design", "volume_fraction"),
+                    )
                 raise Refusal(
                     f"expected a length with which volume_fraction = {limit} can be met: the solid "
                     f"ends are {share:.4g} of the volume, with design.minimum = {self.minimum} "

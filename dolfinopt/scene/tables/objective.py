@@ -174,7 +174,7 @@ class Objective(Table):
     def _check_attached(self, scene: Scene) -> None:
         if not need_of(scene, "eigenproblem") or self.attached != "none":
             return
-        for i in scene.cell_counts:
+        for i in scene.designed:
             if scene.arms[i].solid_ends == 0.0:
                 raise Refusal(
                     'expected more than 0 with objective.attached = "none": without a mass at its '

@@ -34,4 +34,9 @@ class Scenario(Table):
                 )
             if key == "material.poisson_ratio":
                 raise Refusal("expected no material.poisson_ratio: the reduced basis depends on it")
+            if key in ("material", "material.name"):
+                raise Refusal(
+                    "expected single values, e.g. material.young_modulus, not another material: "
+                    "the reduced basis depends on its Poisson's ratio"
+                )
         return changes

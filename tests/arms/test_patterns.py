@@ -1,0 +1,234 @@
+"""Arms that repeat another's design, scaled: densities travel out, gradients back."""
+
+import json
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import TWO_ARM, overrides, run
+
+import dolfinopt as do
+from dolfinopt.arms.patterns import Patterns, uniform_design
+from dolfinopt.errors import InputError
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.output.design import read_design
+from dolfinopt.parallel import Partition
+
+WORLD = MPI.COMM_WORLD
+SMALL = ("arms.cells=[40,4]", "arms.passive=0.05", "optimizer.max_iterations=4")
+REPEATED = ("arms.arm2.pattern=arm1", "arms.arm2.length=0.8", "arms.arm2.height=0.045")
+SCALED = (*SMALL, *REPEATED, "arms.arm2.thickness=0.012", "arms.arm2.density=2500.0")
+REGIONS = (
+    'arms.arm1.regions=[{kind="void", circle=[0.5, 0.0, 0.016]}, '
+    '{kind="solid", box=[0.2, -0.03, 0.3, -0.01]}]'
+)
+
+
+def built(*changes, world=WORLD):
+    scene = do.load_scene(TWO_ARM, (*SMALL, *changes))
+    partition = do.partition_arms(world, scene.cell_counts)
+    return scene, partition, do.build_arms(scene, partition, do.Profile())
+
+
+def by_place(scene, arms, k, values):
+    """Return values of an arm's cells as an array (along, across); of a whole arm."""
+    along, across = scene.arms[k].cells
+    found = np.empty(along * across)
+    x, y = arms[k].mesh.centroid.T / [[scene.arms[k].length], [scene.arms[k].height]]
+    found[
+        np.round(x * along - 0.5).astype(int) * across
+        + np.round((y + 0.5) * across - 0.5).astype(int)
+    ] = values
+    return found
+
+
+def waves(arm):
+    x, y = arm.mesh.centroid.T
+    return 0.5 + 0.4 * np.sin(7.0 * x + 60.0 * y)
+
+
+@pytest.mark.parametrize("projection", ["false", "heaviside", "robust"])
+def test_cells_have_the_densities_of_their_partners(projection):
+    scene, partition, arms = built(*REPEATED, REGIONS, f"design.projection={projection}")
+    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    assert evaluator.variables.size == (160 if 0 in arms else 0)
+    x = evaluator.variables.join({0: waves(arms[0])} if 0 in arms else {})
+    evaluator.continuation.beta = 4.0
+    for design in evaluator.physical_designs(x):
+        mine = {k: by_place(scene, arms, k, one.x_phys) for k, one in design.items()}
+        known = {k: v for part in WORLD.allgather(mine) for k, v in part.items()}
+        assert np.array_equal(known[0], known[1])
+        assert 0.0 in known[0] and 1.0 in known[0]  # regions and solid ends, too
+
+
+def test_the_same_arm_again_is_the_shared_design():
+    """A pattern of the same size ends where `arms.design` does, which has one mesh for both."""
+    histories = []
+    for way in ("design", "pattern"):
+        scene = do.load_scene(TWO_ARM, (*SMALL, f"arms.arm2.{way}=arm1"))
+        result = do.optimize(scene)
+        rows = [(r.objective, r.max_deviation, r.volume_fraction, r.kkt) for r in result.history]
+        histories.append(WORLD.bcast(rows, root=0))
+    assert len(histories[0]) == 5
+    np.testing.assert_allclose(histories[1], histories[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["esl", "static", "eigenfrequency", "deviation"])
+def test_gradients_add_up(kind):
+    """The Taylor test moves one design, and both arms with it."""
+    quick = ("motion.horizon=2.0", "simulation.tolerance=1e-6", "arms.symmetric=true")
+    scene, partition, arms = built(*SCALED, *quick, REGIONS, f"objective.kind={kind}")
+    x = {k: waves(arm) for k, arm in arms.items() if k == 0}
+    test = taylor_test(scene, partition, arms, x, do.Profile())
+    assert [row.direction for row in test.rows][2:] == [
+        "root of the first arm",
+        "tip of the last arm",
+    ]
+    for row in test.rows:
+        assert row.slope != 0.0 and row.rate > 1.9
+
+
+def test_constraints_of_both_arms_bind_one_design():
+    """Every arm's own limits, one volume; their gradients by x against central differences."""
+    scene, partition, arms = built(
+        *SCALED,
+        "objective.kind=static",
+        "constraints.tip_deflection=1e-4",
+        "constraints.first_frequency=50.0",
+    )
+    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    x = evaluator.variables.join({k: waves(arms[k]) for k in arms if k == 0})
+    [here] = evaluator.evaluate(x)
+    names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
+    assert names == [
+        ("volume_fraction", ("arm1",)),
+        ("first_frequency", ("arm1", "arm2")),
+        ("tip_deflection", ("arm1", "arm2")),
+    ]
+    free = evaluator.variables.xmin < evaluator.variables.xmax
+    direction = np.where(free, np.cos(np.arange(x.size)), 0.0)
+    h = 1e-5
+    ahead, behind = (
+        evaluator.evaluate(np.clip(x + sign * h * direction, 0.0, 1.0))[0] for sign in (1.0, -1.0)
+    )
+    differences = np.subtract(ahead.evaluation.constraints, behind.evaluation.constraints) / (2 * h)
+    slopes = WORLD.allreduce(here.constraints @ direction)
+    np.testing.assert_allclose(slopes, differences, rtol=1e-6)
+
+
+def test_any_number_of_ranks_ends_in_the_same_design():
+    scene = do.load_scene(TWO_ARM, SCALED)
+    together, alone = do.optimize(scene), do.optimize(scene, world=MPI.COMM_SELF)
+    for k, x_phys in together.x_phys.items():
+        assert np.array_equal(x_phys, alone.x_phys[k])
+    rows = WORLD.bcast([row.objective for row in together.history], root=0)
+    assert rows == [row.objective for row in alone.history]
+
+
+def test_an_arm_on_two_ranks_has_partners_on_both():
+    """Parts of both arms everywhere: densities and gradients find their cells."""
+    scene = do.load_scene(TWO_ARM, SCALED)
+    partition = Partition(world=WORLD, comm=WORLD, arms=(0, 1))
+    arms = do.build_arms(scene, partition, do.Profile())
+    patterns = Patterns(scene, partition, arms)
+    x, y = arms[0].mesh.centroid.T
+    scale = [1.0 / 0.8, 0.06 / 0.045]
+    for spread, field in ((patterns.spread({0: x + 10.0 * y}), lambda p: p[0] + 10.0 * p[1]),):
+        np.testing.assert_allclose(spread[1], field((arms[1].mesh.centroid * scale).T), rtol=1e-9)
+    u, v = arms[1].mesh.centroid.T
+    [back] = patterns.collect({1: u - v}).items()
+    assert back[0] == 0
+    np.testing.assert_allclose(back[1], x * 0.8 - y * 0.75, rtol=1e-9, atol=1e-12)
+
+
+def test_the_uniform_design():
+    scene, partition, arms = built(*SCALED)
+    uniform = uniform_design(scene, partition, arms, 0.3)
+    assert sorted(uniform) == sorted(arms)
+    for k, x_phys in uniform.items():
+        passive = arms[k].mesh.passive
+        assert passive.sum() == 2 * 2 * 4 and (x_phys[passive] == 1.0).all()
+        assert np.ptp(x_phys) > 0.5  # filtered at the ends of the pattern
+    volume = [arms[k].volume_fraction(x) for k, x in uniform.items()]
+    assert np.ptp(WORLD.allreduce(volume)) < 1e-12
+
+
+def test_a_run_resumes_to_the_same_bits(shared_tmp_path):
+    folders = [shared_tmp_path / name for name in ("whole", "parts")]
+    options = ["--no-plots", *overrides(*SCALED, REGIONS)]
+    run("optimize", TWO_ARM, "--out", folders[0], *options)
+    run("optimize", TWO_ARM, "--out", folders[1], *options, "--set", "optimizer.max_iterations=2")
+    run("optimize", TWO_ARM, "--out", folders[1], *options, "--resume")
+    WORLD.barrier()
+    whole, parts = (np.load(folder / "design.npz") for folder in folders)
+    assert sorted(whole) == sorted(
+        ["units", *(f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "density"))]
+    )
+    for key in whole:
+        assert np.array_equal(whole[key], parts[key]), key
+    assert np.array_equal(whole["arm1/density"], whole["arm2/density"])
+    scale = whole["arm2/centroid"] / whole["arm1/centroid"]
+    np.testing.assert_allclose(scale, np.broadcast_to([0.8, 0.75], scale.shape), rtol=1e-6)
+    one = json.loads((folders[0] / "summary.json").read_text())
+    assert one["volume_fraction"]["arm1"] == pytest.approx(
+        one["volume_fraction"]["arm2"], rel=1e-12
+    )
+    ratio = 0.8 * 0.75 * 1.2 * 2500.0 / 2700.0
+    assert one["mass"]["arm2"] == pytest.approx(ratio * one["mass"]["arm1"], rel=1e-9)
+    assert list(one["constraints"]) == ["volume_fraction_arm1"]
+    # The design simulates alike; one that holds the pattern alone is enough.
+    for arms in (("arm1", "arm2"), ("arm1",)):
+        path = shared_tmp_path / "one.npz"
+        if WORLD.rank == 0:
+            np.savez(path, **{key: whole[key] for key in whole if key.startswith(arms)})
+        WORLD.barrier()
+        scene, partition, built_arms = built(*SCALED, REGIONS)
+        x_phys = read_design(path, partition, built_arms)
+        evaluation, _ = do.evaluate(scene, partition, built_arms, x_phys, do.Profile())
+        # As the optimisation saw it, but for the steps in time, which set out from elsewhere.
+        assert evaluation.compliance == pytest.approx(one["compliance"], rel=1e-4)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (["arms.arm2.pattern=arm3"], 'design of its own: "arm1"'),
+        (["arms.arm1.pattern=arm2"], "no arm before it has one"),
+        (["arms.arm2.pattern=arm1", "arms.arm2.cells=[20,4]"], r"expected \[40, 4\] as arm1 has"),
+        (["arms.arm2.pattern=arm1", "arms.arm2.mesh=meshes/arm.geo"], "arm2 has mesh = "),
+        (["arms.arm1.mesh=meshes/arm.geo", "arms.arm2.pattern=arm1"], "arm1 has mesh = "),
+        (["arms.arm2.pattern=arm1", "arms.arm2.rigid=true"], "found pattern and rigid"),
+        (["arms.arm2.pattern=arm1", "arms.arm2.design=arm1"], "found design and pattern"),
+        (["arms.arm2.pattern=arm1", "arms.arm2.passive=0.1"], "expected none: it is that of arm1"),
+        (["arms.arm2.pattern=arm1", "arms.arm2.symmetric=true"], "expected none: it is that of"),
+        (["arms.arm1.rigid=true", "arms.arm2.pattern=arm1"], "no arm before it has one"),
+    ],
+)
+def test_what_cannot_be_a_pattern(changes, reason):
+    with pytest.raises(InputError, match=reason):
+        do.load_scene(TWO_ARM, (*SMALL, *changes))
+
+
+@pytest.mark.serial
+def test_a_pattern_of_a_pattern_is_refused():
+    three = [{"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}]
+    three += [{"name": "arm2", "pattern": "arm1"}, {"name": "arm3", "pattern": "arm2"}]
+    data = {"material": "POM", "arms": three}
+    with pytest.raises(InputError, match="arm2 itself has that of arm1"):
+        do.scene_from_dict(data)
+    # Identical arms may share the mesh of one that repeats another's design.
+    three[2] = {"name": "arm3", "design": "arm2"}
+    scene = do.scene_from_dict(data)
+    assert scene.owners == (0, 1, 1) and scene.patterns == {1: 0} and scene.designed == (0,)
+
+
+@pytest.mark.serial
+def test_an_arm_takes_from_its_pattern_not_from_the_arm_before():
+    one = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01, "passive": 0.03}
+    one |= {"symmetric": True, "regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
+    other = {"name": "arm2", "passive": 0.1, "symmetric": False, "regions": []}
+    data = {"material": "POM", "arms": [one, other, {"name": "arm3", "pattern": "arm1"}]}
+    third = do.scene_from_dict(data).arms[2]
+    assert third.passive is None and not third.symmetric and third.regions == ()

@@ -1,0 +1,237 @@
+"""Parts of an arm that stay solid or void: which cells they are, in all designs, and refusals."""
+
+import json
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import ROOT, TWO_ARM, overrides, run
+
+import dolfinopt as do
+from dolfinopt.errors import InputError
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.output.views import gather_views
+from dolfinopt.plots.design import REGION, design_page
+from dolfinopt.scene.regions import grid_regions
+
+WORLD = MPI.COMM_WORLD
+SMALL = ("arms.cells=[40,6]", "arms.passive=0.05", "arms.arm2.rigid=true")
+HOLE = '{kind = "void", circle = [0.5, 0.0, 0.021]}'
+LUG = '{kind = "solid", box = [0.2, 0.01, 0.3, 0.05]}'  # beyond the edge, too
+
+
+def regions(*words):
+    return f"arms.arm1.regions=[{', '.join(words)}]"
+
+
+def built(*changes):
+    scene = do.load_scene(TWO_ARM, (*SMALL, *changes))
+    partition = do.partition_arms(WORLD, scene.cell_counts)
+    return scene, partition, do.build_arms(scene, partition, do.Profile())
+
+
+def refused(*changes, small=SMALL):
+    with pytest.raises(InputError) as caught:
+        do.load_scene(TWO_ARM, (*small, *changes))
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("symmetric", ["false", "true"])
+def test_cells_of_regions(symmetric):
+    """By their centroids; where the design is symmetric the mirror image counts, too."""
+    scene, _, arms = built(regions(HOLE, LUG), f"arms.symmetric={symmetric}")
+    for arm in arms.values():
+        x, y = arm.mesh.centroid.T
+        side = np.abs(y) if symmetric == "true" else y
+        lug = (x > 0.2) & (x < 0.3) & (side > 0.01)
+        ends = (x < 0.05) | (x > 0.95)
+        assert np.array_equal(arm.mesh.passive, lug | ends)
+        assert np.array_equal(arm.mesh.void, (x - 0.5) ** 2 + y**2 < 0.021**2)
+        assert arm.mesh.void.any() and lug.any()
+        found, problem = grid_regions(scene.arms[0])
+        assert problem is None and found.void.sum() == arm.mesh.void.sum()
+        assert found.solid.sum() == lug.sum()
+        solid, void = scene.arms[0].fixed_shares
+        assert solid == pytest.approx(arm.mesh.passive.mean())
+        assert void == pytest.approx(arm.mesh.void.mean())
+
+
+@pytest.mark.parametrize("projection", ["false", "heaviside", "robust"])
+@pytest.mark.parametrize("symmetric", ["false", "true"])
+def test_regions_stay_in_every_design(projection, symmetric):
+    scene, partition, arms = built(
+        regions(HOLE, LUG), f"design.projection={projection}", f"arms.symmetric={symmetric}"
+    )
+    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    evaluator.continuation.beta = 8.0
+    variables = evaluator.variables
+    x = np.clip(np.linspace(0.1, 0.9, variables.size), variables.xmin, variables.xmax)
+    for design in evaluator.physical_designs(x):
+        for k, one in design.items():
+            mesh = arms[k].mesh
+            assert (one.x_phys[mesh.passive] == 1.0).all() and (one.x_phys[mesh.void] == 0.0).all()
+            by_x = arms[k].backward(np.ones(mesh.num_cells), one)
+            assert (by_x[mesh.fixed] == 0.0).all() and (by_x[~mesh.fixed] > 0.0).any()
+    fixed = variables.xmin == variables.xmax
+    assert fixed.sum() == sum(arm.mesh.fixed.sum() for arm in arms.values())
+
+
+@pytest.mark.parametrize("law", ["two-material", "simp", "ramp"])
+@pytest.mark.parametrize("kind", ["esl", "eigenfrequency"])
+def test_gradients_with_regions(kind, law):
+    """Void cells keep the stiffness regular with every law; remainders fall by their square."""
+    scene, partition, arms = built(
+        regions(HOLE, LUG),
+        f"objective.kind={kind}",
+        f"interpolation.law={law}",
+        *("motion.horizon=2.0", "simulation.tolerance=1e-6"),
+    )
+    x = {k: 0.5 + 0.4 * np.sin(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
+    for row in taylor_test(scene, partition, arms, x, do.Profile()).rows:
+        assert row.slope != 0.0 and row.rate > 1.9
+
+
+def test_a_run_keeps_its_regions_and_resumes(shared_tmp_path):
+    folders = [shared_tmp_path / name for name in ("whole", "parts")]
+    changes = (*SMALL, regions(HOLE, LUG), "motion.horizon=2.0", "optimizer.max_iterations=6")
+    options = ["--no-plots", *overrides(*changes)]
+    run("optimize", TWO_ARM, "--out", folders[0], *options)
+    run("optimize", TWO_ARM, "--out", folders[1], *options, "--set", "optimizer.max_iterations=3")
+    run("optimize", TWO_ARM, "--out", folders[1], *options, "--resume")
+    WORLD.barrier()
+    whole, parts = (np.load(folder / "design.npz") for folder in folders)
+    for key in whole:
+        assert np.array_equal(whole[key], parts[key]), key
+    x, y = whole["arm1/centroid"].T
+    density = whole["arm1/density"]
+    assert (density[(x - 0.5) ** 2 + y**2 < 0.021**2] == 0.0).all()
+    assert (density[(x > 0.2) & (x < 0.3) & (y > 0.01)] == 1.0).all()
+    summary = json.loads((folders[0] / "summary.json").read_text())
+    assert summary["constraints"]["volume_fraction_arm1"]["value"] == pytest.approx(density.mean())
+    assert summary["volume_fraction"]["arm1"] <= 0.5005
+    assert len(summary["scene"]["arms"][0]["regions"]) == 2
+
+
+def test_regions_are_drawn():
+    scene, partition, arms = built(regions(HOLE, LUG), "arms.symmetric=true")
+    x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
+    views = gather_views(scene, partition, arms, x_phys)
+    if WORLD.rank > 0:
+        return
+    kinds = [kind for kind, _ in views[0].regions]
+    assert kinds == ["void", "void", "solid", "solid"]  # mirror images, too
+    circle = views[0].regions[0][1]
+    np.testing.assert_allclose(np.hypot(*(circle - [0.5, 0.0]).T), 0.021)
+    page = design_page(views[:1], "regions")
+    try:
+        colours = {
+            actor.prop.color.hex_rgb
+            for actor in page.plotter.actors.values()
+            if hasattr(actor, "prop")
+        }
+        assert set(REGION.values()) <= colours
+    finally:
+        page.close()
+
+
+@pytest.mark.serial
+def test_the_volume_knows_regions():
+    """Void that stays makes room: what is left at the minimum counts without it."""
+    most = regions('{kind = "solid", box = [0.1, -0.03, 0.75, 0.03]}')
+    message = refused(most)
+    assert (
+        "arms.0.regions (arm1)" in message
+        and "expected regions with which volume_fraction" in message
+    )
+    do.load_scene(TWO_ARM, (*SMALL, most, "design.volume_fraction=0.8"))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("words", "place", "reason"),
+    [
+        ('{kind="hole", circle=[0.5,0,0.01]}', "regions.0.kind", '"solid" | "void"'),
+        ("{circle=[0.5,0,0.01]}", "missing key arms.0.regions.0.kind", "solid or void"),
+        ('{kind="void"}', "regions.0.kind", "one of box = [x0, y0, x1, y1] and circle"),
+        ('{kind="void", box=[0.4,0,0.5,0.01], circle=[0.5,0,0.01]}', "regions.0.kind", "not both"),
+        ('{kind="void", box=[0.4,0,0.5]}', "regions.0.box", "an array of four numbers"),
+        ('{kind="void", box=[0.5,0,0.4,0.01]}', "regions.0.box", "x0 < x1 and y0 < y1"),
+        ('{kind="void", circle=[0.5,0,0.0]}', "regions.0.circle", "an array of three numbers"),
+        ('{kind="void", round=[0.5,0,0.01]}', "unknown key arms.0.regions.0.round", "kind, box"),
+        (
+            '{kind="void", circle=[500,0,10]}',
+            "regions.0.circle",
+            "a place in the arm, x from 0 to 1",
+        ),
+        ('{kind="void", circle=[0.5,0.05,0.01]}', "regions.0.circle", "y from -0.03 to 0.03 [m]"),
+        ('{kind="void", circle=[0.5,0,0.001]}', "regions.0.circle", "the centroid of no cell"),
+        (f"{HOLE}, {HOLE.replace('void', 'solid')}", "regions.0.circle", "in a solid region, too"),
+        ('{kind="void", circle=[0.02,0,0.03]}', "regions.0.circle", "or shorten arms.passive"),
+        (
+            '{kind="void", box=[0.4,-0.03,0.5,0.03]}',
+            "regions.0.box",
+            "void that does not cut the arm",
+        ),
+        (
+            '{kind="void", box=[0.3,-0.02,0.6,-0.01]}, {kind="void", box=[0.3,0.01,0.6,0.02]}, '
+            '{kind="void", box=[0.3,-0.02,0.325,0.02]}, {kind="void", box=[0.575,-0.02,0.6,0.02]}, '
+            '{kind="solid", circle=[0.45,0,0.015]}',
+            "regions.3.box",
+            "solid cells are joined to neither interface",
+        ),
+    ],
+)
+def test_regions(words, place, reason):
+    message = refused(regions(words))
+    assert place in message and reason in message and len(message.splitlines()) == 1
+
+
+@pytest.mark.serial
+def test_arms_without_cells_have_no_regions():
+    assert "expected none with rigid" in refused(f"arms.arm2.regions=[{HOLE}]")
+    data = do.load_scene(TWO_ARM, (*SMALL, regions(HOLE))).to_tree()
+    assert do.scene_from_dict(data).arms[1].regions == ()
+
+
+@pytest.mark.serial
+def test_nothing_is_written_where_a_region_is_refused(tmp_path):
+    words = overrides(*SMALL, regions('{kind="void", box=[0.4,-0.03,0.5,0.03]}'))
+    with pytest.raises(InputError):
+        run("optimize", TWO_ARM, "--out", tmp_path / "run", *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_arm_takes_the_regions_of_the_arm_before():
+    one = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}
+    one |= {"regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
+    data = {"material": "POM", "arms": [one, {"name": "arm2"}, {"name": "arm3", "regions": []}]}
+    scene = do.scene_from_dict(data, overrides=["arms.arm2.length=0.9"])
+    assert scene.arms[0].regions == scene.arms[1].regions != ()
+    assert scene.arms[2].regions == ()
+    assert do.scene_from_dict(json.loads(json.dumps(scene.to_dict()))) == scene
+
+
+BORES = (f"arms.arm1.mesh={ROOT / 'meshes' / 'arm_bores.geo'}", "arms.arm2.rigid=true")
+
+
+def test_regions_of_a_mesh_file():
+    scene, _, arms = built(*BORES, "arms.passive=0.0", regions(HOLE, LUG))
+    for arm in arms.values():
+        x, y = arm.mesh.centroid.T
+        assert np.array_equal(arm.mesh.void, (x - 0.5) ** 2 + y**2 <= 0.021**2)
+        assert arm.mesh.passive[(x > 0.2) & (x < 0.3) & (y > 0.01)].all()
+    assert scene.arms[0].fixed_shares == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ('{kind="void", box=[0.4,-0.05,0.5,0.05]}', "region 0 of arms.regions: .* does not cut"),
+        ('{kind="void", circle=[5.0,0,0.1]}', "region 0 of arms.regions: .* centroid of no cell"),
+        ('{kind="solid", box=[0.05,-0.05,0.9,0.05]}', "volume_fraction = 0.5: the solid cells are"),
+    ],
+)
+def test_regions_that_a_mesh_file_cannot_have(words, reason):
+    with pytest.raises(InputError, match=reason):
+        built(*BORES, "arms.passive=0.0", regions(words))

@@ -1,0 +1,150 @@
+"""Materials by name: in place of [material], in it, and of an arm; where they are listed."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from runs import TWO_ARM, run
+
+from dolfinopt.errors import InputError
+from dolfinopt.scene.json_schema import scene_schema
+from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
+from dolfinopt.scene.materials import CATALOGUE
+from dolfinopt.scene.plausibility import implausible
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+pytestmark = pytest.mark.serial
+
+ARM = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}
+
+
+def tree(solid, **arm2):
+    return {"material": solid, "arms": [dict(ARM), {"name": "arm2"} | arm2]}
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_material_is_a_plausible_one_with_a_source(name):
+    scene = scene_from_dict(tree(name))
+    known = CATALOGUE[name]
+    values = scene.material.model_dump()
+    assert values == {"name": name, **known.values}
+    assert len(known.source) > 10
+    assert implausible(scene) == []
+    # Yield strains from that of mild steel to that of plastics.
+    assert 1e-3 < known.yield_strength / known.young_modulus < 0.03
+    assert scene_from_dict(json.loads(json.dumps(scene.to_dict()))) == scene
+
+
+def test_the_laminate_follows_from_its_plies():
+    """T300/5208 plies [0/+-45/90]: invariants of Tsai & Hahn, and the first crack across fibres."""
+    E1, E2, nu12, G12, Y = 181e9, 10.3e9, 0.28, 7.17e9, 40e6
+    scale = 1.0 / (1.0 - nu12**2 * E2 / E1)
+    Q11, Q22, Q12 = scale * E1, scale * E2, scale * nu12 * E2
+    U1 = (3.0 * (Q11 + Q22) + 2.0 * Q12 + 4.0 * G12) / 8.0
+    U4 = (Q11 + Q22 + 6.0 * Q12 - 4.0 * G12) / 8.0
+    laminate = CATALOGUE["CFRP quasi-isotropic"]
+    nu = U4 / U1
+    E = U1 * (1.0 - nu**2)
+    assert laminate.young_modulus == pytest.approx(E, rel=2e-3)
+    assert laminate.poisson_ratio == pytest.approx(nu, abs=1e-3)
+    assert laminate.yield_strength == pytest.approx(Y * E / (Q22 - nu * Q12), rel=5e-3)
+
+
+def test_numbers_take_the_place_of_the_catalogue():
+    name = "aluminium 7075-T6"
+    assert scene_from_dict(tree(name)) == scene_from_dict(tree({"name": name}))
+    own = scene_from_dict(tree({"name": name, "density": 2790.0})).material
+    assert (own.density, own.young_modulus, own.yield_strength) == (2790.0, 71.7e9, 460e6)
+    scene = scene_from_dict(tree(name), overrides=["material.young_modulus=70e9"])
+    assert (scene.material.young_modulus, scene.material.density) == (70e9, 2810.0)
+
+
+@pytest.mark.parametrize("key", ["material", "material.name"])
+def test_an_override_names_another_material(key):
+    """Numbers of the file do not outlive it."""
+    scene = load_scene(TWO_ARM, [f"{key}=steel S355"])
+    assert scene.material.model_dump() == {"name": "steel S355", **CATALOGUE["steel S355"].values}
+
+
+def test_yield_strength_is_no_must():
+    assert load_scene(TWO_ARM).material.yield_strength is None
+    assert load_scene(TWO_ARM, ["material.yield_strength=95e6"]).material.yield_strength == 95e6
+
+
+def test_an_arm_has_its_own_material():
+    data = tree("steel S235", material="titanium Ti-6Al-4V", density=4500.0)
+    data["arms"].append({"name": "arm3"})
+    data["arms"].append({"name": "arm4", "material": "POM"})
+    scene = scene_from_dict(data)
+    first, second, third, fourth = (scene.material_of(i) for i in range(4))
+    assert first == scene.material
+    assert (second.young_modulus, second.density) == (113.8e9, 4500.0)
+    assert third == second  # taken over, like all keys
+    assert fourth.density == CATALOGUE["POM"].density
+    changed = scene_from_dict(data, overrides=["arms.arm2.material=PEEK"])
+    assert changed.material_of(1).density == CATALOGUE["PEEK"].density
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("aluminum 7075-T6", '"aluminium 7075-T6"'),
+        ("Steel s355", '"steel S355"'),
+        ("42crmo4", '"steel 42CrMo4"'),
+        ("pla", '"PLA printed"'),
+    ],
+)
+def test_a_misspelt_material_is_suggested(name, near):
+    with pytest.raises(InputError, match=f"did you mean .*{near}") as caught:
+        scene_from_dict(tree(name))
+    assert str(caught.value).startswith("<scene>: material = ")
+    assert "more)" not in str(caught.value)
+    with pytest.raises(InputError, match=rf"arms\.1\.material \(arm2\) = .*did you mean .*{near}"):
+        scene_from_dict(tree("POM", material=name))
+
+
+def test_scenarios_change_values_not_the_material():
+    data = tree("steel S235") | {"scenarios": [{"changes": ["material.density=7800"]}]}
+    assert pose_scenarios(scene_from_dict(data))[0].material.density == 7800
+    for change in ("material=steel S355", "material.name=steel S355"):
+        data["scenarios"] = [{"changes": [change]}]
+        with pytest.raises(InputError, match=r"not another material: .* Poisson's ratio"):
+            scene_from_dict(data)
+
+
+def test_keys_lists_the_catalogue(capsys):
+    run("keys", "material")
+    said = capsys.readouterr().out
+    for name, one in CATALOGUE.items():
+        assert name in said and one.source in said
+    run("keys", "Steel S")
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.startswith("material") and [row[:10] for row in rows] == [
+        "steel S235",
+        "steel S355",
+    ]
+
+
+def test_editors_know_the_names():
+    validate = pytest.importorskip("jsonschema").Draft7Validator(scene_schema())
+    good = 'material = "PEEK"\n[[arms]]\nname = "a"\nmaterial = "POM"'
+    assert validate.is_valid(tomllib.loads(good))
+    assert validate.is_valid(tomllib.loads(good.replace('= "PEEK"', '= {name = "PEEK"}')))
+    assert not validate.is_valid(tomllib.loads(good.replace("PEEK", "PEAK")))
+    assert not validate.is_valid(tomllib.loads(good.replace("POM", "POOM")))
+    assert not validate.is_valid(tomllib.loads(good.replace('= "PEEK"', "= {density = 1.0}")))
+
+
+def test_values_are_those_of_the_scene_written_in_numbers():
+    """A name is another way to write numbers, to the bit."""
+    named = load_scene(TWO_ARM, ["material=aluminium 2024-T3"])
+    numbers = [f"material.{key}={v!r}" for key, v in CATALOGUE["aluminium 2024-T3"].values.items()]
+    plain = load_scene(TWO_ARM, numbers)
+    for i in range(2):
+        ours, theirs = (one.material_of(i).model_dump() for one in (named, plain))
+        assert np.array_equal(list(ours.values())[1:], list(theirs.values())[1:])
