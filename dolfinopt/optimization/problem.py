@@ -97,7 +97,7 @@ def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float,
     turned = -1.0 if response.turned else 1.0
     if response.of_nominal and len(designs) > 1:
         value, by_x = nominal.evaluation.objective, nominal.objective
-        if scene.design.minimum_member:
+        if scene.design.controls_widths:
             dilated = designs[1]
             by_x = value / dilated.evaluation.objective * dilated.objective
         return value, turned * by_x

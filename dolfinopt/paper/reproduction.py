@@ -67,7 +67,7 @@ SWEEPS = {  # table: key, axis, what a value is called
 SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")
 # Both set the filter's radius; where neither is asked for, coarse cells get `FILTER_CELLS` of it.
-FILTER_KEYS = ("design.filter_radius", "design.minimum_member")
+FILTER_KEYS = ("design.filter_radius", "design.minimum_member", "design.minimum_gap")
 NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
 
 Row = tuple[str, str, str, float, float, Case, Case]
