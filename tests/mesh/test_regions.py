@@ -10,7 +10,7 @@ from runs import ROOT, TWO_ARM, overrides, run
 import dolfinopt as do
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.optimization.gradient_check import FALL, taylor_test
 from dolfinopt.output.views import gather_views
 from dolfinopt.plots.design import REGION, design_page
 from dolfinopt.scene.regions import grid_regions
@@ -89,7 +89,9 @@ def test_gradients_with_regions(kind, law):
     )
     x = {k: 0.5 + 0.4 * np.sin(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
     for row in taylor_test(scene, partition, arms, x, do.Profile()).rows:
-        assert row.slope != 0.0 and row.rate > 1.9
+        # Not the finest ones: "simp" has a void of 1e-12, and rounding to suit.
+        rate = np.log(row.remainders[1] / row.remainders[2]) / np.log(FALL)
+        assert row.slope != 0.0 and rate > 1.9
 
 
 def test_a_run_keeps_its_regions_and_resumes(shared_tmp_path):
