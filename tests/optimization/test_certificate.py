@@ -168,6 +168,22 @@ def test_two_bars_above_resonance():
     assert further.excess > 1.0  # the optimum is less than half as compliant
 
 
+def test_two_bars_after_an_impact():
+    """The sum of the largest displacements u_i = v_i / sqrt(k_i): frozen loads overrate stiffness
+    by two, u_i / k_i in place of u_i / (2 k_i), for both bars alike. They end in the optimum."""
+    v, k = np.array([2.0, 1.0]), np.array([1.0, 1.0])
+    for _ in range(200):  # the optimum for the loads k_i u_i of the design before
+        k = 2.0 * np.sqrt(v * np.sqrt(k)) / np.sqrt(v * np.sqrt(k)).sum()
+    np.testing.assert_allclose(k, 2.0 * v ** (2 / 3) / (v ** (2 / 3)).sum(), rtol=1e-12)
+    u = v / np.sqrt(k)
+    material = np.zeros(1), np.full((1, 2), 0.5), (), np.zeros(1, dtype=int)
+    problem = Problem(float(u.sum()), -0.5 * u / k, *material)
+    bounds = np.full(2, 0.1), np.full(2, 1.9)
+    found = judge(k, *bounds, problem, -u / k, {0: slice(0, 2)}, ALONE)
+    assert found.kkt < 1e-12 and found.angle < 1e-5
+    assert found.ratio == pytest.approx(2.0, rel=1e-12)
+
+
 def test_variables_at_bounds_have_no_part_in_the_angle():
     exact, frozen = np.array([1.0, 0.0, 5.0, 7.0]), np.array([1.0, 1.0, -5.0, -7.0])
     x, low, high = np.array([0.5, 0.5, 0.0, 1.0]), np.zeros(4), np.ones(4)
@@ -253,6 +269,17 @@ def test_residual_is_of_the_problem_as_posed(posed):
     assert 1.0 < esl.certificate.angle < 180.0
     assert esl.certificate.ratio == pytest.approx(exact.certificate.ratio, rel=1e-7)
     assert esl.certificate.further is None and esl.certificate.seconds > 0.0
+
+
+def test_limits_of_the_motion_have_frozen_loads():
+    """The objective, a mass, has no loads to freeze; the residual is of limits by the motion."""
+    posed = ["objective.kind=mass", "constraints.deviation=0.05", "design.initial=0.6"]
+    esl = do.optimize(scene(LIGHT, *posed))
+    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", *posed))
+    assert esl.certificate.kkt == pytest.approx(exact.kkt, rel=1e-9)
+    assert np.isnan(esl.certificate.angle)
+    with pytest.raises(do.InputError, match=r"reduction.method.*exact_iterations"):
+        scene(*posed, "reduction.method=balanced", "optimizer.exact_iterations=1")
 
 
 @pytest.mark.parametrize("kind", ["static", "eigenfrequency"])

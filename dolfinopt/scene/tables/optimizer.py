@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from dolfinopt.scene.tables.base import MAX_ITERATIONS, Loc, Refusal, Table
+from dolfinopt.scene.tables.responses import need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -43,7 +44,7 @@ class Optimizer(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse further iterations where there is no exact gradient to iterate with."""
-        if not self.exact_iterations or not scene.objective.needs("motion"):
+        if not self.exact_iterations or not need_of(scene, "motion"):
             return
         own = ("optimizer", "exact_iterations")
         if scene.reduction.method == "balanced":
