@@ -79,7 +79,7 @@ def gradient(
     write_gradient(out, loaded, partition, arms, by_cell, evaluation.objective)
     if world.rank == 0:
         unit = objective_of(loaded).unit
-        name = loaded.objective.gradient if moves else "exact"
+        name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
         click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
     if check:
         _check_gradient(world, loaded, partition, arms, x_phys, profile)
@@ -104,7 +104,7 @@ def _check_gradient(
             remainders = "".join(f"{r:12.2e}" for r in row.remainders)
             slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
             click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
-        if scene.objective.needs("motion"):
+        if scene.objective.has_esl_gradient:
             click.echo(
                 f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
                 f"{test.ratio:.3f} times as long"

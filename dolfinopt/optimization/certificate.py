@@ -24,6 +24,7 @@ from dolfinopt.reduction import METHODS
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.responses import freezes
 
 # Variables nearer to a bound than this part of their range count as held by it.
 AT_BOUND = 1e-3
@@ -202,14 +203,14 @@ def certify(
         return Certificate(missing=missing, violated=violated(problem.limits))
     begun = time.perf_counter()
     exact, frozen = problem, None
-    if needs(scene, "motion"):
+    if freezes(scene):
         used = scene.objective.gradient
         try:
             other = _problem_by(evaluator, x, nominal, "exact" if used == "esl" else "esl")
         except ConvergenceError as error:  # on all ranks; the design is not lost for it
             return Certificate(missing=str(error), violated=violated(problem.limits))
         exact, with_frozen_loads = (other, problem) if used == "esl" else (problem, other)
-        if "motion" in objective_of(scene).needs:
+        if scene.objective.has_esl_gradient:
             frozen = with_frozen_loads.df0dx
     variables, total = evaluator.variables, partial(sum_over_arms, evaluator.partition)
     bounds = variables.xmin, variables.xmax

@@ -97,9 +97,10 @@ def taylor_test(
     slope = _by_x(partition, designed, cells, x)
     frozen = None
     if needs(scene, "motion"):
-        esl = _with(scene, gradient="esl")
-        cells = patterns.collect(gradient(esl, partition, arms, base, profile))
-        frozen = _by_x(partition, designed, cells, x)
+        if scene.objective.has_esl_gradient:
+            esl = _with(scene, gradient="esl")
+            cells = patterns.collect(gradient(esl, partition, arms, base, profile))
+            frozen = _by_x(partition, designed, cells, x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
     value = _fixed_objective(exact, partition, arms, patterns, profile, base)

@@ -34,7 +34,7 @@ class HistoryRow:
     seconds: float
     kkt: float = np.nan
     constraints: Mapping[str, float] = field(default_factory=dict)
-    tightest: str = field(default="", compare=False)
+    tightest: str = field(default="", compare=False, repr=False)
 
     @property
     def columns(self) -> list[str]:

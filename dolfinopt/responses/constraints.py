@@ -102,10 +102,9 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
     limits = []
     # The objective's values come first: it may be the response of a limit, too.
     for bound, found in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
-        response = bound.response
-        unit = response.limit_unit or response.unit
+        unit_of, lower = bound.response.unit_of, bound.response.lower
         limits += [
-            Limit(bound.name, arm, float(value), float(limit), unit, response.lower)
+            Limit(bound.name, arm, float(value), float(limit), unit_of(arm), lower)
             for arm, value, limit in zip(found.arms, found.values, bound.limits(found), strict=True)
         ]
     return tuple(limits)
@@ -115,8 +114,8 @@ def constraint_label(name: str) -> str:
     """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
     for quantity in ("volume_fraction", *Constraints.model_fields):
         if name == quantity or name.startswith(f"{quantity}_"):
-            unit = find_limited(quantity).limit_unit or find_limited(quantity).unit
             arm = name[len(quantity) + 1 :]
+            unit = find_limited(quantity).unit_of(arm)
             return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
     return name
 

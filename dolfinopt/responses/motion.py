@@ -24,7 +24,7 @@ from dolfinopt.responses.response import (
 from dolfinopt.responses.scenarios import combined, cotangents_of_scene, factors, worst_of
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
 from dolfinopt.scene.load import Scene, WorstBy
-from dolfinopt.scene.tables.responses import MOTION, Need
+from dolfinopt.scene.tables.responses import EXACT_ONLY, MOTION, Need
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +72,7 @@ class MotionResponse(Response):
 
     As objective scenarios count as `objective.scenarios` says; a limit holds for every one of
     them: the p-norm of their values, whose true one is the largest.
+    Of those that equivalent static loads say nothing of (`EXACT_ONLY`) the gradient is exact.
     """
 
     needs: ClassVar[frozenset[Need]] = MOTION
@@ -194,7 +195,7 @@ class MotionResponse(Response):
             with profile.phase("adjoint"):
                 return by_owner(scene, _cotangents(self, trajectory))
 
-        if self.options.gradient == "esl":
+        if self.options.gradient == "esl" and self.name not in EXACT_ONLY:
             A = on_root(partition.world, moments)
             with together(partition.world):
                 return {k: esl_gradient(one, A[k]) for k, one in designs.items()}

@@ -119,6 +119,11 @@ class Response(ABC):
         asked = self.options.direction
         return not self.limited and asked is not None and asked != self.natural
 
+    @classmethod
+    def unit_of(cls, value: str) -> str:
+        """Return the unit of the true value of that name, and of its limit."""
+        return cls.limit_unit or cls.unit
+
     @abstractmethod
     def measure(self, analysis: Analysis) -> Measured:
         """Return the values of a design (collective)."""

@@ -177,6 +177,8 @@ REMEMBERED = [
     ["reduction.method=balanced", "reduction.coordinates=3"],
     ["objective.kind=static"],
     ["objective.kind=deviation"],
+    ["objective.kind=effort", "constraints.deviation=8e-3"],
+    ["objective.kind=mass", "constraints.peak_force=[20.0,30.0,20.0]", "constraints.settling=0.1"],
     ["objective.kind=eigenfrequency"],
     ["objective.kind=eigenfrequency", "objective.follow=true", *GENTLE, ROBUST],
     ["objective.kind=eigenfrequency", "objective.follow=true", "arms.arm2.design=arm1"],

@@ -18,6 +18,9 @@ pytestmark = pytest.mark.serial  # designs belong to one rank
 
 COMPLIANCE = {"kind": "compliance", "gradient": "exact"}
 DEVIATION = {"kind": "deviation", "gradient": "exact"}
+EFFORT = {"kind": "effort"}
+PEAK = {"kind": "peak_force"}
+KEPT = {"compliance": 1e6}  # N m; far away
 GRAVITY = {"gravity": [0.0, -9.81]}
 
 
@@ -89,6 +92,19 @@ def scenes(folder: Path) -> dict[str, Tree]:
         "slider-deviation": loop(rod, objective=DEVIATION, motion=GRAVITY),
         "slider-control": loop(rod, control=drive, motion=GRAVITY),
         "pin": loop(four_bar((24, 3))),
+        "effort": arms(EFFORT, True, motion=GRAVITY, constraints=KEPT),
+        "effort-control": arms(EFFORT, False, control=limited, motion=GRAVITY, constraints=KEPT),
+        "effort-soft-joint": with_hardware(
+            arms(EFFORT, False, constraints=KEPT),
+            **joints,
+            joint_stiffness=2e4,
+            joint_damping=50.0,
+        ),
+        "effort-slider": loop(rod, objective=EFFORT, motion=GRAVITY, constraints=KEPT),
+        "effort-slider-control": loop(rod, objective=EFFORT, control=drive, constraints=KEPT),
+        "effort-pin": loop(four_bar((24, 3)), objective=EFFORT, constraints=KEPT),
+        "peak_force-control": arms(PEAK, True, control=GAINS, constraints=KEPT),
+        "peak_force-slider": loop(rod, objective=PEAK, motion=GRAVITY, constraints=KEPT),
     }
 
 
@@ -97,7 +113,7 @@ def scenes(folder: Path) -> dict[str, Tree]:
 # cells that do not lock follow their loads more.
 COSINE = {"slider-deviation": -1.0, "pin": 0.9}
 COSINE |= {f"{kind}{name}": 0.9 for kind in ("", "stiffened-") for name in ELEMENTS}
-SLOW = ("control-limits-gravity", "hardware", "pin")
+SLOW = ("control-limits-gravity", "hardware", "pin", "effort-soft-joint", "effort-pin")
 KINDS = (
     *ELEMENTS,
     *(f"stiffened-{name}" for name in ELEMENTS),
@@ -113,6 +129,14 @@ KINDS = (
     "slider-deviation",
     "slider-control",
     "pin",
+    "effort",
+    "effort-control",
+    "effort-soft-joint",
+    "effort-slider",
+    "effort-slider-control",
+    "effort-pin",
+    "peak_force-control",
+    "peak_force-slider",
 )
 
 
@@ -125,7 +149,10 @@ def slope(gradient: dict[str, np.ndarray], direction: dict[str, np.ndarray]) -> 
     "kind", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else ()) for k in KINDS]
 )
 def test_exact_gradient(kind: str, tmp_path: Path) -> None:
-    """The remainder of Taylor's formula has order 2; the gradient by ESL points the same way."""
+    """The remainder of Taylor's formula has order 2; the gradient by ESL points the same way.
+
+    Of drive forces there is no gradient by ESL, and the exact one stands in its place.
+    """
     model = Model(scene_from_dict(scenes(tmp_path)[kind]))
     rng = np.random.default_rng(0)
     x = {

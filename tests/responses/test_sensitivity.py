@@ -282,6 +282,7 @@ def assert_passed(test: TaylorTest) -> None:
 
 
 LOADED = ["motion.gravity=[0.5,-9.81]", "payload.inertia=0.05"]
+EFFORT = ["objective.kind=effort", "constraints.compliance=1e6"]
 
 
 @pytest.mark.parametrize(
@@ -295,6 +296,8 @@ LOADED = ["motion.gravity=[0.5,-9.81]", "payload.inertia=0.05"]
         ["damping.stiffness_proportional=0.0", "motion.horizon=2.2"],
         ["objective.kind=deviation", "objective.gradient=exact", *LOADED],
         ["objective.kind=compliance", "payload.mass=0.2", "arms.passive=0.05", *LOADED],
+        [*EFFORT, "payload.mass=0.5"],
+        [*EFFORT, "reduction.method=modal", "simulation.stiffening=true", *LOADED],
     ],
     ids=" ".join,
 )

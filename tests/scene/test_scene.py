@@ -143,6 +143,7 @@ def test_demo_states_every_other_key():
         "elbow_angle",
         "modes",
         "follow",
+        "effort_weights",
         *(set(Constraints.model_fields) - {"mass"}),  # the payload has a mass
         "sharpness",
         "continuation",
@@ -605,7 +606,9 @@ BAD_VALUES = [
     ("objective.scenarios", "mean", '"mean"', '"sum" | "worst"'),
     ("constraints.first_frequency", 0.0, "0.0", "a number >= 1e-06 and <= 1000000000"),
     ("constraints.tip_deflection", -1e-3, "-0.001", "a number >= 1e-15 and <= 10000"),
-    *((f"constraints.{key}", -1.0, "-1.0", "a number >= ") for key in Constraints.model_fields),
+    *((f"constraints.{key}", -1.0, "-1.0", " >= ") for key in Constraints.model_fields),
+    ("objective.effort_weights", [1.0, 2.0], "[1.0, 2.0]", "3 numbers, for cart, arm1, arm2"),
+    ("constraints.peak_force", [1.0, 2.0], "[1.0, 2.0]", "3 numbers, for cart, arm1, arm2"),
     ("objective.direction", "up", '"up"', '"minimize" | "maximize"'),
     ("objective.exponent", 1.0, "1.0", "a number >= 2"),
     ("design.volume_fraction", 0.0, "0.0", "a number >= 1e-06 and <= 1"),

@@ -15,6 +15,8 @@ Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
 Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
+Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
+Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 Limit = float | tuple[float, ...]
 
 
@@ -40,6 +42,16 @@ class Constraints(Table):
         default=None,
         description="upper limit of the largest deviation from motion.duration on [m]",
     )
+    effort: Effort | None = Field(
+        default=None,
+        description="upper limit of the weighted root mean square of the drives' forces, see "
+        "objective.effort_weights [-]",
+    )
+    peak_force: tuple[Force, ...] | None = Field(
+        default=None,
+        description="upper limits of the largest force of every drive, the cart's first, then the "
+        "joints' from the base outwards [N, N m]",
+    )
     first_frequency: Frequency | tuple[Frequency, ...] | None = Field(
         default=None,
         description="lower limit of the first natural frequency of every flexible arm with what "
@@ -59,6 +71,7 @@ class Constraints(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse arrays that are not one limit for everything that has a value."""
         owners = {
+            "peak_force": scene.driven,
             "first_frequency": [arm.name for arm in scene.arms if arm.flexible],
             "tip_deflection": [scene.arms[i].name for i in scene.cell_counts],
         }

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 from pydantic import Field, field_validator
 
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import Loc, Refusal, Table
-from dolfinopt.scene.tables.responses import NEEDS, Need, need_of
+from dolfinopt.scene.tables.responses import EXACT_ONLY, LIGHTER, NEEDS, Need, need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -19,6 +19,8 @@ ObjectiveKind = Literal[
     "deviation",
     "settling",
     "mass",
+    "effort",
+    "peak_force",
     "static",
     "eigenfrequency",
     "first_frequency",
@@ -31,6 +33,7 @@ Combination = Literal["sum", "worst"]
 WorstBy = Literal["compliance", "deviation"]
 LARGEST_LOAD = 1e9  # N, N m
 Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
+Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 
 
 class Objective(Table):
@@ -59,7 +62,7 @@ class Objective(Table):
     gradient: GradientKind = Field(
         default="esl",
         description='"esl": equivalent static loads held constant; "exact": of the whole '
-        "simulation [-]",
+        "simulation, as it always is of drive forces [-]",
     )
     exponent: float = Field(
         default=20.0,
@@ -77,6 +80,12 @@ class Objective(Table):
         default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         description="static load cases [F_x N, F_y N, moment N m] at each arm's outboard "
         "interface [-]",
+    )
+    effort_weights: tuple[Weight, ...] | None = Field(
+        default=None,
+        description="what the force of every drive is multiplied by in effort and peak_force, the "
+        "cart's first, then the joints' from the base outwards: the reciprocals of the drives' "
+        "rated forces; default: 1 each [1/N, 1/(N m)]",
     )
     attached: Attached = Field(
         default="rigid-body",
@@ -118,10 +127,16 @@ class Objective(Table):
         """Return whether the objective needs that."""
         return what in NEEDS[self.kind]
 
+    @property
+    def has_esl_gradient(self) -> bool:
+        """Whether the objective has a gradient with frozen equivalent static loads."""
+        return self.needs("motion") and self.kind not in EXACT_ONLY
+
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
         self._check_attached(scene)
         self._check_load_cases(scene)
+        self._check_weights(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):
             if scene.scenarios:
@@ -135,19 +150,44 @@ class Objective(Table):
                     ("scenarios", 0, "changes"),
                 )
             return
-        if self.gradient == "exact" and scene.reduction.method == "balanced":
+        self._check_exact(scene)
+
+    def _check_exact(self, scene: Scene) -> None:
+        """Refuse reductions and integrators without adjoint where the gradient is exact."""
+        because, key = self._why_exact(scene)
+        if because and scene.reduction.method == "balanced":
             raise Refusal(
-                'expected "craig-bampton", "modal" or "krylov" with objective.gradient = "exact": '
+                f'expected "craig-bampton", "modal" or "krylov" with {because}: '
                 "the Gramian's basis has no adjoint",
                 ("reduction", "method"),
-                ("objective", "gradient"),
+                key,
             )
-        if self.gradient == "exact" and scene.simulation.integrator != "radau":
+        if because and scene.simulation.integrator != "radau":
             raise Refusal(
-                'expected "radau" with objective.gradient = "exact": only its trajectory has an '
-                "adjoint",
+                f'expected "radau" with {because}: only its trajectory has an adjoint',
                 ("simulation", "integrator"),
-                ("objective", "gradient"),
+                key,
+            )
+
+    def _why_exact(self, scene: Scene) -> tuple[str, Loc]:
+        """Return what asks for the exact gradient of a motion, and its key; "" if nothing does."""
+        if self.kind in EXACT_ONLY:
+            return f'objective.kind = "{self.kind}"', ("objective", "kind")
+        for key in scene.constraints.limits:
+            if key in EXACT_ONLY:
+                return f"constraints.{key}", ("constraints", key)
+        exact = 'objective.gradient = "exact"' if self.gradient == "exact" else ""
+        return exact, ("objective", "gradient")
+
+    def _check_weights(self, scene: Scene) -> None:
+        if self.effort_weights is None:
+            return
+        drives = scene.driven
+        if len(self.effort_weights) != len(drives) or not any(self.effort_weights):
+            number = "1 number" if len(drives) == 1 else f"{len(drives)} numbers"
+            raise Refusal(
+                f"expected {number}, for {', '.join(drives)}, not all of them 0",
+                ("objective", "effort_weights"),
             )
 
     def _check_load_cases(self, scene: Scene) -> None:
@@ -163,11 +203,15 @@ class Objective(Table):
             )
 
     def _check_lightest(self, scene: Scene) -> None:
-        limited = set(scene.constraints.limits) - {"mass"}
-        if self.kind == "mass" and self.direction != "maximize" and not limited:
+        """Refuse what the removal of all material makes least, unless something keeps it."""
+        limited = set(scene.constraints.limits) - LIGHTER
+        if self.kind in LIGHTER and self.direction != "maximize" and not limited:
+            least = "the lightest design is an empty one"
+            if self.kind != "mass":
+                least = "the design that drives feel least is an empty one"
             raise Refusal(
-                "expected a limit under [constraints] with it, for example deviation: without "
-                "one the lightest design is an empty one",
+                f"expected a limit under [constraints] with it, for example deviation: without "
+                f"one {least}",
                 ("objective", "kind"),
             )
 

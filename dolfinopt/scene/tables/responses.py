@@ -23,12 +23,23 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "eigenfrequency": VIBRATION,
     "first_frequency": VIBRATION,
     "tip_deflection": STATICS,
+    "effort": MOTION,
+    "peak_force": MOTION,
 }
+# Those that no equivalent static load tells anything of: their gradient is always the exact one.
+EXACT_ONLY = frozenset({"effort", "peak_force"})
+# Those that fall with the mass, down to that of no arm at all.
+LIGHTER = frozenset({"mass", "effort", "peak_force"})
 
 
 def asked(scene: Scene) -> list[str]:
     """Return the words of the objective and of everything under [constraints]."""
     return [scene.objective.kind, *scene.constraints.limits]
+
+
+def freezes(scene: Scene) -> bool:
+    """Return whether a gradient of the scene differs with frozen loads from the exact one."""
+    return bool(set(need_of(scene, "motion")) - EXACT_ONLY)
 
 
 def need_of(scene: Scene, what: Need) -> list[str]:

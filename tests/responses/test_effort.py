@@ -1,0 +1,189 @@
+"""Effort of the drives: closed form of a point mass, balance of power, weights, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import TWO_ARM, scene
+
+import dolfinopt as do
+from dolfinopt import Model
+from dolfinopt.errors import InputError
+from dolfinopt.responses.constraints import constraint_label, limits_of
+
+WORLD = MPI.COMM_WORLD
+EFFORT = "objective.kind=effort"
+KEPT = "constraints.compliance=1e6"  # N m; far away
+SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
+
+
+def quintic(t: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return 10 u^3 - 15 u^4 + 6 u^5, u = t / duration at most 1, and its derivatives by t."""
+    u = np.minimum(t / duration, 1.0)
+    s = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
+    sd = (30.0 * u**2 - 60.0 * u**3 + 30.0 * u**4) / duration
+    sdd = (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / duration**2
+    return s, sd, sdd
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a_x b_y - a_y b_x (n,)."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
+    """Return the forces (n, 3) of cart, shoulder and elbow that move a point mass on the arc.
+
+    Newton's law of the payload alone: arms of 1 m without mass hand its force on.
+    """
+    s, sd, sdd = quintic(t, 1.9)
+    angle, rate, second = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
+    radial = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    around = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
+    acceleration = second[:, None] * around - (rate**2)[:, None] * radial
+    force = mass * (acceleration + np.array([0.0, gravity]))
+    shoulder = np.stack([0.5 * radial[:, 0], np.full(len(t), -0.5)], axis=1)
+    chord = radial - shoulder
+    length = np.hypot(*chord.T)[:, None]
+    left = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length
+    elbow = shoulder + 0.5 * chord + np.sqrt(1.0 - 0.25 * length**2) * left  # beta < 0
+    return np.stack([force[:, 0], cross(chord, force), cross(radial - elbow, force)], axis=1)
+
+
+@pytest.mark.parametrize("weights", [None, (0.01, 0.02, 0.05), (0.0, 0.0, 1.0)])
+@pytest.mark.parametrize("gravity", [0.0, 9.81])
+def test_rigid_limit_is_newtons_law(
+    gravity: float, weights: tuple[float, float, float] | None
+) -> None:
+    """Stiff arms of hardly any mass: the payload's inertia is all that the drives feel."""
+    changes = [f"motion.gravity=[0.0, {-gravity}]", "material.density=1e-3"]
+    changes += ["material.young_modulus=1e14", "simulation.stiffening=false"]
+    changes += [] if weights is None else [f"objective.effort_weights={list(weights)}"]
+    result = Model(scene(*SMALL, *changes)).simulate()
+    w = np.ones(3) if weights is None else np.array(weights)
+    t = np.linspace(0.0, 3.0, 30001)
+    squares = ((w * point_mass_forces(t, 6.0, gravity)) ** 2).sum(axis=1)
+    expected = np.sqrt(np.sum(0.5 * (squares[1:] + squares[:-1]) * np.diff(t)) / 3.0)
+    assert result.objective == pytest.approx(expected, rel=1e-4)
+
+
+def test_work_of_the_drives_is_what_damping_takes() -> None:
+    """From rest to rest the forces that the effort is made of do no other work."""
+    changes = ["motion.horizon=4.0", "damping.stiffness_proportional=2e-2"]
+    result = Model(scene(*SMALL, *changes)).simulate()
+    if WORLD.rank == 0:
+        trajectory = result.trajectory
+        assert trajectory is not None
+        power = trajectory.joint_forces * trajectory.motion.qd
+        rates = trajectory.unknowns[1]
+        lost = np.zeros(len(rates))
+        for part, body in zip(
+            trajectory.mechanism.slices, trajectory.mechanism.bodies, strict=True
+        ):
+            lost += np.einsum("ni,ij,nj->n", rates[:, part], body.D, rates[:, part])
+        step = trajectory.t[1]
+        work, heat = (float(x.sum()) * step for x in (power, lost))  # zero at both ends
+        assert work == pytest.approx(heat, rel=1e-2)
+        assert heat > 1e-3 * float(np.abs(power).sum()) * step
+
+
+def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
+    """Weighted; of a fixed base the joints' alone."""
+    for changes in ((), ("motion.base=fixed", "motion.radius=0.6")):
+        made = scene(*SMALL, *changes)
+        result = Model(made).simulate()
+        if WORLD.rank == 0:
+            assert result.trajectory is not None
+            rms = result.trajectory.drives[1][made.driven_columns]
+            assert len(rms) == len(made.driven)
+            assert result.objective == pytest.approx(np.linalg.norm(rms), rel=1e-12)
+        assert result.unit == "-"
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        (["constraints.peak_force=[9.0]"], "expected 3 numbers, for cart, arm1, arm2"),
+        (
+            ["reduction.method=balanced", "objective.kind=esl", "constraints.effort=9"],
+            "with constraints.effort: .*no adjoint",
+        ),
+        (["objective.effort_weights=[1.0]"], "expected 3 numbers, for cart, arm1, arm2"),
+        (["objective.effort_weights=[0.0,0.0,0.0]"], "not all of them 0"),
+        (["reduction.method=balanced"], 'with objective.kind = "effort".*no adjoint'),
+        (["simulation.integrator=generalized-alpha"], '"radau" with objective.kind = "effort"'),
+    ],
+)
+def test_refusals(changes: list[str], expected: str) -> None:
+    """One line that names the key and what is allowed."""
+    with pytest.raises(InputError, match=expected) as caught:
+        do.load_scene(TWO_ARM, [*SMALL, *changes])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["effort", "peak_force"])
+def test_without_a_limit_no_arm_would_be_left(kind: str) -> None:
+    """What the drives carry least is nothing."""
+    with pytest.raises(InputError, match=r"expected a limit under \[constraints\]"):
+        do.load_scene(TWO_ARM, [f"objective.kind={kind}", "constraints.mass=3.0"])
+
+
+def test_peak_forces_are_limited_drive_by_drive() -> None:
+    """The true values are the largest samples; smooth ones and weights only lead there."""
+    limits = "constraints.peak_force=[20.0,30.0,10.0]"
+    made = scene("arms.cells=[20,3]", limits, "objective.effort_weights=[0.0,2.0,1.0]")
+    result = Model(made).simulate()
+    found = limits_of(made, result.evaluation)[-3:]
+    assert [one.name for one in found] == [f"peak_force_{k}" for k in ("cart", "arm1", "arm2")]
+    assert [one.unit for one in found] == ["N", "N m", "N m"]
+    assert [one.limit for one in found] == [20.0, 30.0, 10.0]
+    assert constraint_label("peak_force_cart") == "peak force of cart [N]"
+    assert constraint_label("peak_force_arm2") == "peak force of arm2 [N m]"
+    # As the optimiser has them, the true ones over their limits.
+    relative = [one.value / one.limit - 1.0 for one in found]
+    assert result.evaluation.constraints[-3:] == pytest.approx(relative, rel=1e-12)
+    if WORLD.rank == 0:
+        assert result.trajectory is not None
+        peaks = np.abs(result.trajectory.joint_forces).max(axis=0)
+        assert [one.value for one in found] == pytest.approx(list(peaks), rel=1e-12)
+        smooth = np.array(result.evaluation.responses[-1].smooth)
+        assert (smooth < peaks).all() and (smooth > 0.7 * peaks).all()
+
+
+def test_weighted_sum_of_peak_forces_as_objective() -> None:
+    """Each p-mean times its weight; a large exponent brings it to the peaks."""
+    weights = np.array([0.0, 2.0, 1.0])
+    options = ["objective.effort_weights=[0.0,2.0,1.0]", "objective.exponent=200", KEPT]
+    result = Model(scene("arms.cells=[20,3]", "objective.kind=peak_force", *options)).simulate()
+    if WORLD.rank == 0:
+        assert result.trajectory is not None
+        expected = float(weights @ np.abs(result.trajectory.joint_forces).max(axis=0))
+        assert result.objective == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "limit", ["effort=7.4", "peak_force=[100.0,15.0,7.0]"], ids=["effort", "peak force"]
+)
+def test_a_limit_of_the_drives_is_met(limit: str) -> None:
+    """The stiffest light arms are heavier than these drives can take: true values end at it."""
+    changes = ["arms.cells=[24,3]", "payload.mass=0.5", f"constraints.{limit}"]
+    changes += ["design.volume_fraction=0.7", "design.filter_radius=0.05"]
+    changes += ["simulation.tolerance=1e-3", "motion.horizon=2.2", "optimizer.max_iterations=30"]
+    result = do.optimize(scene(*changes))
+    assert not result.violated
+    asked = [one for one in result.limits if one.quantity != "volume_fraction"]
+    assert -5e-3 < max(one.excess for one in asked) <= 1e-3
+
+
+def test_the_gradient_is_exact_whatever_is_asked_for() -> None:
+    """Frozen loads tell nothing of forces that come from mass."""
+    model = Model(scene(*SMALL, "motion.horizon=2.2"))
+    frozen, exact = (model.gradient(kind=kind) for kind in ("esl", "exact"))
+    for name, values in exact.items():
+        np.testing.assert_array_equal(values, frozen[name])
+        assert values.any()
+    # Material at the end of the last arm is carried by every drive.
+    if WORLD.rank == 0:
+        x = model.centroids["arm2"][:, 0]
+        assert exact["arm2"][x > 0.9].sum() > 0.0
