@@ -10,6 +10,7 @@ SUMMARY = {
     "max_deviation": "m",
     "max_deviation_time": "s",
     "settling": "m",
+    "stress": "Pa",
     "mass": "kg",
     "grayness": "-",
     "volume_fraction": "-",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import UnitLoads, unit_loads
+from dolfinopt.fem.stress import LoadFields, load_fields
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.reduction import METHODS, Basis, Options
@@ -48,6 +50,7 @@ class DesignState:
         scene: says how to reduce, and the damping.
         num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
         stiffened: whether its body has geometric stiffness.
+        kept: what responses know of it, by their name; theirs to fill.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class DesignState:
         self.x_phys.setflags(write=False)
         self.material, self.elastic, self.solid = material, elastic, solid
         self.scene, self.num_modes, self.stiffened = scene, num_modes, stiffened
+        self.kept: dict[str, Any] = {}
         self._initial = initial
         self._basis: Basis | None = None
         self._body: ShapeIntegrals | None = None
@@ -129,6 +133,12 @@ class DesignState:
     def unit_loads(self) -> UnitLoads:
         """The static fields of unit accelerations, forces and moment, see there."""
         return unit_loads(self.elastic)
+
+    @cached_property
+    def load_fields(self) -> LoadFields:
+        """The static fields of all loads, those of the elastic motion's inertia included."""
+        with self.elastic.profile.phase("stress"):
+            return load_fields(self.unit_loads, self.basis.V, self.basis.MV)
 
     def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
         """Return the natural modes with what is carried; once for the same load.

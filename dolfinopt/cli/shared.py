@@ -157,6 +157,7 @@ def draw(
     from dolfinopt.plots.design import draw_design
     from dolfinopt.plots.drives import draw_drives
     from dolfinopt.plots.machine import figure_of
+    from dolfinopt.plots.stress import draw_stress
     from dolfinopt.plots.style import save
     from dolfinopt.responses.constraints import deviation_limits, limits_by_column
     from dolfinopt.responses.response import objective_of
@@ -164,6 +165,8 @@ def draw(
     minimised = objective_of(scene)
     label = f"{minimised.label} [{minimised.unit}]"
     draw_design(folder / "design.png", designed(views), scene.name)
+    if stressed := [view for view in views if view.stress is not None]:
+        draw_stress(folder / "stress.png", stressed, scene.name)
     if history:
         limits = limits_by_column(scene, history[0].constraints)
         draw_history(folder / "history.png", history, label, limits)
@@ -201,7 +204,7 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         ending = f"{summary['iterations']} iterations ({ending}), {_sought(summary)}"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
-        f"{_largest(summary)}, "
+        f"{_largest(summary)}, {_stress(summary)}"
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
     )
@@ -227,6 +230,18 @@ def _largest(summary: Mapping[str, Any]) -> str:
     return (
         f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
         f"at {summary['max_deviation_time']:.3f} s"
+    )
+
+
+def _stress(summary: Mapping[str, Any]) -> str:
+    """Return the largest stress, where and when, and a comma; "" where there is none."""
+    found = summary["stress"]
+    if found is None:
+        return ""
+    x, y = found["place"]
+    return (
+        f"largest stress {1e-6 * found['value']:.4g} MPa in {found['arm']} at ({x:.3g}, {y:.3g}) m "
+        f"and {found['instant']:.3f} s, "
     )
 
 

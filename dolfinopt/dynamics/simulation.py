@@ -11,6 +11,7 @@ import numpy as np
 from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.load_coefficients import load_coefficients
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
@@ -112,6 +113,11 @@ class Trajectory:
             return self.problem.at(self.t).forces(*self.unknowns)
         qd, qdd = self.unknowns[1:]
         return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+
+    @cached_property
+    def load_coefficients(self) -> list[np.ndarray]:
+        """What loads every body (n, 7 + 2 q), see the function of this name."""
+        return load_coefficients(self.problem, self.t, self.unknowns)
 
     @property
     def is_machine(self) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem import cells
@@ -22,6 +23,8 @@ from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.interior import InteriorSystem
+from dolfinopt.fem.stress import element_centres, stress_operator
+from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
 from dolfinopt.profiling import Profile
@@ -68,6 +71,22 @@ class Substructure:
     def quadrature(self) -> Quadrature:
         """Stress and gradients at the quadrature points."""
         return quadrature(self.mesh, self.operators)
+
+    @cached_property
+    def stress_operator(self) -> np.ndarray:
+        """That of `fem.stress` at the element centres (n_cells, 3, 2 n), 1/m."""
+        centres = element_centres(compat.cell_geometry_nodes(self.mesh.mesh, 0).shape[1])
+        return stress_operator(self.mesh, self.operators, centres)
+
+    @cached_property
+    def interface_distance(self) -> np.ndarray:
+        """Distance (n_cells,) of every centroid to the nearest node of an interface, m.
+
+        Collective on the arm's ranks.
+        """
+        T = self.T
+        nodes = np.concatenate(T.comm.allgather(T.points[T.inboard | T.outboard]))
+        return cKDTree(nodes).query(self.mesh.centroid)[0]
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.

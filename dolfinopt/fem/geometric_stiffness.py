@@ -71,7 +71,12 @@ class UnitLoads:
         return K0
 
     def gradient(
-        self, V: np.ndarray, by_K0: np.ndarray, *, static: bool = False
+        self,
+        V: np.ndarray,
+        by_K0: np.ndarray,
+        *,
+        static: bool = False,
+        by_fields: np.ndarray | None = None,
     ) -> GeometricGradient:
         """Differentiate a function of K0 by modes and material (collective on the arm's ranks).
 
@@ -84,13 +89,19 @@ class UnitLoads:
             by_K0: (7, q, q) derivatives.
             static: whether V begins with the constraint modes, by which `by_modes` then
                 differentiates u_F, too, and `by_stiffness` by S.
+            by_fields: (n_nodes, 2, 7) derivatives of the same function by `fields`, where it
+                depends on them otherwise, too; contributions of this rank's cells.
         """
         arm, q = self.arm, V.shape[2]
+        if len(by_K0) == 0:  # of a linear body
+            assert by_fields is not None
+            by_V, by_young = np.zeros_like(V), np.zeros_like(arm.young)
+            return self._through_fields(by_fields, by_V, by_young, static)
         quadrature, (count, n) = arm.substructure.quadrature, arm.operators.cells.shape
         i, j = np.triu_indices(q)
         by_pairs = by_K0[:, i, j] + np.where(i == j, 0.0, by_K0[:, j, i])
         by_young = np.empty(count)
-        by_modes, by_fields = np.empty((count, n, 2, q)), np.empty((count, n, 2, NUM_LOADS))
+        by_modes, by_nodes = np.empty((count, n, 2, q)), np.empty((count, n, 2, NUM_LOADS))
         for cells, points, H in self._parts(V):
             size, pairs = cells.stop - cells.start, np.empty((len(i), H.shape[3]))
             by_stress = [by_pairs @ _pairs(H, terms, pairs) for terms in _TERMS]
@@ -98,13 +109,28 @@ class UnitLoads:
             nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
             by_young[cells] = np.einsum("ekp,ekp->e", self._cell_values(cells), nodal)
             nodal *= arm.young[cells, None, None]
-            by_fields[cells] = nodal.reshape(size, n, 2, NUM_LOADS)
+            by_nodes[cells] = nodal.reshape(size, n, 2, NUM_LOADS)
             by_H = _pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points])
             by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, 2 * q)
             nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
             by_modes[cells] = nodal.reshape(size, n, 2, q)
-        forces = sum_at_nodes(arm.operators, by_fields)
-        by_V, by_stiffness = sum_at_nodes(arm.operators, by_modes), np.zeros((3, 3))
+        forces = sum_at_nodes(arm.operators, by_nodes)
+        if by_fields is not None:
+            forces = forces + by_fields
+        by_V = sum_at_nodes(arm.operators, by_modes)
+        return self._through_fields(forces, by_V, by_young, static)
+
+    def _through_fields(
+        self, forces: np.ndarray, by_V: np.ndarray, by_young: np.ndarray, static: bool
+    ) -> GeometricGradient:
+        """Add the part through the fields u_p, given derivatives `forces` (n_nodes, 2, 7) by them.
+
+        Args:
+            forces: contributions of this rank's cells.
+            by_V, by_young: the other parts; changed in place.
+            static: see `gradient`.
+        """
+        arm, by_stiffness = self.arm, np.zeros((3, 3))
         solved = slice(0, NUM_LOADS)
         if static:
             solved = slice(0, NUM_INERTIAL)

@@ -1,4 +1,4 @@
-"""design.vtu and design.xdmf: density and arm by cell, for ParaView."""
+"""design.vtu and design.xdmf: density, arm and largest stress by cell, for ParaView."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ XDMF_CELLS = {3: 4, 4: 5}  # its numbers of triangles and quadrilaterals, by cor
 
 
 def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
-    """Write design.vtu and design.xdmf: density and arm by cell, see `_Sheet`.
+    """Write design.vtu and design.xdmf: density, arm and, if known, stress by cell, see `_Sheet`.
 
     One grid, because few programs read collections. ParaView and PyVista read both, meshio the
     former: it takes no XDMF with the instant without which PyVista takes none.
@@ -36,12 +36,20 @@ class _Sheet:
         cells: (n_cells, 3 or 4) points around each cell, an array an arm.
         density: (all cells,).
         arm: (all cells,) number of the arm, from 0 in the scene's order.
+        stress: (all cells,) largest von Mises stress along the motion, Pa, or None.
     """
 
     points: np.ndarray
     cells: list[np.ndarray]
     density: np.ndarray
     arm: np.ndarray
+    stress: np.ndarray | None = None
+
+    @property
+    def fields(self) -> dict[str, np.ndarray]:
+        """What every cell has, by name."""
+        found = {"density": self.density, "arm": self.arm}
+        return found if self.stress is None else found | {"stress": self.stress}
 
 
 def _sheet(views: Sequence[ArmView]) -> _Sheet:
@@ -56,7 +64,9 @@ def _sheet(views: Sequence[ArmView]) -> _Sheet:
             offset -= 2.0 * np.ptp(own[:, 1])
             count += len(own)
     density = np.concatenate([view.density for view in designed(views)])
-    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm))
+    stresses = [view.stress for view in designed(views) if view.stress is not None]
+    whole = np.concatenate(stresses) if len(stresses) == len(cells) else None
+    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm), whole)
 
 
 def _write_vtu(path: Path, sheet: _Sheet) -> None:
@@ -82,8 +92,8 @@ def _write_vtu(path: Path, sheet: _Sheet) -> None:
     add(cells, "offsets", np.cumsum(corners))
     add(cells, "types", np.where(corners == 4, VTK_QUAD, VTK_TRIANGLE))
     data = Xml.SubElement(piece, "CellData", Scalars="density")
-    add(data, "density", sheet.density)
-    add(data, "arm", sheet.arm)
+    for name, values in sheet.fields.items():
+        add(data, name, values)
     write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
 
 
@@ -105,7 +115,8 @@ def _write_xdmf(path: Path, sheet: _Sheet) -> None:
         _data_item(topology, np.concatenate([part.ravel() for part in parts]), "Int")
     geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
     _data_item(geometry, sheet.points, "Float")
-    for name, values, kind in (("density", sheet.density, "Float"), ("arm", sheet.arm, "Int")):
+    for name, values in sheet.fields.items():
+        kind = "Int" if values.dtype.kind == "i" else "Float"
         attribute = Xml.SubElement(grid, "Attribute", Name=name, Center="Cell")
         attribute.set("AttributeType", "Scalar")
         _data_item(attribute, values, kind)

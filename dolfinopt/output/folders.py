@@ -28,6 +28,7 @@ RUN_FILES = (
     "drives.png",
     "motion.gif",
     "machine.png",
+    "stress.png",
     CHECKPOINT,
 )
 

@@ -26,6 +26,7 @@ from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.order_selection import OrderSelection
+from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.contents import named_files, with_relative_paths
 from dolfinopt.scene.load import Scene
 
@@ -98,15 +99,16 @@ def write_simulation(
     """
     begun = time.perf_counter() - wall
     one = simulated
-    views = gather_views(one.scene, one.partition, one.arms, one.x_phys)
-    summary = summarise(one, wall)
+    stress = stress_report(one.partition, one.arms, one.trajectory, one.profile)
+    views = gather_views(one.scene, one.partition, one.arms, one.x_phys, stress)
+    summary = summarise(one, wall, stress)
     with together(one.partition.world):
         if one.trajectory is None:
             return None
         write_design(folder, views)
         if paraview:
             write_fields(folder, views)
-        write_trajectory(folder, one.trajectory, one.initial_deviation)
+        write_trajectory(folder, one.trajectory, one.initial_deviation, stress)
         if pictures is not None:
             since = time.perf_counter()
             pictures(views)

@@ -32,6 +32,7 @@ from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import objective_of
+from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.plausibility import implausible
 from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
@@ -53,12 +54,15 @@ FALLS_APART = (
 )
 
 
-def summarise(run: Simulated, wall: float) -> dict[str, Any]:
+def summarise(
+    run: Simulated, wall: float, stress: Mapping[int, ArmStress] | None = None
+) -> dict[str, Any]:
     """Return the content of summary.json on the root, an empty dict elsewhere (collective).
 
     Args:
         run: the design, what came of it and how it was found.
         wall: seconds since the command began, s.
+        stress: of every arm with a design, by its place in the chain, see `stress_report`.
     """
     scene, partition = run.scene, run.partition
     cost = _cost(run, wall)  # without what follows
@@ -71,6 +75,7 @@ def summarise(run: Simulated, wall: float) -> dict[str, Any]:
             **_figures(run.evaluation),
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            "stress": _stress(scene, stress or {}),
             **_of_designs(scene, run.evaluation, traits),
             **_of_responses(run),
             "simulation_error_estimate": run.evaluation.error,
@@ -217,6 +222,19 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     if trajectory.closure_force is not None:
         found["closure_force_peak"] = float(np.linalg.norm(trajectory.closure_force, axis=1).max())
     return found
+
+
+def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | None:
+    """Return the largest stress at element centres, and at Gauss points, too; of every arm."""
+    if not stress:
+        return None
+    place, one = max(stress.items(), key=lambda item: item[1].peak.value)
+    at, other = max(stress.items(), key=lambda item: item[1].peak_at_points.value)
+    return {
+        **one.peak.to_dict(scene.arms[place].name),
+        "at_gauss_points": other.peak_at_points.to_dict(scene.arms[at].name),
+        "by_arm": {scene.arms[k].name: each.peak.value for k, each in stress.items()},
+    }
 
 
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:

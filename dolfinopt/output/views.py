@@ -16,6 +16,7 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.responses.stress_report import ArmStress
 
 
 CIRCLE = 48  # corners that stand for a circle in pictures
@@ -34,6 +35,8 @@ class ArmView:
         designed: False for arms without a design: rigid ones and those from a file.
         length: from joint axis to joint axis, m; None if not known.
         regions: what the scene keeps solid or void: kind and outline (n, 2), m, of every region.
+        stress: (n_cells,) largest von Mises stress along the motion, Pa; None if not known.
+        stress_instant: (n_cells,) when it is reached, s; likewise.
     """
 
     name: str
@@ -44,12 +47,23 @@ class ArmView:
     designed: bool = True
     length: float | None = None
     regions: tuple[tuple[str, np.ndarray], ...] = ()
+    stress: np.ndarray | None = None
+    stress_instant: np.ndarray | None = None
 
 
 def gather_views(
-    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    stress: Mapping[int, ArmStress] | None = None,
 ) -> list[ArmView]:
-    """Collect every arm on the root (collective); empty list elsewhere."""
+    """Collect every arm on the root (collective); empty list elsewhere.
+
+    Args:
+        scene, partition, arms, x_phys: the designs.
+        stress: what `stress_report` returned of their motion, if it is known.
+    """
 
     def collect(values: Any) -> dict[int, np.ndarray]:
         with together(partition.world):
@@ -75,7 +89,7 @@ def gather_views(
     shapes = collect(modes)
     with together(partition.world):
         if partition.world.rank == 0:
-            return _views(scene, corners, centroids, densities, shapes)
+            return _views(scene, corners, centroids, densities, shapes, stress or {})
         return []
 
 
@@ -85,6 +99,7 @@ def _views(
     centroids: Mapping[int, np.ndarray],
     densities: Mapping[int, np.ndarray],
     shapes: Mapping[int, np.ndarray],
+    stress: Mapping[int, ArmStress],
 ) -> list[ArmView]:
     """Return the views of all arms in the chain, given those with a design (root only)."""
     views = []
@@ -96,6 +111,7 @@ def _views(
         order = canonical_order(centroids[owner])
         # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
         around = [0, 1, 3, 2] if corners[owner].shape[1] == 4 else [0, 1, 2]
+        known = stress.get(index)
         views.append(
             ArmView(
                 name,
@@ -105,6 +121,8 @@ def _views(
                 shapes[owner][order][:, around],
                 length=scene.arms[index].length,
                 regions=_outlines(scene, index),
+                stress=None if known is None else known.by_cell[order],
+                stress_instant=None if known is None else known.when[order],
             )
         )
     return views

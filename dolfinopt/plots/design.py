@@ -133,8 +133,8 @@ def design_page(views: Sequence[ArmView], title: str) -> Page:
             page.lines(np.stack([points, np.roll(points, -1, axis=0)], axis=1), REGION[kind])
         if view.length is not None:
             page.mark(layout.place(index, np.array([[0.0, 0.0], [view.length, 0.0]])))
-    _draw_ruler(page, layout)
-    _draw_colour_scale(page, layout)
+    draw_ruler(page, layout)
+    draw_colour_scale(page, layout, DENSITY, (0.0, 0.25, 0.5, 0.75, 1.0))
     return page
 
 
@@ -164,18 +164,24 @@ class Page:
         camera.clipping_range = (1.0, 200.0)
         self.texts: list[str] = []
 
-    def fill(self, corners: np.ndarray, density: np.ndarray) -> None:
-        """Fill polygons (n, k, 2) with the colours of (n,) densities."""
+    def fill(
+        self,
+        corners: np.ndarray,
+        values: np.ndarray,
+        colours: str = COLOURS,
+        span: tuple[float, float] = (0.0, 1.0),
+    ) -> None:
+        """Fill polygons (n, k, 2) with the colours of (n,) values between both ends of `span`."""
         count, sides = corners.shape[:2]
         numbers = np.arange(count * sides).reshape(count, sides)
         faces = np.column_stack([np.full(count, sides), numbers])
         mesh = self.pyvista.PolyData(_in_space(corners, 0.0), faces.ravel())
-        mesh.cell_data[DENSITY] = density
+        mesh.cell_data["values"] = values
         self.plotter.add_mesh(
             mesh,
-            scalars=DENSITY,
-            cmap=COLOURS,
-            clim=(0.0, 1.0),
+            scalars="values",
+            cmap=colours,
+            clim=span,
             lighting=False,
             show_scalar_bar=False,
             reset_camera=False,
@@ -280,7 +286,7 @@ def _caption(view: ArmView) -> str:
     )
 
 
-def _draw_ruler(page: Page, layout: Layout) -> None:
+def draw_ruler(page: Page, layout: Layout) -> None:
     """Draw a length scale below the last arm."""
     y = layout.bottom - 16.0
     low, high = layout.span
@@ -293,8 +299,14 @@ def _draw_ruler(page: Page, layout: Layout) -> None:
         page.write(f"{mark:.6g}{unit}", where, y - 40.0, TEXT, centred=True)
 
 
-def _draw_colour_scale(page: Page, layout: Layout) -> None:
-    """Draw the colour scale at the foot of the page."""
+def draw_colour_scale(
+    page: Page,
+    layout: Layout,
+    label: str,
+    marks: Sequence[float] | np.ndarray,
+    colours: str = COLOURS,
+) -> None:
+    """Draw the colour scale at the foot of the page, from 0 to the last of its marks."""
     long, high, y, steps = 500.0, 26.0, 46.0, 256
     x = layout.width - MARGIN - long
     edges = x + long * np.linspace(0.0, 1.0, steps + 1)
@@ -302,11 +314,11 @@ def _draw_colour_scale(page: Page, layout: Layout) -> None:
     corners[:, [0, 3], 0] = edges[:-1, None]
     corners[:, [1, 2], 0] = edges[1:, None]
     corners[:, :2, 1], corners[:, 2:, 1] = y, y + high
-    page.fill(corners, np.linspace(0.0, 1.0, steps))
+    page.fill(corners, np.linspace(0.0, 1.0, steps), colours)
     frame = np.array([[x, y], [x + long, y], [x + long, y + high], [x, y + high]])
     page.lines(np.stack([frame, np.roll(frame, -1, axis=0)], axis=1), GREY)
-    for mark in (0.0, 0.25, 0.5, 0.75, 1.0):
-        where = x + mark * long
+    for mark in marks:
+        where = x + mark / marks[-1] * long
         page.lines([[[where, y], [where, y - 8.0]]])
         page.write(f"{mark:g}", where, y - 37.0, TEXT, centred=True)
-    page.write(DENSITY, x - 20.0, y, TEXT, ends=True)
+    page.write(label, x - 20.0, y, TEXT, ends=True)

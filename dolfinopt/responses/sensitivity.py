@@ -41,7 +41,9 @@ def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
         return -state.young_slope * energies
 
 
-def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray:
+def exact_gradient(
+    state: DesignState, cotangents: ShapeIntegrals, by_columns: np.ndarray | None = None
+) -> np.ndarray:
     """Return the derivative by x_phys of one arm of a function of its floating body.
 
     Every integral is a product u . M v or u . K v of modes and rigid motions, so its derivative
@@ -51,6 +53,8 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
     Args:
         state: of the arm.
         cotangents: the function's derivatives by the body's integrals; those by D join K's.
+        by_columns: (n_nodes, 2, q + 7 + 2 q) its derivatives by `LoadFields.columns`, where it
+            depends on these, too; contributions of this rank's cells.
 
     Returns:
         (n_cells,) over this rank's cells.
@@ -63,11 +67,15 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
         partners = mass_partners(elastic.points, V, cotangents)
         by_V = elastic.mass_times(partners.by_modes)
         by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
-        geometric = None
-        if cotangents.is_stiffened:
+        geometric = inertial = by_unit_loads = None
+        if by_columns is not None:
+            modes, by_unit_loads, by_elastic = state.load_fields.split(by_columns)
+            inertial = state.load_fields.gradient(by_elastic)
+            by_V += modes + inertial.by_modes
+        if cotangents.is_stiffened or by_unit_loads is not None:
             by_K0 = np.concatenate([cotangents.K0, cotangents.K0_outboard])
             static = state.scene.reduction.method == "craig-bampton"
-            geometric = state.unit_loads.gradient(V, by_K0, static=static)
+            geometric = state.unit_loads.gradient(V, by_K0, static=static, by_fields=by_unit_loads)
             by_V += geometric.by_modes
             if static:  # K's first block is S; the constraint modes' interior is in equilibrium
                 by_K[:3, :3] += geometric.by_stiffness
@@ -82,9 +90,10 @@ def exact_gradient(state: DesignState, cotangents: ShapeIntegrals) -> np.ndarray
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        if geometric is not None:
-            energies += geometric.by_young
-            masses += geometric.by_density
+        for part in (geometric, inertial):
+            if part is not None:
+                energies += part.by_young
+                masses += part.by_density
         return state.young_slope * energies + state.density_slope * masses
 
 

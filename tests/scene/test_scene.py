@@ -145,6 +145,7 @@ def test_demo_states_every_other_key():
         "follow",
         "effort_weights",
         *(set(Constraints.model_fields) - {"mass"}),  # the payload has a mass
+        *("stress_exponent", "stress_margin"),
         "sharpness",
         "continuation",
         "erosion",

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
 Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
+Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
@@ -41,6 +42,11 @@ class Constraints(Table):
     settling: Distance | None = Field(
         default=None,
         description="upper limit of the largest deviation from motion.duration on [m]",
+    )
+    stress: Pressure | None = Field(
+        default=None,
+        description="upper limit of the largest von Mises stress of all arms along the motion, "
+        "relaxed for intermediate density [Pa]",
     )
     effort: Effort | None = Field(
         default=None,

@@ -18,6 +18,7 @@ ObjectiveKind = Literal[
     "compliance",
     "deviation",
     "settling",
+    "stress",
     "mass",
     "effort",
     "peak_force",
@@ -70,6 +71,20 @@ class Objective(Table):
         le=200,
         description="exponent p of the p-means that stand for extremes: over time, modes, load "
         "cases, scenarios, robust designs [-]",
+    )
+    stress_exponent: float = Field(
+        default=10.0,
+        ge=2,
+        le=100,
+        description="exponent p of the p-mean of the stress over cells and instants; the larger, "
+        "the closer to the largest stress and the harder for the optimiser [-]",
+    )
+    stress_margin: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e4,
+        description="cells closer than this to an interface do not count for the stress: at the "
+        "corners of a clamped edge it grows without bound as cells shrink [m]",
     )
     scenarios: Combination = Field(
         default="sum",

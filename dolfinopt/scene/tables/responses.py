@@ -19,6 +19,7 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "compliance": MOTION,
     "deviation": MOTION,
     "settling": MOTION,
+    "stress": MOTION,
     "static": STATICS,
     "eigenfrequency": VIBRATION,
     "first_frequency": VIBRATION,

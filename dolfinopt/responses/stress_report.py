@@ -1,0 +1,160 @@
+"""The stress of one simulated motion: where and when it is largest, and its map over all cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.fem.stress import places_of, stress_operator, stress_points
+from dolfinopt.mesh import compat
+from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
+from dolfinopt.responses.cell_stress import CellStress, cell_stress
+from dolfinopt.responses.screening import every, maxima, screen
+from dolfinopt.responses.stress_loads import ArmLoads, arm_loads
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.profiling import Profile
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Where and when the stress of one arm is largest.
+
+    Attributes:
+        value: Pa.
+        place: in the arm's frame, undeformed, m.
+        instant: s.
+    """
+
+    value: float
+    place: tuple[float, float]
+    instant: float
+
+    def to_dict(self, arm: str) -> dict[str, Any]:
+        """Return its entry of summary.json."""
+        return {
+            "value": self.value,
+            "arm": arm,
+            "place": list(self.place),
+            "instant": self.instant,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ArmStress:
+    """Von Mises stress of one arm of the chain along the motion, relaxed for partial density.
+
+    Attributes:
+        peak: the largest at the element centres: what a limit is for.
+        peak_at_points: the largest at centres and 2 x 2 Gauss points.
+        by_cell: (n_cells,) the largest at the centre of every cell, Pa; ranks in order.
+        when: (n_cells,) its instant, s.
+        by_instant: (n_times,) the largest at all centres, Pa.
+    """
+
+    peak: Peak
+    peak_at_points: Peak
+    by_cell: np.ndarray
+    when: np.ndarray
+    by_instant: np.ndarray
+
+
+def stress_report(
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    trajectory: Trajectory | None,
+    profile: Profile,
+) -> dict[int, ArmStress]:
+    """Return the stress of every arm with a design, by its place in the chain (collective).
+
+    Not counted: nothing depends on it.
+
+    Args:
+        partition: which ranks do which arm.
+        arms: this rank's, reduced.
+        trajectory: of these designs; on the root.
+        profile: of this rank.
+
+    Returns:
+        On the root; empty elsewhere.
+    """
+
+    def loads() -> dict[int, list[ArmLoads]]:
+        if trajectory is None:
+            return {}
+        scene = next(iter(arms.values())).scene
+        return arm_loads(scene, [trajectory])
+
+    by_owner: dict[int, list[ArmLoads]] = on_root(partition.world, loads)
+    if not by_owner:
+        return {}
+    counts = replace(profile.counts)
+    peaks: dict[int, list[_Peaks]] = {}
+    values: dict[int, np.ndarray] = {}
+    with profile.phase("stress"), together(partition.world):
+        for k, arm in arms.items():
+            state = arm.current
+            cells = cell_stress(state, arm.scene.objective.stress_margin)
+            found = [_arm_stress(partition, cells, one) for one in by_owner[k]]
+            peaks[k] = [one for one, _ in found]
+            values[k] = np.stack([value for _, value in found], axis=1)
+    profile.counts = counts
+    every_peak, whole = gather_arms(partition, peaks), gather_cells(partition, values)
+    if trajectory is None:
+        return {}
+    return {
+        one.place: _of_place(one, whole[k][:, number], trajectory.t)
+        for k, each in every_peak.items()
+        for number, one in enumerate(each)
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Peaks:
+    """Of one arm: place in the chain, value, place (2,) and sample of both peaks, history (n,)."""
+
+    place: int
+    centre: tuple[float, np.ndarray, int]
+    points: tuple[float, np.ndarray, int]
+    by_instant: np.ndarray
+
+
+def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
+    def peak(value: float, place: np.ndarray, sample: int) -> Peak:
+        return Peak(value, (float(place[0]), float(place[1])), float(t[sample]))
+
+    when = t[cells[:, 1].astype(int)]
+    return ArmStress(peak(*peaks.centre), peak(*peaks.points), cells[:, 0], when, peaks.by_instant)
+
+
+def _arm_stress(
+    partition: Partition, cells: CellStress, loads: ArmLoads
+) -> tuple[_Peaks, np.ndarray]:
+    """Return the peaks of one arm, and largest value and its sample of every cell (n_cells, 2).
+
+    Collective on the arm's ranks.
+    """
+    comm, a, coarse = partition.comm, loads.coefficients, every(len(loads.coefficients))
+    found, largest = maxima(comm, cells.A, a), screen(comm, cells.A, a, coarse)
+    where = cells.state.mesh.centroid
+    centre = largest.largest, _shared(partition, where, largest.point), largest.instant
+    state, mesh = cells.state, cells.state.mesh
+    points = stress_points(compat.cell_geometry_nodes(mesh.mesh, 0).shape[1])
+    operator = stress_operator(mesh, state.elastic.operators, points)
+    A = state.load_fields.stress(state.solid.young_modulus * operator)
+    A *= np.repeat(cells.root * (cells.weights > 0.0), len(points))[:, None]
+    largest = screen(comm, A, a, coarse)
+    place = _shared(partition, places_of(mesh, points).reshape(-1, 2), largest.point)
+    peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant), found.by_instant)
+    return peaks, np.column_stack([found.by_point, found.when])
+
+
+def _shared(partition: Partition, places: np.ndarray, point: int) -> np.ndarray:
+    """Return the place of a point that one rank of the arm knows, on all of them."""
+    known = partition.comm.allgather(places[point] if point >= 0 else None)
+    return next(one for one in known if one is not None)
