@@ -1,0 +1,352 @@
+"""Stress along the motion: against the full model, by finite differences, and as a limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from reference_machines import GAINS, slider_crank, two_arm, with_keys
+from remainders import Built, build, rates, uneven, wave
+from runs import TWO_ARM
+
+import dolfinopt as do
+from dolfinopt.fem.geometric_stiffness import static_response
+from dolfinopt.fem.stress import rotated
+from dolfinopt.multibody.inverse_dynamics import outward_pass
+from dolfinopt.responses import stress as module
+from dolfinopt.responses.cell_stress import CellStress, cell_stress
+from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
+from dolfinopt.responses.stress_loads import arm_loads, motions_of
+from dolfinopt.responses.stress_report import stress_report
+from dolfinopt.scene.load import scene_from_dict
+
+QUICK = "simulation.sample=0.01", "simulation.tolerance=1e-7", "objective.gradient=exact"
+
+
+class Analysed:
+    """A design, analysed for its stress."""
+
+    def __init__(self, built: Built, x) -> None:
+        _, self.trajectory = built.evaluate(x, simulated=True)
+        designs = {k: arm.current for k, arm in built.arms.items()}
+        self.analysis = Analysis(
+            built.scene, built.partition, designs, self.trajectory, built.profile
+        )
+        self.response = find("stress")(built.scene.objective)
+
+    def measure(self) -> Measured:
+        return self.response.measure(self.analysis)
+
+    def gradient(self) -> CellGradient:
+        [row] = self.response.gradients(self.analysis)
+        return row
+
+
+# -- displacements and stress against the full model -------------------------------------------
+
+
+def all_loads(arm, frame, rates_at, outboard, n):
+    """Return all loads of an instant on nodes and outboard interface, from the frame's motion.
+
+    -M (a + S X wd - X w^2 + ...), and what `outboard` (3,) takes away.
+    """
+    V, X = arm.current.basis.V, arm.current.elastic.points
+    u, ud, udd = (V @ x[n] for x in rates_at)
+    a, w, wd = frame.a[n], frame.w[n], frame.wd[n]
+
+    def turned(field):
+        return rotated(field[:, :, None])[:, :, 0]
+
+    acceleration = np.array([a.real, a.imag]) + wd * turned(X + u) - w * w * (X + u)
+    acceleration += 2.0 * w * turned(ud) + udd
+    elastic = arm.current.elastic
+    interior, end = elastic.restrict(-elastic.mass_times(acceleration[:, :, None]))
+    return interior, end + outboard[:, None]
+
+
+def geometric_matrix(arm, p):
+    """Return sum_p p K0_p of all nodal displacements, assembled from the loads' stress."""
+    elastic, loads = arm.current.elastic, arm.current.unit_loads
+    quadrature = elastic.substructure.quadrature
+    count, n = elastic.operators.cells.shape
+    xx, yy, xy = np.tensordot(loads.stresses, p, (1, 0)).reshape(3, count, -1)
+    D = quadrature.derivatives.reshape(count, -1, 2, n)
+    tensor = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
+    blocks = np.einsum("epai,epab,epbj->eij", D, tensor, D)
+    rows, columns = (np.broadcast_to(x, blocks.shape).ravel() for x in (
+        elastic.operators.cells[:, :, None], elastic.operators.cells[:, None, :]))  # fmt: skip
+    scalar = sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(len(elastic.points),) * 2)
+    return sp.kron(scalar, sp.eye(2))
+
+
+def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
+    """Return the relaxed stress of a nodal field (n_nodes, 2)."""
+    elastic = cells.state.elastic
+    values = field[elastic.operators.cells].reshape(len(cells.root), -1, 1)
+    found = (elastic.substructure.stress_operator @ values)[:, :, 0]
+    return cells.state.solid.young_modulus * cells.root * np.linalg.norm(found, axis=1)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("element", ["incompatible", "quadratic"])
+@pytest.mark.parametrize("method", ["craig-bampton", "modal"])
+def test_static_solution_of_all_loads(method: str, element: str) -> None:
+    """Without damping and stiffening mode acceleration is the full model's static solution.
+
+    The loads are those of the frame's motion, put together node by node. Mode displacement misses
+    it by what the modes cannot show.
+    """
+    built = build(
+        "simulation.stiffening=false", f"reduction.method={method}", "simulation.tolerance=1e-7",
+        "damping.stiffness_proportional=0", f"arms.element={element}", "motion.gravity=[0,-9.81]",
+    )  # fmt: skip
+    one = Analysed(built, built.fields(wave))
+    trajectory = one.trajectory
+    y, yd, ydd = trajectory.unknowns
+    frames, _ = outward_pass(trajectory.mechanism, trajectory.motion, y, yd, ydd)
+    worst = 0.0
+    for k, arm in built.arms.items():
+        part, c = trajectory.mechanism.slices[k], trajectory.load_coefficients[k]
+        rates_at = y[:, part], yd[:, part], ydd[:, part]
+        cells = cell_stress(arm.current)
+        [loads] = arm_loads(built.scene, [trajectory])[k]
+        for n in (300, 1200, 2500):
+            right = all_loads(arm, frames[k], rates_at, c[n, 4:7], n)
+            full = lengths(cells, static_response(arm.current.elastic, *right)[:, :, 0])
+            found = np.linalg.norm(cells.A @ loads.coefficients[n], axis=0)
+            assert np.abs(found - full).max() < 1e-6 * full.max()
+            modal = lengths(cells, arm.current.basis.V @ y[n, part])
+            worst = max(worst, float(np.abs(modal - full).max() / full.max()))
+    assert worst > (0.05 if method == "modal" else 1e-4)
+
+
+@pytest.mark.serial
+def test_static_solution_of_the_stiffened_arm() -> None:
+    """With stiffening, K less the loads' geometric stiffness: 0.2 % of the stress, 2 % allowed."""
+    built = build("simulation.stiffening=true", "simulation.tolerance=1e-7",
+                  "damping.stiffness_proportional=0")  # fmt: skip
+    one = Analysed(built, built.fields(wave))
+    trajectory = one.trajectory
+    y, yd, ydd = trajectory.unknowns
+    frames, _ = outward_pass(trajectory.mechanism, trajectory.motion, y, yd, ydd)
+    effect = 0.0
+    for k, arm in built.arms.items():
+        part, c = trajectory.mechanism.slices[k], trajectory.load_coefficients[k]
+        rates_at, cells = (y[:, part], yd[:, part], ydd[:, part]), cell_stress(arm.current)
+        [loads] = arm_loads(built.scene, [trajectory])[k]
+        elastic = arm.current.elastic
+        n = int(np.argmax(np.abs(c[:, 5])))
+        right = all_loads(arm, frames[k], rates_at, c[n, 4:7], n)
+        linear = static_response(elastic, *right)[:, :, 0]
+        Kg, u = geometric_matrix(arm, -c[n, :7]), linear
+        for _ in range(6):  # K u = f + sum_p p K0_p u
+            more = elastic.restrict((Kg @ u.ravel()).reshape(-1, 2, 1))
+            u = static_response(elastic, right[0] + more[0], right[1] + more[1])[:, :, 0]
+        full = lengths(cells, u)
+        found = np.linalg.norm(cells.A @ loads.coefficients[n], axis=0)
+        assert np.abs(found - full).max() < 2.5e-3 * full.max()
+        effect = max(effect, float(np.abs(lengths(cells, linear) - full).max() / full.max()))
+    assert effect > 0.01  # it is there
+
+
+@pytest.mark.serial
+def test_largest_of_all_samples_and_cells() -> None:
+    """The true value is the largest of all, however few instants are looked at; so is the map."""
+    built = build("simulation.sample=0.002")
+    one = Analysed(built, built.fields(wave))
+    report = stress_report(built.partition, built.arms, one.trajectory, built.profile)
+    largest = 0.0
+    for k, arm in built.arms.items():
+        cells = cell_stress(arm.current)
+        [loads] = arm_loads(built.scene, motions_of(one.trajectory))[k]
+        s = np.linalg.norm(np.moveaxis(cells.A @ loads.coefficients.T, 0, 2), axis=2)
+        largest = max(largest, float(s.max()))
+        e, n = np.unravel_index(np.argmax(s), s.shape)
+        peak = report[k].peak
+        assert peak.value == pytest.approx(s.max(), rel=1e-9)
+        assert peak.place == pytest.approx(arm.mesh.centroid[e])
+        assert peak.instant == one.trajectory.t[n]
+        assert report[k].peak_at_points.value > peak.value  # nearer to the edge
+        np.testing.assert_allclose(report[k].by_cell, s.max(axis=1), atol=2e-4 * s.max())
+        np.testing.assert_allclose(report[k].by_instant, s.max(axis=0), atol=2e-4 * s.max())
+    measured = one.measure()
+    assert measured.values[0] == pytest.approx(largest, rel=1e-9)
+    assert 0.2 * largest < measured.smooth[0] < largest
+
+
+@pytest.mark.serial
+def test_cells_near_an_interface_may_be_left_out() -> None:
+    """The stress grows at the clamped corners; objective.stress_margin takes them out."""
+    built = build("objective.stress_margin=0.1", cells=(40, 4))
+    near = build(cells=(40, 4))
+    even = built.fields(lambda k, x, y: np.full(len(x), 0.7))
+    inner, whole = Analysed(built, even), Analysed(near, even)
+    assert inner.measure().values[0] < whole.measure().values[0]
+    report = stress_report(built.partition, built.arms, inner.trajectory, built.profile)
+    length = built.scene.arms[0].length
+    for one in report.values():
+        assert 0.1 <= one.peak.place[0] <= length - 0.1
+
+
+@pytest.mark.serial
+def test_void_has_no_stress() -> None:
+    """Nor an infinite derivative."""
+    built = build(*QUICK)
+    x = built.fields(lambda k, x, y: np.where((x > 0.4) & (x < 0.6) & (abs(y) < 0.02), 0.0, 1.0))
+    one = Analysed(built, x)
+    report = stress_report(built.partition, built.arms, one.trajectory, built.profile)
+    for k in x:
+        assert not report[k].by_cell[x[k] == 0.0].any()
+        assert report[k].by_cell[x[k] == 1.0].all()
+    assert all(np.isfinite(g).all() for g in one.gradient().values())
+
+
+# -- gradients ---------------------------------------------------------------------------------
+
+KINDS = {
+    "linear": ("simulation.stiffening=false",),
+    "stiffened": ("simulation.stiffening=true", "damping.stiffness_proportional=1e-3"),
+    "modal": ("simulation.stiffening=true", "reduction.method=modal"),
+    "krylov": ("reduction.method=krylov",),
+    "incompatible": ("arms.element=incompatible", "objective.stress_margin=0.1"),
+    "scenarios": ('scenarios=[{changes=["payload.mass=2"]},{changes=["motion.gravity=[0,-9.81]", '
+                   '"material.density=3000", "material.young_modulus=60e9"]}]',),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The remainder of Taylor's formula has order 2, on any number of ranks.
+
+    All instants count, so that none comes or goes on the way.
+    """
+    monkeypatch.setattr(module, "CUT", 0.0)
+    built = build(*QUICK, *KINDS[kind])
+    x, d = built.fields(wave), built.fields(uneven)
+    slope = built.dot(Analysed(built, x).gradient(), d)
+
+    def value(h: float) -> float:
+        moved = {k: x[k] + h * d[k] for k in x}
+        return Analysed(built, moved).measure().smooth[0]
+
+    assert rates(value, slope, (1e-2, 2.5e-3)) == pytest.approx(2.0, abs=0.06)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", ["control", "slider"])
+def test_exact_gradient_of_machines(kind: str) -> None:
+    """Loads through free rigid coordinates and the closure's force are differentiated, too."""
+    stress = {"kind": "stress", "gradient": "exact"}
+    if kind == "control":
+        tree = two_arm("arms.cells=[20,3]", "motion.horizon=2.2", objective=stress, control=GAINS)
+        tree = with_keys(tree, {"simulation": {"tolerance": 1e-6, "sample": 0.01}})
+    else:
+        keys = {
+            "objective": stress,
+            "design": {"initial": 0.5},
+            "motion": {"speed": 60.0, "duration": 0.05, "horizon": 0.1},
+            "reduction": {"coordinates": 4},
+            "simulation": {"tolerance": 1e-7, "sample": 1e-3},
+        }
+        tree = with_keys(slider_crank(0.008, (24, 3)), keys)
+    model = do.Model(scene_from_dict(tree))
+    rng = np.random.default_rng(0)
+    x = {
+        name: np.clip(0.5 + 0.3 * np.sin(1.7 * np.arange(len(one))), 0.1, 1.0)
+        for name, one in model.uniform(0.5).items()
+    }
+    direction = {name: rng.uniform(-1.0, 1.0, len(one)) for name, one in x.items()}
+    exact = model.gradient(x, "exact")
+    slope = float(sum(exact[name] @ direction[name] for name in x))
+
+    def value(h: float) -> float:
+        return model.simulate({name: x[name] + h * direction[name] for name in x}).objective
+
+    h = 1e-4
+    # Instants near the limit of half the largest stress come and go: a thousandth of their part.
+    assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
+
+
+@pytest.mark.serial
+def test_gradient_with_frozen_loads() -> None:
+    """That of the static solutions under the loads of the instants, by differences."""
+    built = build("simulation.sample=0.05", "simulation.stiffening=false",
+                  "damping.stiffness_proportional=0", "objective.gradient=esl")  # fmt: skip
+    x, d = built.fields(wave), built.fields(uneven)
+    one = Analysed(built, x)
+    gradient, p = one.gradient(), built.scene.objective.stress_exponent
+    found = one.response._found(one.analysis)
+    loads = {}
+    for k, chosen in found.chosen.items():
+        state, part = found.cells[k].state, one.trajectory.mechanism.slices[k]
+        fields = state.load_fields.columns
+        # K u of every chosen instant.
+        loads[k] = [
+            state.elastic.restrict(state.elastic.stiffness_times((fields @ a)[:, :, None]))
+            for each in chosen
+            for a in each.a
+        ]
+        assert part is not None
+
+    def value(h: float) -> float:
+        total = 0.0
+        for k, right in loads.items():
+            arm = built.arms[k]
+            arm.set_design(x[k] + h * d[k])
+            cells = cell_stress_of_fields(arm)
+            for interior, end in right:
+                u = static_response(arm.current.elastic, interior, end)[:, :, 0]
+                total += float(cells.weights @ (lengths(cells, u) / found.largest) ** p)
+        return found.largest * (total / found.weight) ** (1.0 / p)
+
+    assert value(0.0) == pytest.approx(found.smooth, rel=1e-6)
+    slope = built.dot(gradient, d)
+    assert slope == pytest.approx((value(1e-5) - value(-1e-5)) / 2e-5, rel=1e-5)
+
+
+def cell_stress_of_fields(arm) -> CellStress:
+    """Return weights and relaxation of a design alone."""
+    state = arm.current
+    empty = np.zeros((3, len(state.x_phys), 0))
+    return CellStress(state, empty, arm.mesh.area, np.sqrt(state.x_phys))
+
+
+# -- as limit and objective ---------------------------------------------------------------------
+
+
+@pytest.mark.serial
+def test_work_is_done_once() -> None:
+    """Value and gradient share fields and search; a design that is only simulated has none."""
+    built = build(*QUICK, "simulation.stiffening=false", "reduction.coordinates=4",
+                  "constraints.stress=1e8")  # fmt: skip
+    x = built.fields(wave)
+    one = Analysed(built, x)
+    one.measure()
+    before = built.profile.counts.solves
+    one.measure()
+    assert built.profile.counts.solves == before
+    one.gradient()
+    adjoint = 4 + 2 * 4  # unit loads' inertia, elastic inertia
+    modes = 3  # and the constraint modes; normal modes iterate
+    assert built.profile.counts.solves - before >= 2 * (adjoint + modes)
+    plain = build(*QUICK, "simulation.stiffening=false", "reduction.coordinates=4")
+    assert built.profile.counts.solves > plain.profile.counts.solves
+
+
+@pytest.mark.serial
+@pytest.mark.slow
+def test_lightest_arms_below_a_stress() -> None:
+    """Half of what the even design bears costs mass, and the true stress meets the limit."""
+    options = [
+        "arms.cells=[40,6]", "simulation.sample=0.005", "objective.kind=mass",
+        "objective.gradient=exact", "design.volume_fraction=1.0", "design.initial=0.6",
+        "constraints.deviation=0.08", "optimizer.max_iterations=60",
+    ]  # fmt: skip
+    found = {}
+    for limit in (60e6, 90e6):
+        scene = do.load_scene(TWO_ARM, [*options, f"constraints.stress={limit:g}"])
+        result = do.optimize(scene)
+        one = next(each for each in result.limits if each.quantity == "stress")
+        assert one.unit == "Pa" and one.met, one.sentence
+        found[limit] = result.evaluation.objective
+    assert found[60e6] > found[90e6]
