@@ -108,7 +108,7 @@ def write_simulation(
         write_design(folder, views)
         if paraview:
             write_fields(folder, views)
-        write_trajectory(folder, one.trajectory, one.initial_deviation, stress)
+        write_trajectory(folder, one.trajectory, one.initial_deviation)
         if pictures is not None:
             since = time.perf_counter()
             pictures(views)

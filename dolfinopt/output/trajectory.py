@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,14 +13,10 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.responses.stress_report import ArmStress
 
 
 def write_trajectory(
-    folder: Path,
-    trajectory: Trajectory,
-    initial: np.ndarray | None = None,
-    stress: Mapping[int, ArmStress] | None = None,
+    folder: Path, trajectory: Trajectory, initial: np.ndarray | None = None
 ) -> None:
     """Write trajectory.npz and trajectory.csv; their units stand in `trajectory_units`.
 
@@ -29,7 +24,6 @@ def write_trajectory(
         folder: where.
         trajectory: what.
         initial: (n, 2) deviation of the initial design, m, kept for the picture.
-        stress: of every arm with a design, by its place in the chain.
     """
     arrays = {
         "t": trajectory.t,
@@ -39,8 +33,6 @@ def write_trajectory(
         "compliance": trajectory.compliance,
         "joint_forces": trajectory.joint_forces,
     } | _of_machine(trajectory)
-    if stress:
-        arrays["stress"] = np.stack([one.by_instant for one in stress.values()], axis=1)
     if initial is not None:
         arrays["initial_deviation"] = initial
     scene = trajectory.scene
@@ -56,8 +48,6 @@ def write_trajectory(
         "joint_forces": ", ".join(("N", *["N m"] * len(scene.arms))),
         "closure_force": "N, " + _directions(scene),
         "slider_position": "m, from closure.point along closure.direction",
-        "stress": "Pa, largest at the element centres of "
-        + ", ".join(scene.arms[k].name for k in stress or ()),
         "initial_deviation": "m",
     }
     arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])

@@ -21,6 +21,7 @@ from mpi4py import MPI
 # bounded, not computed.
 NEGLIGIBLE = 1e-4
 SINGULAR = 1e-13  # relative square below which a combination of columns counts as none
+MAPPED = 1e-3  # of the largest length, the error of a map of all points
 COARSE = 200  # instants, at most, at which all points are looked at first
 POINTS, INSTANTS = 2048, 64  # of one block, so that it stays in the cache
 BATCH = 16  # instants that are looked at before the bound is compared again
@@ -83,37 +84,33 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Maxima:
-    """The largest lengths of all points over all instants, right to `NEGLIGIBLE`.
+def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`).
 
-    Attributes:
-        by_point: (n_points,) over the instants.
-        when: (n_points,) the instant of each.
-        by_instant: (n,) over all points of all ranks.
+    Right to `MAPPED` times the largest of all; of instants no more are looked at than that takes.
     """
-
-    by_point: np.ndarray
-    when: np.ndarray
-    by_instant: np.ndarray
-
-
-def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> Maxima:
-    """Return the largest |A_e a_n| of every point and instant (collective on `comm`)."""
-    few = _condense(comm, A, a)
-    by_point, when = np.full(A.shape[1], -1.0), np.zeros(A.shape[1], dtype=int)
-    by_instant = np.zeros(len(a))
-    for start in range(0, A.shape[1], POINTS):
-        here = slice(start, start + POINTS)
-        for first in range(0, len(a), INSTANTS):
-            part = slice(first, first + INSTANTS)
-            squares = np.square(few.B[:, here] @ few.y[part].T).sum(axis=0)
-            np.maximum(by_instant[part], squares.max(axis=0), out=by_instant[part])
+    few, count = _condense(comm, A, a), A.shape[1]
+    instants = every(len(a))
+    enough = MAPPED * float(few.lengths(comm, instants).max(initial=0.0))
+    while True:
+        apart = few.apart(instants)
+        crowded = np.unique(np.searchsorted(instants, np.flatnonzero(apart > enough)))
+        halves = (instants[crowded - 1] + instants[crowded]) // 2
+        wider = np.union1d(instants, halves)
+        if len(wider) == len(instants):
+            break
+        instants = wider
+    by_point, when = np.full(count, -1.0), np.zeros(count, dtype=int)
+    for first in range(0, len(instants), INSTANTS):
+        part = instants[first : first + INSTANTS]
+        for start in range(0, count, POINTS):
+            here = slice(start, start + POINTS)
+            squares = _squares(few.B[:, here], few.y[part])
             worst = squares.argmax(axis=1)
-            values = np.take_along_axis(squares, worst[:, None], axis=1)[:, 0]
+            values = squares[np.arange(len(worst)), worst]
             larger = values > by_point[here]
-            by_point[here][larger], when[here][larger] = values[larger], first + worst[larger]
-    return Maxima(np.sqrt(np.maximum(by_point, 0.0)), when, np.sqrt(_max(comm, by_instant)))
+            by_point[here][larger], when[here][larger] = values[larger], part[worst[larger]]
+    return np.sqrt(np.maximum(by_point, 0.0)), when
 
 
 def every(count: int, most: int = COARSE) -> np.ndarray:
@@ -144,14 +141,22 @@ class _Condensed:
 
     def between(self, known: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return upper bounds (n,) from the values at the instants `known`, ends included."""
-        n = np.arange(len(self.y))
-        right = np.clip(np.searchsorted(known, n), 1, max(1, len(known) - 1))
-        right = np.minimum(right, len(known) - 1)
-        i, j = known[np.maximum(right - 1, 0)], known[right]
-        s = (n - i) / np.maximum(j - i, 1)
-        apart = self.y - (1.0 - s)[:, None] * self.y[i] - s[:, None] * self.y[j]
+        i, j, s = self._beside(known)
         ends = (1.0 - s) * (values[i] + self.rest[i]) + s * (values[j] + self.rest[j])
-        return ends + np.abs(apart) @ self.norms + self.rest
+        return ends + self.apart(known) + self.rest
+
+    def apart(self, known: np.ndarray) -> np.ndarray:
+        """Return sum_k |d_k| max_e |B_e,k| (n,) of what is not linear between the known."""
+        i, j, s = self._beside(known)
+        apart = self.y - (1.0 - s)[:, None] * self.y[i] - s[:, None] * self.y[j]
+        return np.abs(apart) @ self.norms
+
+    def _beside(self, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the known instants before and after every one, and where between them it is."""
+        n = np.arange(len(self.y))
+        right = np.minimum(np.maximum(np.searchsorted(known, n), 1), len(known) - 1)
+        i, j = known[np.maximum(right - 1, 0)], known[right]
+        return i, j, (n - i) / np.maximum(j - i, 1)
 
 
 def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
@@ -159,11 +164,11 @@ def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
 
     By the singular values of a in the metric of A'A, so that columns that cancel do no harm.
     """
-    scale = _norms(comm, A)
-    scale[scale == 0.0] = 1.0
-    scaled = A / scale
-    flat = scaled.reshape(-1, A.shape[2])
+    flat = A.reshape(-1, A.shape[2])
     gram = comm.allreduce(flat.T @ flat)
+    scale = np.sqrt(np.diagonal(gram))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    gram /= np.outer(scale, scale)
     values, vectors = np.linalg.eigh(0.5 * (gram + gram.T))
     if comm.size > 1:  # processors may round differently
         values, vectors = comm.bcast((values, vectors), root=0)
@@ -174,7 +179,7 @@ def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
     if comm.size > 1:
         directions = comm.bcast(directions, root=0)
     y = (inside[:, kept] * root) @ directions.T
-    B = scaled @ ((vectors[:, kept] / root) @ directions.T)
+    B = A @ ((vectors[:, kept] / root) @ directions.T / scale[:, None])
     norms = _norms(comm, B)
     sizes = np.abs(y) * norms
     behind = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1]  # of a direction and all behind it
@@ -189,8 +194,8 @@ def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
 
 def _norms(comm: MPI.Comm, A: np.ndarray) -> np.ndarray:
     """Return max_e |A_e,k| (m,) of every column (collective)."""
-    norms = np.sqrt(np.square(A).sum(axis=0).max(axis=0, initial=0.0))
-    return _max(comm, norms)
+    squares = np.einsum("cek,cek->ek", A, A)
+    return _max(comm, np.sqrt(squares.max(axis=0, initial=0.0)))
 
 
 def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -199,9 +204,18 @@ def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndar
     for first in range(0, len(a), INSTANTS):
         part = slice(first, first + INSTANTS)
         for start in range(0, A.shape[1], POINTS):
-            squares = np.square(A[:, start : start + POINTS] @ a[part].T).sum(axis=0)
+            squares = _squares(A[:, start : start + POINTS], a[part])
             np.maximum(out[part], squares.max(axis=0), out=out[part])
     return np.sqrt(_max(comm, out))
+
+
+def _squares(A: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return |A_e a_n|^2 (n_points, n)."""
+    parts = A @ a.T
+    np.multiply(parts, parts, out=parts)
+    parts[0] += parts[1]
+    parts[0] += parts[2]
+    return parts[0]
 
 
 def _point_of(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> int:

@@ -52,16 +52,15 @@ class ArmStress:
     Attributes:
         peak: the largest at the element centres: what a limit is for.
         peak_at_points: the largest at centres and 2 x 2 Gauss points.
-        by_cell: (n_cells,) the largest at the centre of every cell, Pa; ranks in order.
+        by_cell: (n_cells,) the largest at the centre of every cell, Pa, to a thousandth of the
+            largest of all; ranks in order.
         when: (n_cells,) its instant, s.
-        by_instant: (n_times,) the largest at all centres, Pa.
     """
 
     peak: Peak
     peak_at_points: Peak
     by_cell: np.ndarray
     when: np.ndarray
-    by_instant: np.ndarray
 
 
 def stress_report(
@@ -85,7 +84,7 @@ def stress_report(
     """
 
     def loads() -> dict[int, list[ArmLoads]]:
-        if trajectory is None:
+        if trajectory is None or not arms:
             return {}
         scene = next(iter(arms.values())).scene
         return arm_loads(scene, [trajectory])
@@ -116,12 +115,11 @@ def stress_report(
 
 @dataclass(frozen=True, eq=False)
 class _Peaks:
-    """Of one arm: place in the chain, value, place (2,) and sample of both peaks, history (n,)."""
+    """Of one arm: place in the chain; value, place (2,) and sample of both peaks."""
 
     place: int
     centre: tuple[float, np.ndarray, int]
     points: tuple[float, np.ndarray, int]
-    by_instant: np.ndarray
 
 
 def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
@@ -129,7 +127,7 @@ def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
         return Peak(value, (float(place[0]), float(place[1])), float(t[sample]))
 
     when = t[cells[:, 1].astype(int)]
-    return ArmStress(peak(*peaks.centre), peak(*peaks.points), cells[:, 0], when, peaks.by_instant)
+    return ArmStress(peak(*peaks.centre), peak(*peaks.points), cells[:, 0], when)
 
 
 def _arm_stress(
@@ -140,7 +138,8 @@ def _arm_stress(
     Collective on the arm's ranks.
     """
     comm, a, coarse = partition.comm, loads.coefficients, every(len(loads.coefficients))
-    found, largest = maxima(comm, cells.A, a), screen(comm, cells.A, a, coarse)
+    by_cell, when = maxima(comm, cells.A, a)
+    largest = screen(comm, cells.A, a, coarse)
     where = cells.state.mesh.centroid
     centre = largest.largest, _shared(partition, where, largest.point), largest.instant
     state, mesh = cells.state, cells.state.mesh
@@ -150,8 +149,8 @@ def _arm_stress(
     A *= np.repeat(cells.root * (cells.weights > 0.0), len(points))[:, None]
     largest = screen(comm, A, a, coarse)
     place = _shared(partition, places_of(mesh, points).reshape(-1, 2), largest.point)
-    peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant), found.by_instant)
-    return peaks, np.column_stack([found.by_point, found.when])
+    peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant))
+    return peaks, np.column_stack([by_cell, when])
 
 
 def _shared(partition: Partition, places: np.ndarray, point: int) -> np.ndarray:
