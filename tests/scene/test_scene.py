@@ -612,6 +612,8 @@ BAD_VALUES = [
     ("constraints.peak_force", [1.0, 2.0], "[1.0, 2.0]", "3 numbers, for cart, arm1, arm2"),
     ("objective.direction", "up", '"up"', '"minimize" | "maximize"'),
     ("objective.exponent", 1.0, "1.0", "a number >= 2"),
+    ("objective.stress_exponent", 1.0, "1.0", "a number >= 2"),
+    ("objective.stress_margin", -0.1, "-0.1", "a number >= 0"),
     ("design.volume_fraction", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
     ("design.volume_fraction", 1.5, "1.5", "a number >= 1e-06 and <= 1"),
     ("design.volume_fraction", 5e-4, "0.001 (default)", "at most volume_fraction = 0.0005"),
