@@ -6,12 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dolfinopt.optimization.optimality import ACTIVE, Sum, kkt_residual
+from dolfinopt.optimization.optimality import Sum, kkt_residual
 from dolfinopt.optimization.problem import Problem
-from dolfinopt.responses.constraints import EXCESS, Limit
+from dolfinopt.responses.constraints import Limit
 
 # Share of the violated constraint's gradient that another one must balance to stand against it.
 OPPOSES = 0.05
+NEAR = 0.02  # a limit counts as reached within this share of it: the iterations may end any time
 # Residual up to which nothing that the limits and bounds allow lessens the violation.
 STUCK = 0.2
 
@@ -34,20 +35,25 @@ def conflict_sentences(
         problem: at x.
         x, xmin, xmax, parts, total: as for `kkt_residual`.
     """
+    # All of the volume is no limit that could be relaxed, but that of a solid arm.
+    full = [one.quantity == "volume_fraction" and one.limit >= 1.0 for one in problem.limits]
+    eased = ~np.array(full, dtype=bool)
     found: dict[str, None] = {}  # two limits that conflict with each other say the same
-    for index in dict.fromkeys(problem.rows[problem.f > EXCESS].tolist()):
+    for index, limit in enumerate(problem.limits):
+        if limit.met:
+            continue
         own = problem.rows == index
         row = int(np.flatnonzero(own)[np.argmax(problem.f[own])])
-        others = np.flatnonzero(~own & (problem.f >= -ACTIVE))
+        others = np.flatnonzero(~own & (problem.f >= -NEAR) & eased[problem.rows])
         g, rows = problem.dfdx[row], problem.dfdx[others]
         residual, multipliers = kkt_residual(
-            x, xmin, xmax, g, problem.f[others], rows, parts, total
+            x, xmin, xmax, g, np.zeros(len(others)), rows, parts, total
         )
         sizes = _sizes(np.vstack([g, rows]) * (xmax - xmin), parts, total)
         strong = multipliers * sizes[1:] > OPPOSES
         opposed = {problem.limits[k] for k in problem.rows[others[strong]]}
         names = [one for one in problem.limits if one in opposed]
-        found[_sentence(problem.limits[index], names, residual)] = None
+        found[_sentence(limit, names, residual)] = None
     return "; ".join(found)
 
 

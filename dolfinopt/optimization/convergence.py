@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+
 from dolfinopt.scene.load import Scene
 from dolfinopt.units import NOT_MET
 
@@ -11,6 +13,7 @@ from dolfinopt.units import NOT_MET
 MOVING = 0.5
 # Grayness above which a projection has not done its work: as if 2 % of the cells stood at 1/2.
 GREY = 0.02
+LEAP = 2.0  # value of a constraint after over before a step that is too long
 
 Ending = Literal["", "converged", "infeasible", "limit"]
 
@@ -39,6 +42,15 @@ def ending(
     if rests and kkt <= scene.optimizer.kkt_tolerance:
         return "converged"
     return "limit" if iteration >= scene.optimizer.max_iterations else ""
+
+
+def leaps(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether a step leaves a constraint exceeded twice as far as it was before.
+
+    Args:
+        before, after: (m,) relative constraints, value / limit - 1; those that are kept count as 0.
+    """
+    return bool((1.0 + after > LEAP * (1.0 + np.maximum(before, 0.0))).any())
 
 
 def stop_reason(

@@ -12,14 +12,15 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import stiffening_of
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.assessment import assess, initial_selection
 from dolfinopt.optimization.certificate import certify
 from dolfinopt.optimization.conflicts import conflict_sentences
-from dolfinopt.optimization.convergence import Ending, ending, stop_reason
+from dolfinopt.optimization.convergence import Ending, ending, leaps, stop_reason
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
-from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
+from dolfinopt.optimization.mma import CURVED, MMAState, initial_state, mma_step
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.optimization.result import Result
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 # A checkpoint is written when this much time has passed: a kill costs no more than that, and
 # writing stays below a percent of the run.
 CHECKPOINT_INTERVAL = 2.0  # s
+
+# A step that leads astray is repeated with a move limit so much shorter, so many times in all.
+SHORTER, ATTEMPTS = 0.25, 4
 
 Report = Callable[[HistoryRow], None]
 
@@ -94,6 +98,7 @@ class _Run:
         finished: why the iterations have ended, "" while they go on.
         selection: of the coordinates, where the scene leaves it to "auto".
         initial_deviation: (n_times, 2) of the initial design, m (root only).
+        curved: what MMA is told of constraints that are curved, if there are any.
     """
 
     problem: Problem
@@ -119,6 +124,8 @@ class _Run:
         self.selection: OrderSelection | None = None
         self.initial_deviation = np.empty((0, 2))
         self.seconds_before = 0.0  # spent before a resume
+        curved = self.scene.constraints.limits.keys() - {"mass"}
+        self.curved = {"widest": CURVED} if curved else {}
         self.begun = self.saved = time.perf_counter()
 
     def go(self, memory: Memory | None) -> Result:
@@ -128,8 +135,7 @@ class _Run:
         if memory is None:
             self._record()
         while not self._finished():
-            self._update(self.problem)
-            self._evaluate()
+            self._step(self.problem)
             self._record()
             self._checkpoint()
         self._checkpoint(force=True)
@@ -165,7 +171,29 @@ class _Run:
         )
         return bool(self.finished)
 
-    def _update(self, problem: Problem) -> None:
+    def _step(self, problem: Problem) -> None:
+        """Update the design and evaluate it; shorten a step that curved constraints forbid.
+
+        Collective. Where a limit is exceeded twice as far as before, or the motion can no longer be
+        simulated, the linear forecast has failed: MMA is asked again from the design before.
+        """
+        x, state = self.x, self.state
+        projected = self.continuation.beta, dict(self.continuation.thresholds)
+        for attempt in range(ATTEMPTS):
+            last = attempt == ATTEMPTS - 1 or not self.curved
+            self._update(problem, self.continuation.move * SHORTER**attempt)
+            try:
+                self._evaluate()
+            except ConvergenceError:  # on all ranks
+                if last:
+                    raise
+            else:
+                if last or not leaps(problem.f, self.problem.f):
+                    return
+            self.x, self.state, self.iteration = x, state, self.iteration - 1
+            self.continuation.beta, self.continuation.thresholds = projected
+
+    def _update(self, problem: Problem, move: float) -> None:
         """Make one MMA step, and one of the continuation (collective)."""
         with self.profile.phase("mma"):
             x, self.state = mma_step(
@@ -176,7 +204,8 @@ class _Run:
                 self.variables.xmin,
                 self.variables.xmax,
                 self.state,
-                move=self.continuation.move,
+                move=move,
+                **self.curved,
                 comm=self.partition.world,
                 pieces=self.variables.pieces,
             )
@@ -231,8 +260,7 @@ class _Run:
         other.x, other.state = self.x, initial_state(self.x)
         try:
             for _ in range(count):
-                other._update(problem)
-                other._evaluate()
+                other._step(problem)
                 problem, other.kkt = other.problem, other._residual()
                 yield problem
                 if other._finished() and other.finished != "limit":

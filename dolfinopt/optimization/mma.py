@@ -30,6 +30,7 @@ Array = npt.NDArray[np.float64]
 _INITIAL_DISTANCE = 0.5
 _SMALLEST_DISTANCE = 0.01
 _LARGEST_DISTANCE = 10.0
+CURVED = 1.0  # for curved constraints: with 10 limits of the motion are left every 25 steps
 _WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: asyincr)
 _NARROW = 0.7  # where it turned back (asydecr)
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
@@ -100,6 +101,7 @@ def mma_step(
     state: MMAState,
     *,
     move: float = 0.2,
+    widest: float = _LARGEST_DISTANCE,
     comm: MPI.Comm | None = None,
     pieces: Mapping[int, int] | None = None,
 ) -> tuple[Array, MMAState]:
@@ -119,6 +121,8 @@ def mma_step(
         xmin, xmax: (n,) or scalar bounds; a variable with xmin == xmax stays.
         state: what the step before returned, or `initial_state(x)`.
         move: largest step of a variable, in units of its range.
+        widest: largest distance of the asymptotes, in these units. Wide ones make the approximation
+            nearly linear, which lets curved constraints be left again and again.
         comm: communicator over which the variables are distributed; None: all are here.
         pieces: number and length of the consecutive pieces of this rank's variables. Sums are
             taken piece by piece and added in the order of their numbers: as long as no piece is
@@ -145,6 +149,7 @@ def mma_step(
         xmax if xmax.ndim else np.full(x.shape, xmax),
         state,
         move,
+        widest,
         {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
     )
     f_agreed, largest = _agree(given, comm)
@@ -169,6 +174,7 @@ class _Given:
     xmax: Array
     state: MMAState
     move: float
+    widest: float
     pieces: Mapping[int, int]
 
     def gradients(self, columns: slice) -> Array:
@@ -212,6 +218,8 @@ def _fault(given: _Given) -> str:
             return f"state.{name} does not hold {n} finite numbers"
     if sum(given.pieces.values()) != n:
         return f"pieces hold {sum(given.pieces.values())} variables, x {n}"
+    if given.widest < _INITIAL_DISTANCE:
+        return f"widest is {given.widest}, expected at least {_INITIAL_DISTANCE}"
     if not 0.0 < given.move <= 1.0:
         return f"move is {given.move}, expected 0 < move <= 1"
     outside = (given.x < given.xmin) | (given.x > given.xmax)
@@ -258,7 +266,7 @@ def _asymptote_distance(given: _Given, columns: slice, width: Array) -> Array:
     moving = np.minimum(np.abs(last), np.abs(before)) > _AT_REST
     factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
     distance = factor * (state.upp[columns] - state.low[columns]) / (2.0 * width)
-    return np.minimum(np.maximum(distance, _SMALLEST_DISTANCE), _LARGEST_DISTANCE)
+    return np.minimum(np.maximum(distance, _SMALLEST_DISTANCE), given.widest)
 
 
 @dataclass(frozen=True, eq=False)

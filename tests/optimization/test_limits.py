@@ -1,0 +1,142 @@
+"""Limits of the motion, of mass and frequencies: met by true values, or said to conflict."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import TWO_ARM
+
+import dolfinopt as do
+from dolfinopt.optimization.problem import problem_of
+from dolfinopt.responses.constraints import EXCESS, limits_by_column, tightest
+from dolfinopt.responses.response import constraints_of
+
+WORLD = MPI.COMM_WORLD
+QUICK = ["arms.cells=[40,4]", "design.filter_radius=0.05", "design.volume_fraction=1.0"]
+QUICK += ["simulation.sample=0.005", "reduction.coordinates=3", "objective.gradient=exact"]
+
+
+def scene(*changes, iterations):
+    settings = [*QUICK, *changes, f"optimizer.max_iterations={iterations}"]
+    return do.load_scene(TWO_ARM, settings)
+
+
+def values(result):
+    return {one.name: one for one in result.limits if one.quantity != "volume_fraction"}
+
+
+@pytest.mark.parametrize(
+    ("deviation", "settling", "active"),
+    [(0.008, 0.001, "deviation"), (0.012, 2.5e-4, "settling")],
+)
+def test_lightest_arms_keep_limits_by_their_true_values(deviation, settling, active):
+    """From an initial design that is seven times beyond them, to 0.1 % of the active one."""
+    limits = [f"constraints.deviation={deviation}", f"constraints.settling={settling}"]
+    result = do.optimize(scene("objective.kind=mass", *limits, iterations=60))
+    found = values(result)
+    assert set(found) == {"deviation", "settling"} and not result.violated
+    assert found[active].value == pytest.approx(found[active].limit, rel=1e-3)
+    evaluation = result.evaluation
+    assert found["deviation"].value == evaluation.max_deviation  # what the summary has
+    if result.trajectory is not None:
+        assert found["settling"].value == result.trajectory.settling
+        # The sum of the summary's masses.
+        bodies = result.trajectory.mechanism.bodies
+        assert sum(one.mass for one in bodies) == pytest.approx(evaluation.objective, rel=1e-10)
+    # The lightest: with a little more of the limit there is a lighter one, so it is not void.
+    assert 1.7 < evaluation.objective < 3.2
+
+
+def test_limits_are_not_left_again():
+    """Asymptotes that widen without bound leave a curved limit every 25 iterations or so."""
+    changes = ["objective.kind=mass", "constraints.deviation=0.008", "objective.gradient=esl"]
+    result = do.optimize(scene(*changes, iterations=60))
+    if WORLD.rank == 0:
+        reached = [row.constraints["deviation"] / 0.008 - 1.0 for row in result.history]
+        assert reached[0] > 5.0
+        assert max(reached[10:]) < EXCESS
+        assert {row.tightest for row in result.history[10:]} == {"limits met"}
+        assert result.history[0].tightest.startswith("deviation 5")
+
+
+def test_limits_that_conflict_are_named():
+    changes = ["constraints.deviation=0.008", "constraints.mass=1.5"]
+    result = do.optimize(scene(*changes, "objective.kind=mass", iterations=12))
+    assert not result.converged
+    sentence = "deviation <= 0.008 m and mass <= 1.5 kg conflict: relax one of them"
+    assert sentence in result.stop_reason and sentence in result.violated
+    # What even solid arms do not keep.
+    result = do.optimize(scene("objective.kind=mass", "constraints.deviation=0.004", iterations=12))
+    assert "no design near this one meets deviation <= 0.004 m" in result.stop_reason
+    # What one iteration cannot reach is no conflict.
+    result = do.optimize(scene("objective.kind=mass", "constraints.deviation=0.008", iterations=1))
+    assert "nothing stands against deviation <= 0.008 m" in result.stop_reason
+
+
+def test_limits_hold_for_the_worst_scenario():
+    loads = '[{changes=["payload.mass=3"], weight=5.0}, {changes=["payload.mass=6"]}]'
+    changes = ["objective.kind=mass", "constraints.deviation=0.01", f"scenarios={loads}"]
+    result = do.optimize(scene(*changes, "objective.scenarios=sum", iterations=40))
+    light, heavy = (one.max_deviation for one in result.evaluation.scenarios)
+    assert light < heavy == values(result)["deviation"].value
+    assert heavy == pytest.approx(0.01, rel=1e-3) and not result.violated
+
+
+def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass():
+    changes = ["objective.kind=mass", "constraints.deviation=0.012", "design.projection=robust"]
+    built = scene(*changes, "design.erosion=0.2", iterations=1)
+    evaluator = evaluator_of(built)
+    x = np.full(evaluator.variables.size, 0.6)
+    x[::7] = 0.3
+    designs = evaluator.evaluate(x)
+    problem = problem_of(built, designs)
+    masses = [one.evaluation.objective for one in designs]
+    assert masses[0] < masses[2] < masses[1]  # eroded, nominal, dilated
+    assert problem.f0 == masses[2]
+    limits = {one.quantity: one for one in problem.limits}
+    deviations = [one.evaluation.max_deviation for one in designs]
+    assert limits["deviation"].value == max(deviations) == deviations[0]
+    assert np.array_equal(problem.df0dx, designs[2].objective)
+    # Every design's deviation is a row, and all of them are one limit in reports.
+    rows = [problem.limits[k].quantity for k in problem.rows]
+    assert rows.count("deviation") == 3 and rows.count("volume_fraction") == 2
+    assert problem.f[problem.rows == rows.index("deviation")] == pytest.approx(
+        [one / 0.012 - 1.0 for one in deviations], rel=1e-9
+    )
+
+
+def evaluator_of(built):
+    from dolfinopt.optimization.evaluator import Evaluator
+
+    partition = do.partition_arms(WORLD, built.cell_counts)
+    profile = do.Profile()
+    return Evaluator(built, partition, do.build_arms(built, partition, profile), profile)
+
+
+def test_an_objective_turned_round_rises():
+    """The tips are to move as far as they can: as in a compliant machine."""
+    changes = ["objective.kind=tip_deflection", "objective.direction=maximize"]
+    result = do.optimize(scene(*changes, "constraints.first_frequency=[0.5,1.0]", iterations=20))
+    if WORLD.rank == 0:
+        first, *_, last = (row.objective for row in result.history)
+        assert last > 50.0 * first
+    found = values(result)
+    assert {name: one.limit for name, one in found.items()} == {
+        "first_frequency_arm1": 0.5,
+        "first_frequency_arm2": 1.0,
+    }
+    assert all(one.least and one.met for one in found.values())
+
+
+def test_limits_by_the_columns_of_the_history():
+    built = scene("constraints.first_frequency=[0.5,1.0]", "constraints.mass=2.0", iterations=1)
+    names = ["volume_fraction_arm1", "volume_fraction_arm2", "mass"]
+    names += ["first_frequency_arm1", "first_frequency_arm2"]
+    assert limits_by_column(built, names) == dict(
+        zip(names, [1.0, 1.0, 2.0, 0.5, 1.0], strict=True)
+    )
+    assert [one.name for one in constraints_of(built)] == [
+        "volume_fraction", "mass", "first_frequency"
+    ]  # fmt: skip
+    assert tightest(()) == ""
