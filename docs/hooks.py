@@ -23,10 +23,13 @@ from dolfinopt.scene.load import describe_keys
 ROOT = Path(__file__).parents[1]
 TABLES = {
     "": "Top level",
-    "material": "Material of all arms that state none of their own.",
+    "material": 'Material of all arms that state none of their own. `material = "NAME"` at the top '
+    "of the scene takes a material of the catalogue; `dolfinopt keys material` lists them.",
     "interpolation": "How stiffness and mass follow from the density x of a cell.",
     "arms": "An array of tables, one `[[arms]]` an arm, from the base outwards. "
     "A key that an arm leaves out has the value of the arm before it.",
+    "arms.regions": "An array of tables below an arm's, one `[[arms.regions]]` a part of the arm "
+    "that stays solid or void.",
     "motion": "What the machine does.",
     "control": "Drives with feed-forward and feedback; without this table joints are prescribed.",
     "closure": "What closes the chain: a slider or a pin at the end of the last arm.",
@@ -87,7 +90,7 @@ def scene_reference() -> str:
         table, _, key = info.key.rpartition(".")
         if table not in known:
             known.add(table)
-            array = table in ("arms", "scenarios")
+            array = table in ("arms", "arms.regions", "scenarios")
             title = f"`[[{table}]]`" if array else f"`[{table}]`" if table else TABLES[""]
             lines += [f"\n## {title} {{#{table or 'top'}}}\n"]
             lines += [f"{TABLES.get(table, '')}\n"] if table else []

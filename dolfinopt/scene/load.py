@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 from pydantic import ValidationError
 
@@ -36,7 +36,7 @@ from dolfinopt.scene.messages import (
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.spelling import cut, input_error, shown
 from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, PATTERN_KEYS, Arm
-from dolfinopt.scene.tables.base import Loc, Refusal
+from dolfinopt.scene.tables.base import Loc, Refusal, without_none
 from dolfinopt.scene.tables.interpolation import Law
 from dolfinopt.scene.tables.material import MATERIAL_VALUES
 from dolfinopt.scene.tables.motion import Motion
@@ -464,11 +464,18 @@ def _check_known(tree: dict[str, Any], loc: Loc, where: str) -> None:
         parent = model_at(above)
         if isinstance(key, int):
             continue
-        if parent is None:
+        if parent is None or _is_array(above):
             remedy = f"set {dotted(above, tree)} as a whole: {allowed_words(field_at(above))}"
             raise input_error(where, f"unknown key {dotted(loc, tree)}; {remedy}")
         if key not in parent.model_fields:
             raise input_error(where, unknown_key(above, key, parent.model_fields, tree))
+
+
+def _is_array(loc: Loc) -> bool:
+    """Tell whether `loc` is the path of an array of tables."""
+    if not loc or isinstance(loc[-1], int):
+        return False
+    return get_origin(without_none(field_at(loc).annotation)) is tuple
 
 
 def _store(tree: dict[str, Any], loc: Loc, value: Any) -> None:

@@ -102,6 +102,45 @@ def test_the_radius_of_a_width(erosion):
     assert np.diff(y[order]).max() > 0.0
 
 
+@pytest.mark.parametrize(("member", "gap"), [(0.04, 0.08), (0.05, 0.025), (0.05, 0.05)])
+@pytest.mark.parametrize("erosion", [0.05, 0.1, 0.25])
+def test_a_member_and_a_gap_of_two_widths(member, gap, erosion):
+    """One filter: the strips that just reach the eroded and the dilated threshold are as wide."""
+    data = {"projection": "robust", "erosion": erosion}
+    data |= {"minimum_member": member, "minimum_gap": gap}
+    fine = ("arms.height=0.2", "arms.cells=[400,60]")
+    design = do.load_scene(TWO_ARM, (f"design={toml(data)}", *fine)).design
+    assert min(design.erosions) == pytest.approx(erosion) and max(design.erosions) < 0.5
+    cell = 1.0 / 8000.0
+    mesh = structured_arm(MPI.COMM_SELF, "a", 1.0, 0.002, (8000, 1))
+    smooth = HelmholtzFilter(mesh, design.radius)
+    for wanted, distance in zip((member, gap), design.erosions, strict=True):
+        # Void within solid is solid within void, turned round.
+        half = -design.radius / (2.0 * np.sqrt(3.0)) * np.log(0.5 - distance)
+        strip = np.clip((half - np.abs(mesh.centroid[:, 0] - 0.5)) / cell + 0.5, 0.0, 1.0)
+        y = smooth.forward(strip)
+        assert y.max() == pytest.approx(0.5 + distance, abs=2e-3)
+        assert (y > 0.5).sum() * cell == pytest.approx(wanted, abs=3.0 * cell)
+
+
+@pytest.mark.parametrize("key", ["minimum_member", "minimum_gap"])
+def test_one_width_is_that_of_members_and_gaps(key):
+    design = do.load_scene(TWO_ARM, ("design.projection=robust", f"design.{key}=0.018")).design
+    assert design.least_widths == (0.018, 0.018) and design.erosions == (0.1, 0.1)
+    other = do.load_scene(TWO_ARM, ("design.projection=robust", "design.minimum_member=0.018"))
+    assert design.radius == other.design.radius and other.design.controls_widths
+
+
+def test_what_repeats_a_design_smaller_keeps_the_width():
+    """The filter of the pattern is wider by as much as the smallest copy is smaller."""
+    width = ("design.projection=robust", "design.minimum_member=0.015")
+    small = ("arms.arm2.pattern=arm1", "arms.arm2.height=0.048", "arms.arm2.length=0.9")
+    scene = do.load_scene(TWO_ARM, (*width, *small))
+    assert scene.filter_radius(0) == pytest.approx(scene.design.radius / 0.8)
+    plain = do.load_scene(TWO_ARM, small)  # without a width it is the stated radius
+    assert plain.filter_radius(0) == plain.design.filter_radius
+
+
 def toml(data):
     return "{" + ", ".join(f"{k}={v!r}" for k, v in data.items()) + "}"
 
@@ -134,6 +173,24 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
         member, gap = widths[0]
         assert member >= width - cell
         assert gap >= width - cell
+
+
+def test_a_gap_of_its_own_widens_the_gaps():
+    """The gaps of a nearly full arm are as wide as asked, and were thinner with members alone."""
+    full = ("design.volume_fraction=0.75", "design.initial=0.75", "design.minimum_member=0.01")
+    more = ("design.erosion=0.25", "design.sharpness=64", "design.continuation=10")
+    cell, gaps = 0.06 / 18, []
+    for gap in (0.0, 0.02):
+        changes = (*ROBUST, *full, *more, f"design.minimum_gap={gap}")
+        scene = do.load_scene(TWO_ARM, (*changes, "optimizer.max_iterations=120"))
+        result = do.optimize(scene)
+        widths = _widths(result.partition, result.arms, result.x_phys)
+        if WORLD.rank == 0:
+            member, found = widths[0]
+            assert member >= 0.01 - cell
+            gaps.append(found)
+    if WORLD.rank == 0:
+        assert gaps[0] < 0.02 - cell and gaps[1] >= 0.02 - cell
 
 
 @pytest.mark.parametrize("width", [0.012, 0.0])
@@ -171,6 +228,42 @@ def test_which_design_carries_the_volume(width):
             r"expected 0\.0075, the default, with minimum_member = 0\.02: .* 0\.049976",
         ),
         (["design.minimum_member=-1.0"], "a number >= 0"),
+        (
+            ["design.minimum_gap=0.015"],
+            'minimum_gap = 0.015: .* unless design.projection = "robust"',
+        ),
+        (
+            ["design.projection=robust", "design.minimum_gap=0.014"],
+            r"minimum_gap = 0\.014: expected at least 3 cells of arm .arm1., 0\.015 \[m\]; .* gap",
+        ),
+        (
+            [
+                *("design.projection=robust", "arms.height=0.3", "arms.cells=[200,60]"),
+                *("design.minimum_member=0.015", "design.minimum_gap=0.08"),
+            ],
+            r"minimum_gap = 0\.08: expected at most 0\.06477 \[m\], 4\.32 times minimum_member = ",
+        ),
+        (
+            [
+                *("design.projection=robust", "arms.height=0.3", "arms.cells=[200,60]"),
+                *("design.minimum_member=0.08", "design.minimum_gap=0.015"),
+            ],
+            r"minimum_member = 0\.08: expected at most 0\.06477 \[m\], 4\.32 times minimum_gap = ",
+        ),
+        (
+            [
+                *("design.projection=robust", "design.minimum_member=0.015"),
+                "design.minimum_gap=0.035",
+            ],
+            r"two members of 0\.015 \[m\] and a gap of 0\.035 \[m\] within the height of arm",
+        ),
+        (
+            [
+                *("design.projection=robust", "design.minimum_member=0.018"),
+                *("arms.arm2.pattern=arm1", "arms.arm2.height=0.05"),
+            ],
+            "a third of the height of what repeats arm .arm1., 0.01667",
+        ),
     ],
 )
 def test_widths_that_cannot_be(overrides, reason):

@@ -197,6 +197,13 @@ def test_arms_without_cells_have_no_regions():
 
 
 @pytest.mark.serial
+def test_regions_are_set_as_a_whole():
+    message = refused("arms.arm1.regions.0.kind=void")
+    assert "unknown key arms.0.regions.0 (arm1); set arms.0.regions (arm1) as a whole" in message
+    assert "an array of tables" in message
+
+
+@pytest.mark.serial
 def test_nothing_is_written_where_a_region_is_refused(tmp_path):
     words = overrides(*SMALL, regions('{kind="void", box=[0.4,-0.03,0.5,0.03]}'))
     with pytest.raises(InputError):

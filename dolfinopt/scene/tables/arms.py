@@ -103,9 +103,6 @@ class Arm(Table):
         description="name of an earlier arm whose design this one repeats, scaled to its own "
         "length and height, cell by cell [-]",
     )
-    regions: tuple[Region, ...] = Field(
-        default=(), description="parts of the arm that stay solid or void"
-    )
     rigid: bool = Field(
         default=False, description="a rigid bar of solid material, not optimised [-]"
     )
@@ -177,6 +174,9 @@ class Arm(Table):
     yield_strength: YieldStrength | None = Field(
         default=None,
         description="yield strength of this arm's material; default: material.yield_strength [Pa]",
+    )
+    regions: tuple[Region, ...] = Field(
+        default=(), description="parts of the arm that stay solid or void"
     )
 
     @model_validator(mode="after")
