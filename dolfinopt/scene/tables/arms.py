@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 CellShape = Literal["quadrilateral", "triangle"]
 ElementName = Literal["incompatible", "linear", "quadratic"]
-DEFAULT_ELEMENT: dict[CellShape, ElementName] = {"quadrilateral": "linear", "triangle": "linear"}
+DEFAULT_ELEMENT: dict[CellShape, ElementName] = {
+    "quadrilateral": "incompatible",
+    "triangle": "quadratic",
+}
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MESH_FILES = (".geo", ".msh", ".step", ".stp")
@@ -82,8 +85,8 @@ class Arm(Table):
     )
     element: ElementName | None = Field(
         default=None,
-        description="finite element: bilinear quadrilaterals with incompatible modes, linear, or "
-        "quadratic; default: linear [-]",
+        description='finite element: "incompatible" are bilinear quadrilaterals that bend without '
+        "locking; default: incompatible quadrilaterals, quadratic triangles [-]",
     )
     passive: float | None = Field(
         default=None,
