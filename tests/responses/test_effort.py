@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM, scene
+from runs import ROOT, TWO_ARM, scene
 
 import dolfinopt as do
 from dolfinopt import Model
@@ -174,6 +177,34 @@ def test_a_limit_of_the_drives_is_met(limit: str) -> None:
     assert not result.violated
     asked = [one for one in result.limits if one.quantity != "volume_fraction"]
     assert -5e-3 < max(one.excess for one in asked) <= 1e-3
+
+
+@pytest.mark.slow
+def test_least_effort_at_the_accuracy_of_least_compliance() -> None:
+    """Lighter arms do as well, and the drives feel it."""
+    changes = ["arms.cells=[30,4]", "payload.mass=0.5", "design.filter_radius=0.05"]
+    changes += ["simulation.tolerance=1e-3", "optimizer.max_iterations=40"]
+    stiff = do.optimize(scene(*changes, "constraints.effort=1e3"))
+    kept = f"constraints.deviation={stiff.evaluation.max_deviation}"
+    lazy = do.optimize(scene(*changes, EFFORT, kept))
+    assert not lazy.violated
+    before = stiff.evaluation.values_of("effort")[0]
+    assert lazy.evaluation.objective < 0.95 * before  # 0.923
+
+
+def test_effort_demo(shared_tmp_path: Path) -> None:
+    """Runs, tables and draws on few cells."""
+    path = ROOT / "demos" / "demo_effort.py"
+    spec = importlib.util.spec_from_file_location("demo_effort", path)
+    assert spec is not None and spec.loader is not None
+    demo = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(demo)
+    rows = demo.main(shared_tmp_path, (20, 2), 3)
+    if WORLD.rank == 0:
+        assert [row["design"] for row in rows] == ["least compliance", "least effort"]
+        lines = (shared_tmp_path / "effort.csv").read_text(encoding="utf-8").splitlines()
+        assert len(lines) == 3 and lines[0].startswith("design,effort,deviation [mm]")
+        assert (shared_tmp_path / "effort.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_gradient_is_exact_whatever_is_asked_for() -> None:
