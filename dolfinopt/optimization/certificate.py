@@ -59,11 +59,14 @@ class Further:
     def sentence(self) -> str:
         """E.g. "5.1 % above the best of 20 further iterations with the exact gradient"."""
         how = f"{self.iterations} further iterations with the exact gradient"
-        if self.excess > 0.0:
-            worst = "" if self.feasible else ", which does not keep all constraints"
-            where = "below" if self.maximised else "above"
-            return f"{100.0 * self.excess:.2g} % {where} the best of {how}{worst}"
-        return f"{how} found nothing better"
+        if not self.feasible:
+            return f"{how} found no design that keeps all constraints"
+        if self.excess == 0.0:
+            return f"{how} found nothing better"
+        percent = 100.0 * abs(self.excess)
+        size = f"{percent:.2g}" if percent < 99.5 else f"{percent:.0f}"
+        where = "above" if (self.excess > 0.0) != self.maximised else "below"
+        return f"{size} % {where} the best of {how}"
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ class Certificate:
         """All of it in one line."""
         if self.missing:
             return f"no exact gradient to judge the design by: {self.missing}"
-        parts = [f"residual {self.kkt:.2g} under the exact gradient"]
+        kept = " of a design that does not keep all constraints" if self.violated else ""
+        parts = [f"residual {self.kkt:.2g} under the exact gradient{kept}"]
         if np.isfinite(self.angle):
             parts.append(f"that with frozen loads points {self.angle:.3g} degrees off it")
         if self.further is not None:

@@ -211,7 +211,11 @@ def test_best_of_what_keeps_the_constraints():
     assert most.objective == 4.0 and most.excess == pytest.approx(0.25)
     assert most.sentence.startswith("25 % below the best of 2 ")
     none = best_of(at(3.0, met=False), [at(2.0, met=False)])
-    assert not none.feasible and "does not keep all constraints" in none.sentence
+    assert not none.feasible
+    assert none.sentence.endswith("found no design that keeps all constraints")
+    assert best_of(at(9.0), [at(2.0)]).sentence.startswith("350 % above")
+    mended = best_of(at(3.0, met=False), [at(4.0)])
+    assert mended.feasible and mended.sentence.startswith("25 % below the best of 1 ")
 
     def failing():
         yield at(2.0)
