@@ -40,7 +40,8 @@ def write_gradient(
 ) -> None:
     """Write the gradient with respect to the physical densities (collective).
 
-    Of a shared design once, under the name of the arm it belongs to.
+    Of a shared design once, under the name of the arm it belongs to; of arms that repeat another's
+    design each arm's own, which add up cell by cell.
     """
     centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
     gathered = gather_cells(partition, by_cell)

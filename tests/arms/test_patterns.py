@@ -117,6 +117,28 @@ def test_constraints_of_both_arms_bind_one_design():
     np.testing.assert_allclose(slopes, differences, rtol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["stress", "peak_force"])
+def test_gradients_of_extremes_know_void_cells(kind):
+    """A void cell has no stress and no say; central differences by the design of both arms."""
+    exact = ("objective.gradient=exact", "simulation.tolerance=1e-7", "motion.horizon=2.2")
+    limit = "constraints.deviation=0.02"
+    scene, partition, arms = built(*REPEATED, REGIONS, *exact, limit, f"objective.kind={kind}")
+    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    variables = evaluator.variables
+    start = np.concatenate([waves(arms[k]) for k in arms if k == 0] or [np.empty(0)])
+    x = np.clip(start, variables.xmin, variables.xmax)
+    free = variables.xmin < variables.xmax
+    direction = np.where(free, np.cos(1.7 * np.arange(x.size)), 0.0)
+    [here] = evaluator.evaluate(x)
+    assert np.isfinite(here.objective).all() and np.isfinite(here.constraints).all()
+    h = 1e-4
+    ahead, behind = (
+        evaluator.evaluate(x + sign * h * direction)[0].evaluation.objective for sign in (1, -1)
+    )
+    slope = WORLD.allreduce(float(here.objective @ direction))
+    assert slope == pytest.approx((ahead - behind) / (2.0 * h), rel=1e-5)
+
+
 def test_any_number_of_ranks_ends_in_the_same_design():
     scene = do.load_scene(TWO_ARM, SCALED)
     together, alone = do.optimize(scene), do.optimize(scene, world=MPI.COMM_SELF)
