@@ -24,8 +24,15 @@ PRESETS = {"objectives": "objective", "reductions": "reduction"}
     metavar="N",
     help="of the reductions, any number of times; default: 4 and 12",
 )
+@click.option(
+    "--kind",
+    "kinds",
+    multiple=True,
+    metavar="KIND",
+    help="of the objectives, any number of times; default: all",
+)
 @study_options
-def compare(run: StudyRun, what: str, coordinates: tuple[int, ...]) -> None:
+def compare(run: StudyRun, what: str, coordinates: tuple[int, ...], kinds: tuple[str, ...]) -> None:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
@@ -33,8 +40,10 @@ def compare(run: StudyRun, what: str, coordinates: tuple[int, ...]) -> None:
     """
     if coordinates and what == "objectives":
         raise InputError("--coordinates: expected only with compare SCENE reductions")
+    if kinds and what != "objectives":
+        raise InputError("--kind: expected only with compare SCENE objectives")
     from dolfinopt.study.studies import study
 
     preset: Any = PRESETS[what]
     vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
-    run.carry_out(preset, [], partial(study, run.scene, preset, vary, []))
+    run.carry_out(preset, [], partial(study, run.scene, preset, vary, [], kinds=kinds))

@@ -16,7 +16,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.assessment import assess, initial_selection
 from dolfinopt.optimization.certificate import certify
 from dolfinopt.optimization.conflicts import conflict_sentences
-from dolfinopt.optimization.convergence import Ending, ending, leaps, stop_reason
+from dolfinopt.optimization.convergence import Ending, ending, landing, leaps, stop_reason
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
@@ -179,9 +179,12 @@ class _Run:
         """
         x, state = self.x, self.state
         projected = self.continuation.beta, dict(self.continuation.thresholds)
+        move = self.continuation.move
+        if self.curved:
+            move *= landing(self.scene, self.iteration, float(problem.f.max()))
         for attempt in range(ATTEMPTS):
             last = attempt == ATTEMPTS - 1 or not self.curved
-            self._update(problem, self.continuation.move * SHORTER**attempt)
+            self._update(problem, move * SHORTER**attempt)
             try:
                 self._evaluate()
             except ConvergenceError:  # on all ranks

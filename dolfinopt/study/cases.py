@@ -180,6 +180,11 @@ class Outcome:
         with np.load(self.folder / "trajectory.npz", allow_pickle=False) as data:
             return data["t"], np.hypot(*data["deviation"].T)
 
+    def summary(self) -> dict[str, Any]:
+        """Return the content of summary.json."""
+        found: dict[str, Any] = json.loads((self.folder / "summary.json").read_text("utf-8"))
+        return found
+
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""
         from dolfinopt.output.history import read_history

@@ -14,6 +14,7 @@ import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.responses import need_of
 from dolfinopt.study.cases import Case, Outcome
 from dolfinopt.study.plans import (
     COMPLIANCE,
@@ -31,7 +32,9 @@ from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table
 from dolfinopt.study.variants import (
     METHODS,
     OBJECTIVES,
+    RESPONSES,
     changed,
+    posed,
     reduction_name,
     reductions,
     reference_scene,
@@ -51,10 +54,17 @@ def _good(frame: pd.DataFrame) -> list[Outcome]:
 # -- objectives ------------------------------------------------------------------------------
 
 
-def objective_plan(scene: Scene) -> Plan:
-    """Plan a design for every objective that the scene allows."""
+def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
+    """Plan a design for every objective that the scene allows, or for some kinds, see `posed`.
+
+    Raises:
+        InputError: the scene cannot have one of these kinds.
+    """
     rows: Rows = [({}, Case(scene, label="initial design"))]
-    for label, settings in OBJECTIVES:
+    if kinds:
+        cases = [Case(posed(scene, kind), "optimize", label=kind) for kind in kinds]
+        return Plan("objective", [*rows, *(({}, case) for case in cases)], _objectives)
+    for label, settings in (*OBJECTIVES, *RESPONSES):
         free = ["objective.worst=compliance"] if "worst=deviation" not in settings else []
         try:
             other = changed(scene, *free, *(f"objective.{setting}" for setting in settings))
@@ -65,13 +75,14 @@ def objective_plan(scene: Scene) -> Plan:
 
 
 def _objectives(frame: pd.DataFrame) -> Report:
-    columns = ["label", *QUANTITIES, "at [s]", "grayness [-]", "iterations", "seconds", "ended by"]
+    measures = pd.DataFrame([_measures(outcome) for outcome in frame["outcome"]])
+    columns = ["label", *QUANTITIES, "at [s]"]
+    rest = ["grayness [-]", "iterations", "seconds", "ended by"]
+    whole = pd.concat([frame[columns], measures, frame[rest]], axis=1)
     title = "Designs optimised for every objective, simulated in the scene."
-    table = Table("", title, frame[columns].rename(columns={"label": "objective"}))
+    table = Table("", title, whole.rename(columns={"label": "objective"}))
     good = _good(frame)
-    dynamic = [
-        o for o in good if o.case.action == "optimize" and o.case.scene.objective.needs("motion")
-    ]
+    dynamic = [o for o in good if o.case.action == "optimize" and need_of(o.case.scene, "motion")]
     others = [o for o in good if o not in dynamic]
     panels = [
         *deviation_panels("initial, static, eigenfrequency", others),
@@ -81,6 +92,22 @@ def _objectives(frame: pd.DataFrame) -> Report:
         LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
         design_figure("designs", "Designs by objective", good),
     ]
+
+
+def _measures(outcome: Outcome) -> dict[str, float]:
+    """Return what else a design does in its motion: true values, in the scene's weights."""
+    found = {"settling [mm]": math.nan, "stress [MPa]": math.nan, "effort [-]": math.nan,
+             "mass [kg]": math.nan}  # fmt: skip
+    if outcome.failure:
+        return found
+    summary, weights = outcome.summary(), outcome.case.scene.objective.effort_weights
+    forces = np.array([*summary["drive_rms"].values()])
+    found["settling [mm]"] = 1e3 * summary["settling"]
+    if summary.get("stress") is not None:
+        found["stress [MPa]"] = 1e-6 * summary["stress"]["value"]
+    found["effort [-]"] = float(np.linalg.norm(forces if weights is None else forces * weights))
+    found["mass [kg]"] = float(sum(summary["mass"].values()))
+    return found
 
 
 # -- coordinates -----------------------------------------------------------------------------

@@ -37,6 +37,7 @@ def study(
     world: MPI.Comm,
     *,
     reoptimize: bool = False,
+    kinds: Sequence[str] = (),
     shown: bool = True,
 ) -> Study:
     """Do a study (collective); the result is complete on the root.
@@ -49,6 +50,7 @@ def study(
         folder: DIR, where the cases are kept.
         world: all ranks.
         reoptimize: optimise for every scenario, too.
+        kinds: of objectives to compare; by default all.
         shown: draw progress.
 
     Raises:
@@ -56,7 +58,7 @@ def study(
     """
     from dolfinopt.parallel import on_root
 
-    plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize)
+    plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize, kinds)
     return carry_out(plan, folder, world, shown=shown)
 
 
@@ -86,6 +88,7 @@ def _plan(
     vary: tuple[str, ...],
     designs: tuple[Path, ...],
     reoptimize: bool,
+    kinds: Sequence[str],
 ) -> Plan:
     """Check what is asked and plan it (root only)."""
     asked = [parse_vary(text) for text in vary]
@@ -94,7 +97,7 @@ def _plan(
         if keys.count(key) > 1:
             raise InputError(f"--vary {key} twice; give all its values in one")
     if preset in ("objective", "reduction", "coordinates"):
-        return _preset_plan(scene, preset, asked, designs, reoptimize)
+        return _preset_plan(scene, preset, asked, designs, reoptimize, kinds)
     if preset is None and not asked:
         raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
     if preset is not None:
@@ -118,6 +121,7 @@ def _preset_plan(
     asked: Sequence[Vary],
     designs: tuple[Path, ...],
     reoptimize: bool,
+    kinds: Sequence[str],
 ) -> Plan:
     """Plan a preset that has its own variants."""
     command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
@@ -130,7 +134,7 @@ def _preset_plan(
     if reoptimize:
         raise InputError(f"--reoptimize: not with {command}; see compare reductions")
     if preset == "objective":
-        return objective_plan(scene)
+        return objective_plan(scene, kinds)
     counts = asked[0].whole_numbers if asked else None
     if preset == "coordinates":
         return coordinates_plan(scene, preset, designs, counts)

@@ -11,6 +11,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
+from dolfinopt.scene.tables.responses import LIGHTER
 
 # Label, and the settings that make it.
 OBJECTIVES = (
@@ -25,6 +26,13 @@ OBJECTIVES = (
     ("eigenfrequency, rigid bodies attached", ("kind=eigenfrequency", "attached=rigid-body")),
     ("eigenfrequency, point masses attached", ("kind=eigenfrequency", "attached=point-mass")),
     ("eigenfrequency, nothing attached", ("kind=eigenfrequency", "attached=none")),
+)
+# Those that a comparison adds to the paper's.
+RESPONSES = (
+    ("settling", ("kind=settling",)),
+    ("stress", ("kind=stress",)),
+    ("effort of the drives", ("kind=effort",)),
+    ("mass", ("kind=mass",)),
 )
 # Craig-Bampton with this many coordinates stands for the unreduced arm.
 REFERENCE_METHOD, REFERENCE = "craig-bampton", 48
@@ -131,6 +139,24 @@ def changed(scene: Scene, *overrides: str) -> Scene:
     check_motion(other)
     check_forces(other)
     return other
+
+
+def posed(scene: Scene, kind: str) -> Scene:
+    """Return the scene with another objective, for designs that can be compared with each other.
+
+    What falls with the mass needs the scene's limits and takes as much material as they ask for;
+    what falls with stiffness has the volume for its limit, by default half of it, and no other.
+
+    Raises:
+        InputError: the scene cannot have that objective.
+    """
+    tree = scene.to_tree()
+    tree["objective"] |= {"kind": kind, "direction": None}
+    if kind not in LIGHTER:
+        tree["constraints"] = {}
+    elif scene.objective.kind not in LIGHTER or "volume_fraction" not in tree["design"]:
+        tree["design"]["volume_fraction"] = None if kind == "mass" else 1.0
+    return scene_from_dict(tree, scene.source)
 
 
 def varied(scene: Scene, settings: Sequence[tuple[Vary, str]]) -> Scene:

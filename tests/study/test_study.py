@@ -333,6 +333,9 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
         (["compare", TWO_ARM, "designs"], "objectives"),
         (["compare", TWO_ARM, "objectives", "--coordinates", "4"], "--coordinates"),
         (["compare", TWO_ARM, "reductions", "--coordinates", "100000"], "100000"),
+        (["compare", TWO_ARM, "reductions", "--kind", "esl"], "--kind"),
+        (["compare", TWO_ARM, "objectives", "--kind", "joy"], 'objective.kind = "joy"'),
+        (["compare", TWO_ARM, "objectives", "--kind", "mass"], "a limit under"),
         (["study", TWO_ARM, "payload", "--designs", "a.npz"], "sweep"),
     ],
 )
@@ -354,7 +357,9 @@ def test_objective(folder):
     rows = rows_of(folder / "objective.csv")
     names = [row["objective"] for row in rows]
     # "Nothing attached" needs solid ends.
-    possible = [label for label, _ in variants.OBJECTIVES if "nothing attached" not in label]
+    # Nor does the scene limit what grows as material is taken away.
+    every = (*variants.OBJECTIVES, *variants.RESPONSES[:2])
+    possible = [label for label, _ in every if "nothing attached" not in label]
     assert names == ["initial design", *possible]
     assert [row["iterations"] for row in rows] == ["0"] + len(possible) * ["1"]
     compliance = dict(zip(names, column(rows, "compliance [N m]"), strict=True))
@@ -377,7 +382,35 @@ def test_objective(folder):
 def test_solid_ends_allow_nothing_attached():
     plan = presets.objective_plan(scene("arms.passive=0.05"))
     labels = [case.label for _, case in plan.rows]
-    assert labels == ["initial design", *(label for label, _ in variants.OBJECTIVES)]
+    every = (*variants.OBJECTIVES, *variants.RESPONSES[:2])
+    assert labels == ["initial design", *(label for label, _ in every)]
+
+
+SIX = ("mass", "esl", "deviation", "stress", "effort", "settling")
+
+
+def test_one_scene_posed_six_ways(folder):
+    """What falls with the mass keeps the scene's limits, the others have half the material."""
+    limits = ["--set", "constraints.deviation=0.03", "--set", "objective.gradient=exact"]
+    kinds = [part for kind in SIX for part in ("--kind", kind)]
+    run(TWO_ARM, "objectives", *kinds, *SETTINGS, *limits, "--set", "optimizer.max_iterations=2",
+        "--no-plots", "--out", folder, command="compare")  # fmt: skip
+    rows = {row["objective"]: row for row in rows_of(folder / "objective.csv")}
+    assert list(rows) == ["initial design", *SIX]
+    columns = ["mass [kg]", "compliance [N m]", "maximal deviation [mm]", "stress [MPa]"]
+    columns += ["effort [-]", "settling [mm]"]
+    for row in rows.values():
+        assert all(float(row[name]) > 0.0 for name in columns)
+    folders = [one for one in (folder / "cases").iterdir() if (one / "summary.json").is_file()]
+    found = [json.loads((one / "summary.json").read_text()) for one in folders]
+    posed = {one["scene"]["objective"]["kind"]: one for one in found if one["iterations"]}
+    assert set(posed) == set(SIX)
+    for kind, one in posed.items():
+        names = {name for name in one["constraints"] if "volume" not in name}
+        assert names == ({"deviation"} if kind in ("mass", "effort") else set())
+        volume = one["scene"]["design"]["volume_fraction"]
+        assert volume == {"mass": None, "effort": 1.0}.get(kind, 0.5)
+        assert float(rows[kind]["mass [kg]"]) == pytest.approx(sum(one["mass"].values()))
 
 
 def test_exact_gradient_only_where_there_is_one():

@@ -44,5 +44,5 @@ def freezes(scene: Scene) -> bool:
 
 
 def need_of(scene: Scene, what: Need) -> list[str]:
-    """Return those of `asked` that need that."""
-    return [name for name in asked(scene) if what in NEEDS[name]]
+    """Return those of `asked` that need that; of words that are no scene's nothing is known."""
+    return [name for name in asked(scene) if what in NEEDS.get(name, ())]
