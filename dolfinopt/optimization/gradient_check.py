@@ -16,9 +16,8 @@ from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.evaluation import evaluate, gradient
-from dolfinopt.responses.objective import load_cases, objective
-from dolfinopt.responses.response import needs
-from dolfinopt.responses.scenarios import combined
+from dolfinopt.responses.motion import MotionResponse
+from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -177,27 +176,32 @@ def _fixed_objective(
     base: Trajectory | None,
 ) -> Callable[[Cells], float]:
     """Return J(x), of a motion with the load cases and time steps of `base`."""
-    start = () if base is None else base.solutions
+    start, response = () if base is None else base.solutions, objective_of(scene)
 
     def value(x: Cells) -> float:
         x_phys = _physical(partition, arms, patterns, x)
         evaluation, trajectory = evaluate(
             scene, partition, arms, x_phys, profile, start, simulated=False
         )
-        if not needs(scene, "motion"):
+        if not isinstance(response, MotionResponse):
             return evaluation.objective
 
         def at_base_instants() -> float:
             assert trajectory is not None and base is not None
-            pairs = zip(trajectory.scenarios, base.scenarios, strict=True)
-            values = [objective(one, one.scene, load_cases(at, one.scene)) for one, at in pairs]
-            if values:
-                return combined(scene, values)[0]
-            return objective(trajectory, scene, load_cases(base, scene))
+            return sum(_at(base, trajectory, part) for _, part in response.parts(scene))
 
         return on_root(partition.world, at_base_instants)
 
     return value
+
+
+def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float:
+    """Return one value of a motion at the instants that `base` chooses."""
+    if not trajectory.scenarios:
+        return part.value(trajectory, part.load_cases(base))
+    pairs = zip(trajectory.scenarios, base.scenarios, strict=True)
+    values = [part.value(one, part.load_cases(at)) for one, at in pairs]
+    return part.combine(trajectory.scene, values)[0]
 
 
 def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:

@@ -140,7 +140,7 @@ class Objective(Table):
 
     def needs(self, what: Need) -> bool:
         """Return whether the objective needs that."""
-        return what in NEEDS[self.kind]
+        return what in NEEDS.get(self.kind, ())
 
     @property
     def has_esl_gradient(self) -> bool:
