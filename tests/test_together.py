@@ -18,7 +18,7 @@ from dolfinopt.arms import arm, design_state
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity
-from dolfinopt.fem.elements import LagrangeElement
+from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.mesh import compat
 from dolfinopt.optimization.gradient_check import taylor_test
@@ -268,7 +268,7 @@ def test_gradient(place, monkeypatch):
     [
         (mesh, "mesh_geo"),
         (mesh, "_arm_mesh"),
-        (LagrangeElement, "operators"),
+        (IncompatibleElement, "operators"),
         (arm, "Substructure"),
     ],
 )
