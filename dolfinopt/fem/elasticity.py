@@ -24,6 +24,8 @@ from dolfinopt.fem.floating import Connectivity
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.interior import InteriorSystem
 from dolfinopt.fem.stress import element_centres, stress_operator
+from dolfinopt.fem.uniform import single, uniform_cells
+from dolfinopt.fem.uniform_stress import UniformStress
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
@@ -37,6 +39,7 @@ class Substructure:
     Attributes:
         mesh: the arm.
         operators: its element operators.
+        uniform: the cells of this rank where those of all ranks are alike, as in a grid.
         profile: of this rank.
         T: the interface transformation.
         interior: the interior block in PETSc; one factorisation, of the design that asked last.
@@ -49,7 +52,8 @@ class Substructure:
             InputError: the mesh lacks an interface.
         """
         self.mesh = mesh
-        self.operators = operators
+        self.uniform = uniform_cells(mesh.comm, operators)
+        self.operators = operators = self.uniform.operators if self.uniform else operators
         self.profile = profile
         size = len(operators.points)
         dofs = np.repeat(2 * operators.cells, 2, axis=1)
@@ -87,6 +91,16 @@ class Substructure:
         T = self.T
         nodes = np.concatenate(T.comm.allgather(T.points[T.inboard | T.outboard]))
         return cKDTree(nodes).query(self.mesh.centroid)[0]
+
+    def uniform_stress(self) -> UniformStress | None:
+        """How stress stiffens cells that are all alike; None otherwise (collective)."""
+        if self.uniform is None:
+            return None
+        operators = self.quadrature.derivatives, self.quadrature.stress
+        derivatives, stress = (single(self.mesh.comm, operator) for operator in operators)
+        if derivatives is None or stress is None:  # turned by half a turn k_e and m_e are the same
+            return None
+        return UniformStress(self.uniform, derivatives, stress)
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.
@@ -197,10 +211,14 @@ class ElasticArm:
         of the field, and nothing cancels. K_bb + K_bI Psi, its algebraic equal for constraint
         modes, loses (length / cell)^3 in digits.
         """
-        values = cells.cell_values(self.operators, field)
-        columns = field.shape[2]
-        products = (self.operators.stiffness @ values) * self.young[:, None, None]
-        energy = self.comm.allreduce(values.reshape(-1, columns).T @ products.reshape(-1, columns))
+        uniform = self.substructure.uniform
+        if uniform is not None:
+            part = uniform.energy_matrix(field, self.young)
+        else:
+            values = cells.cell_values(self.operators, field)
+            products = (self.operators.stiffness @ values) * self.young[:, None, None]
+            part = values.reshape(-1, field.shape[2]).T @ products.reshape(-1, field.shape[2])
+        energy = self.comm.allreduce(part)
         return 0.5 * (energy + energy.T)
 
     def cell_stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -209,6 +227,8 @@ class ElasticArm:
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
+        if (uniform := self.substructure.uniform) is not None:
+            return uniform.stiffness_products(left, right)
         return cells.stiffness_products(self.operators, left, right)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -217,6 +237,8 @@ class ElasticArm:
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
+        if (uniform := self.substructure.uniform) is not None:
+            return uniform.mass_products(left, right)
         return cells.mass_products(self.operators, left, right)
 
     # -- the interior ------------------------------------------------------------------------

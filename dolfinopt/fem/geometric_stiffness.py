@@ -58,17 +58,25 @@ class UnitLoads:
 
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (7, q, q) in modes V (n_nodes, 2, q) (collective on the arm's ranks)."""
-        q = V.shape[2]
+        arm, q = self.arm, V.shape[2]
         i, j = np.triu_indices(q)
-        packed = np.zeros((NUM_LOADS, len(i)))
-        for _, points, H in self._parts(V):
-            pairs = np.empty((len(i), H.shape[3]))
-            for stress, terms in zip(self.stresses[:, :, points], _TERMS, strict=True):
-                packed += stress @ _pairs(H, terms, pairs).T
-        packed = self.arm.comm.allreduce(packed)
+        if (uniform := arm.substructure.uniform_stress) is not None:
+            packed = uniform.stiffness(self.fields, arm.young, V)
+        else:
+            packed = self._stiffness(V)
+        packed = arm.comm.allreduce(packed)
         K0 = np.empty((NUM_LOADS, q, q))
         K0[:, i, j] = K0[:, j, i] = packed
         return K0
+
+    def _stiffness(self, V: np.ndarray) -> np.ndarray:
+        """Return K0 (7, pairs i <= j) of this rank's cells."""
+        packed = np.zeros((NUM_LOADS, V.shape[2] * (V.shape[2] + 1) // 2))
+        for _, points, H in self._parts(V):
+            pairs = np.empty((packed.shape[1], H.shape[3]))
+            for stress, terms in zip(self.stresses[:, :, points], _TERMS, strict=True):
+                packed += stress @ _pairs(H, terms, pairs).T
+        return packed
 
     def gradient(
         self,
@@ -92,11 +100,24 @@ class UnitLoads:
             by_fields: (n_nodes, 2, 7) derivatives of the same function by `fields`, where it
                 depends on them otherwise, too; contributions of this rank's cells.
         """
-        arm, q = self.arm, V.shape[2]
+        arm = self.arm
         if len(by_K0) == 0:  # of a linear body
             assert by_fields is not None
+            forces = np.zeros_like(by_fields)
             by_V, by_young = np.zeros_like(V), np.zeros_like(arm.young)
-            return self._through_fields(by_fields, by_V, by_young, static)
+        elif (uniform := arm.substructure.uniform_stress) is not None:
+            by_V, forces, by_young = uniform.gradient(self.fields, arm.young, V, by_K0)
+        else:
+            by_V, forces, by_young = self._gradient(V, by_K0)
+        if by_fields is not None:
+            forces = forces + by_fields
+        return self._through_fields(forces, by_V, by_young, static)
+
+    def _gradient(
+        self, V: np.ndarray, by_K0: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Differentiate by modes, fields and Young's modulus, see `UniformStress.gradient`."""
+        arm, q = self.arm, V.shape[2]
         quadrature, (count, n) = arm.substructure.quadrature, arm.operators.cells.shape
         i, j = np.triu_indices(q)
         by_pairs = by_K0[:, i, j] + np.where(i == j, 0.0, by_K0[:, j, i])
@@ -114,11 +135,8 @@ class UnitLoads:
             by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, 2 * q)
             nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
             by_modes[cells] = nodal.reshape(size, n, 2, q)
-        forces = sum_at_nodes(arm.operators, by_nodes)
-        if by_fields is not None:
-            forces = forces + by_fields
         by_V = sum_at_nodes(arm.operators, by_modes)
-        return self._through_fields(forces, by_V, by_young, static)
+        return by_V, sum_at_nodes(arm.operators, by_nodes), by_young
 
     def _through_fields(
         self, forces: np.ndarray, by_V: np.ndarray, by_young: np.ndarray, static: bool
@@ -151,7 +169,7 @@ class UnitLoads:
     def _cell_values(self, cells: slice) -> np.ndarray:
         """Return the fields at the nodes of these cells (cells, 2n, 7)."""
         nodes = self.arm.operators.cells[cells]
-        return self.fields[nodes].reshape(len(nodes), -1, NUM_LOADS)
+        return _centred(self.fields[nodes]).reshape(len(nodes), -1, NUM_LOADS)
 
     def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
         """Yield runs of cells: cells, points, modes' gradients there.
@@ -162,7 +180,7 @@ class UnitLoads:
         count, q = len(derivatives), V.shape[2]
         p = derivatives.shape[1] // 2
         for cells in _runs(count, max(1, CHUNK // (p * q * (q + 1)))):
-            values = V[self.arm.operators.cells[cells]]
+            values = _centred(V[self.arm.operators.cells[cells]])
             H = derivatives[cells] @ values.reshape(*values.shape[:2], 2 * q)
             H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, 2, 2, q), 0, 3))
             yield cells, slice(p * cells.start, p * cells.stop), H
@@ -229,6 +247,11 @@ def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray)
     load = outboard + arm.comm.allreduce(modes.interior.T @ interior)
     tip = np.linalg.solve(modes.stiffness, load)
     return arm.expand(particular + modes.interior @ tip, tip)
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    """Return nodal values (n_cells, n, 2, k) less their mean, see `cells.cell_values`."""
+    return values - values.mean(axis=1, keepdims=True)
 
 
 def _runs(count: int, step: int) -> Iterator[slice]:

@@ -21,6 +21,8 @@ from dolfinopt.scene import load as scenes
 if TYPE_CHECKING:
     from dolfinopt.scene.regions import Cells
 
+SNAP = 1e-9  # distance of a node from its line of the grid, in cells, up to which it is rounding
+
 
 @dataclass(frozen=True, eq=False)
 class ArmMesh:
@@ -120,7 +122,16 @@ def structured_arm(
                 mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
     with together(comm):
+        _snap(parts[0].geometry.x[:, 0], 0.0, length / cells[0])
+        _snap(parts[0].geometry.x[:, 1], -0.5 * height, height / cells[1])
         return _arm_mesh(comm, name, length, *parts)
+
+
+def _snap(values: np.ndarray, first: float, step: float) -> None:
+    """Move coordinates that lie on a grid but for Gmsh's rounding, 1e-14 m, to its very lines."""
+    lines = first + step * np.rint((values - first) / step)
+    near = np.abs(values - lines) < SNAP * step
+    values[near] = lines[near]
 
 
 def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:

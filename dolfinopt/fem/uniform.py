@@ -1,0 +1,115 @@
+"""Meshes whose cells are all alike: one element matrix for all, and dense products with it.
+
+Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+
+from dolfinopt.fem.elements import ElementOperators
+
+# Largest difference of the cells' matrices from their mean, in its largest entry: rounding of the
+# nodes' places, 1e-16 m in cells of 1 mm, and what Gmsh adds to it in a file's grid.
+ALIKE = 1e-11
+
+
+def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
+    """Return the mean of all ranks' matrices (n_cells, ...) that are the same but for rounding.
+
+    Or None; collective.
+    """
+    count = comm.allreduce(len(matrices))
+    if count == 0:
+        return None
+    mean = comm.allreduce(matrices.sum(axis=0)) / count
+    error = comm.allreduce(np.abs(matrices - mean).max(initial=0.0), op=MPI.MAX)
+    return mean if error <= ALIKE * np.abs(mean).max() else None
+
+
+class UniformCells:
+    """The cells of one rank, all alike; n nodes a cell.
+
+    Attributes:
+        operators: of the arm.
+        stiffness: (2n, 2n) of any cell, see `ElementOperators`.
+        mass: (n, n).
+    """
+
+    def __init__(self, operators: ElementOperators, stiffness: np.ndarray, mass: np.ndarray):
+        self.operators, self.stiffness, self.mass = operators, stiffness, mass
+        self._corners = np.ascontiguousarray(operators.cells.T)
+        count = self._corners.size
+        self._sum = sp.csr_matrix(
+            (np.ones(count), (self._corners.ravel(), np.arange(count))),
+            shape=(len(operators.points), count),
+        )
+
+    def values(self, field: np.ndarray) -> np.ndarray:
+        """Return the cells' nodal values (n, 2, k, n_cells) of a field (n_nodes, 2, k)."""
+        nodes, columns = self._corners, field.shape[1] * field.shape[2]
+        flat = np.ascontiguousarray(field.reshape(len(field), columns).T)
+        out = np.empty((len(nodes), columns, nodes.shape[1]))
+        for corner, found in zip(nodes, out, strict=True):
+            np.take(flat, corner, axis=1, out=found, mode="clip")
+        return out.reshape(len(nodes), *field.shape[1:], -1)
+
+    def sum_at_nodes(self, forces: np.ndarray) -> np.ndarray:
+        """Return the nodal field (n_nodes, 2, k) of the cells' forces (n, 2, k, n_cells)."""
+        n, *shape, count = forces.shape
+        rows = forces.reshape(n, -1, count).swapaxes(1, 2).reshape(n * count, -1)
+        return (self._sum @ rows).reshape(-1, *shape)
+
+    def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+        values = self.centred(right)
+        products = self.stiffness @ values.reshape(len(self.stiffness), -1)
+        if left is not right:
+            values = self.centred(left)
+        return _sum_of_products(values, products)
+
+    def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+        values = self.values(right)
+        return _sum_of_products(self.values(left), self.mass @ values.reshape(len(values), -1))
+
+    def energy_matrix(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
+        """Return field' K field (k, k) of this rank's cells."""
+        values = self.centred(field).reshape(-1, field.shape[2], len(young))
+        products = self.stiffness @ values.reshape(len(values), -1)
+        products = products.reshape(values.shape) * young
+        return np.matmul(values, products.swapaxes(1, 2)).sum(axis=0)
+
+    def centred(self, field: np.ndarray) -> np.ndarray:
+        """Return `values` less their mean, which has no energy, see `cells.cell_values`."""
+        values = self.values(field)
+        values -= values.mean(axis=0)
+        return values
+
+
+def uniform_cells(comm: MPI.Comm, operators: ElementOperators) -> UniformCells | None:
+    """Return the cells of this rank, if those of all ranks are alike (collective).
+
+    Their operators then have exactly the same matrices. What is assembled from these knows no
+    rounding of the nodes' places; and the same mean belongs in the other operators of a cell, or
+    rotations of a cell would strain it by that rounding.
+    """
+    stiffness, mass = single(comm, operators.stiffness), single(comm, operators.mass)
+    if stiffness is None or mass is None:
+        return None
+    same = replace(
+        operators,
+        stiffness=np.broadcast_to(stiffness, operators.stiffness.shape),
+        mass=np.broadcast_to(mass, operators.mass.shape),
+    )
+    return UniformCells(same, stiffness, mass)
+
+
+def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the sum of left times right over all axes but the last, the cells'."""
+    rows = left.reshape(-1, left.shape[-1])
+    return np.einsum("ie,ie->e", rows, right.reshape(rows.shape))
