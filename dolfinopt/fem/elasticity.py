@@ -285,9 +285,8 @@ class ElasticArm:
             x.array = vector
             self.interior_mass().mult(x, y)
             return y.array_r
-        field = np.zeros((len(self.points), 2))
-        field[self.interior_nodes] = vector.reshape(-1, 2)
-        return (self.M.matrix @ field)[self.interior_nodes].ravel()
+        nodes = self.substructure.interior.node_mass(self.M.matrix)
+        return (nodes @ vector.reshape(-1, 2)).ravel()
 
     @cached_property
     def _constraint_modes(self) -> ConstraintModes:

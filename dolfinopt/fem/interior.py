@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 
+import numpy as np
 import scipy.sparse as sp
 from petsc4py import PETSc
 
@@ -51,6 +52,7 @@ class InteriorSystem:
         self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
         self._stiffness_of: sp.csr_matrix | None = None
         self._mass_of: sp.csr_matrix | None = None
+        self._node_mass_of: sp.csr_matrix | None = None
 
     @cached_property
     def _entries(self) -> InteriorEntries:
@@ -76,6 +78,12 @@ class InteriorSystem:
         return BandCholesky(self._entries.rows, self._entries.columns, T.num_interior)
 
     @cached_property
+    def _band_source(self) -> np.ndarray:
+        """Places in K's data of the entries that the band takes."""
+        assert self._band is not None
+        return self._entries.source[self._band.taken]
+
+    @cached_property
     def _ksp(self) -> PETSc.KSP:
         # Natural: the interior dofs are numbered for it.
         return direct_solver(self._stiffness.mat, "natural", OPTIONS)
@@ -89,13 +97,28 @@ class InteriorSystem:
         with self._profile.phase("factorisation"):
             # What rounding has made indefinite PETSc factorises all the same; whether the result
             # is worth anything is judged by it.
-            if band is not None and band.factorise(K.data[self._entries.source]):
+            if band is not None and band.factorise(K.data[self._band_source]):
                 self._factor = band
             else:
                 self._factor = self._petsc(K)
         self._profile.counts.factorisations += 1
         self._factorised = K
         return self._factor
+
+    @cached_property
+    def _nodes(self) -> InteriorEntries:
+        numbers = self._T.numbers[0::2]
+        return interior_entries(self._patterns[1], 1, np.where(numbers < 0, -1, numbers // 2))
+
+    def node_mass(self, M: sp.csr_matrix) -> sp.csr_matrix:
+        """Return M_II of one displacement component, on the arm's only rank; M acts on nodes."""
+        if self._node_mass_of is not M:
+            nodes, size = self._nodes, self._T.num_interior // 2
+            starts = np.searchsorted(nodes.rows, np.arange(size + 1))
+            values = M.data[nodes.source]
+            self._node_mass = sp.csr_matrix((values, nodes.columns, starts), (size, size))
+            self._node_mass_of = M
+        return self._node_mass
 
     def _petsc(self, K: sp.csr_matrix) -> PetscFactor:
         self._ksp.setOperators(self.stiffness(K))
