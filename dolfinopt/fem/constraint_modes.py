@@ -51,7 +51,7 @@ def static_modes(arm: ElasticArm) -> ConstraintModes:
     Raises:
         ConvergenceError: the contrast between solid and void is too large for this design.
     """
-    coupling, corner = arm.restrict(arm.stiffness_times(arm.rigid))
+    coupling, corner = arm.restrict(arm.substructure.rigid_forces(arm.young))
     modes = _with_energies(arm, arm.solve(-coupling), coupling, corner)
     if floats(arm):
         modes = _refined(arm, modes)

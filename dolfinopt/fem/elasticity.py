@@ -72,6 +72,25 @@ class Substructure:
         return Connectivity(T.comm, operators.space, operators.cells, T.inboard, T.outboard)
 
     @cached_property
+    def _rigid_forces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cells at the outboard interface, and k_e times its unit motions there (cells, 2n, 3)."""
+        cells = self.operators.cells
+        near = np.flatnonzero(self.T.outboard[cells].any(axis=1))
+        values = self.T.rigid[cells[near]].reshape(len(near), -1, 3)
+        return near, self.operators.stiffness[near] @ values
+
+    def rigid_forces(self, young: np.ndarray) -> np.ndarray:
+        """Return K times unit motions of the outboard interface (n_nodes, 2, 3), of these cells.
+
+        Only the cells at the interface contribute.
+        """
+        near, forces = self._rigid_forces
+        forces = (forces * young[near, None, None]).reshape(-1, 2, 3)
+        field = np.zeros((len(self.operators.points), 2, 3))
+        np.add.at(field, self.operators.cells[near].ravel(), forces)
+        return field
+
+    @cached_property
     def quadrature(self) -> Quadrature:
         """Stress and gradients at the quadrature points."""
         return quadrature(self.mesh, self.operators)
