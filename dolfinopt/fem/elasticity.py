@@ -76,7 +76,7 @@ class Substructure:
         """Cells at the outboard interface, and k_e times its unit motions there (cells, 2n, 3)."""
         cells = self.operators.cells
         near = np.flatnonzero(self.T.outboard[cells].any(axis=1))
-        values = self.T.rigid[cells[near]].reshape(len(near), -1, 3)
+        values = self.T.rigid[cells[near]].reshape(len(near), 2 * cells.shape[1], 3)
         return near, self.operators.stiffness[near] @ values
 
     def rigid_forces(self, young: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ class UniformCells:
         out = np.empty((len(nodes), columns, nodes.shape[1]))
         for corner, found in zip(nodes, out, strict=True):
             np.take(flat, corner, axis=1, out=found, mode="clip")
-        return out.reshape(len(nodes), *field.shape[1:], -1)
+        return out.reshape(len(nodes), *field.shape[1:], nodes.shape[1])
 
     def sum_at_nodes(self, forces: np.ndarray) -> np.ndarray:
         """Return the nodal field (n_nodes, 2, k) of the cells' forces (n, 2, k, n_cells)."""
