@@ -111,6 +111,7 @@ class Substructure:
         nodes = np.concatenate(T.comm.allgather(T.points[T.inboard | T.outboard]))
         return cKDTree(nodes).query(self.mesh.centroid)[0]
 
+    @cached_property
     def uniform_stress(self) -> UniformStress | None:
         """How stress stiffens cells that are all alike; None otherwise (collective)."""
         if self.uniform is None:
