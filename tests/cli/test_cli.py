@@ -42,6 +42,7 @@ def test_optimize_writes_every_file(optimised):
         "history.csv",
         "history.png",
         "machine.png",
+        "stress.png",
         "summary.json",
         "trajectory.csv",
         "trajectory.npz",

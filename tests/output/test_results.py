@@ -2,6 +2,8 @@
 
 import json
 
+import meshio
+import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import TWO_ARM
@@ -60,6 +62,23 @@ def test_files(result, shared_tmp_path, paraview):
         assert summary["iterations"] == iterations
     assert [view.name for view in written.views] == ["arm1", "arm2"]
     assert written.summary["compliance"] == result.evaluation.compliance
+    _check_stress(written, one / "design.vtu" if paraview else None)
+
+
+def _check_stress(written, vtu):
+    """The largest stress of the summary is that of its cell in the map, in ParaView's file, too."""
+    found = written.summary["stress"]
+    view = next(view for view in written.views if view.name == found["arm"])
+    worst = int(np.argmax(view.stress))
+    assert view.stress[worst] == pytest.approx(found["value"], rel=1e-3)
+    assert found["value"] == max(found["by_arm"].values())
+    assert list(found["by_arm"]) == ["arm1", "arm2"]
+    assert 0.0 < found["instant"] <= 3.0 and len(found["place"]) == 2
+    assert found["at_gauss_points"]["value"] > found["value"]
+    assert written.summary["units"]["stress"] == "Pa"
+    if vtu is not None:
+        whole = np.concatenate([view.stress for view in written.views])
+        np.testing.assert_allclose(meshio.read(vtu).cell_data["stress"][0], whole, rtol=1e-9)
 
 
 def test_summary_comes_last(result, shared_tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
+from PIL import Image
 from runs import TWO_ARM
 
 from dolfinopt.multibody.drives import Closure, pin, slider
@@ -18,7 +19,7 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots import animation, curves, design, loops, machine, shapes, style
+from dolfinopt.plots import animation, curves, design, loops, machine, shapes, stress, style
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -225,6 +226,37 @@ def test_captions_give_the_axis_distance():
     page.close()
     (caption,) = [words for words in page.texts if words.startswith("with")]
     assert "axis distance 1 m, 0.2 m high" in caption
+
+
+def test_stress_says_where_when_and_in_what_unit(tmp_path):
+    """Largest value, place and instant above every arm; a scale of round numbers; a picture."""
+    views = []
+    for name, largest in (("arm1", 61e6), ("arm2", 40e6)):
+        view = beam(name, 1.0, 0.1, 20, 4)
+        s = largest * (1.0 - view.centroid[:, 0]) / (1.0 - view.centroid[0, 0])
+        views.append(replace(view, stress=s, stress_instant=np.full(len(s), 0.75)))
+    page = stress.stress_page(views, "two arms")
+    page.close()
+    assert any("arm1   largest 61 MPa at x = 0.025 m" in words for words in page.texts)
+    assert any("arm2   largest 40 MPa" in words and "t = 0.75 s" in words for words in page.texts)
+    assert stress.STRESS in page.texts and "[MPa]" in stress.STRESS
+    marks = stress.scale_marks(61.0)
+    assert marks.tolist() == [0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0]
+    assert {f"{mark:g}" for mark in marks} <= set(page.texts)
+    path = stress.draw_stress(tmp_path / "stress.png", views, "two arms")
+    with Image.open(path) as image:
+        shown = np.asarray(image.convert("RGB")).astype(int)
+    red = (shown[..., 0] > 100) & (shown[..., 1] < 60)  # the darkest end of the scale
+    assert 100 < red.sum() < 0.1 * red.size
+    blue = (shown[..., 2] > shown[..., 0] + 80).sum()  # the ring around the place
+    assert 20 < blue < 2000
+
+
+@pytest.mark.parametrize("largest", [0.0, 0.9, 1.0, 3.3, 61.0, 99.0, 1234.0])
+def test_marks_of_the_stress(largest):
+    marks = stress.scale_marks(largest)
+    assert 2 <= len(marks) <= 9 and marks[0] == 0.0
+    assert largest <= marks[-1] * (1.0 + 1e-9) and marks[-1] <= max(1.6 * largest, 1.0)
 
 
 def test_outline_is_what_one_cell_has_alone():

@@ -170,7 +170,7 @@ def test_largest_of_all_samples_and_cells() -> None:
         np.testing.assert_allclose(report[k].by_cell, s.max(axis=1), atol=1.5e-3 * s.max())
     measured = one.measure()
     assert measured.values[0] == pytest.approx(largest, rel=1e-9)
-    assert 0.2 * largest < measured.smooth[0] < largest
+    assert 0.05 * largest < measured.smooth[0] < largest
 
 
 @pytest.mark.serial
@@ -219,7 +219,7 @@ def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
     All instants count, so that none comes or goes on the way.
     """
-    monkeypatch.setattr(module, "CUT", 0.0)
+    monkeypatch.setattr(module, "NEGLIGIBLE", 0.0)
     built = build(*QUICK, *KINDS[kind])
     x, d = built.fields(wave), built.fields(uneven)
     slope = built.dot(Analysed(built, x).gradient(), d)
@@ -262,7 +262,7 @@ def test_exact_gradient_of_machines(kind: str) -> None:
         return model.simulate({name: x[name] + h * direction[name] for name in x}).objective
 
     h = 1e-4
-    # Instants near the limit of half the largest stress come and go: a thousandth of their part.
+    # Instants near the limit of those that count come and go.
     assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
 
 
@@ -335,17 +335,17 @@ def test_work_is_done_once() -> None:
 @pytest.mark.serial
 @pytest.mark.slow
 def test_lightest_arms_below_a_stress() -> None:
-    """Half of what the even design bears costs mass, and the true stress meets the limit."""
+    """The true stress meets the limit that the lightest arms run into; history and summary say."""
     options = [
-        "arms.cells=[40,6]", "simulation.sample=0.005", "objective.kind=mass",
-        "objective.gradient=exact", "design.volume_fraction=1.0", "design.initial=0.6",
-        "constraints.deviation=0.08", "optimizer.max_iterations=60",
+        "arms.cells=[30,6]", "design.filter_radius=0.03", "simulation.sample=0.01",
+        "reduction.coordinates=3", "optimizer.max_iterations=70", "design.volume_fraction=1.0",
+        "objective.gradient=exact", "objective.kind=mass", "design.initial=0.6",
+        "motion.duration=2.4", "constraints.stress=35e6",
     ]  # fmt: skip
-    found = {}
-    for limit in (60e6, 90e6):
-        scene = do.load_scene(TWO_ARM, [*options, f"constraints.stress={limit:g}"])
-        result = do.optimize(scene)
-        one = next(each for each in result.limits if each.quantity == "stress")
-        assert one.unit == "Pa" and one.met, one.sentence
-        found[limit] = result.evaluation.objective
-    assert found[60e6] > found[90e6]
+    rows = []
+    result = do.optimize(do.load_scene(TWO_ARM, options), report=rows.append)
+    one = next(each for each in result.limits if each.quantity == "stress")
+    assert one.unit == "Pa" and one.met and one.value > 0.95 * one.limit, one.sentence
+    assert rows[-1].constraints["stress"] == one.value
+    assert max(row.constraints["stress"] for row in rows) > 1.1 * one.limit  # it was in the way
+    assert result.evaluation.objective < 0.5 * rows[0].objective

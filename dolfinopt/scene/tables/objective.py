@@ -73,11 +73,11 @@ class Objective(Table):
         "cases, scenarios, robust designs [-]",
     )
     stress_exponent: float = Field(
-        default=10.0,
+        default=4.0,
         ge=2,
         le=100,
-        description="exponent p of the p-mean of the stress over cells and instants; the larger, "
-        "the closer to the largest stress and the harder for the optimiser [-]",
+        description="exponent p of the p-mean of the stress over cells and instants; with larger "
+        "ones cells come and go as the largest, and steps must be small [-]",
     )
     stress_margin: float = Field(
         default=0.0,
