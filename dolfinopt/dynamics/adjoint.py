@@ -39,33 +39,87 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 # Share of the multipliers that a correction may have left: their error is a tenth of it or less.
 ENOUGH = 1e-8
 POOR = 0.3  # contraction above which more coordinates are treated densely
+KEPT_BYTES = 64e6  # of factors that are kept for further functions
+
+_Factors = tuple[NewtonMatrix, Linearisation]
 
 
 def trajectory_gradient(
     system: ElasticSystem | MachineSystem, solution: Solution, t: np.ndarray, by_q: np.ndarray
 ) -> list[ShapeIntegrals]:
-    """Return dJ/d(constants) of every body through the trajectory's coordinates.
+    """Return what `Adjoint.gradient` does, of a single function."""
+    return Adjoint(system, solution).gradient(t, by_q)
 
-    Args:
+
+class Adjoint:
+    """The transposed recursion of one trajectory: factorised once for all functions of it.
+
+    Attributes:
         system, solution: as solved by `radau.integrate`.
-        t: (m,) instants at which J looks at the coordinates, s.
-        by_q: (m, N) dJ/dq there; or (k, m, N), k <= 3, by q, qd and qdd in this order.
     """
-    by_rates = by_q if by_q.ndim == 3 else by_q[None]
-    method, modes = radau_iia(len(solution.nodes)), system.preconditioner()
-    stages = stages_of(modes, method, solution.time_grid)
-    z, zd, a = (modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
-    z_s, zd_s = stage_values(stages, z, zd, a)
-    by_a, by_y = _sampled(solution, t, modes.gradient_to_modes(by_rates))
-    multipliers, first = _backwards(stages, z_s, zd_s, a, by_a, by_y)
-    q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
-    size = q.shape[2]
-    times = solution.time_grid[:-1, None] + np.diff(solution.time_grid)[:, None] * method.c
-    # Rows in z are T' times those in q: their multipliers turn like coordinates.
-    flat = (x.reshape(-1, size) for x in (q, qd, solution.a, modes.from_modes(multipliers)))
-    gradient = system.body_gradient(times.ravel(), *flat)
-    by_start = modes.gradient_from_modes(first)
-    return add_gradients(gradient, system.start_gradient(solution.q[0], by_start))
+
+    def __init__(self, system: ElasticSystem | MachineSystem, solution: Solution) -> None:
+        """Evaluate the trajectory at all stages."""
+        self.system, self.solution = system, solution
+        method, self._modes = radau_iia(len(solution.nodes)), system.preconditioner()
+        self._stages = stages_of(self._modes, method, solution.time_grid)
+        z, zd, a = (self._modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
+        self._at = (*stage_values(self._stages, z, zd, a), a)
+        q, qd = stage_values(self._stages, solution.q, solution.qd, solution.a)
+        steps = np.diff(solution.time_grid)[:, None]
+        self._times = (solution.time_grid[:-1, None] + steps * method.c).ravel()
+        self._rates = tuple(x.reshape(-1, q.shape[2]) for x in (q, qd, solution.a))
+        self._kept: dict[bytes, _Factors] = {}
+
+    def gradient(self, t: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
+        """Return dJ/d(constants) of every body through the trajectory's coordinates.
+
+        Args:
+            t: (m,) ascending instants at which J looks at the coordinates, s.
+            by_q: (m, N) dJ/dq there; or (k, m, N), k <= 3, by q, qd and qdd in this order.
+        """
+        by_rates = by_q if by_q.ndim == 3 else by_q[None]
+        by_a, by_y = _sampled(self.solution, t, self._modes.gradient_to_modes(by_rates))
+        multipliers, first = self._backwards(by_a, by_y)
+        # Rows in z are T' times those in q: their multipliers turn like coordinates.
+        turned = self._modes.from_modes(multipliers).reshape(self._rates[0].shape)
+        q, qd, a = self._rates
+        gradient = self.system.body_gradient(self._times, q, qd, a, turned)
+        by_start = self._modes.gradient_from_modes(first)
+        return add_gradients(gradient, self.system.start_gradient(self.solution.q[0], by_start))
+
+    def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,).
+
+        Newton's matrix is not the derivative where coordinates are treated as fast: what its answer
+        leaves, by the exact derivative, is answered again until nothing is left.
+        """
+        stages = self._stages
+        slow, limits = next_slow_coordinates(stages, limits_for(stages), 0)
+        while True:
+            multipliers, after = np.empty_like(by_a), np.zeros_like(by_y[0])
+            for part in reversed(windows(stages, slow)):
+                matrix, exact = self._factorised(part, slow)
+                answer = _answered(matrix, exact, by_a[part], by_y[part], after)
+                if answer is None:
+                    break
+                multipliers[part], after = answer
+            else:
+                return multipliers, after[0]
+            slow, limits = next_slow_coordinates(stages, limits, len(slow))
+
+    def _factorised(self, part: slice, slow: np.ndarray) -> _Factors:
+        """Return Newton's matrix of some steps, and the exact derivative; kept if they are all."""
+        key = slow.tobytes()
+        if key in self._kept:
+            return self._kept[key]
+        window = self._stages.window(part.start, part.stop)
+        q, qd, a = (x[part] for x in self._at)
+        matrix = factorise(window, q, qd, a, slow)
+        exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
+        if len(window.h) == len(self._stages.h) and matrix.inverse.nbytes <= KEPT_BYTES:
+            self._kept = {key: (matrix, exact)}
+        return matrix, exact
 
 
 def add_gradients(
@@ -82,53 +136,24 @@ def _sampled(
 
     Args:
         solution: with the time grid.
-        t: (m,) instants, s.
+        t: (m,) ascending instants, s.
         by_rates: (k, m, N) dJ by q, qd and qdd there, or by the first k of them.
     """
     step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(solution.a) - 1)
     h = np.diff(solution.time_grid)[step]
     tau = (t - solution.time_grid[step]) / h
     integrals = lagrange_integrals(solution.nodes, tau)
+    weights = [integrals[2 - k] * (h ** (2 - k))[:, None] for k in range(len(by_rates))]
+    by_instant = sum(w[:, :, None] * by[:, None] for w, by in zip(weights, by_rates, strict=True))
+    late = (h * tau)[:, None] * by_rates[0]
+    if len(by_rates) > 1:
+        late += by_rates[1]
+    found, first = np.unique(step, return_index=True)  # instants of a step lie side by side
     by_a = np.zeros_like(solution.a)
     by_y = np.zeros((len(solution.a), 2, by_rates.shape[2]))
-    for derivative, by in enumerate(by_rates):
-        weights = integrals[2 - derivative] * (h ** (2 - derivative))[:, None]
-        np.add.at(by_a, step, weights[:, :, None] * by[:, None])
-        if derivative == 0:
-            np.add.at(by_y, step, np.stack([by, (h * tau)[:, None] * by], axis=1))
-        elif derivative == 1:
-            np.add.at(by_y[:, 1], step, by)
+    by_a[found] = np.add.reduceat(by_instant, first)
+    by_y[found] = np.add.reduceat(np.stack([by_rates[0], late], axis=1), first)
     return by_a, by_y
-
-
-def _backwards(
-    stages: Stages,
-    q: np.ndarray,
-    qd: np.ndarray,
-    a: np.ndarray,
-    by_a: np.ndarray,
-    by_y: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,).
-
-    Newton's matrix is not the derivative where coordinates are treated as fast: what its answer
-    leaves, by the exact derivative, is answered again until nothing is left.
-    """
-    slow, limits = next_slow_coordinates(stages, limits_for(stages), 0)
-    while True:
-        multipliers, after = np.empty_like(a), np.zeros_like(by_y[0])
-        for part in reversed(windows(stages, slow)):
-            window = stages.window(part.start, part.stop)
-            at = (q[part], qd[part], a[part])
-            matrix = factorise(window, *at, slow)
-            exact = tangent_at(window, *at) if len(matrix.fast) else matrix.tangent
-            answer = _answered(matrix, exact, by_a[part], by_y[part], after)
-            if answer is None:
-                break
-            multipliers[part], after = answer
-        else:
-            return multipliers, after[0]
-        slow, limits = next_slow_coordinates(stages, limits, len(slow))
 
 
 def _answered(

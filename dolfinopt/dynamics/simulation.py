@@ -9,7 +9,9 @@ from functools import cached_property, partial
 import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
+from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.build import build_system
+from dolfinopt.dynamics.drive_forces import DriveForces
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.load_coefficients import load_coefficients
 from dolfinopt.dynamics.machine_system import MachineSystem
@@ -53,6 +55,16 @@ class Trajectory:
     def mechanism(self) -> Mechanism:
         """What moved."""
         return self.problem.mechanism
+
+    @cached_property
+    def adjoint(self) -> Adjoint:
+        """The transposed recursion, for the gradient of any function of the motion."""
+        return Adjoint(self.problem, self.solution)
+
+    @cached_property
+    def drive_forces(self) -> DriveForces:
+        """The forces of all drives at the samples, for the gradient of any function of them."""
+        return DriveForces(self.problem, self.t, self.unknowns)
 
     @cached_property
     def unknowns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

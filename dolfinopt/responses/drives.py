@@ -6,7 +6,6 @@ from abc import abstractmethod
 
 import numpy as np
 
-from dolfinopt.dynamics.drive_forces import drive_force_gradient
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.shape_integrals import integrals_of
 from dolfinopt.responses.motion import LoadCases, MotionResponse
@@ -28,12 +27,11 @@ class DriveResponse(MotionResponse):
         self, trajectory: Trajectory, cases: LoadCases
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
-        t, rates = trajectory.t[cases.indices], trajectory.unknowns
-        weights = np.zeros((len(t), trajectory.joint_forces.shape[1]))
-        weights[:, trajectory.scene.driven_columns] = self.by_forces(trajectory, cases)
-        y, yd, ydd = (x[cases.indices] for x in rates)
-        by_rates, bodies = drive_force_gradient(trajectory.problem, t, (y, yd, ydd), weights)
-        return by_rates, [integrals_of(one) for one in bodies]
+        weights = np.zeros_like(trajectory.joint_forces)
+        by_forces = self.by_forces(trajectory, cases)
+        weights[cases.indices, trajectory.scene.driven_columns] = by_forces
+        by_rates, bodies = trajectory.drive_forces.gradient(weights)
+        return by_rates[:, cases.indices], [integrals_of(one) for one in bodies]
 
     def weights(self, scene: Scene) -> np.ndarray:
         """Return the weight of every drive (drives,), 1/N and 1/(N m): 1 of each by default."""

@@ -9,7 +9,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from dolfinopt.dynamics.adjoint import trajectory_gradient
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.parallel import on_root, together
@@ -116,9 +115,7 @@ class MotionResponse(Response):
         """
         cases = self.load_cases(trajectory)
         by_q, own = self.derivatives(trajectory, cases)
-        followed = trajectory_gradient(
-            trajectory.problem, trajectory.solution, trajectory.t[cases.indices], by_q
-        )
+        followed = trajectory.adjoint.gradient(trajectory.t[cases.indices], by_q)
         return [add_integrals(a, fields) for a, fields in zip(followed, own, strict=True)]
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dolfinopt.dynamics.adjoint import add_gradients, trajectory_gradient
+from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.load_coefficients import load_gradient, num_loads
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -92,7 +92,7 @@ def loads_gradient(
     rates = (motion.unknowns[0][instants], motion.unknowns[1][instants])
     through = load_gradient(problem, t, (*rates, motion.unknowns[2][instants]), by_c)
     through.by_rates[0] += motion.by_unknowns(by_q)
-    followed = trajectory_gradient(problem, motion.solution, t, through.by_rates)
+    followed = motion.adjoint.gradient(t, through.by_rates)
     total = add_gradients(add_gradients(followed, through.by_bodies), own)
     if motion.scene is not scene:
         total = [

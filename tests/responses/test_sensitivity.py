@@ -31,7 +31,7 @@ from scipy.optimize import brentq
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.adjoint import add_gradients, trajectory_gradient
+from dolfinopt.dynamics.adjoint import Adjoint, add_gradients, trajectory_gradient
 from dolfinopt.dynamics.drive_forces import drive_force_gradient
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.solution import Solution
@@ -432,14 +432,14 @@ def no_modes(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hold the coordinates."""
 
-    def none(problem: ElasticSystem, *_: object) -> list[ShapeIntegrals]:
-        bodies = problem.mechanism.bodies
+    def none(adjoint: Adjoint, *_: object) -> list[ShapeIntegrals]:
+        bodies = adjoint.system.mechanism.bodies
         return [
             replace(scaled(body, 0.0, 0.0, 0.0), outboard=np.zeros_like(body.outboard))
             for body in bodies
         ]
 
-    monkeypatch.setattr("dolfinopt.responses.motion.trajectory_gradient", none)
+    monkeypatch.setattr(Adjoint, "gradient", none)
 
 
 def no_start(monkeypatch: pytest.MonkeyPatch) -> None:
