@@ -50,6 +50,7 @@ from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
 from dolfinopt.study.studies import Preset, study
+from dolfinopt.units import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -151,9 +152,10 @@ class SimulationResult:
         return None
 
     def __repr__(self) -> str:
+        objective = with_unit(f"{self.objective:.4g}", self.unit)
         return (
-            f"{type(self).__name__}({self.scene.name!r}, objective={self.objective:.4g} "
-            f"{self.unit}, max_deviation={1e3 * self.max_deviation:.4g} mm)"
+            f"{type(self).__name__}({self.scene.name!r}, objective={objective}, "
+            f"max_deviation={1e3 * self.max_deviation:.4g} mm)"
         )
 
     def _repr_png_(self) -> bytes | None:

@@ -41,3 +41,8 @@ HISTORY = {
     "seconds": "s",
     "kkt": "-",
 }
+
+
+def with_unit(value: str, unit: str) -> str:
+    """Return a number with its unit, "-" of none left out."""
+    return value if unit == "-" else f"{value} {unit}"

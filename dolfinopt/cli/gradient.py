@@ -11,6 +11,7 @@ import click
 from dolfinopt.cli.options import design_option, overwrite_option, scene_argument, set_option
 from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.units import with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -80,7 +81,8 @@ def gradient(
     if world.rank == 0:
         unit = objective_of(loaded).unit
         name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
-        click.echo(f"objective {evaluation.objective:.6g} {unit}; {name} gradient in {out}")
+        value = with_unit(f"{evaluation.objective:.6g}", unit)
+        click.echo(f"objective {value}; {name} gradient in {out}")
     if check:
         _check_gradient(world, loaded, partition, arms, x_phys, profile)
 

@@ -17,7 +17,7 @@ import click
 from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
 from dolfinopt.output.folders import RUN_FILES, check_unused, prepare_folder
-from dolfinopt.units import NOT_MET
+from dolfinopt.units import NOT_MET, with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -255,7 +255,7 @@ def _minimised(summary: Mapping[str, Any]) -> str:
     if scenarios:
         how = "weighted sum" if options["scenarios"] == "sum" else "worst"
         name += f" ({how} of {len(scenarios)} scenarios)"
-    text = f"{name} {summary['objective']:.4g} {response.unit}"
+    text = with_unit(f"{name} {summary['objective']:.4g}", response.unit)
     if response.stands_for:
         frequencies = summary["loaded_frequency"].items()
         found = ", ".join(f"{arm} {value:.4g} {response.limit_unit}" for arm, value in frequencies)

@@ -19,6 +19,7 @@ from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.motion import MotionResponse
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.responses import EXACT_ONLY
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -27,6 +28,8 @@ FALL = 4.0  # ratio of one step to the next: remainders of second order fall by 
 STEPS = tuple(0.01 / FALL**k for k in range(5))  # of the design variable, down to 4e-5
 MARGIN = 0.05  # design variables are moved this far inside [0, 1]: the steps must not leave it
 ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
+# The same of drive forces: they are made of accelerations, which are less accurate.
+ROUNDING_OF_FORCES = 1e-9
 PASSES = 1.9  # least rate; 2 is exact, a wrong gradient has 1
 
 Cells = Mapping[int, np.ndarray]
@@ -102,8 +105,10 @@ def taylor_test(
             frozen = _by_x(partition, designed, cells, x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
+    share = ROUNDING_OF_FORCES if scene.objective.kind in EXACT_ONLY else ROUNDING
     value = _fixed_objective(exact, partition, arms, patterns, profile, base)
     here = value(x)
+    rounding = share * abs(here)
     rows = []
     for name, direction in _directions(scene, designed).items():
         along = _dot(partition, slope, direction)
@@ -111,7 +116,7 @@ def taylor_test(
         remainders = tuple(
             abs(value({k: x[k] + h * direction[k] for k in x}) - here - h * along) for h in STEPS
         )
-        rows.append(TaylorRow(name, along, frozen_along, remainders, _rate(remainders, here)))
+        rows.append(TaylorRow(name, along, frozen_along, remainders, _rate(remainders, rounding)))
     if frozen is None:
         return TaylorTest(tuple(rows), np.nan, np.nan)
     lengths = [np.sqrt(_dot(partition, g, g)) for g in (slope, frozen)]
@@ -231,7 +236,7 @@ def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np
     }
 
 
-def _rate(remainders: tuple[float, ...], value: float) -> float:
+def _rate(remainders: tuple[float, ...], rounding: float) -> float:
     """Return the order of the finest remainders in h; those at rounding level say nothing."""
-    known = [r for r in remainders if r > ROUNDING * abs(value)]
+    known = [r for r in remainders if r > rounding]
     return float(np.log(known[-2] / known[-1]) / np.log(FALL)) if len(known) > 1 else np.inf
