@@ -21,7 +21,8 @@ import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.inverse_dynamics import Rates, body_loads
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
 
 UNIT_LOADS = 7  # of frame and outboard interface, in the plane
@@ -33,7 +34,10 @@ def num_loads(num_modes: int) -> int:
 
 
 def load_coefficients(
-    system: ElasticSystem | MachineSystem, t: np.ndarray, rates: Rates
+    system: ElasticSystem | MachineSystem,
+    t: np.ndarray,
+    rates: Rates,
+    motion: RigidMotion | None = None,
 ) -> list[np.ndarray]:
     """Return c (n, 7 + 2 q) of every body, see above; m/s2, 1/s2, N, N m and modes per s2.
 
@@ -41,7 +45,15 @@ def load_coefficients(
         system: what moves.
         t: (n,) instants, s.
         rates: its unknowns and their derivatives there, each (n, S).
+        motion: its rigid coordinates there, if they are known: of prescribed ones a short cut.
     """
+    if isinstance(system, ElasticSystem) and motion is not None:
+        found = []
+        loads = body_loads(system.mechanism, motion, rates)
+        for (p, w), part in zip(loads, system.mechanism.slices, strict=True):
+            (q, qd, qdd), w, wd = (x[:, part] for x in rates), w[:, None], p[:, 2, None]
+            found.append(-np.hstack([p, qdd - w * w * q, wd * q + 2.0 * w * qd]))
+        return found
     probe = _Probe(system)
     rows = probe.system.at(t).residual(*(probe.spread(x) for x in rates))
     return [-rows[:, part] for part in probe.places]

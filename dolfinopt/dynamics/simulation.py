@@ -129,7 +129,7 @@ class Trajectory:
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
         """What loads every body (n, 7 + 2 q), see the function of this name."""
-        return load_coefficients(self.problem, self.t, self.unknowns)
+        return load_coefficients(self.problem, self.t, self.unknowns, self.motion)
 
     @property
     def is_machine(self) -> bool:

@@ -104,8 +104,10 @@ class LoadFields:
         """
         cells, columns = self.arm.operators.cells, self.columns
         values = columns[cells].reshape(*operator.shape[::2], -1)
-        found = (operator @ values).reshape(len(cells), -1, 3, columns.shape[2])
-        return np.ascontiguousarray(np.moveaxis(found, 2, 0).reshape(3, -1, columns.shape[2]))
+        found = np.empty((3, len(cells), operator.shape[1] // 3, columns.shape[2]))
+        for component, out in enumerate(found):
+            np.matmul(operator[:, component::3], values, out=out)
+        return found.reshape(3, -1, columns.shape[2])
 
     def stress_transposed(self, operator: np.ndarray, by_stress: np.ndarray) -> np.ndarray:
         """Return the derivatives by the columns' nodal values, given those by `stress`.

@@ -226,10 +226,31 @@ def elastic_residual(
     return inward_pass(mechanism, motion, (q, qd, qdd), driven=False)[0]
 
 
+def body_loads(
+    mechanism: Mechanism, motion: RigidMotion, rates: Rates
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return p = (a_x, a_y, wd, -w^2, F_x, F_y, T) (n, 7) and w (n,) of every body."""
+    if 0 < len(rates[0]) < FEW:
+        count = len(rates[0])
+        few, at, *others = several(mechanism, motion, *rates)
+        found = body_loads(few, at, (others[0], others[1], others[2]))
+        return [(p[:count], w[:count]) for p, w in found]
+    loads: list[tuple[np.ndarray, np.ndarray]] = []
+    inward_pass(mechanism, motion, rates, driven=False, loads=loads)
+    return loads
+
+
 def inward_pass(
-    mechanism: Mechanism, motion: RigidMotion, rates: Rates, driven: bool
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    rates: Rates,
+    driven: bool,
+    loads: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[np.ndarray, tuple[np.ndarray, list[np.ndarray]]]:
-    """Return the elastic residual and, if `driven`, the first joint's force and all moments."""
+    """Return the elastic residual and, if `driven`, the first joint's force and all moments.
+
+    What loads every body is put into `loads`, if given, see `body_loads`.
+    """
     frames, tip = outward_pass(mechanism, motion, *rates)
     force, moment = np.zeros_like(tip[0]), np.zeros_like(tip[2])
     rows = np.empty_like(rates[0])
@@ -241,6 +262,8 @@ def inward_pass(
             force = force + carried[0] * frame.next_a
             moment = moment + carried[1] * frame.next_wd
         force = frame.joint_rotation * force  # of everything outboard, in this frame
+        if loads is not None:
+            loads.insert(0, (_load_columns(frame, (force, moment)), frame.w))
         rows[:, part] = _body_residual(frame, own, (force, moment), scale)
         if k > 0 or driven:
             moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame, own)
@@ -256,10 +279,7 @@ def _body_residual(
     e, ed, edd = rates
     body, constants = frame.constants.body, frame.constants
     w, wd = frame.w, frame.wd
-    load_coefficients = np.empty((len(e), 7))
-    columns = (frame.a.real, frame.a.imag, wd, -w * w, load[0].real, load[0].imag, load[1])
-    for i, column in enumerate(columns):
-        load_coefficients[:, i] = column
+    load_coefficients = _load_columns(frame, load)
     load_coefficients[:, :4] *= as_column(scale.mass)
     w, wd = w[:, None], wd[:, None]
     inertial = (edd - (w * w) * e) @ body.M
@@ -273,6 +293,15 @@ def _body_residual(
     if constants.D is not None:
         inertial += as_column(scale.damping) * product(ed, constants.D)
     return inertial
+
+
+def _load_columns(frame: Frame, load: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return (a_x, a_y, wd, -w^2, F_x, F_y, T) (n, 7)."""
+    columns = np.empty((len(frame.w), 7))
+    parts = (frame.a.real, frame.a.imag, frame.wd, -frame.w * frame.w)
+    for i, column in enumerate((*parts, load[0].real, load[0].imag, load[1])):
+        columns[:, i] = column
+    return columns
 
 
 def body_moment(frame: Frame, rates: Rates) -> np.ndarray:

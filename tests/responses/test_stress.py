@@ -10,6 +10,7 @@ from remainders import Built, build, rates, uneven, wave
 from runs import TWO_ARM
 
 import dolfinopt as do
+from dolfinopt.dynamics.load_coefficients import load_coefficients
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import rotated
 from dolfinopt.multibody.inverse_dynamics import outward_pass
@@ -85,6 +86,21 @@ def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
     values = field[elastic.operators.cells].reshape(len(cells.root), -1, 1)
     found = (elastic.substructure.stress_operator @ values)[:, :, 0]
     return cells.state.solid.young_modulus * cells.root * np.linalg.norm(found, axis=1)
+
+
+@pytest.mark.serial
+def test_both_ways_to_the_loads_agree() -> None:
+    """From the passes of inverse dynamics, and from the rows of coordinates that never move."""
+    built = build("simulation.stiffening=true", "motion.gravity=[0,-9.81]", "arms.joint_mass=0.3")
+    trajectory = Analysed(built, built.fields(wave)).trajectory
+    n = np.array([0, 500, 1300, 2900])
+    rates_at = tuple(x[n] for x in trajectory.unknowns)
+    found = load_coefficients(trajectory.problem, trajectory.t[n], rates_at)
+    short = load_coefficients(trajectory.problem, trajectory.t[n], rates_at, trajectory.motion[n])
+    for one, other, whole in zip(found, short, trajectory.load_coefficients, strict=True):
+        scale = np.abs(whole).max(axis=0).clip(1e-300)
+        np.testing.assert_allclose(one / scale, other / scale, atol=1e-12)
+        np.testing.assert_allclose(whole[n] / scale, other / scale, atol=1e-12)
 
 
 @pytest.mark.serial
@@ -207,7 +223,7 @@ KINDS = {
     "stiffened": ("simulation.stiffening=true", "damping.stiffness_proportional=1e-3"),
     "modal": ("simulation.stiffening=true", "reduction.method=modal"),
     "krylov": ("reduction.method=krylov",),
-    "incompatible": ("arms.element=incompatible", "objective.stress_margin=0.1"),
+    "linear cells": ("arms.element=linear", "objective.stress_margin=0.1"),
     "scenarios": ('scenarios=[{changes=["payload.mass=2"]},{changes=["motion.gravity=[0,-9.81]", '
                    '"material.density=3000", "material.young_modulus=60e9"]}]',),
 }  # fmt: skip
