@@ -17,6 +17,7 @@ from dolfinopt.cli.gradient import gradient
 from dolfinopt.cli.init import init
 from dolfinopt.cli.keys import keys
 from dolfinopt.cli.optimize import optimize
+from dolfinopt.cli.part import part
 from dolfinopt.cli.plot import plot
 from dolfinopt.cli.reproduce import reproduce
 from dolfinopt.cli.schema import schema
@@ -96,7 +97,7 @@ def commands(ctx: click.Context) -> None:
 
 
 STARTING = (init, keys, schema)
-WORKING = (optimize, simulate, gradient, export, plot)
+WORKING = (optimize, simulate, gradient, part, export, plot)
 STUDYING = (sweep, compare, uncertainty, reproduce, bench)
 for command in (*STARTING, *WORKING, *STUDYING):
     commands.add_command(command)

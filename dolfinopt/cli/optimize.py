@@ -77,5 +77,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
     written = write_result(scene, folder, result, elapsed(), pictures=drawn)
     if written is not None:
         conclude(written.summary, folder)
+        if scene.design.projection:
+            click.echo(f"parts for the workshop: dolfinopt part {folder}")
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")

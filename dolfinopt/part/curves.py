@@ -1,0 +1,244 @@
+"""Plane curves of a part: lines, arcs and cubic B-splines, all over a parameter t in [0, 1]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+DEGREE = 3
+# Gauss points on [0, 1], exact for polynomials of degree five: area under a cubic.
+_GAUSS = 0.5 + 0.5 * np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
+_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+MIRROR = np.array([1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """The straight line from `start` to `end`, each (2,), m."""
+
+    start: np.ndarray
+    end: np.ndarray
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return the points (n, 2) at parameters (n,), m."""
+        t = np.asarray(t, dtype=float)[:, None]
+        return (1.0 - t) * self.start + t * self.end  # both ends to the bit
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        """Return the derivative (n, 2) by t, m."""
+        return np.broadcast_to(self.end - self.start, (len(t), 2))
+
+    def parameters(self, tolerance: float) -> np.ndarray:
+        """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
+        return np.array([0.0, 1.0])
+
+    @property
+    def area(self) -> float:
+        """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
+        return 0.5 * _cross(self.start, self.end)
+
+    def reversed(self) -> Line:
+        """Return the same curve from end to start."""
+        return Line(self.end, self.start)
+
+    def mirrored(self) -> Line:
+        """Return the mirror image about y = 0, run through in the same sense."""
+        return Line(self.start * MIRROR, self.end * MIRROR)
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """An arc of a circle; a whole one where the sweep is 2 pi.
+
+    Attributes:
+        centre: (2,) m.
+        radius: m.
+        begin: angle of the start, rad.
+        sweep: by which it turns, positive to the left, rad.
+    """
+
+    centre: np.ndarray
+    radius: float
+    begin: float
+    sweep: float
+
+    @property
+    def is_circle(self) -> bool:
+        """Whether it is a whole circle."""
+        return abs(self.sweep) >= 2.0 * np.pi * (1.0 - 1e-12)
+
+    @property
+    def start(self) -> np.ndarray:
+        """Its first point (2,), m."""
+        return self.at(np.zeros(1))[0]
+
+    @property
+    def end(self) -> np.ndarray:
+        """Its last point (2,), m."""
+        return self.at(np.ones(1))[0]
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return the points (n, 2) at parameters (n,), m."""
+        angle = self.begin + self.sweep * np.asarray(t, dtype=float)
+        return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        """Return the derivative (n, 2) by t, m."""
+        angle = self.begin + self.sweep * np.asarray(t, dtype=float)
+        return self.radius * self.sweep * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+
+    def parameters(self, tolerance: float) -> np.ndarray:
+        """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
+        step = 2.0 * np.arccos(max(1.0 - tolerance / self.radius, 0.5))
+        # A multiple of four: a whole circle reaches its extremes.
+        return np.linspace(0.0, 1.0, 4 * int(np.ceil(abs(self.sweep) / step / 4.0)) + 1)
+
+    @property
+    def area(self) -> float:
+        """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
+        chord = _cross(self.centre, self.end - self.start)
+        return 0.5 * (self.radius**2 * self.sweep + chord)
+
+    def reversed(self) -> Arc:
+        """Return the same curve from end to start."""
+        return Arc(self.centre, self.radius, self.begin + self.sweep, -self.sweep)
+
+    def mirrored(self) -> Arc:
+        """Return the mirror image about y = 0, run through in the same sense."""
+        return Arc(self.centre * MIRROR, self.radius, -self.begin, -self.sweep)
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """A cubic B-spline that begins at its first control point and ends at its last.
+
+    Attributes:
+        knots: (n + 4,), 0 and 1 four times each at the ends.
+        points: (n, 2) control points, m.
+    """
+
+    knots: np.ndarray
+    points: np.ndarray
+
+    @property
+    def start(self) -> np.ndarray:
+        """Its first point (2,), m."""
+        return self.points[0]
+
+    @property
+    def end(self) -> np.ndarray:
+        """Its last point (2,), m."""
+        return self.points[-1]
+
+    @property
+    def breaks(self) -> np.ndarray:
+        """Where its polynomials meet, ends included."""
+        return np.unique(self.knots)
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return the points (n, 2) at parameters (n,), m."""
+        return BSpline(self.knots, self.points, DEGREE)(np.asarray(t, dtype=float))
+
+    def derivative(self, t: np.ndarray, order: int = 1) -> np.ndarray:
+        """Return a derivative (n, 2) by t, m."""
+        whole = BSpline(self.knots, self.points, DEGREE)
+        return whole.derivative(order)(np.asarray(t, dtype=float))
+
+    def parameters(self, tolerance: float) -> np.ndarray:
+        """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
+        ends = self.breaks
+        bends = np.linalg.norm(self.derivative(_inside(ends), 2).reshape(-1, 2, 2), axis=2)
+        # A second derivative is linear between breaks: largest at one of them.
+        count = np.ceil(np.diff(ends) * np.sqrt(bends.max(axis=1) / (8.0 * tolerance)))
+        pieces = zip(ends[:-1], ends[1:], np.maximum(count, 1).astype(int))
+        return np.append(
+            np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in pieces]), 1.0
+        )
+
+    @property
+    def area(self) -> float:
+        """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
+        ends = self.breaks
+        t = (ends[:-1, None] + np.diff(ends)[:, None] * _GAUSS).ravel()
+        weights = (np.diff(ends)[:, None] * _WEIGHTS).ravel()
+        p, d = self.at(t), self.derivative(t)
+        return 0.5 * float(weights @ (p[:, 0] * d[:, 1] - p[:, 1] * d[:, 0]))
+
+    def reversed(self) -> Spline:
+        """Return the same curve from end to start."""
+        return Spline(1.0 - self.knots[::-1], self.points[::-1])
+
+    def mirrored(self) -> Spline:
+        """Return the mirror image about y = 0, run through in the same sense."""
+        return Spline(self.knots, self.points * MIRROR)
+
+    def bezier(self) -> np.ndarray:
+        """Return the control points (n, 4, 2) of its polynomials one by one, m."""
+        ends = self.breaks
+        width = np.diff(ends)[:, None]
+        p = self.at(ends)
+        d = self.derivative(_inside(ends)).reshape(-1, 2, 2)
+        a, b = p[:-1], p[1:]
+        return np.stack([a, a + width * d[:, 0] / 3.0, b - width * d[:, 1] / 3.0, b], axis=1)
+
+    def part(self, first: float, last: float) -> Spline:
+        """Return the piece between two parameters, first < last."""
+        ends = self.breaks
+        inner = ends[(ends > first + 1e-12) & (ends < last - 1e-12)]
+        knots = np.concatenate([[first] * 4, inner, [last] * 4])
+        # It is a spline of these knots itself: interpolation in as many points gives it exactly.
+        t = np.array([knots[k + 1 : k + 4].mean() for k in range(len(knots) - 4)])
+        basis = BSpline.design_matrix(t, knots, DEGREE).toarray()
+        points = np.linalg.solve(basis, self.at(t))
+        return Spline((knots - first) / (last - first), points)
+
+
+Curve = Line | Arc | Spline
+
+
+def sampled(curves: list[Curve], tolerance: float) -> np.ndarray:
+    """Return points (n, 2) along curves that follow one another, chords within a distance, m.
+
+    The last point is left out where it is the first.
+    """
+    points = np.concatenate([c.at(c.parameters(tolerance))[:-1] for c in curves])
+    last = curves[-1].end
+    if np.linalg.norm(last - curves[0].start) > 1e-9 * np.ptp(points, axis=0).max():
+        points = np.vstack([points, last])
+    return points
+
+
+def curvature(curve: Curve, t: np.ndarray) -> np.ndarray:
+    """Return the curvature (n,) at parameters, positive where it turns to the left, 1/m."""
+    if isinstance(curve, Line):
+        return np.zeros(len(t))
+    if isinstance(curve, Arc):
+        return np.full(len(t), np.sign(curve.sweep) / curve.radius)
+    d, dd = curve.derivative(t), curve.derivative(t, 2)
+    speed = np.maximum(np.linalg.norm(d, axis=1), np.finfo(float).tiny)
+    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3
+
+
+def direction(curve: Curve, t: float) -> np.ndarray:
+    """Return the unit tangent (2,) at a parameter."""
+    d = curve.derivative(np.array([t]))[0]
+    size = np.linalg.norm(d)
+    if size == 0.0:  # a spline whose first control points coincide
+        d = (
+            curve.at(np.array([min(t + 1e-3, 1.0)]))[0]
+            - curve.at(np.array([max(t - 1e-3, 0.0)]))[0]
+        )
+        size = np.linalg.norm(d)
+    return d / size
+
+
+def _inside(ends: np.ndarray) -> np.ndarray:
+    """Return both ends of every piece, a hair inside: where a derivative may jump."""
+    hair = 1e-9 * np.diff(ends)
+    return np.stack([ends[:-1] + hair, ends[1:] - hair], axis=1).ravel()
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])

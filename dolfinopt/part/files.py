@@ -1,0 +1,122 @@
+"""The folder of parts: all files of all arms, there together or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+from dolfinopt.disk import write_atomically, write_text, writing
+from dolfinopt.output.folders import remove_stale
+from dolfinopt.part.drawings import dxf_text, r12_text, svg_text
+from dolfinopt.part.part import Part
+from dolfinopt.part.scene_file import scene_text
+from dolfinopt.part.solid import stl_bytes
+from dolfinopt.part.step import use_millimetres, write_step
+from dolfinopt.scene.load import Scene
+
+FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl")
+SCENE, FIGURES, PICTURE = "part.toml", "part.json", "part.png"
+
+
+def file_names(scene: Scene) -> list[str]:
+    """Return the names of all files, the one that says they are complete first."""
+    arms = [
+        arm.name for arm, owner in zip(scene.arms, scene.owners, strict=True) if owner is not None
+    ]
+    return [FIGURES, SCENE, PICTURE, *(f"{arm}{kind}" for arm in arms for kind in FORMATS)]
+
+
+def figures_of(scene: Scene, parts: Mapping[int, Part]) -> dict[str, Any]:
+    """Return the content of part.json."""
+    arms = {
+        arm.name: parts[owner].figures(scene.material_of(owner).density)
+        for arm, owner in zip(scene.arms, scene.owners, strict=True)
+        if owner is not None
+    }
+    units = {
+        "area": "m2", "volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m",
+        "tolerance": "m", "tool_radius": "m", "smallest_concave_radius": "m",
+        "thinnest_member": "m",
+    }  # fmt: skip
+    return {"name": scene.name, "arms": arms, "units": units}
+
+
+def write_parts(
+    folder: Path,
+    scene: Scene,
+    parts: Mapping[int, Part],
+    picture: Any = None,
+) -> dict[str, Any]:
+    """Write the files of all arms into a folder that exists; return the content of part.json.
+
+    They are made in a folder beside them and moved when all are there, part.json last: whoever
+    finds it finds all.
+
+    Args:
+        folder: exists.
+        scene: of the arms.
+        parts: by their place in the chain.
+        picture: called with the path of part.png, if any.
+
+    Raises:
+        OutputError: the disk is full, for instance.
+    """
+    names = file_names(scene)
+    with writing(folder):
+        temporary = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
+    try:
+        _write_drawings(temporary, scene, parts)
+        _write_steps(temporary, scene, parts)
+        write_text(temporary / SCENE, scene_text(scene, parts, folder))
+        if picture is not None:
+            picture(temporary / PICTURE)
+        figures = figures_of(scene, parts)
+        write_text(temporary / FIGURES, json.dumps(figures, indent=1) + "\n")
+        remove_stale(folder, names)
+        with writing(folder):
+            for name in reversed(names):
+                if (temporary / name).exists():
+                    os.replace(temporary / name, folder / name)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return figures
+
+
+def _of_arms(scene: Scene, parts: Mapping[int, Part]) -> Sequence[tuple[str, Part]]:
+    """Return the names of all arms with a part; some may share one."""
+    return [
+        (arm.name, parts[owner])
+        for arm, owner in zip(scene.arms, scene.owners, strict=True)
+        if owner is not None
+    ]
+
+
+def _write_drawings(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> None:
+    for name, part in _of_arms(scene, parts):
+        shape, title = part.shape, f"{name} of {scene.name}"
+        write_text(folder / f"{name}.dxf", dxf_text(shape))
+        write_text(folder / f"{name}_r12.dxf", r12_text(shape, 0.5 * part.tolerance))
+        write_text(folder / f"{name}.svg", svg_text(shape, title))
+        data = stl_bytes(shape, part.domain.thickness, 0.5 * part.tolerance, title)
+        write_atomically(folder / f"{name}.stl", partial(_copy, data))
+
+
+def _copy(data: bytes, stream: IO[bytes]) -> None:
+    stream.write(data)
+
+
+def _write_steps(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> None:
+    from mpi4py import MPI
+
+    from dolfinopt.mesh.gmsh_session import gmsh_on_root, silent_terminal
+
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh, silent_terminal():
+        use_millimetres(gmsh, folder)
+        for name, part in _of_arms(scene, parts):
+            write_step(gmsh, folder, part.shape, part.domain.thickness, name)

@@ -1,0 +1,330 @@
+"""Where the material of a part ends: the level of the density that holds the material's volume.
+
+What stays solid, the interfaces and the arm's own outline are kept; islands are dropped, and every
+hole, gap and concave corner is as wide as the tool.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.part.curves import sampled
+from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
+from dolfinopt.part.levels import Raster, rasterise
+
+if TYPE_CHECKING:
+    from shapely import Geometry, Polygon
+
+AREA = 1e-4  # relative: up to which the level is sought
+LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leaves at one level
+NARROW = 5e-5  # bracket of the level, of the field's range
+STEPS = 60  # of the search for the level
+CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
+QUADRANT = 12  # sides of a quarter of the tool's circle
+STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
+SLIVER = 2e-3  # area of a corner that is rounded, squares of the radius: turns of 20 degrees
+TOOL = 0.2  # default radius of the tool, cells
+# Material along an interface that the design leaves void, in cells: the interface is rigid.
+STRIP = 0.5
+# Width of members that the design has and the level has not, in cells: solid cells that share a
+# corner are joined in the finite elements.
+LINK = 0.5
+UNIFORM = 1e-3  # range of a density without outline
+PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
+NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
+# Corners are rounded by the tool's radius and so many tolerances: curves may turn a little sharper.
+ROUNDING = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """The polygon of a part and how it was found.
+
+    Attributes:
+        domain: the arm.
+        polygon: shapely's, m; with sides on the arm's own curves where it touches them.
+        level: of the field.
+        offset: by which the outline was moved outwards, m; 0 where the level alone would do.
+        tool_radius: m.
+        rounding: radius of its concave corners, m.
+        chord: distance of its sides from the arm's own curves, m.
+        islands, islands_area: number of pieces that join no interface and were dropped; m2.
+        filled: number of holes narrower than the tool, closed.
+    """
+
+    domain: Domain
+    polygon: Polygon
+    level: float
+    offset: float
+    tool_radius: float
+    rounding: float
+    chord: float
+    islands: int
+    islands_area: float
+    filled: int
+
+    @property
+    def area(self) -> float:
+        """Area within the polygon, m2."""
+        return float(self.polygon.area)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """What all levels have in common, as shapely's geometries.
+
+    Attributes:
+        arm: where material may be.
+        stays: where it must be.
+        links: along which the design hangs together.
+        inboard, outboard: lines of the interfaces.
+    """
+
+    arm: Geometry
+    stays: Geometry
+    links: Geometry
+    inboard: Geometry
+    outboard: Geometry
+
+
+def default_tool(domain: Domain) -> float:
+    """Return the tool's radius where none is asked for, m."""
+    return TOOL * domain.cell
+
+
+def draw_outline(
+    domain: Domain, tool_radius: float, tolerance: float, rounding: float | None = None
+) -> Outline:
+    """Find the outline whose area is the material's volume over the thickness.
+
+    Args:
+        domain: the arm.
+        tool_radius: of every concave corner, m.
+        tolerance: of the part, m; the polygon is far closer to the arm's own curves.
+        rounding: radius of the polygon's concave corners, m; by default so much more than the
+            tool's that curves within the tolerance can hardly turn sharper than it.
+
+    Raises:
+        InputError: the tool does not fit into the arm; no material joins the interfaces; what must
+            stay solid is more than the volume.
+    """
+    where = f"arm {domain.name!r}"
+    if 2.0 * tool_radius >= domain.height:
+        raise InputError(
+            f"--tool-radius = {tool_radius:g} m: the tool is as wide as {where}, which is "
+            f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
+        )
+    radius = tool_radius + ROUNDING * tolerance if rounding is None else rounding
+    radius = 0.0 if tool_radius == 0.0 else radius
+    given = _given(domain, CHORD * tolerance)
+    raster = rasterise(domain)
+    target = domain.volume
+    if given.stays.area > target * (1.0 + AREA):
+        raise InputError(
+            f"{where}: what stays solid has {1e6 * given.stays.area:.6g} mm2, the design "
+            f"{1e6 * target:.6g} mm2; shorten arms.passive or raise design.volume_fraction"
+        )
+
+    if target > given.arm.area * (1.0 - AREA):
+        polygon = max(_parts(given.arm), key=lambda p: p.area)
+        return Outline(domain, polygon, 0.0, 0.0, tool_radius, radius, CHORD * tolerance, 0, 0.0, 0)
+    if float(np.ptp(domain.field)) < UNIFORM:
+        raise InputError(
+            f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
+            "optimise it first"
+        )
+
+    def at(level: float, offset: float = 0.0) -> Outline:
+        return _at(domain, given, raster, level, offset, radius, CHORD * tolerance)
+
+    found = _at_level(at, domain, raster)
+    if _off(found) > LEAP:  # a large piece joins or leaves: move the outline itself
+        found = _at_offset(at, found)
+    if _off(found) > LEAP:
+        raise InputError(
+            f"{where}: the material of the design does not hang together: at no level has the "
+            "piece that joins both interfaces the design's volume; let the optimisation go on until "
+            "the design is crisp (design.projection)"
+        )
+    return replace(found, tool_radius=tool_radius, rounding=radius)
+
+
+def _given(domain: Domain, chord: float) -> _Given:
+    import shapely
+
+    arm = domain.outline.area_inside(chord)
+    interfaces = {}
+    for label in (INBOARD, OUTBOARD):
+        curves = [edge.curve for edge in domain.outline.edges if edge.label == label]
+        interfaces[label] = shapely.union_all(
+            [shapely.LineString(np.vstack([sampled([c], chord), c.end])) for c in curves]
+        )
+    strips = [one.buffer(STRIP * domain.cell) for one in interfaces.values()]
+    stays = shapely.union_all([domain.solid.area_inside(chord), *strips]).intersection(arm)
+    links = shapely.MultiLineString(list(domain.links)).buffer(
+        0.5 * LINK * domain.cell, quad_segs=4
+    )
+    return _Given(arm, stays, links.intersection(arm), interfaces[INBOARD], interfaces[OUTBOARD])
+
+
+def _at(
+    domain: Domain,
+    given: _Given,
+    raster: Raster,
+    level: float,
+    offset: float,
+    tool: float,
+    chord: float,
+) -> Outline:
+    """Return the outline at a level, moved outwards by an offset, m."""
+    import shapely
+
+    above = shapely.simplify(raster.above(level), STRAIGHT * chord / CHORD)
+    if offset:
+        above = above.buffer(offset, quad_segs=QUADRANT)
+    whole = shapely.union_all([above.intersection(given.arm), given.stays, given.links])
+    before = _parts(whole)
+    if tool > 0.0:
+        whole = _rounded(whole, tool, chord).intersection(given.arm)
+    whole = _without_necks(whole, NECK * chord / CHORD, chord)
+    parts = _parts(whole)
+    near = 1e-6 * domain.extent
+    kept = [p for p in parts if all(p.distance(i) < near for i in (given.inboard, given.outboard))]
+    main = max(kept, key=lambda p: p.area) if kept else shapely.Polygon()
+    pinhole = 0.25 * np.pi * (PINHOLE * domain.cell) ** 2
+    holes = [ring for ring in main.interiors if _is_kept(ring, given.arm, pinhole)]
+    dropped = [p for p in parts if p is not main]
+    closed = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in dropped)
+    return Outline(
+        domain=domain,
+        polygon=shapely.Polygon(main.exterior, holes) if kept else main,
+        level=level,
+        offset=offset,
+        tool_radius=tool,
+        rounding=tool,
+        chord=chord,
+        islands=len(dropped),
+        islands_area=float(sum(p.area for p in dropped)),
+        filled=max(closed - len(holes), 0),
+    )
+
+
+def _rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
+    """Return the polygons with all that a disc cannot reach from without added to them.
+
+    Elsewhere their sides stay what they are to the bit.
+    """
+    import shapely
+
+    closed = whole.buffer(radius, quad_segs=QUADRANT).buffer(-radius, quad_segs=QUADRANT)
+    added = shapely.get_parts(closed.difference(whole))
+    # The rounding of numbers, and every corner of the polygon, leave slivers all along.
+    added = added[shapely.area(added) > SLIVER * radius * radius]
+    return shapely.union_all([whole, *shapely.buffer(added, 0.1 * chord, join_style="mitre")])
+
+
+def _without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
+    """Return the polygons without what is narrower than a width and joins wider parts."""
+    import shapely
+
+    opened = whole.buffer(-0.5 * width, quad_segs=QUADRANT).buffer(
+        0.5 * width + 0.1 * chord, quad_segs=QUADRANT
+    )
+    pieces = shapely.get_parts(whole.difference(opened))
+    necks = []
+    for piece in pieces[shapely.area(pieces) > 0.01 * width * width]:
+        touched = piece.buffer(chord).intersection(opened)
+        if len(_parts(touched)) != 1:  # a corner touches one wider part
+            necks.append(piece.buffer(chord, join_style="mitre"))
+    return whole.difference(shapely.union_all(necks)) if necks else whole
+
+
+def _is_kept(ring: Any, arm: Geometry, least: float) -> bool:
+    """Return whether a hole is a bore of the arm or no mere pinhole."""
+    import shapely
+
+    hole = shapely.Polygon(ring)
+    return bool(hole.area > least or not arm.covers(hole.representative_point()))
+
+
+def _parts(geometry: Geometry) -> list[Polygon]:
+    import shapely
+
+    return [p for p in shapely.get_parts(geometry) if p.geom_type == "Polygon" and p.area > 0.0]
+
+
+def _off(outline: Outline) -> float:
+    """Return by how much the area is off the volume, relative."""
+    return abs(outline.area / outline.domain.volume - 1.0)
+
+
+def _at_level(at: Callable[[float], Outline], domain: Domain, raster: Raster) -> Outline:
+    """Return the outline of the level at which it has the volume's area."""
+    low, high = float(raster.values.min()), float(raster.values.max())
+    order = np.argsort(-domain.field)
+    filled = np.cumsum(domain.area[order])
+    last = min(int(np.searchsorted(filled, domain.volume)), len(order) - 1)
+    first = domain.field[order[last]]
+    step = 0.02 * (high - low)
+    return _root(lambda level: at(level), float(first), step, (low - step, high + step), -1.0)
+
+
+def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline:
+    """Return the outline at the level of `found`, moved so that it has the volume's area."""
+    step, most = 0.02 * found.domain.cell, 2.0 * found.domain.cell
+    moved = _root(lambda offset: at(found.level, offset), 0.0, step, (-most, most), 1.0)
+    return min(found, moved, key=_off)
+
+
+def _root(
+    at: Callable[[float], Outline],
+    first: float,
+    step: float,
+    span: tuple[float, float],
+    sign: float,
+) -> Outline:
+    """Return the outline whose area is the volume, or the nearest one where the area leaps.
+
+    Args:
+        at: the outline by a number.
+        first: where to begin.
+        step: by which to look for a bracket at first.
+        span: what the number may be.
+        sign: 1 where the area grows with it, -1 where it falls.
+    """
+    tried: list[tuple[float, float]] = []
+    best: Outline | None = None
+    place = min(max(first, span[0]), span[1])
+    for _ in range(STEPS):
+        one = at(place)
+        off = one.area / one.domain.volume - 1.0
+        if best is None or abs(off) < _off(best):
+            best = one
+        if abs(off) < AREA:
+            break
+        tried.append((place, off * sign))
+        over = min((p for p in tried if p[1] > 0.0), default=None)
+        under = max((p for p in tried if p[1] <= 0.0), default=None)
+        if over is None or under is None:
+            if place in span:
+                break
+            if len(tried) > 1 and tried[-1][1] != tried[-2][1]:  # where a straight line ends
+                (a, f), (b, g) = tried[-2:]
+                step = min(max(abs(1.3 * g * (b - a) / (g - f)), 0.5 * step), 4.0 * step)
+            place = min(max(place - np.sign(off) * sign * step, span[0]), span[1])
+        else:
+            if abs(over[0] - under[0]) < NARROW * (span[1] - span[0]):
+                break
+            share = -under[1] / (over[1] - under[1])
+            # Every third step halves the bracket, for an area may leap; as it does to nothing.
+            leaps = len(tried) % 3 == 0 or max(over[1], -under[1]) > 0.5
+            place = under[0] + (0.5 if leaps else min(max(share, 0.03), 0.97)) * (
+                over[0] - under[0]
+            )
+    assert best is not None
+    return best

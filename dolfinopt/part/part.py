@@ -1,0 +1,144 @@
+"""From a folder of results to the parts of its arms, and their figures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dolfinopt.errors import InputError
+from dolfinopt.part.domain import Domain, read_domains
+from dolfinopt.part.outline import Outline, default_tool, draw_outline
+from dolfinopt.part.shape import Shape, make_shape
+from dolfinopt.part.widths import thinnest_member
+from dolfinopt.scene.load import Scene
+
+TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
+LEAST = 1e-7  # m, the finest tolerance: that of CAD programs
+TRIES, ENOUGH = 3, 0.98  # of the radius of concave corners; share of the tool's that will do
+GRAY = 0.02  # grayness from which on a design is no longer close to any part
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The part of one arm.
+
+    Attributes:
+        domain: the arm and its design.
+        outline: its polygon.
+        shape: its curves.
+        tolerance: of the curves, m.
+        thinnest: width of its thinnest member, m; None where nothing is thin.
+    """
+
+    domain: Domain
+    outline: Outline
+    shape: Shape
+    tolerance: float
+    thinnest: float | None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the workshop or the designer should know, a sentence each."""
+        one, outline = self.domain, self.outline
+        found = []
+        if one.grayness > GRAY:
+            found.append(
+                f"arm {one.name!r}: grayness {one.grayness:.2g}: the design is neither solid nor "
+                "void in many cells, and the part, which is, will do otherwise; optimise with "
+                'design.projection = "robust"'
+            )
+        if outline.islands:
+            share = 100.0 * outline.islands_area / one.volume
+            found.append(
+                f"arm {one.name!r}: {outline.islands} pieces without a joint to both interfaces "
+                f"({share:.2g} % of the volume) are left out"
+            )
+        if self.thinnest is not None and self.thinnest < 0.9 * one.minimum_member:
+            found.append(
+                f"arm {one.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, below "
+                f"design.minimum_member = {1e3 * one.minimum_member:.3g} mm"
+            )
+        return found
+
+    def figures(self, density: float) -> dict[str, Any]:
+        """Return the entry of part.json.
+
+        Args:
+            density: of the material, kg/m3.
+        """
+        one, shape = self.domain, self.shape
+        volume = shape.area * one.thickness
+        radius = shape.concave_radius()
+        return {
+            "area": shape.area,
+            "volume": volume,
+            "mass": density * volume,
+            "design_volume": one.volume * one.thickness,
+            "level": self.outline.level,
+            "distance": shape.distance(),
+            "tolerance": self.tolerance,
+            "curves": len(shape.curves),
+            "control_points": shape.control_points,
+            "loops": len(shape.loops),
+            "tool_radius": self.outline.tool_radius,
+            "smallest_concave_radius": radius if math.isfinite(radius) else None,
+            "thinnest_member": self.thinnest,
+            "islands_left_out": self.outline.islands,
+            "holes_filled": self.outline.filled,
+            "grayness": one.grayness,
+            "warnings": self.warnings,
+        }
+
+
+def make_parts(
+    scene: Scene, folder: Path, tool_radius: float | None = None, tolerance: float | None = None
+) -> dict[int, Part]:
+    """Return the parts of the arms that have a design of their own, by their place in the chain.
+
+    Args:
+        scene: of the run.
+        folder: with its design.npz.
+        tool_radius: of concave corners, m; default a fifth of a cell.
+        tolerance: of the curves, m; default 0.1 mm or a tenth of a cell, the smaller.
+
+    Raises:
+        InputError: no design in the folder, or no part can be made of it with these values.
+    """
+    for name, value, least in (
+        ("--tool-radius", tool_radius, 0.0),
+        ("--tolerance", tolerance, LEAST),
+    ):
+        if value is not None and not (math.isfinite(value) and value >= least):
+            raise InputError(f"{name} = {value:g} m: expected a length of at least {least:g} m")
+    if not (folder / "design.npz").is_file():
+        raise InputError(
+            f"{folder / 'design.npz'}: no design there; name the folder of a finished optimize or "
+            "simulate run"
+        )
+    return {
+        k: make_part(domain, tool_radius, tolerance)
+        for k, domain in read_domains(scene, folder).items()
+    }
+
+
+def make_part(domain: Domain, tool_radius: float | None, tolerance: float | None) -> Part:
+    """Return the part of one arm, see `make_parts`."""
+    if tolerance is None:
+        tolerance = min(TOLERANCE, CELLS * domain.cell)
+    elif tolerance > domain.cell:
+        raise InputError(
+            f"--tolerance = {tolerance:g} m: expected at most a cell of arm {domain.name!r}, "
+            f"{domain.cell:.3g} m"
+        )
+    tool = default_tool(domain) if tool_radius is None else tool_radius
+    rounding = None
+    for _ in range(TRIES):
+        outline = draw_outline(domain, tool, tolerance, rounding)
+        shape = make_shape(outline, tolerance)
+        radius = shape.concave_radius()
+        if radius >= ENOUGH * tool:
+            break
+        rounding = outline.rounding * min(1.1 * tool / radius, 2.0)
+    return Part(domain, outline, shape, tolerance, thinnest_member(outline))

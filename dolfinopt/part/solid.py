@@ -1,0 +1,60 @@
+"""STL: the surface of a part in triangles, watertight."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dolfinopt.part.shape import Shape
+
+MM = 1e3  # of a metre
+
+
+def stl_bytes(shape: Shape, thickness: float, tolerance: float, title: str) -> bytes:
+    """Return a binary STL of the shape extruded from z = 0 to its thickness, in millimetres.
+
+    Args:
+        shape: m.
+        thickness: m.
+        tolerance: of chords in place of curves, m.
+        title: for the header.
+    """
+    corners = _facets(shape.polygons(tolerance), thickness) * MM
+    data = np.zeros(len(corners), dtype=[("n", "<f4", 3), ("p", "<f4", (3, 3)), ("a", "<u2")])
+    data["p"] = corners
+    a, b, c = (data["p"][:, k].astype(float) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    data["n"] = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    head = f"{title}, mm".encode("ascii", "replace")[:80].ljust(80)
+    return head + np.uint32(len(corners)).tobytes() + data.tobytes()
+
+
+def _facets(loops: list[np.ndarray], thickness: float) -> np.ndarray:
+    """Return the corners (n, 3, 3) of the facets, m, counterclockwise from outside."""
+    import shapely
+
+    # As the file will have them: corners that fall together there must not be two here.
+    loops = [_rounded(loop) for loop in loops]
+    polygon = shapely.Polygon(loops[0], loops[1:])
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    flat = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    twice = (flat[:, 1, 0] - flat[:, 0, 0]) * (flat[:, 2, 1] - flat[:, 0, 1])
+    twice -= (flat[:, 2, 0] - flat[:, 0, 0]) * (flat[:, 1, 1] - flat[:, 0, 1])
+    flat[twice < 0.0] = flat[twice < 0.0][:, ::-1]
+    top, bottom = _lifted(flat, thickness), _lifted(flat[:, ::-1], 0.0)
+    walls = []
+    for loop in loops:
+        after = np.roll(loop, -1, axis=0)
+        a, b = _lifted(loop, 0.0), _lifted(after, 0.0)
+        c, d = _lifted(after, thickness), _lifted(loop, thickness)
+        walls += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    return np.concatenate([bottom, top, *walls])
+
+
+def _rounded(loop: np.ndarray) -> np.ndarray:
+    """Return a loop's corners as single precision in mm has them, none twice in a row."""
+    points = (MM * loop).astype(np.float32).astype(float) / MM
+    return points[(points != np.roll(points, 1, axis=0)).any(axis=1)]
+
+
+def _lifted(points: np.ndarray, z: float) -> np.ndarray:
+    return np.concatenate([points, np.full((*points.shape[:-1], 1), z)], axis=-1)

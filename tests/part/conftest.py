@@ -1,0 +1,43 @@
+"""Designs whose parts are known, without an optimisation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import scene
+
+from dolfinopt.arms.arm import build_arms
+from dolfinopt.parallel import partition_arms
+from dolfinopt.part.domain import Domain, domain_of
+from dolfinopt.profiling import Profile
+
+ONE = ("arms.1.rigid=true", "design.projection=robust", "arms.0.passive=0.015")
+
+
+@lru_cache(maxsize=8)
+def built(*changes: str):
+    """Return a scene and its only arm with a design."""
+    one = scene(*changes)
+    partition = partition_arms(MPI.COMM_SELF, one.cell_counts)
+    return one, build_arms(one, partition, Profile())[0]
+
+
+@pytest.fixture
+def design() -> Callable[..., Domain]:
+    """Return a function that makes the domain of a density given by x and y, m."""
+
+    def make(density: Callable, *changes: str) -> Domain:
+        one, arm = built(*ONE, *changes)
+        values = np.asarray(density(*arm.mesh.centroid.T), dtype=float)
+        return domain_of(one, 0, arm, np.where(arm.mesh.passive, 1.0, values))
+
+    return make
+
+
+def frame(x, y):
+    """Two flanges and three struts, with four windows between."""
+    return (np.abs(y) > 0.0149) | (np.abs((x + 0.125) % 0.25 - 0.125) < 0.0124)

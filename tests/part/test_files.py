@@ -1,0 +1,266 @@
+"""Files of parts, read by others."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import xml.etree.ElementTree as ElementTree
+
+import click
+import numpy as np
+import pytest
+from conftest import frame
+from mpi4py import MPI
+from runs import TWO_ARM, run, shell
+
+import dolfinopt as do
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
+
+pytestmark = pytest.mark.serial
+
+BORES = mesh_folder() / "arm_bores.geo"
+CHANGES = [
+    "arms.1.rigid=true",
+    "design.projection=robust",
+    "arms.0.passive=0.01",
+    "optimizer.max_iterations=1",
+]
+
+
+def folder_with(path, density, *changes):
+    """Write what `dolfinopt part` reads of a run: scene and design."""
+    scene = do.load_scene(TWO_ARM, [*CHANGES, *changes])
+    arm = arm_mesh(MPI.COMM_SELF, scene.arms[0])
+    path.mkdir()
+    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
+    values = np.where(arm.passive, 1.0, density(*arm.centroid.T).astype(float))
+    np.savez(path / "design.npz", **{"arm1/centroid": arm.centroid, "arm1/density": values})
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of parts of a rectangular arm, and of one with bores."""
+    base = tmp_path_factory.mktemp("parts")
+    run("part", folder_with(base / "plain", frame), "--no-plots")
+
+    def bored(x, y):
+        return frame(x, y) | (np.minimum(x, 1.0 - x) < 0.05)
+
+    changes = [f"arms.0.mesh={BORES}", "arms.0.mesh_size=0.006", "arms.0.symmetric=true"]
+    run("part", folder_with(base / "bores", bored, *changes), "--no-plots")
+    return {name: base / name / "part" for name in ("plain", "bores")}
+
+
+@pytest.fixture(params=["plain", "bores"])
+def part(request, made):
+    folder = made[request.param]
+    return folder, json.loads((folder / "part.json").read_text())["arms"]["arm1"]
+
+
+def bores_of(part):
+    return 2 if "bores" in str(part[0]) else 0
+
+
+def test_folder_is_complete(part):
+    names = {path.name for path in part[0].iterdir()}
+    kinds = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl")
+    assert names == {"part.json", "part.toml", *(f"arm1{kind}" for kind in kinds)}
+
+
+def test_step_is_one_solid_of_the_volume(part):
+    folder, figures = part
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
+        gmsh.open(str(folder / "arm1.step"))
+        ((_, solid),) = gmsh.model.getEntities(3)
+        volume = gmsh.model.occ.getMass(3, solid)
+        low, high = np.reshape(gmsh.model.getBoundingBox(3, solid), (2, 3))
+        plane = [face for face in gmsh.model.getEntities(2) if _is_end(gmsh, face)]
+        loops = [_loops(gmsh, face) for face in plane]
+    assert volume == pytest.approx(1e9 * figures["volume"], rel=1e-6)
+    assert (low[2], high[2]) == pytest.approx((0.0, 10.0), abs=1e-5)
+    assert loops == [figures["loops"]] * 2
+    text = (folder / "arm1.step").read_text()
+    assert "PRODUCT('arm1'" in text and text.count("MANIFOLD_SOLID_BREP(") == 1
+
+
+def _is_end(gmsh, face):
+    low, high = np.reshape(gmsh.model.getBoundingBox(*face), (2, 3))
+    return high[2] - low[2] < 1e-3
+
+
+def _loops(gmsh, face):
+    """Count the closed loops around a face."""
+    follows = {}
+    for curve in gmsh.model.getBoundary([face], oriented=False):
+        ends = gmsh.model.getBoundary([curve], oriented=False)
+        tags = [tag for _, tag in ends] or [-curve[1]]
+        for tag in tags:
+            follows.setdefault(tag, set()).update(tags)
+    count = 0
+    while follows:
+        ahead = [next(iter(follows))]
+        count += 1
+        while ahead:
+            ahead += [tag for tag in follows.pop(ahead.pop(), ()) if tag in follows]
+    return count
+
+
+def test_face_is_an_arm_again(part):
+    folder, figures = part
+    scene = do.load_scene(folder / "part.toml")
+    arm = arm_mesh(MPI.COMM_SELF, scene.arms[0])
+    assert arm.area.sum() == pytest.approx(figures["area"], rel=3e-3)  # straight cells
+    assert len(arm.inboard_facets) > 4 and len(arm.outboard_facets) > 4
+    assert arm.notes == ()
+    text = (folder / "arm1_face.step").read_text()
+    assert text.count("EDGE_CURVE('inboard'") == text.count("EDGE_CURVE('outboard'") == 1
+
+
+@pytest.mark.parametrize("name", ["arm1.dxf", "arm1_r12.dxf"])
+def test_dxf_is_clean_and_has_two_layers(part, name):
+    import ezdxf
+
+    folder, figures = part
+    document = ezdxf.readfile(folder / name)
+    audit = document.audit()
+    assert not audit.errors and not audit.fixes
+    model = document.modelspace()
+    assert {entity.dxf.layer for entity in model} == {"outline", "holes"}
+    circles = list(model.query("CIRCLE"))
+    assert [c.dxf.radius for c in circles] == pytest.approx([10.0] * bores_of(part), abs=1e-6)
+    if name == "arm1.dxf":
+        assert document.dxfversion == "AC1024"
+        assert document.header["$INSUNITS"] == 4  # mm
+        assert len(model) == figures["curves"]
+        count = sum(len(spline.control_points) for spline in model.query("SPLINE"))
+        assert count == figures["control_points"]
+    else:
+        assert document.dxfversion == "AC1009"
+        assert {entity.dxftype() for entity in model} <= {"POLYLINE", "CIRCLE"}
+        assert len(model) == figures["loops"]
+        assert _area_of_polylines(model) == pytest.approx(1e6 * figures["area"], rel=1e-3)
+
+
+def _area_of_polylines(model):
+    areas = [np.pi * circle.dxf.radius**2 for circle in model.query("CIRCLE")]
+    for polyline in model.query("POLYLINE"):
+        corners = np.array([v.dxf.location.vec2 for v in polyline.vertices])
+        bulge = np.array([v.dxf.bulge for v in polyline.vertices])
+        after = np.roll(corners, -1, axis=0)
+        twice = corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]
+        chord = np.linalg.norm(after - corners, axis=1)
+        angle = 4.0 * np.arctan(bulge)
+        radius = np.divide(chord, 2.0 * np.sin(0.5 * angle), out=0 * chord, where=bulge != 0.0)
+        areas.append(abs(0.5 * twice.sum() + (0.5 * radius**2 * (angle - np.sin(angle))).sum()))
+    return 2.0 * max(areas) - sum(areas)
+
+
+def test_stl_is_watertight(part):
+    trimesh = pytest.importorskip("trimesh")
+    folder, figures = part
+    body = trimesh.load(folder / "arm1.stl")
+    assert body.is_watertight and body.is_winding_consistent and body.volume > 0.0
+    assert body.volume == pytest.approx(1e9 * figures["volume"], rel=2e-3)  # chords
+    assert body.body_count == 1
+
+
+def test_svg_is_to_scale(part):
+    folder, figures = part
+    root = ElementTree.parse(folder / "arm1.svg").getroot()
+    space = "{http://www.w3.org/2000/svg}"
+    assert root.tag == f"{space}svg" and root.attrib["width"].endswith("mm")
+    left, _, width, _ = map(float, root.attrib["viewBox"].split())
+    assert width == pytest.approx(float(root.attrib["width"][:-2]), rel=1e-5)
+    assert left < 0.0 and left + width > 1000.0
+    path = root.find(f"{space}path").attrib["d"]
+    assert path.count("M ") == path.count("Z") == figures["loops"]
+
+
+def test_freecad_opens_the_solid(part):
+    program = shutil.which("freecadcmd") or shutil.which("FreeCADCmd")
+    if program is None:
+        pytest.skip("no FreeCAD on this machine")
+    folder, figures = part
+    script = folder / "check.py"
+    script.write_text(
+        "import Part\n"
+        f"shape = Part.read({str(folder / 'arm1.step')!r})\n"
+        "print('FOUND', len(shape.Solids), shape.isValid(), shape.Solids[0].isClosed(), "
+        "shape.Volume)\n"
+    )
+    try:
+        done = subprocess.run([program, str(script)], capture_output=True, text=True, timeout=120)
+    finally:
+        script.unlink()
+    _, solids, valid, closed, volume = done.stdout.split("FOUND")[1].join(["x ", ""]).split()[:5]
+    assert (solids, valid, closed) == ("1", "True", "True")
+    assert float(volume) == pytest.approx(1e9 * figures["volume"], rel=1e-6)
+
+
+def test_scene_of_the_parts_is_simulated(made, tmp_path):
+    out = tmp_path / "out"
+    scene = made["plain"] / "part.toml"
+    words = ("--set", "arms.0.mesh_size=0.01", "--set", "simulation.sample=0.01")
+    run("simulate", scene, "--no-plots", "--out", out, *words)
+    summary = json.loads((out / "summary.json").read_text())
+    figures = json.loads((made["plain"] / "part.json").read_text())["arms"]["arm1"]
+    assert summary["mass"]["arm1"] == pytest.approx(figures["mass"], rel=0.01)
+    assert summary["volume_fraction"]["arm1"] == pytest.approx(1.0)
+
+
+# --- commands ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--tolerance", "5e-8"], "--tolerance = 5e-08 m: expected a length of at least 1e-07 m"),
+        (["--tolerance", "nan"], "--tolerance = nan m: expected a length"),
+        (["--tolerance", "0.5"], "expected at most a cell of arm 'arm1'"),
+        (["--tool-radius", "-1"], "--tool-radius = -1 m: expected a length of at least 0 m"),
+        (["--tool-radius", "0.04"], "the tool is as wide as arm 'arm1', which is 0.06 m high"),
+    ],
+)
+def test_bad_values_are_refused(tmp_path, words, reason):
+    folder = folder_with(tmp_path / "run", frame)
+    with pytest.raises(InputError) as caught:
+        run("part", folder, "--no-plots", *words)
+    assert reason in str(caught.value) and len(str(caught.value).splitlines()) == 1
+    assert not (folder / "part").exists()
+
+
+def test_folder_without_a_design_is_refused(tmp_path):
+    done = shell("part", tmp_path)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert "summary.json: cannot be read" in done.stderr
+    folder = folder_with(tmp_path / "run", frame)
+    (folder / "design.npz").unlink()
+    with pytest.raises(InputError, match=r"design\.npz: no design there"):
+        run("part", folder)
+
+
+def test_used_folder_is_refused(made):
+    with pytest.raises(InputError, match=r"holds results already.*--overwrite"):
+        run("part", made["plain"].parent, "--no-plots")
+
+
+def test_interrupted_command_leaves_what_was_there(tmp_path, monkeypatch):
+    from dolfinopt.part import files
+
+    folder = folder_with(tmp_path / "run", frame)
+    (folder / "part").mkdir()
+    (folder / "part" / "note.txt").write_text("mine")
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "write_step", interrupted)
+    with pytest.raises(click.Abort):
+        run("part", folder, "--no-plots")
+    assert [path.name for path in (folder / "part").iterdir()] == ["note.txt"]

@@ -1,0 +1,142 @@
+"""Outlines and shapes of designs that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import frame
+
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
+from dolfinopt.part.curves import Arc, Line
+from dolfinopt.part.outline import draw_outline
+from dolfinopt.part.part import make_part
+
+pytestmark = pytest.mark.serial
+
+BORES = (
+    f"arms.0.mesh={mesh_folder() / 'arm_bores.geo'}",
+    "arms.0.mesh_size=0.006",
+    "arms.0.passive=0.0075",
+    "arms.0.symmetric=true",
+)
+
+
+def check(part, holes):
+    """Check what every part fulfils."""
+    shape, domain = part.shape, part.domain
+    assert shape.area == pytest.approx(domain.volume, rel=1e-6)
+    assert part.outline.area == pytest.approx(domain.volume, rel=5e-3)
+    assert shape.distance() <= part.tolerance
+    assert shape.is_simple(0.05 * part.tolerance)
+    assert len(shape.loops) == 1 + holes
+    for loop in shape.loops:
+        ends = np.array([piece.curve.end for piece in loop])
+        starts = np.array([piece.curve.start for piece in loop])
+        np.testing.assert_allclose(np.roll(ends, 1, axis=0), starts, atol=1e-9)
+    areas = [sum(piece.curve.area for piece in loop) for loop in shape.loops]
+    assert areas[0] > 0.0 and max(areas[1:], default=-1.0) < 0.0
+
+
+def test_frame(design):
+    part = make_part(design(frame), None, None)
+    check(part, holes=4)
+    assert part.outline.islands == part.outline.filled == 0
+    outer = [piece.curve for piece in part.shape.loops[0]]
+    assert [type(curve) for curve in outer] == [Line] * 4  # the arm's own outline
+    corners = sorted(tuple(np.round(curve.start, 12)) for curve in outer)
+    assert corners == [(0.0, -0.03), (0.0, 0.03), (1.0, -0.03), (1.0, 0.03)]
+    assert sorted(piece.label for piece in part.shape.loops[0]) == ["", "", "inboard", "outboard"]
+    assert part.shape.control_points < 40 * 4
+    # Flanges of 15 mm, struts of 25 mm; the level rounds corners and widens the windows for it.
+    assert part.thinnest == pytest.approx(0.015, rel=0.05)
+    assert part.warnings == []
+
+
+@pytest.mark.parametrize("radius", [0.001, 0.003, 0.006])
+def test_concave_corners_have_the_radius_of_the_tool(design, radius):
+    part = make_part(design(frame), radius, None)
+    check(part, holes=4)
+    assert radius * 0.98 <= part.shape.concave_radius() <= radius + 0.005
+
+
+def test_tolerance_bounds_the_distance_and_sets_the_number_of_points(design):
+    parts = [make_part(design(frame), None, tolerance) for tolerance in (5e-4, 1e-4, 2e-5)]
+    for part in parts:
+        check(part, holes=4)
+    points = [part.shape.control_points for part in parts]
+    assert points[0] <= points[1] <= points[2] < 8 * points[0]
+
+
+def test_island_is_dropped(design):
+    def density(x, y):
+        return frame(x, y) | (np.hypot(x - 0.375, y) < 0.008)
+
+    part = make_part(design(density), None, None)
+    check(part, holes=4)
+    assert part.outline.islands == 1
+    assert "1 pieces without a joint to both interfaces" in part.warnings[0]
+
+
+def test_strut_of_one_cell_stays(design):
+    def density(x, y):
+        return frame(x, y) | (np.abs(x - 0.3725) < 0.002)
+
+    part = make_part(design(density), None, None)
+    check(part, holes=5)
+    assert 0.002 < part.thinnest < 0.006
+
+
+def test_cells_that_share_a_corner_stay_joined(design):
+    """A diagonal chain, which elements join at their nodes."""
+
+    def density(x, y):
+        column, row = np.floor(x / 0.005 + 1e-9), np.floor((y + 0.03) / 0.005 + 1e-9)
+        return frame(x, y) | ((column - 72 == row - 3) & (np.abs(y) < 0.015))
+
+    part = make_part(design(density), None, None)
+    check(part, holes=5)
+
+
+def test_design_that_falls_apart_is_refused(design):
+    with pytest.raises(InputError, match=r"arm 'arm1'.*does not hang together"):
+        make_part(design(lambda x, y: np.abs(x - 0.5) > 0.05), None, None)
+
+
+def test_full_arm_is_its_own_outline(design):
+    part = make_part(design(lambda x, y: np.ones_like(x)), None, None)
+    assert part.shape.area == pytest.approx(0.06, rel=1e-12)
+    assert len(part.shape.curves) == 4 and part.shape.control_points == 0
+
+
+def test_gray_design_says_what_it_is(design):
+    def density(x, y):
+        return 0.2 + 0.7 * (y / 0.03) ** 2
+
+    part = make_part(design(density, "design.projection=false"), None, None)
+    check(part, holes=len(part.shape.loops) - 1)
+    assert any("grayness" in text and "robust" in text for text in part.warnings)
+
+
+def test_bores_are_exact_and_the_part_is_its_mirror_image(design):
+    def density(x, y):
+        return (np.abs(y) > 0.0149) | (np.abs(x - 0.5) < 0.02) | (np.minimum(x, 1.0 - x) < 0.05)
+
+    part = make_part(design(density, *BORES), None, None)
+    check(part, holes=4)
+    for label, x in (("inboard", 0.0), ("outboard", 1.0)):
+        (curve,) = [piece.curve for piece in part.shape.pieces if piece.label == label]
+        assert isinstance(curve, Arc) and curve.is_circle
+        assert np.array_equal(curve.centre, [x, 0.0])
+        assert curve.radius == pytest.approx(0.01, abs=1e-9)
+    ends = [p.curve for p in part.shape.loops[0] if isinstance(p.curve, Arc)]
+    assert [curve.radius for curve in ends] == pytest.approx([0.03, 0.03], abs=1e-9)
+    points = np.vstack([loop for loop in part.shape.polygons(1e-6)])
+    from scipy.spatial import cKDTree
+
+    assert cKDTree(points).query(points * [1.0, -1.0])[0].max() < 1e-12
+
+
+def test_tool_as_wide_as_the_arm_is_refused(design):
+    with pytest.raises(InputError, match=r"--tool-radius = 0.03 m: the tool is as wide as"):
+        draw_outline(design(frame), 0.03, 1e-4)
