@@ -67,7 +67,7 @@ class Domain:
         rim, rim_cells: (n, 2, 2) m, the sides of cells on the arm's outline, counterclockwise
             around the cell; (n,) which cell.
         outline: the arm's own, bores included.
-        solid: where material stays.
+        solid, void: where material stays, and where there is none.
         grid: numbers of cells (along, across) where they form one.
         length, thickness: m.
         symmetric: about y = 0.
@@ -86,6 +86,7 @@ class Domain:
     rim_cells: np.ndarray
     outline: Region
     solid: Region
+    void: Region
     grid: tuple[int, int] | None
     length: float
     thickness: float
@@ -154,6 +155,8 @@ def _filtered(
         return {}
     found = {}
     for k, arm in arms.items():
+        if k not in memory.cells:
+            continue
         x = memory.cells[k][:, 0]
         design = arm.physical_designs(x, memory.beta, memory.thresholds[k])[-1]
         if np.abs(design.x_phys - x_phys[k]).max() < EQUAL:
@@ -162,8 +165,8 @@ def _filtered(
 
 
 def _before_projection(arm: Arm, x: np.ndarray) -> np.ndarray:
-    """Return the filtered densities of design variables; not cut off where cells stay solid."""
-    x = np.where(arm.mesh.passive, 1.0, x)
+    """Return the filtered densities of design variables, also where cells stay solid or void."""
+    x = arm.mesh.keep(x)
     return arm.filter.forward(x if arm.symmetry is None else arm.symmetry.forward(x))
 
 
@@ -210,6 +213,7 @@ def domain_of(
         rim_cells=rim_cells,
         outline=region(np.ones(len(nodes), dtype=bool)),
         solid=region(mesh.passive),
+        void=region(mesh.void),
         grid=entry.cells,
         length=entry.length,
         thickness=entry.thickness,

@@ -148,8 +148,8 @@ def draw_outline(
     if _off(found) > LEAP:
         raise InputError(
             f"{where}: the material of the design does not hang together: at no level has the "
-            "piece that joins both interfaces the design's volume; let the optimisation go on until "
-            "the design is crisp (design.projection)"
+            "piece that joins both interfaces the design's volume; let the optimisation go on "
+            "until the design is crisp (design.projection)"
         )
     return replace(found, tool_radius=tool_radius, rounding=radius)
 
@@ -157,7 +157,7 @@ def draw_outline(
 def _given(domain: Domain, chord: float) -> _Given:
     import shapely
 
-    arm = domain.outline.area_inside(chord)
+    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
     interfaces = {}
     for label in (INBOARD, OUTBOARD):
         curves = [edge.curve for edge in domain.outline.edges if edge.label == label]

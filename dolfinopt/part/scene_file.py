@@ -31,7 +31,12 @@ def scene_text(scene: Scene, parts: Mapping[int, Part], folder: Path) -> str:
         if owner is not None:
             row.update(_arm(scene.arms[owner].name if arm.design else arm.name, parts[owner]))
     data["design"].update(
-        volume_fraction=1.0, shared_volume=False, initial=1.0, projection=False, minimum_member=0.0
+        volume_fraction=1.0,
+        shared_volume=False,
+        initial=1.0,
+        projection=False,
+        minimum_member=0.0,
+        minimum_gap=0.0,
     )
     head = (
         "# The arms as parts, see their .step files: simulate and study them like any scene.\n"
@@ -51,6 +56,8 @@ def _arm(name: str, part: Part) -> dict[str, Any]:
         "height": height,
         "cells": None,
         "passive": None,
+        "pattern": None,
+        "regions": None,
         "symmetric": False,  # which its mesh is not to the last cell
     }
     if "element" in Arm.model_fields:

@@ -41,7 +41,7 @@ def trace(outline: Outline, tolerance: float) -> list[list[Run]]:
     import shapely
 
     domain = outline.domain
-    edges = [*domain.outline.edges, *domain.solid.edges]
+    edges = [*domain.outline.edges, *domain.solid.edges, *domain.void.edges]
     polygon: Any = outline.polygon
     if domain.symmetric:
         wide = 2.0 * domain.extent

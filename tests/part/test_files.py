@@ -37,7 +37,7 @@ def folder_with(path, density, *changes):
     arm = arm_mesh(MPI.COMM_SELF, scene.arms[0])
     path.mkdir()
     (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
-    values = np.where(arm.passive, 1.0, density(*arm.centroid.T).astype(float))
+    values = arm.keep(density(*arm.centroid.T).astype(float))
     np.savez(path / "design.npz", **{"arm1/centroid": arm.centroid, "arm1/density": values})
     return path
 

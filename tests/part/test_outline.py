@@ -137,6 +137,23 @@ def test_bores_are_exact_and_the_part_is_its_mirror_image(design):
     assert cKDTree(points).query(points * [1.0, -1.0])[0].max() < 1e-12
 
 
+def test_regions_stay_solid_and_void(design):
+    regions = (
+        '[{kind="solid", box=[0.3, -0.02, 0.4, 0.01]}, {kind="void", box=[0.5, 0.02, 0.6, 0.03]}]'
+    )
+    part = make_part(design(frame, f"arms.0.regions={regions}"), None, None)
+    import shapely
+
+    polygon = shapely.Polygon(*_rings(part))
+    assert polygon.buffer(1e-8).covers(shapely.box(0.3, -0.02, 0.4, 0.01))
+    assert not polygon.buffer(-1e-8).intersects(shapely.box(0.5, 0.02, 0.6, 0.03))
+
+
+def _rings(part):
+    outer, *holes = part.shape.polygons(1e-7)
+    return outer, holes
+
+
 def test_tool_as_wide_as_the_arm_is_refused(design):
     with pytest.raises(InputError, match=r"--tool-radius = 0.03 m: the tool is as wide as"):
         draw_outline(design(frame), 0.03, 1e-4)
