@@ -634,6 +634,7 @@ BAD_VALUES = [
     ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
     ("optimizer.max_iterations", 16**5000, "2**20000...", "an integer >= 0 and <= 1000000"),
     ("optimizer.max_iterations", 400.0, "400.0", "an integer >= 0"),
+    ("optimizer.exact_iterations", -1, "-1", "an integer >= 0"),
     ("optimizer.move", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
     ("optimizer.move", 1.1, "1.1", "a number >= 1e-06 and <= 1"),
     ("optimizer.tolerance", -1.0, "-1.0", "a number >= 0"),
