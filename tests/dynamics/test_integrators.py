@@ -556,6 +556,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
         Path(__file__).parents[2] / "demos" / "two_arm.toml",
         (
             "arms.cells=[40,4]",
+            "arms.element=linear",
             "payload.mass=11.2",
             "motion.duration=0.87",
             "motion.flattening=0.46",

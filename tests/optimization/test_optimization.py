@@ -87,9 +87,9 @@ def test_constraints_keep_their_bounds():
     # Loose ones, only to be told the values: they change the free design by rounding.
     loose = ["constraints.first_frequency=0.1", "constraints.tip_deflection=1.0"]
     free = do.optimize(small(*QUICK, *loose, iterations=40))
-    assert free.evaluation.loaded_frequencies[0] < 5.2 < free.evaluation.loaded_frequencies[1]
-    assert max(free.evaluation.constraints[4:]) > 6e-5 - 1.0
-    for bound in ("constraints.first_frequency=5.215", "constraints.tip_deflection=5.2e-5"):
+    assert free.evaluation.loaded_frequencies[0] < 5.03 < free.evaluation.loaded_frequencies[1]
+    assert max(free.evaluation.constraints[4:]) > 7e-5 - 1.0
+    for bound in ("constraints.first_frequency=5.06", "constraints.tip_deflection=6.0e-5"):
         kept = do.optimize(small(*QUICK, bound, iterations=40))
         # MMA approaches an active bound to a fraction of its last change.
         assert max(kept.evaluation.constraints) == pytest.approx(0.0, abs=1e-3)
@@ -97,7 +97,7 @@ def test_constraints_keep_their_bounds():
         if WORLD.rank == 0:
             assert kept.history[-1].volume_fraction == pytest.approx(0.5, abs=1e-3)
         if "frequency" in bound:
-            assert kept.evaluation.loaded_frequencies[0] == pytest.approx(5.215, rel=1e-3)
+            assert kept.evaluation.loaded_frequencies[0] == pytest.approx(5.06, rel=1e-3)
 
 
 @pytest.mark.slow
