@@ -21,6 +21,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, get_args
@@ -47,6 +48,7 @@ from dolfinopt.responses.constraints import limits_by_column
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
+from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
 from dolfinopt.study.studies import Preset, study
@@ -98,6 +100,14 @@ class SimulationResult:
         """Largest distance of the end-effector from its rigid path, m."""
         return self.evaluation.max_deviation
 
+    @property
+    def max_stress(self) -> float:
+        """Largest von Mises stress along the motion at an element's centre, Pa.
+
+        nan where it was not asked for, see `Model.simulate`, and on other ranks than 0.
+        """
+        return max((float(v.stress.max()) for v in self.views if v.stress is not None), default=nan)
+
     def to_frame(self) -> DataFrame | None:
         """Return deviation (m) and compliance of every arm (N m) over time (s, the index).
 
@@ -132,6 +142,13 @@ class SimulationResult:
         from dolfinopt.plots.design import design_figure
 
         return design_figure(designed(self.views), self.scene.name) if self.views else None
+
+    def plot_stress(self) -> Figure | None:
+        """Return the figure of every cell's largest stress; None where it was not asked for."""
+        from dolfinopt.plots.stress import stress_figure
+
+        known = [view for view in self.views if view.stress is not None]
+        return stress_figure(known, self.scene.name) if known else None
 
     def plot_machine(self) -> Figure | None:
         """Return the figure of the machine in a few poses along its path."""
@@ -274,11 +291,12 @@ class Model:
             raise InputError(f"density {density}: expected a number >= 0 and <= 1")
         return self._gathered(self._uniform(density))
 
-    def simulate(self, x: Design = None) -> SimulationResult:
+    def simulate(self, x: Design = None, *, stress: bool = False) -> SimulationResult:
         """Simulate a design.
 
         Args:
             x: the design, see the class; None: the initial one.
+            stress: whether the stress of all cells is to be known, too.
 
         Raises:
             InputError: it does not fit the scene's arms.
@@ -287,7 +305,8 @@ class Model:
         partition, arms, x_phys = self._prepared(x)
         choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
         evaluation, trajectory = evaluate(self.scene, partition, arms, x_phys, self._profile)
-        views = gather_views(self.scene, partition, arms, x_phys)
+        found = stress_report(partition, arms, trajectory, self._profile) if stress else None
+        views = gather_views(self.scene, partition, arms, x_phys, found)
         return SimulationResult(self.scene, evaluation, self._gathered(x_phys), trajectory, views)
 
     def gradient(self, x: Design = None, kind: str | None = None) -> dict[str, np.ndarray]:
@@ -334,12 +353,13 @@ class Model:
         place = None if folder is None else Path(folder)
         found = optimize(self.scene, place, resume=resume, world=self._world, report=report)
         self._arms()  # the order of the cells
+        stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
             self.scene,
             found.evaluation,
             self._gathered(found.x_phys, found.partition),
             found.trajectory,
-            gather_views(self.scene, found.partition, found.arms, found.x_phys),
+            gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
             found.iterations,
             found.converged,
             found.stop_reason,

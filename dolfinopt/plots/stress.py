@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +21,10 @@ from dolfinopt.plots.design import (
     stack_arms,
 )
 from dolfinopt.plots.shapes import outline
-from dolfinopt.plots.style import BLUE, GREY, PathLike, round_number
+from dolfinopt.plots.style import BLUE, GREY, PathLike, new_figure, round_number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLOURS = "YlOrRd"  # nothing is light, the largest dark
 STRESS = "largest von Mises stress along the motion [MPa]"
@@ -38,14 +42,26 @@ def draw_stress(path: PathLike, views: Sequence[ArmView], title: str) -> Path:
     """
     from PIL import Image
 
-    page = stress_page(views, title)
-    try:
-        image = Image.fromarray(page.render())
-    finally:
-        page.close()
+    image = Image.fromarray(_image(views, title))
     target = Path(path)
     write_atomically(target, lambda stream: image.save(stream, format="PNG", compress_level=3))
     return target
+
+
+def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
+    """Return the picture of `draw_stress` as a figure of Matplotlib, pixel for pixel."""
+    image = _image(views, title)
+    figure = new_figure(image.shape[1] / 100.0, image.shape[0] / 100.0, 100, laid_out=False)
+    figure.figimage(image)
+    return figure
+
+
+def _image(views: Sequence[ArmView], title: str) -> np.ndarray:
+    page = stress_page(views, title)
+    try:
+        return page.render()
+    finally:
+        page.close()
 
 
 def stress_page(views: Sequence[ArmView], title: str) -> Page:

@@ -331,7 +331,7 @@ def cell_stress_of_fields(arm) -> CellStress:
 
 @pytest.mark.serial
 def test_work_is_done_once() -> None:
-    """Value and gradient share fields and search; a design that is only simulated has none."""
+    """Value and gradient share fields and search."""
     built = build(*QUICK, "simulation.stiffening=false", "reduction.coordinates=4",
                   "constraints.stress=1e8")  # fmt: skip
     x = built.fields(wave)
@@ -344,8 +344,16 @@ def test_work_is_done_once() -> None:
     adjoint = 4 + 2 * 4  # unit loads' inertia, elastic inertia
     modes = 3  # and the constraint modes; normal modes iterate
     assert built.profile.counts.solves - before >= 2 * (adjoint + modes)
-    plain = build(*QUICK, "simulation.stiffening=false", "reduction.coordinates=4")
-    assert built.profile.counts.solves > plain.profile.counts.solves
+
+
+@pytest.mark.serial
+def test_stress_in_python() -> None:
+    """Asked for, a simulation knows it and draws it; an optimisation knows it anyway."""
+    model = do.Model(do.load_scene(TWO_ARM, ["arms.cells=[20,3]", "simulation.sample=0.01"]))
+    plain, asked = model.simulate(), model.simulate(stress=True)
+    assert np.isnan(plain.max_stress) and plain.plot_stress() is None
+    assert 1e6 < asked.max_stress < 1e9
+    assert asked.plot_stress() is not None
 
 
 @pytest.mark.serial
