@@ -13,12 +13,11 @@ from dolfinopt.units import NOT_MET
 MOVING = 0.5
 # Grayness above which a projection has not done its work: as if 2 % of the cells stood at 1/2.
 GREY = 0.02
-# A step is too long that leaves a violated constraint at so many times its value, or exceeds a
-# limit by such a share although the design before kept all, to half of that.
-LEAP, LEAVE = 2.0, 0.05
-# The last iterations of a run take steps so much shorter, so that it does not end in the middle of
-# one: near limits that follow the design true values settle to 0.1 % as steps do.
-LAST, LANDING = 8, 0.1
+# A step is too long that leaves a constraint at so many times its value before, or of its limit.
+LEAP = 2.0
+# A run whose iterations are spent while it exceeds limits by no more than this share goes on with
+# steps so much shorter, for so many at most: limits that follow the design settle as steps do.
+NEARLY, LANDING, LAST = 0.05, 0.1, 8
 
 Ending = Literal["", "converged", "infeasible", "limit"]
 
@@ -55,21 +54,7 @@ def leaps(before: np.ndarray, after: np.ndarray) -> bool:
     Args:
         before, after: (m,) relative constraints, value / limit - 1.
     """
-    if before.max() <= 0.5 * LEAVE and after.max() > LEAVE:
-        return True
     return bool((1.0 + after > LEAP * (1.0 + np.maximum(before, 0.0))).any())
-
-
-def landing(scene: Scene, iteration: int, excess: float) -> float:
-    """Return by how much the move limit is shortened near the end of the iterations.
-
-    Args:
-        scene: with their number.
-        iteration: design updates made.
-        excess: relative violation of the worst limit; a design far from it lands nowhere yet.
-    """
-    near = iteration >= scene.optimizer.max_iterations - LAST and excess <= LEAVE
-    return LANDING if near else 1.0
 
 
 def stop_reason(

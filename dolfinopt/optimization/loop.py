@@ -16,7 +16,15 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.assessment import assess, initial_selection
 from dolfinopt.optimization.certificate import certify
 from dolfinopt.optimization.conflicts import conflict_sentences
-from dolfinopt.optimization.convergence import Ending, ending, landing, leaps, stop_reason
+from dolfinopt.optimization.convergence import (
+    LANDING,
+    LAST,
+    NEARLY,
+    Ending,
+    ending,
+    leaps,
+    stop_reason,
+)
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
@@ -139,6 +147,7 @@ class _Run:
             self._record()
             self._checkpoint()
         self._checkpoint(force=True)
+        self._land()
         return self._result()
 
     def _begin(self, memory: Memory | None) -> None:
@@ -171,17 +180,19 @@ class _Run:
         )
         return bool(self.finished)
 
-    def _step(self, problem: Problem) -> None:
+    def _step(self, problem: Problem, factor: float = 1.0) -> None:
         """Update the design and evaluate it; shorten a step that curved constraints forbid.
 
         Collective. Where a limit is exceeded twice as far as before, or the motion can no longer be
         simulated, the linear forecast has failed: MMA is asked again from the design before.
+
+        Args:
+            problem: at x.
+            factor: on the move limit.
         """
         x, state = self.x, self.state
         projected = self.continuation.beta, dict(self.continuation.thresholds)
-        move = self.continuation.move
-        if self.curved:
-            move *= landing(self.scene, self.iteration, float(problem.f.max()))
+        move = factor * self.continuation.move
         for attempt in range(ATTEMPTS):
             last = attempt == ATTEMPTS - 1 or not self.curved
             self._update(problem, move * SHORTER**attempt)
@@ -195,6 +206,20 @@ class _Run:
                     return
             self.x, self.state, self.iteration = x, state, self.iteration - 1
             self.continuation.beta, self.continuation.thresholds = projected
+
+    def _land(self) -> None:
+        """Take short steps where the iterations ended just beyond a limit (collective).
+
+        The checkpoint does not know of them: a run that is resumed with more iterations goes on as
+        if it had not ended.
+        """
+        if self.finished != "limit" or not self.curved:
+            return
+        for _ in range(LAST):
+            if not violated(self.problem.limits) or self.problem.f.max() > NEARLY:
+                return
+            self._step(self.problem, LANDING)
+            self._record()
 
     def _update(self, problem: Problem, move: float) -> None:
         """Make one MMA step, and one of the continuation (collective)."""
