@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.fem.cells import sum_at_nodes
+from dolfinopt.fem.uniform_stress import StiffenedModes
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
@@ -60,14 +61,27 @@ class UnitLoads:
         """Return K0 (7, q, q) in modes V (n_nodes, 2, q) (collective on the arm's ranks)."""
         arm, q = self.arm, V.shape[2]
         i, j = np.triu_indices(q)
-        if (uniform := arm.substructure.uniform_stress) is not None:
-            packed = uniform.stiffness(self.fields, arm.young, V)
+        if arm.substructure.uniform_stress is not None:
+            packed = self._stiffened(V).stiffness()
         else:
             packed = self._stiffness(V)
         packed = arm.comm.allreduce(packed)
         K0 = np.empty((NUM_LOADS, q, q))
         K0[:, i, j] = K0[:, j, i] = packed
         return K0
+
+    @cached_property
+    def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
+        return {}
+
+    def _stiffened(self, V: np.ndarray) -> StiffenedModes:
+        """Return what is known of these modes where cells are all alike; for the last, the same."""
+        known = self._last.get("modes")
+        if known is None or known[0] is not V:
+            tensor = self.arm.substructure.uniform_stress
+            assert tensor is not None
+            known = self._last["modes"] = V, tensor.of(self.fields, self.arm.young, V)
+        return known[1]
 
     def _stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (7, pairs i <= j) of this rank's cells."""
@@ -105,8 +119,8 @@ class UnitLoads:
             assert by_fields is not None
             forces = np.zeros_like(by_fields)
             by_V, by_young = np.zeros_like(V), np.zeros_like(arm.young)
-        elif (uniform := arm.substructure.uniform_stress) is not None:
-            by_V, forces, by_young = uniform.gradient(self.fields, arm.young, V, by_K0)
+        elif arm.substructure.uniform_stress is not None:
+            by_V, forces, by_young = self._stiffened(V).gradient(by_K0)
         else:
             by_V, forces, by_young = self._gradient(V, by_K0)
         if by_fields is not None:

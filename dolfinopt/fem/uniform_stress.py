@@ -42,88 +42,103 @@ class UniformStress:
         T = np.einsum("ps,pbc->sbc", S[:, 0], products[:, 0, 0])
         T += np.einsum("ps,pbc->sbc", S[:, 1], products[:, 1, 1])
         T += np.einsum("ps,pbc->sbc", S[:, 2], products[:, 0, 1] + products[:, 1, 0])
-        self._b, self._c = np.triu_indices(len(self.gradients))
-        self.tensor = T[:, self._b, self._c]
+        b, c = np.triu_indices(len(self.gradients))
+        self.tensor = T[:, b, c]
 
-    def stiffness(self, fields: np.ndarray, young: np.ndarray, V: np.ndarray) -> np.ndarray:
-        """Return K0 (loads, pairs i <= j of modes) of this rank's cells.
+    def of(self, fields: np.ndarray, young: np.ndarray, V: np.ndarray) -> StiffenedModes:
+        """Return the geometric stiffness of modes by the stress of fields.
 
         Args:
             fields: (n_nodes, 2, loads) whose stress stiffens.
             young: (n_cells,).
             V: (n_nodes, 2, q) modes.
         """
-        packed = np.zeros((fields.shape[2], V.shape[2] * (V.shape[2] + 1) // 2))
-        amplitudes, strengths = self._gradients_of(V), self._stresses_of(fields)
-        for run in self._runs(V):
-            force = self._contracted(strengths[..., run] * young[run])
-            products = self._products(amplitudes[..., run])
-            packed += np.matmul(force, products.swapaxes(1, 2)).sum(axis=0)
+        return StiffenedModes(self, fields, young, V)
+
+    def gradients_of(self, V: np.ndarray) -> np.ndarray:
+        """Return a (r, 2, q, n_cells)."""
+        values = self.cells.centred(V)
+        a = self.gradients @ values.reshape(len(values), -1)
+        return a.reshape(len(a), *values.shape[1:])
+
+    def stresses_of(self, fields: np.ndarray) -> np.ndarray:
+        """Return s (m, loads, n_cells) of unit Young's modulus."""
+        values = self.cells.centred(fields)
+        s = self.stresses @ values.reshape(self.stresses.shape[1], -1)
+        return s.reshape(len(s), *values.shape[2:])
+
+    def at_nodes(self, operator: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Return the nodal field (n_nodes, 2, k) of derivatives by what `operator` gives."""
+        nodal = operator.T @ by.reshape(len(by), -1)
+        n = len(self.cells.operators.cells[0])
+        return self.cells.sum_at_nodes(nodal.reshape(n, 2, -1, by.shape[-1]))
+
+
+class StiffenedModes:
+    """K0 of some modes of one design by the stress of some fields, and its derivatives.
+
+    What the value has computed its derivatives do not compute again.
+    """
+
+    def __init__(self, tensor: UniformStress, fields: np.ndarray, young: np.ndarray, V: np.ndarray):
+        """See `UniformStress.of`."""
+        self._tensor, self._young = tensor, young
+        self._a, self._s = tensor.gradients_of(V), tensor.stresses_of(fields)
+        self._i, self._j = np.triu_indices(V.shape[2])
+        b, c = np.triu_indices(len(self._a))
+        self._pairs = list(zip(b, c, strict=True))
+        # What the products of amplitudes are multiplied by (bc, loads, n_cells).
+        force = tensor.tensor.T @ (self._s * young).reshape(len(self._s), -1)
+        self._force = force.reshape(len(force), *self._s.shape[1:])
+        self._kept: np.ndarray | None = None
+
+    def stiffness(self) -> np.ndarray:
+        """Return K0 (loads, pairs i <= j of modes) of this rank's cells."""
+        packed = np.zeros((self._s.shape[1], len(self._i)))
+        for run, products in self._parts():
+            packed += np.matmul(self._force[..., run], products.swapaxes(1, 2)).sum(axis=0)
         return packed
 
-    def gradient(
-        self, fields: np.ndarray, young: np.ndarray, V: np.ndarray, by_K0: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def gradient(self, by_K0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Differentiate a function of K0, given its derivative by K0 (loads, q, q), any symmetry.
 
         Returns:
             Its derivatives by the modes (n_nodes, 2, q) and by the fields (n_nodes, 2, loads),
             contributions of this rank's cells, and by Young's modulus (n_cells,), both held.
         """
-        loads, q = fields.shape[2], V.shape[2]
-        n, count = self.gradients.shape[1], len(young)
-        by_V, by_fields = np.empty((n, 2, q, count)), np.empty((n, 2, loads, count))
-        by_young = np.empty(count)
-        i, j = np.triu_indices(q)
-        both = by_K0 + by_K0.swapaxes(1, 2)
-        by_pairs = np.where(i == j, 0.5, 1.0) * both[:, i, j]
-        amplitudes, strengths = self._gradients_of(V), self._stresses_of(fields)
-        for run in self._runs(V):
-            a, s = amplitudes[..., run], strengths[..., run]
-            size = run.stop - run.start
-            by_force = np.matmul(by_pairs, self._products(a))
-            by_s = (self.tensor @ by_force.reshape(len(by_force), -1)).reshape(s.shape)
-            by_young[run] = np.einsum("sle,sle->e", s, by_s)
-            by_s *= young[run]
-            nodal = self.stresses.T @ by_s.reshape(len(by_s), -1)
-            by_fields[..., run] = nodal.reshape(n, 2, loads, size)
-            weights = np.matmul(both[:, i, j].T, self._contracted(s * young[run]))
-            by_a = self._products_transposed(a, weights)
-            nodal = self.gradients.T @ by_a.reshape(len(by_a), -1)
-            by_V[..., run] = nodal.reshape(n, 2, q, size)
-        total = self.cells.sum_at_nodes
-        return total(by_V), total(by_fields), by_young
+        tensor, (i, j) = self._tensor, (self._i, self._j)
+        twice = (by_K0 + by_K0.swapaxes(1, 2))[:, i, j]  # the diagonal is doubled
+        once = np.where(i == j, 0.5, 1.0) * twice
+        by_a, by_s = np.zeros_like(self._a), np.empty_like(self._s)
+        for run, products in self._parts():
+            by_force = np.matmul(once, products)
+            part = tensor.tensor @ by_force.reshape(len(by_force), -1)
+            by_s[..., run] = part.reshape(len(part), *by_force.shape[1:])
+            weights = np.matmul(twice.T, self._force[..., run])
+            self._add_transposed(by_a[..., run], self._a[..., run], weights)
+        by_young = np.einsum("sle,sle->e", self._s, by_s)
+        by_s *= self._young
+        by_V = tensor.at_nodes(tensor.gradients, by_a)
+        return by_V, tensor.at_nodes(tensor.stresses, by_s), by_young
 
-    def _runs(self, V: np.ndarray) -> Iterator[slice]:
-        count, q = len(self.cells.operators.cells), V.shape[2]
-        step = max(1, CHUNK // (len(self._b) * q * (q + 1) // 2))
+    def _parts(self) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield runs of cells, and the products of their modes' amplitudes."""
+        count = self._a.shape[-1]
+        step = max(1, CHUNK // (len(self._pairs) * len(self._i)))
         for first in range(0, count, step):
-            yield slice(first, min(first + step, count))
-
-    def _gradients_of(self, V: np.ndarray) -> np.ndarray:
-        """Return a (r, 2, q, n_cells)."""
-        values = self.cells.centred(V)
-        a = self.gradients @ values.reshape(len(values), -1)
-        return a.reshape(len(a), *values.shape[1:])
-
-    def _stresses_of(self, fields: np.ndarray) -> np.ndarray:
-        """Return s (m, loads, n_cells) of unit Young's modulus."""
-        values = self.cells.centred(fields)
-        s = self.stresses @ values.reshape(self.stresses.shape[1], -1)
-        return s.reshape(len(s), *values.shape[2:])
-
-    def _contracted(self, s: np.ndarray) -> np.ndarray:
-        """Return what the products of amplitudes are multiplied by (bc, loads, cells)."""
-        force = self.tensor.T @ s.reshape(len(s), -1)
-        return force.reshape(len(force), *s.shape[1:])
+            run = slice(first, min(first + step, count))
+            products = self._products(self._a[..., run]) if self._kept is None else self._kept
+            if step >= count:
+                self._kept = products
+            yield run, products
 
     def _products(self, a: np.ndarray) -> np.ndarray:
         """Return a_ib . a_jc + a_ic . a_jb, half of it for b = c (bc, pairs i <= j, cells)."""
-        q, size = a.shape[2:]
-        out = np.empty((len(self._b), q * (q + 1) // 2, size))
+        size = a.shape[3]
+        out = np.empty((len(self._pairs), len(self._i), size))
         first, second = term = np.empty((2, size))
-        for found, b, c in zip(out, self._b, self._c, strict=True):
-            for one, i, j in zip(found, *np.triu_indices(q), strict=True):
+        for found, (b, c) in zip(out, self._pairs, strict=True):
+            for one, i, j in zip(found, self._i, self._j, strict=True):
                 np.multiply(a[b, :, i], a[c, :, j], out=term)
                 np.add(first, second, out=one)
                 if b != c:
@@ -134,22 +149,21 @@ class UniformStress:
                         one += np.add(first, second, out=first)
         return out
 
-    def _products_transposed(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives by a (r, 2, q, cells), given those by the products.
+    def _add_transposed(self, by_a: np.ndarray, a: np.ndarray, weights: np.ndarray) -> None:
+        """Add the derivatives by a (r, 2, q, cells), given those by `_products`.
 
         Args:
+            by_a: to which they are added.
             a: amplitudes.
             weights: (bc, pairs i <= j, cells), doubled for i = j.
         """
-        by_a, term = np.zeros_like(a), np.empty((2, a.shape[3]))
-        pairs = list(zip(*np.triu_indices(a.shape[2]), strict=True))
-        for weight, b, c in zip(weights, self._b, self._c, strict=True):
-            for w, (i, j) in zip(weight, pairs, strict=True):
+        term = np.empty((2, a.shape[3]))
+        for weight, (b, c) in zip(weights, self._pairs, strict=True):
+            for w, i, j in zip(weight, self._i, self._j, strict=True):
                 # b and c, and i and j, change places, unless they are the same.
-                for d, e in {(b, c), (c, b)}:
-                    for k, m in {(i, j), (j, i)}:
+                for d, e in dict.fromkeys([(b, c), (c, b)]):
+                    for k, m in dict.fromkeys([(i, j), (j, i)]):
                         by_a[d, :, k] += np.multiply(w, a[e, :, m], out=term)
-        return by_a
 
 
 def _factors(operator: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
