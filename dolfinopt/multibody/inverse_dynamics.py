@@ -28,6 +28,9 @@ from dolfinopt.multibody.mechanism import Mechanism, ModalConstants, product
 from dolfinopt.multibody.motion import RigidMotion
 
 Rates = tuple[np.ndarray, np.ndarray, np.ndarray]  # q, qd, qdd
+NUM_LOADS = 7  # that stiffen
+# Up to so many modes their products two by two are cheaper than a sum for each load.
+FEW_MODES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +53,21 @@ class SecondOrder:
     second: np.ndarray
 
 
-def _second_order(K0: np.ndarray, rates: Rates) -> SecondOrder:
-    flat = K0.transpose(1, 0, 2).reshape(K0.shape[1], -1)  # K0_p is symmetric
-    shape = (len(rates[0]), *K0.shape[:2])
-    e, ed, edd = ((x @ flat).reshape(shape) for x in rates)
-    value, rate, second = (_work(e, x) for x in rates)
-    value *= 0.5
-    second += _work(ed, rates[1])
+def _second_order(constants: ModalConstants, rates: Rates) -> SecondOrder:
+    K0, (count, q) = constants.K0, rates[0].shape
+    assert K0 is not None
+    flat = K0.transpose(1, 0, 2).reshape(q, -1)  # K0_p is symmetric
+    e, ed, edd = ((x @ flat).reshape(count, NUM_LOADS, q) for x in rates)
+    if q <= FEW_MODES:
+        i, j, weights = constants.second_order
+        together = np.stack(rates)
+        (x, xd, xdd), (y, yd, ydd) = (together.take(pair, axis=2) for pair in (i, j))
+        products = np.stack([x * y, xd * y + x * yd, xdd * y + 2.0 * xd * yd + x * ydd])
+        value, rate, second = (products.reshape(-1, len(i)) @ weights).reshape(3, count, -1)
+    else:
+        value, rate, second = (_work(e, x) for x in rates)
+        value *= 0.5
+        second += _work(ed, rates[1])
     return SecondOrder(K0, e, ed, edd, value, rate, second)
 
 
@@ -155,7 +166,7 @@ def outward_pass(
         moved = [x @ constants.kinematics for x in (e, qd[:, part], qdd[:, part])]
         bent = None
         if constants.K0 is not None:
-            bent = _second_order(constants.K0, (e, qd[:, part], qdd[:, part]))
+            bent = _second_order(constants, (e, qd[:, part], qdd[:, part]))
             for linear, more in zip(moved, (bent.value, bent.rate, bent.second), strict=True):
                 linear += more
         (s, d, rotation), (sd, dd, rotation_d), (sdd, ddd, rotation_dd) = (

@@ -46,6 +46,20 @@ class ModalConstants:
     D: np.ndarray | None
     K0: np.ndarray | None
 
+    @cached_property
+    def second_order(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What -1/2 q'K0_p q is by the products q_i q_j, in the columns of `kinematics`.
+
+        Returns:
+            i <= j (pairs,) each, and the weights (pairs, 6).
+        """
+        assert self.K0 is not None
+        i, j = np.triu_indices(len(self.rotation))
+        weights = np.zeros((len(i), 6))
+        interface = self.K0[[0, 1, 4, 5, 6]][:, i, j]  # a_x, a_y, F_x, F_y, T
+        weights[:, :5] = -(np.where(i == j, 0.5, 1.0) * interface).T
+        return i, j, weights
+
 
 def _modal_constants(body: ShapeIntegrals) -> ModalConstants:
     C, (B_x, B_y, rotation) = body.C, body.outboard

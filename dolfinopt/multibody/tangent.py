@@ -9,6 +9,7 @@ through force and moment: its rows are a block of its own coordinates and a rank
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -27,6 +28,10 @@ from dolfinopt.multibody.motion import RigidMotion
 
 _FrameDerivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # of (a, w, wd), each (n, 3 S)
 _Columns = tuple[slice, slice, slice]  # of q, qd, qdd among the 3 S
+
+
+# K, D, M, G and what they are multiplied by.
+Coupling = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, tuple[PerInstant, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +75,23 @@ class _BodyTangent:
         geometric = None if self.geometric is None else self.geometric[part]
         changed = {name: getattr(self, name)[part] for name in names}
         return replace(self, geometric=geometric, **changed)
+
+    def coupling(self, own: np.ndarray, times: int) -> Coupling:
+        """Return K, D, M, G (kept, own) and `factors`; every step of Newton's method asks for them.
+
+        Args:
+            own: rows of the body.
+            times: see `factors`.
+        """
+        key = own.tobytes(), times
+        if key not in self._known:
+            K, D, M, G = (x[np.ix_(own, self.kept)].T for x in self.matrices)
+            self._known[key] = K, D, M, G, self.factors(times)
+        return self._known[key]
+
+    @cached_property
+    def _known(self) -> dict[tuple[bytes, int], Coupling]:
+        return {}
 
     def factors(self, times: int = 1) -> tuple[PerInstant, ...]:
         """Return what K and M, by q; D and G, by qd; M, by qdd, are multiplied by, as columns.
@@ -153,8 +175,7 @@ class Tangent:
             out.append((rows @ change).swapaxes(1, 2).reshape(len(q), -1))
         for part in self.bodies:
             own = wanted[(wanted >= part.rows.start) & (wanted < part.rows.stop)] - part.rows.start
-            K, D, M, G = (x[np.ix_(own, part.kept)].T for x in part.matrices)
-            k, m_q, g_q, d, g_v, m = part.factors(times)
+            K, D, M, G, (k, m_q, g_q, d, g_v, m) = part.coupling(own, times)
             e, ed, edd = q[:, part.columns], qd[:, part.columns], qdd[:, part.columns]
             coupled = (part.left[:, own] @ (part.right @ change)).swapaxes(1, 2).reshape(len(q), -1)
             coupled += (m * edd + m_q * e) @ M + (g_q * e + g_v * ed) @ G
