@@ -12,9 +12,8 @@ from scipy.linalg import lapack
 
 from dolfinopt.errors import InputError
 
-# Up to so many rows a narrow band is factorised as such on one rank, by LAPACK or by PETSc's
-# Cholesky in natural order; nested dissection beats both beyond, and MUMPS and CHOLMOD up to
-# 150 000 rows (`dolfinopt bench`, solvers).
+# From so many rows on nested dissection beats the narrow band in PETSc's Cholesky on one rank; and
+# from there on both beat MUMPS and CHOLMOD up to 150 000 rows (`dolfinopt bench`, solvers).
 NESTED_ROWS = 30_000
 # LAPACK factorises wider bands block by block, which is faster in the lower triangle; narrower ones
 # entry by entry, faster in the upper triangle. Solutions with the upper one take 60 to 80 %.

@@ -12,7 +12,6 @@ from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_ent
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.profiling import Profile
 from dolfinopt.solver import (
-    NESTED_ROWS,
     BandCholesky,
     Factor,
     PetscFactor,
@@ -22,6 +21,9 @@ from dolfinopt.solver import (
 )
 
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
+# Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
+# has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
+MOST_WORK = 1e9
 
 
 class InteriorSystem:
@@ -72,10 +74,12 @@ class InteriorSystem:
     @cached_property
     def _band(self) -> BandCholesky | None:
         """LAPACK's factor, where one rank owns a band that is narrow enough."""
-        T = self._T
-        if T.comm.size > 1 or T.num_interior >= NESTED_ROWS or has_options(OPTIONS):
+        if self._T.comm.size > 1 or has_options(OPTIONS):
             return None
-        return BandCholesky(self._entries.rows, self._entries.columns, T.num_interior)
+        rows, columns, size = self._entries.rows, self._entries.columns, self._T.num_interior
+        if size * float((rows - columns).max(initial=0)) ** 2 > MOST_WORK:
+            return None
+        return BandCholesky(rows, columns, size)
 
     @cached_property
     def _band_source(self) -> np.ndarray:
