@@ -30,4 +30,4 @@ def test_notes_and_panels_of_some_rows() -> None:
     panels = solvers.diagram().panels(rows)
     assert [line.label for line in panels[0].lines] == [solvers.OURS, "mumps, its own"]
     assert f"{solvers.OURS}, 2 threads" in [line.label for line in panels[1].lines]
-    assert "petsc, natural is fastest, 0.02 s on 1 thread" in solvers.diagram().notes(rows)[1]
+    assert "lapack, natural is fastest, 0.02 s on 1 thread" in solvers.diagram().notes(rows)[1]
