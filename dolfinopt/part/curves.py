@@ -190,6 +190,7 @@ class Spline:
         knots = np.concatenate([[first] * 4, inner, [last] * 4])
         # It is a spline of these knots itself: interpolation in as many points gives it exactly.
         t = np.array([knots[k + 1 : k + 4].mean() for k in range(len(knots) - 4)])
+        t = np.clip(t, first, last)  # a mean of equal numbers may differ from them
         basis = BSpline.design_matrix(t, knots, DEGREE).toarray()
         points = np.linalg.solve(basis, self.at(t))
         return Spline((knots - first) / (last - first), points)

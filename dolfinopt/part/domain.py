@@ -62,8 +62,8 @@ class Domain:
         field: (n_cells,) what is smooth from cell to cell and falls where x_phys does: the
             filtered densities before they are projected, or x_phys itself.
         crisp: whether `field` is a projected design, which leaps from cell to cell.
-        links: (n, 2, 2) m, lines between the centroids of neighbouring solid cells of a projected
-            design, in a corner at least, where one of them has a void neighbour.
+        links: (n, 2, 2) m, lines between the centroids of solid cells of a projected design that
+            share a corner at least, where one of them is in a member no wider than a cell.
         rim, rim_cells: (n, 2, 2) m, the sides of cells on the arm's outline, counterclockwise
             around the cell; (n,) which cell.
         outline: the arm's own, bores included.
@@ -237,10 +237,11 @@ def _links(
     near = shared.data >= (1 if nodes.shape[1] == 4 else 2)
     a, b = shared.row[near], shared.col[near]
     solid = x_phys > 0.5
-    edge = np.zeros(len(nodes), dtype=bool)
-    for here, there in ((a, b), (b, a)):
-        edge[here[~solid[there]]] = True
-    linked = solid[a] & solid[b] & (edge[a] | edge[b])
+    # Wider than a cell is a member with a node that no void cell touches.
+    inner = np.ones(int(nodes.max()) + 1, dtype=bool)
+    inner[nodes[~solid]] = False
+    thin = ~inner[nodes].any(axis=1)
+    linked = solid[a] & solid[b] & (thin[a] | thin[b])
     return np.stack([centroid[a[linked]], centroid[b[linked]]], axis=1)
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from dolfinopt.part.curves import DEGREE, Spline
 
 ROUNDS = 40  # of inserting knots
-FOOTPOINTS = 3  # corrections of the parameters after each solution
-NEARLY = 1.5  # distance in tolerances from which on corrections are not worth while
+FOOTPOINTS = 2  # corrections of the parameters after each solution
+IDLE = 0.6  # distance beside a knot, in tolerances, up to which its removal is tried
+NEARLY = 1.3  # distance in tolerances from which on corrections are not worth while
 LEAST = 5  # points in a span that is divided
 REMOVED_UP_TO = 60  # knots of a curve of which one after the other is tried
 
@@ -82,14 +83,20 @@ def _thinned(
     target: Target, tolerance: float, curve: Spline, t: np.ndarray, inner: np.ndarray
 ) -> Spline:
     """Return a spline without the knots that the tolerance does not take."""
+    off = np.linalg.norm(target.points - curve.at(t), axis=1)
     k = 0 if len(inner) <= REMOVED_UP_TO else len(inner)
     while k < len(inner):
+        ends = np.concatenate([[0.0], inner, [1.0]])
+        beside = (t >= ends[k]) & (t <= ends[k + 2])
+        if off[beside].max(initial=0.0) > IDLE * tolerance:  # it is needed
+            k += 1
+            continue
         fewer = np.delete(inner, k)
-        other, where, off = _solve(target, t, fewer, rounds=1)
-        if tolerance < off.max() < NEARLY * tolerance:
-            other, where, off = _solve(target, where, fewer)
-        if off.max() <= tolerance:
-            curve, t, inner = other, where, fewer
+        other, where, apart = _solve(target, t, fewer, rounds=1)
+        if tolerance < apart.max() < NEARLY * tolerance:
+            other, where, apart = _solve(target, where, fewer)
+        if apart.max() <= tolerance:
+            curve, t, inner, off = other, where, fewer, apart
         else:
             k += 1
     return curve
@@ -102,13 +109,13 @@ def _solve(
     knots = np.concatenate([np.zeros(DEGREE + 1), inner, np.ones(DEGREE + 1)])
     points = target.points
     for _ in range(rounds):
-        controls = _least_squares(target, t, knots)
         first, values, slopes = _basis(knots, t)
-        near = controls[first[:, None] + np.arange(DEGREE + 1)]
-        gap = points - np.einsum("ik,ikc->ic", values, near)
-        slope = np.einsum("ik,ikc->ic", slopes, near)
+        place = first[:, None] + np.arange(DEGREE + 1)
+        controls = _least_squares(target, place, values, knots)
+        gap = points - np.einsum("ik,ikc->ic", values, controls[place])
+        slope = np.einsum("ik,ikc->ic", slopes, controls[place])
         t = t + (gap * slope).sum(axis=1) / np.maximum((slope**2).sum(axis=1), 1e-300)
-        t = np.maximum.accumulate(np.clip(t, 0.0, 1.0))
+        t = np.maximum.accumulate(np.minimum(np.maximum(t, 0.0), 1.0))
         t[0], t[-1] = 0.0, 1.0
     first, values, _ = _basis(knots, t)
     near = controls[first[:, None] + np.arange(DEGREE + 1)]
@@ -138,18 +145,24 @@ def _basis(knots: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return span - DEGREE, values, slopes
 
 
-def _least_squares(target: Target, t: np.ndarray, knots: np.ndarray) -> np.ndarray:
+def _least_squares(
+    target: Target, place: np.ndarray, values: np.ndarray, knots: np.ndarray
+) -> np.ndarray:
     """Return the control points (n, 2) of least squares under the conditions at the ends.
 
     An end with a direction leaves one unknown of its second control point: the distance.
+
+    Args:
+        target: points and conditions.
+        place, values: (n_points, 4) numbers and values of the B-splines at the points.
+        knots: of the spline.
     """
     n, points = len(knots) - DEGREE - 1, target.points
-    first, values, _ = _basis(knots, t)
-    basis = np.zeros((len(t), n))
-    np.put_along_axis(basis, first[:, None] + np.arange(DEGREE + 1), values, axis=1)
+    basis = np.zeros((len(points), n))
+    np.put_along_axis(basis, place, values, axis=1)
     # So little that it counts only where a span has no points: third differences.
     third = np.diff(np.eye(n), 3, axis=0)
-    gram = basis.T @ basis + 1e-9 * len(t) / n * third.T @ third
+    gram = basis.T @ basis + 1e-9 * len(points) / n * third.T @ third
     right = basis.T @ points
     ends = [
         (place, tangent)
@@ -160,7 +173,9 @@ def _least_squares(target: Target, t: np.ndarray, knots: np.ndarray) -> np.ndarr
     fixed[0], fixed[-1] = points[0], points[-1]
     for place, _ in ends:
         fixed[place] = points[0] if place == 1 else points[-1]
-    inner = np.setdiff1d(np.arange(1, n - 1), [place for place, _ in ends])
+    is_inner = np.full(n, True)
+    is_inner[[0, -1, *(place for place, _ in ends)]] = False
+    inner = np.flatnonzero(is_inner)
     load = right - gram @ fixed
     # Inner points as they follow from the handles: `base - sum of handle * answer * tangent`.
     sides = np.column_stack([load[inner], *(gram[inner, place] for place, _ in ends)])

@@ -138,7 +138,8 @@ def make_part(domain: Domain, tool_radius: float | None, tolerance: float | None
         outline = draw_outline(domain, tool, tolerance, rounding)
         shape = make_shape(outline, tolerance)
         radius = shape.concave_radius()
-        if radius >= ENOUGH * tool:
+        # Where nobody has asked for a tool, curves within the tolerance of its path will do.
+        if tool_radius is None or radius >= ENOUGH * tool:
             break
         rounding = outline.rounding * min(1.1 * tool / radius, 2.0)
     return Part(domain, outline, shape, tolerance, thinnest_member(outline))
