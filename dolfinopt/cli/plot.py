@@ -27,12 +27,14 @@ def plot(folder: Path, animation: bool) -> None:
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.stress_report import stress_report
 
     loaded = on_root(world, scene_of, folder)
     profile = Profile()
     partition, arms, x_phys = design_of(world, loaded, folder / "design.npz", profile)
     _, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
-    views = gather_views(loaded, partition, arms, x_phys)
+    stress = stress_report(partition, arms, trajectory, profile)
+    views = gather_views(loaded, partition, arms, x_phys, stress)
     if trajectory is None:
         return
     history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
