@@ -105,7 +105,7 @@ def test_constraints_keep_their_bounds():
     ("kind", "overrides"),
     [
         ("heaviside", ["arms.cells=[60,8]", "design.filter_radius=0.025"]),
-        ("robust", ["arms.cells=[40,6]", "design.filter_radius=0.0375"]),
+        ("robust", ["arms.cells=[60,8]", "design.filter_radius=0.025"]),
     ],
 )
 def test_projection_ends_crisp(kind, overrides):
