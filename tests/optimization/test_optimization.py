@@ -183,6 +183,8 @@ REMEMBERED = [
     ["objective.kind=deviation"],
     ["objective.kind=effort", "constraints.deviation=8e-3"],
     ["objective.kind=mass", "constraints.peak_force=[20.0,30.0,20.0]", "constraints.settling=0.1"],
+    ["objective.kind=mass", "constraints.deviation=0.05", "constraints.stress=60e6"],
+    ["objective.kind=settling", "objective.gradient=exact", "constraints.mass=1.7"],
     ["objective.kind=eigenfrequency"],
     ["objective.kind=eigenfrequency", "objective.follow=true", *GENTLE, ROBUST],
     ["objective.kind=eigenfrequency", "objective.follow=true", "arms.arm2.design=arm1"],

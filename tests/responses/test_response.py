@@ -28,6 +28,7 @@ from dolfinopt.responses.response import (
     objective_of,
     on_all_ranks,
 )
+from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.constraints import Constraints
 from dolfinopt.scene.tables.responses import NEEDS
@@ -258,3 +259,18 @@ def test_p_norm_of_nothing() -> None:
     assert p_norm(np.zeros(3), 20.0)[0] == 0.0
     assert not p_norm(np.zeros(3), 20.0)[1].any()
     assert p_norm_of_lengths(np.zeros((3, 2)), 20.0)[0] == 0.0
+
+
+def test_the_least_made_smooth() -> None:
+    """At most the least value, derivative by differences; a single value is itself."""
+    values = [3.0, 2.0, 2.2]
+    least, slopes = worst_of(values, 20.0, least=True)
+    assert 2.0 * 3.0 ** (-1.0 / 20.0) <= least <= 2.0
+    for k in range(3):
+        there, back = (
+            worst_of([v + s * 1e-6 * (i == k) for i, v in enumerate(values)], 20.0, least=True)[0]
+            for s in (1.0, -1.0)
+        )
+        assert slopes[k] == pytest.approx((there - back) / 2e-6, rel=1e-6)
+    assert worst_of([3.0], 20.0, least=True) == (3.0, [1.0])
+    assert worst_of([3.0, 0.0], 20.0, least=True) == (0.0, [0.0, 0.0])
