@@ -28,7 +28,13 @@ from dolfinopt.optimization.convergence import (
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Memory
-from dolfinopt.optimization.mma import CURVED, MMAState, initial_state, mma_step
+from dolfinopt.optimization.mma import (
+    CURVED_DISTANCE,
+    LARGEST_DISTANCE,
+    MMAState,
+    initial_state,
+    mma_step,
+)
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.optimization.result import Result
@@ -106,7 +112,7 @@ class _Run:
         finished: why the iterations have ended, "" while they go on.
         selection: of the coordinates, where the scene leaves it to "auto".
         initial_deviation: (n_times, 2) of the initial design, m (root only).
-        curved: what MMA is told of constraints that are curved, if there are any.
+        curved: whether constraints other than volume and mass are to be kept.
     """
 
     problem: Problem
@@ -132,8 +138,7 @@ class _Run:
         self.selection: OrderSelection | None = None
         self.initial_deviation = np.empty((0, 2))
         self.seconds_before = 0.0  # spent before a resume
-        curved = self.scene.constraints.limits.keys() - {"mass"}
-        self.curved = {"widest": CURVED} if curved else {}
+        self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
         self.begun = self.saved = time.perf_counter()
 
     def go(self, memory: Memory | None) -> Result:
@@ -233,7 +238,7 @@ class _Run:
                 self.variables.xmax,
                 self.state,
                 move=move,
-                **self.curved,
+                widest=CURVED_DISTANCE if self.curved else LARGEST_DISTANCE,
                 comm=self.partition.world,
                 pieces=self.variables.pieces,
             )

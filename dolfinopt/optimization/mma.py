@@ -29,8 +29,10 @@ Array = npt.NDArray[np.float64]
 # Asymptote distances, in units of a variable's range xmax - xmin (Svanberg 2007).
 _INITIAL_DISTANCE = 0.5
 _SMALLEST_DISTANCE = 0.01
-_LARGEST_DISTANCE = 10.0
-CURVED = 1.0  # for curved constraints: with 10 limits of the motion are left every 25 steps
+LARGEST_DISTANCE = 10.0
+CURVED_DISTANCE = (
+    1.0  # for curved constraints: with 10 limits of the motion are left every 25 steps
+)
 _WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: asyincr)
 _NARROW = 0.7  # where it turned back (asydecr)
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
@@ -101,7 +103,7 @@ def mma_step(
     state: MMAState,
     *,
     move: float = 0.2,
-    widest: float = _LARGEST_DISTANCE,
+    widest: float = LARGEST_DISTANCE,
     comm: MPI.Comm | None = None,
     pieces: Mapping[int, int] | None = None,
 ) -> tuple[Array, MMAState]:

@@ -418,7 +418,7 @@ def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
     iterations = []
     step = optimization._Run._update
     monkeypatch.setattr(
-        optimization._Run, "_update", lambda run, d: (iterations.append(1), step(run, d))
+        optimization._Run, "_update", lambda run, *a: (iterations.append(1), step(run, *a))
     )
     # Under another name: a checkpoint does not depend on it.
     renamed = Case(scene('name="another"'), "optimize")
