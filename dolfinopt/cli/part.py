@@ -30,6 +30,12 @@ if TYPE_CHECKING:
     help="largest distance of the curves from the outline; default: 0.1 mm or a tenth of a cell, "
     "the smaller",
 )
+@click.option(
+    "--curves",
+    type=click.Choice(["splines", "arcs"]),
+    default="splines",
+    help="splines, or lines and arcs alone for machines that know no splines",
+)
 @overwrite_option
 @plots_option
 def part(
@@ -37,6 +43,7 @@ def part(
     out: Path | None,
     tool_radius: float | None,
     tolerance: float | None,
+    curves: str,
     overwrite: bool,
     plots: bool,
 ) -> None:
@@ -55,7 +62,8 @@ def part(
     claim(world, target, overwrite, file_names(scene))
 
     def make() -> None:
-        _write(scene, target, make_parts(scene, folder, tool_radius, tolerance), plots)
+        parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs")
+        _write(scene, target, parts, plots)
 
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
@@ -76,9 +84,10 @@ def _write(scene: Scene, target: Path, parts: dict[int, Part], plots: bool) -> N
     figures = write_parts(target, scene, parts, picture if plots else None)
     warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
     for name, row in figures["arms"].items():
+        points = f" with {row['control_points']} control points" if row["control_points"] else ""
         click.echo(
             f"{name}: {1e6 * row['area']:.6g} mm2, {row['mass']:.4g} kg, {row['loops'] - 1} holes, "
-            f"{row['curves']} curves with {row['control_points']} control points, at most "
+            f"{row['curves']} curves{points}, at most "
             f"{1e3 * row['distance']:.2g} mm from the outline"
         )
     for arm, owner in zip(scene.arms, scene.owners, strict=True):

@@ -118,6 +118,12 @@ class Domain:
         """Mean of 4 x (1 - x) over the area."""
         return float(4.0 * self.x_phys * (1.0 - self.x_phys) @ self.area / self.area.sum())
 
+    @property
+    def gray_share(self) -> float:
+        """Share of the material in cells of densities between 0.1 and 0.9."""
+        gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
+        return float((self.x_phys * self.area)[gray].sum() / self.volume)
+
 
 def read_domains(scene: Scene, folder: Path) -> dict[int, Domain]:
     """Return the arms with a design of their own, by their place in the chain, on this rank alone.

@@ -45,9 +45,9 @@ class Part:
         found = []
         if one.grayness > GRAY:
             found.append(
-                f"arm {one.name!r}: grayness {one.grayness:.2g}: the design is neither solid nor "
-                "void in many cells, and the part, which is, will do otherwise; optimise with "
-                'design.projection = "robust"'
+                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
+                "the material is in cells that are neither solid nor void; the part is another "
+                'design than the optimised one; optimise with design.projection = "robust"'
             )
         if outline.islands:
             share = 100.0 * outline.islands_area / one.volume
@@ -93,7 +93,11 @@ class Part:
 
 
 def make_parts(
-    scene: Scene, folder: Path, tool_radius: float | None = None, tolerance: float | None = None
+    scene: Scene,
+    folder: Path,
+    tool_radius: float | None = None,
+    tolerance: float | None = None,
+    arcs: bool = False,
 ) -> dict[int, Part]:
     """Return the parts of the arms that have a design of their own, by their place in the chain.
 
@@ -102,6 +106,7 @@ def make_parts(
         folder: with its design.npz.
         tool_radius: of concave corners, m; default a fifth of a cell.
         tolerance: of the curves, m; default 0.1 mm or a tenth of a cell, the smaller.
+        arcs: lines and arcs in place of splines.
 
     Raises:
         InputError: no design in the folder, or no part can be made of it with these values.
@@ -118,12 +123,14 @@ def make_parts(
             "simulate run"
         )
     return {
-        k: make_part(domain, tool_radius, tolerance)
+        k: make_part(domain, tool_radius, tolerance, arcs)
         for k, domain in read_domains(scene, folder).items()
     }
 
 
-def make_part(domain: Domain, tool_radius: float | None, tolerance: float | None) -> Part:
+def make_part(
+    domain: Domain, tool_radius: float | None, tolerance: float | None, arcs: bool = False
+) -> Part:
     """Return the part of one arm, see `make_parts`."""
     if tolerance is None:
         tolerance = min(TOLERANCE, CELLS * domain.cell)
@@ -136,7 +143,7 @@ def make_part(domain: Domain, tool_radius: float | None, tolerance: float | None
     rounding = None
     for _ in range(TRIES):
         outline = draw_outline(domain, tool, tolerance, rounding)
-        shape = make_shape(outline, tolerance)
+        shape = make_shape(outline, tolerance, arcs)
         radius = shape.concave_radius()
         # Where nobody has asked for a tool, curves within the tolerance of its path will do.
         if tool_radius is None or radius >= ENOUGH * tool:

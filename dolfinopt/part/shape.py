@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.part.arcs import biarcs
 from dolfinopt.part.curves import (
     MIRROR,
     Arc,
@@ -34,6 +35,7 @@ from dolfinopt.part.trace import (
 
 FITTED = 0.8  # share of the tolerance for the splines; the rest is for the area
 POINTS = 8  # of a free run in a cell that the splines are fitted to
+ARCS = 0.25  # share of the tolerance for arcs in place of splines
 STEPS = 6  # of the area's correction
 SQUARE = np.radians(30.0)  # a curve meets the axis of symmetry at a right angle, or as a corner
 
@@ -65,10 +67,13 @@ class Shape:
     Attributes:
         loops: the outer one first, counterclockwise, then the holes, clockwise.
         offset: by which free curves were moved for the area, m.
+        apart: distance of free arcs from the splines in whose place they are, and of these from
+            the outline, m; 0 where free curves are splines.
     """
 
     loops: tuple[tuple[Piece, ...], ...]
     offset: float = 0.0
+    apart: float = 0.0
 
     @property
     def pieces(self) -> list[Piece]:
@@ -92,7 +97,7 @@ class Shape:
 
     def distance(self) -> float:
         """Return the largest distance of free curves from what they were fitted to, m."""
-        return max((_apart(p) for p in self.pieces if p.run is not None), default=0.0)
+        return self.apart or max((_apart(p) for p in self.pieces if p.run is not None), default=0.0)
 
     def concave_radius(self) -> float:
         """Return the smallest radius of concave places on free curves, m; infinity without any."""
@@ -116,18 +121,24 @@ class Shape:
         return [sampled([p.curve for p in loop], tolerance) for loop in self.loops]
 
 
-def make_shape(outline: Outline, tolerance: float) -> Shape:
+def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     """Return the curves of an outline.
 
     Args:
         outline: whose polygon they follow.
         tolerance: largest distance of the free curves from it, m.
+        arcs: lines and arcs in place of splines.
 
     Raises:
         InputError: curves on both sides of a neck meet.
     """
+
+    def change(shape: Shape) -> Shape:
+        return with_arcs(shape, ARCS * tolerance) if arcs else shape
+
     for share in (1.0, 0.75, 0.5, 0.25):
-        shape = with_area(_follow(outline, share * tolerance), outline.domain.volume)
+        finest = share * tolerance * (1.0 - ARCS if arcs else 1.0)
+        shape = with_area(_follow(outline, finest), outline.domain.volume, change)
         if shape.distance() <= tolerance and shape.is_simple(0.1 * share * tolerance):
             return shape
     raise InputError(
@@ -419,6 +430,21 @@ def _moved(piece: Piece, distance: float) -> Curve:
     if piece.fixed[1]:
         normal[-2:] = 0.0
     return Spline(knots, curve.points + distance * normal)
+
+
+def with_arcs(shape: Shape, tolerance: float) -> Shape:
+    """Return the shape with lines and arcs within a distance, m, of its splines."""
+    loops = tuple(
+        tuple(
+            replace(piece, curve=one, run=None)
+            for piece in loop
+            for one in (
+                biarcs(piece.curve, tolerance) if isinstance(piece.curve, Spline) else [piece.curve]
+            )
+        )
+        for loop in shape.loops
+    )
+    return Shape(loops, apart=shape.distance() + tolerance)
 
 
 def _apart(piece: Piece) -> float:
