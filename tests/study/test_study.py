@@ -391,6 +391,7 @@ SIX = ("mass", "esl", "deviation", "stress", "effort", "settling")
 
 def test_one_scene_posed_six_ways(folder):
     """What falls with the mass keeps the scene's limits, the others have half the material."""
+    folder = folder / "six"
     limits = ["--set", "constraints.deviation=0.03", "--set", "objective.gradient=exact"]
     kinds = [part for kind in SIX for part in ("--kind", kind)]
     run(TWO_ARM, "objectives", *kinds, *SETTINGS, *limits, "--set", "optimizer.max_iterations=2",
