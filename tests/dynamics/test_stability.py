@@ -534,6 +534,7 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
         TWO_ARM,
         [
             "arms.cells=[48,6]",
+            "arms.element=linear",
             "reduction.method=modal",
             "optimizer.max_iterations=15",
             "design.filter_radius=0.03",
@@ -542,6 +543,7 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
     )
     x_phys = do.optimize(scene, world=MPI.COMM_SELF).x_phys
     trajectory = moved(
+        "arms.element=linear",
         "reduction.coordinates=12",
         "damping.stiffness_proportional=0.0",
         "motion.horizon=2.0",
