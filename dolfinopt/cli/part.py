@@ -53,6 +53,8 @@ def part(
     millimetres; part.toml is the machine with these parts, to be simulated like any scene.
     """
     world = start()
+    if world.size > 1:
+        raise InputError("part: runs on one process alone; start it without mpirun")
     from dolfinopt.parallel import on_root
     from dolfinopt.part.files import file_names
     from dolfinopt.part.part import make_parts
