@@ -44,7 +44,7 @@ def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     path, out = write_scene(SCENES[kind](), shared_tmp_path), shared_tmp_path / "out"
     run("simulate", path, *QUICK, "--out", out, "--animation")
     WORLD.barrier()
-    pictures = {"design.png", "machine.png", "drives.png", "motion.gif"}
+    pictures = {"design.png", "machine.png", "drives.png", "motion.gif", "stress.png"}
     pictures |= set() if kind == "pin" else {"deviation.png"}
     drawn = {one.name for one in out.iterdir() if one.suffix in (".png", ".gif")}
     assert drawn == pictures

@@ -364,7 +364,7 @@ def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
     for index in np.ndindex(shape):
         change = np.zeros(shape)
         change[index] = 1.0
-        if name in ("K", "D", "K0_outboard"):
+        if name in ("K", "D", "K0", "K0_outboard"):
             change = change + change.swapaxes(-1, -2)
         elif name == "W":
             change[0] += change[0].T

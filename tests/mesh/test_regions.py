@@ -199,7 +199,7 @@ def test_arms_without_cells_have_no_regions():
 @pytest.mark.serial
 def test_regions_are_set_as_a_whole():
     message = refused("arms.arm1.regions.0.kind=void")
-    assert "unknown key arms.0.regions.0 (arm1); set arms.0.regions (arm1) as a whole" in message
+    assert "unknown key arms.0.regions.0.kind (arm1); set arms.0.regions (arm1) as a" in message
     assert "an array of tables" in message
 
 
