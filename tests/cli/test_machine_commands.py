@@ -85,6 +85,7 @@ def test_bodies_of_a_loop_are_exported(shared_tmp_path):
     assert written == {arm + kind for arm in arms for kind in kinds}
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("kind", ["slider", "control"])
 def test_gradient_of_machines_is_checked(kind, shared_tmp_path, capsys):
     scene = SCENES[kind]()

@@ -114,6 +114,7 @@ def rate(errors, factor=2.0):
     return -np.polyfit(steps, np.log(errors), 1)[0]
 
 
+@pytest.mark.serial
 def test_response_to_a_point_converges_to_the_exponential_kernel():
     """Error of the Green's function beyond its tip; order 2 in the cell size."""
     r = 0.05

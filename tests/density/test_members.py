@@ -159,6 +159,7 @@ ROBUST = [
 ]
 
 
+@pytest.mark.serial
 def test_members_of_a_robust_design_are_as_wide_as_asked():
     """To one cell; members along the edges, too, which a mirroring filter would halve."""
     width, cell = 0.012, 0.06 / 18

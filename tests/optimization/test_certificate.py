@@ -116,6 +116,7 @@ def test_derivatives_of_two_bars():
         assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(bars.frozen(k)[i], rel=1e-8)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("w2", [0.1, 0.3, 0.4])
 def test_two_bars_rest_where_no_optimum_is(w2):
     """Frozen loads converge, and by their own gradient to an optimum; it is none."""
@@ -326,6 +327,7 @@ def test_failing_gradient_does_not_lose_the_design(monkeypatch):
     assert result.certificate.sentence == expected
 
 
+@pytest.mark.serial
 def test_light_payload_pays_for_frozen_loads():
     """With 0.2 kg the loads are the arms' own: frozen, they end twice as compliant.
 
@@ -349,11 +351,13 @@ def test_light_payload_pays_for_frozen_loads():
     assert further.objective < 1.1 * exact.evaluation.objective
 
 
+@pytest.mark.serial
 def test_heavy_payload_loses_little():
     result = do.optimize(scene("optimizer.exact_iterations=20", iterations=40))
     assert result.certificate.further.excess < 0.05
 
 
+@pytest.mark.serial
 def test_projection_goes_on_from_where_it_is():
     """An unfinished continuation is held; what comes after the certificate is not changed."""
     changes = ["design.projection=robust", LIGHT]

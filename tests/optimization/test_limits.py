@@ -29,6 +29,7 @@ def values(result):
     return {one.name: one for one in result.limits if one.quantity != "volume_fraction"}
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(
     ("deviation", "settling", "active"),
     [(0.008, 0.001, "deviation"), (0.012, 2.5e-4, "settling")],
@@ -51,6 +52,7 @@ def test_lightest_arms_keep_limits_by_their_true_values(deviation, settling, act
     assert 1.7 < evaluation.objective < 3.2
 
 
+@pytest.mark.serial
 def test_demo_of_the_lightest_arms():
     """Coarse, and tighter where only the fine one is at its limit of the stress."""
     coarse = [*QUICK[:2], "simulation.sample=0.005", "constraints.stress=14e6"]
@@ -65,6 +67,7 @@ def test_demo_of_the_lightest_arms():
     assert reached["stress"].value <= 14e6 * (1.0 + EXCESS)
 
 
+@pytest.mark.serial
 def test_limits_are_not_left_again():
     """Asymptotes that widen without bound leave a curved limit every 25 iterations or so."""
     changes = ["objective.kind=mass", "constraints.deviation=0.008", "objective.gradient=esl"]
@@ -77,6 +80,7 @@ def test_limits_are_not_left_again():
         assert result.history[0].tightest == "deviation 597 % over limit"
 
 
+@pytest.mark.serial
 def test_limits_that_conflict_are_named():
     changes = ["constraints.deviation=0.008", "constraints.mass=1.5"]
     result = do.optimize(scene(*changes, "objective.kind=mass", iterations=12))

@@ -39,6 +39,7 @@ RESULTS = {
 }
 
 
+@pytest.mark.serial
 @DEMOS
 def test_demo(path):
     """What a demo ends with, on few cells: the figures of this version."""
@@ -127,6 +128,7 @@ def test_gradient_of_scenarios(path, changes):
     assert test.passed, [row.rate for row in test.rows]
 
 
+@pytest.mark.serial
 def test_cut_design_that_falls_apart_is_told(shared_tmp_path):
     """Cut at one half before it is crisp, a rod cannot be simulated: the result is kept."""
     changes = ["design.projection=heaviside", "design.sharpness=4.0", "optimizer.max_iterations=3"]

@@ -267,6 +267,7 @@ def test_cantilever_steps_agree_with_mmapy():
     assert asymptotes < 1e-12
 
 
+@pytest.mark.serial
 def test_two_volumes_reach_the_optimum():
     """Every half has x_j = sqrt(e_j / l) within its bounds, l from its volume."""
     n, lo, hi = 40, 1e-3, 1.0
@@ -282,6 +283,7 @@ def test_two_volumes_reach_the_optimum():
         np.testing.assert_allclose(designs[-1][half], exact, atol=1e-6)
 
 
+@pytest.mark.serial
 def test_two_volume_steps_agree_with_mmapy():
     n = 60
     design, asymptotes = largest_difference_from_mmapy(
@@ -291,6 +293,7 @@ def test_two_volume_steps_agree_with_mmapy():
     assert asymptotes < 1e-12
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("seed", range(15))
 def test_nonconvex_steps_agree_with_mmapy(seed):
     """To mmapy's residual over the least curvature, 1e-7 / 1e4 / raa0 = 1e-6, times some."""
@@ -636,6 +639,7 @@ def test_variables_at_rest_keep_their_asymptotes():
     np.testing.assert_allclose(new.upp - x, 0.3 * np.array([1.0, 1.0, 1.2, 0.7]), rtol=1e-14)
 
 
+@pytest.mark.serial
 def test_warm_start_saves_evaluations(monkeypatch):
     """The multipliers of the step before save most evaluations once the design settles."""
     n, counts = 400, {"warm": 0, "cold": 0}

@@ -43,6 +43,7 @@ def test_two_arm_manipulator(element, compliance, deviation):
         assert last.grayness < 0.35
 
 
+@pytest.mark.serial
 def test_volume_limits():
     """Each arm keeps its own limit; a shared limit lets material move to the inner arm."""
     for shared in (False, True):
@@ -58,6 +59,7 @@ def test_volume_limits():
                 assert fractions == pytest.approx([0.5, 0.5], abs=2e-3)
 
 
+@pytest.mark.serial
 def test_stops_when_the_design_rests():
     result = do.optimize(small("optimizer.tolerance=0.05", iterations=200))
     assert result.converged and result.iterations < 200

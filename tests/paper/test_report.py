@@ -68,6 +68,7 @@ def page(folder):
     return Reader((folder / "report.html").read_text(encoding="utf-8"))
 
 
+@pytest.mark.serial
 def test_page_says_where_the_scene_is_not_the_papers(folder):
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert "two flexible arms that move 6 kg along a semicircle." in text
@@ -129,6 +130,7 @@ def test_every_statement_is_told(made, folder):
         assert check.holds or check.reason in text
 
 
+@pytest.mark.serial
 def test_page_without_some_results(made, tmp_path):
     """Cases that failed are named; nothing that needs them holds, and the rest is told."""
     (plan, outcomes, _), _ = made

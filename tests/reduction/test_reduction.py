@@ -188,6 +188,7 @@ def test_modes_keep_the_interfaces(shared_arm, method):
     assert np.array_equal(basis.MV, arm.mass_times(basis.V))
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("method", sorted(REDUCTORS))
 def test_a_hundred_coordinates(method):
     """All of the first 100 modes, none twice, none missed, on any number of ranks."""
@@ -272,6 +273,7 @@ def test_a_warm_start_finds_the_same_modes_with_less_work(shared_arm, method, q)
     assert np.diag(warm.stiffness) == pytest.approx(np.diag(cold.stiffness), rel=1e-11)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("method", sorted(REDUCTORS))
 def test_the_start_decides_nothing(shared_arm, method):
     """From any one mode, or with signs reversed, the search ends with the same basis."""
@@ -308,6 +310,7 @@ def test_a_mode_of_another_symmetry_becomes_the_lowest():
     assert kinds == {"stretching", "bending"}  # the crossing took place
 
 
+@pytest.mark.serial
 def test_modes_point_the_same_way_on_any_mesh():
     seen = {method: [] for method in ALL}
     for cells in ((20, 2), (40, 4), (60, 6)):
@@ -469,6 +472,7 @@ def test_quadrature_resolves_resonances(low, high):
         assert weights @ product(omega, *pair) == pytest.approx(exact, rel=1e-7)
 
 
+@pytest.mark.serial
 def test_more_coordinates_bring_the_full_arm(shared_arm):
     """Natural modes against 40 of them, compliance against constraint modes, of every method."""
     arm = shared_arm
@@ -536,6 +540,7 @@ def test_subspaces_repeat_themselves_and_ignore_the_start(own_arm, method):
         assert np.array_equal(COMM.bcast(ours), ours)
 
 
+@pytest.mark.serial
 def test_what_subspaces_cost():
     arm = make_arm(comm=COMM)
     counts = arm.profile.counts
@@ -553,6 +558,7 @@ def test_what_subspaces_cost():
     assert (counts.factorisations, counts.eigenproblems) == (1, 0)
 
 
+@pytest.mark.serial
 def test_what_subspaces_cannot_do():
     arm = make_arm((2, 1), COMM)
     arm = with_densities(arm, graded(arm.mesh.centroid))

@@ -54,6 +54,7 @@ def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
     return np.stack([force[:, 0], cross(chord, force), cross(radial - elbow, force)], axis=1)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("weights", [None, (0.01, 0.02, 0.05), (0.0, 0.0, 1.0)])
 @pytest.mark.parametrize("gravity", [0.0, 9.81])
 def test_rigid_limit_is_newtons_law(
@@ -179,6 +180,7 @@ def test_a_limit_of_the_drives_is_met(limit: str) -> None:
     assert -5e-3 < max(one.excess for one in asked) <= 1e-3
 
 
+@pytest.mark.serial
 @pytest.mark.slow
 def test_least_effort_at_the_accuracy_of_least_compliance() -> None:
     """Lighter arms do as well, and the drives feel it."""

@@ -111,6 +111,7 @@ def rebuilt(built: Built, scene: Scene) -> Built:
 QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
 
 
+@pytest.mark.serial
 def test_a_new_response_is_minimised() -> None:
     """The optimiser finds what is known: x0 everywhere; nothing but the result is simulated."""
     scene = minimised(do.load_scene(TWO_ARM, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
@@ -177,6 +178,7 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert rates(value, built.dot(row, d), (4e-2, 1e-2)) == pytest.approx(2.0, abs=0.2)
 
 
+@pytest.mark.serial
 def test_deviation_is_limited_and_compliance_minimised() -> None:
     """Through the registry alone: the limit, tighter than the free design is, is met."""
     options = [*QUICK, "objective.kind=compliance", "objective.gradient=exact"]
@@ -190,6 +192,7 @@ def test_deviation_is_limited_and_compliance_minimised() -> None:
     assert kept.evaluation.objective > free.evaluation.objective
 
 
+@pytest.mark.serial
 def test_the_volume_is_minimised_under_a_limit() -> None:
     """The volume is a response like the others: least material that is stiff enough."""
     options = [*QUICK, "objective.kind=static", "optimizer.max_iterations=80"]

@@ -577,6 +577,7 @@ def demo() -> ModuleType:
     return module
 
 
+@pytest.mark.serial
 def test_payload_demo(shared_tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Runs, tables and draws on few cells; a light payload gains by the exact gradient."""
     rows = demo().main(shared_tmp_path, (20, 2), (0.2,), 15)

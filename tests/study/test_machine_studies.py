@@ -52,6 +52,7 @@ def test_sweep(path, key, values, folder):
     assert abs(found[1] - found[0]) > 0.05 * found[0]
 
 
+@pytest.mark.serial
 def test_random_gain_and_speed(folder):
     for path, key, law in (
         (CONTROLLED, "control.stiffness_factor", "normal:1:0.05"),
