@@ -72,7 +72,10 @@ def history_figure(
     figure.subplots_adjust(left=0.075, right=0.985, wspace=0.17, hspace=0.32,
                            bottom=0.5 / total, top=1.0 - 0.75 / total)  # fmt: skip
     iteration = np.array([row.iteration for row in rows])
-    bounds = {constraint_label(name): limit for name, limit in (limits or {}).items()}
+    bounds = {}
+    for name, limit in (limits or {}).items():
+        label, factor = _drawn(name)
+        bounds[label] = factor * limit
     ordered = grid.T.ravel()  # down the first column, then down the second
     for axes, (label, values) in zip(ordered, panels.items()):
         _draw_history_panel(axes, iteration, values, label, bounds.get(label))
@@ -98,6 +101,17 @@ HISTORY = {
     "kkt": ("Karush-Kuhn-Tucker residual [-]", 1.0),
 }
 SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
+# Units of constraints in pictures: ending of the label, its replacement, factor.
+DRAWN = ((" [m]", " [mm]", 1e3), (" [Pa]", " [MPa]", 1e-6))
+
+
+def _drawn(constraint: str) -> tuple[str, float]:
+    """Return label and factor of a constraint's panel."""
+    label = constraint_label(constraint)
+    for unit, drawn, factor in DRAWN:
+        if label.endswith(unit):
+            return label.removesuffix(unit) + drawn, factor
+    return label, 1.0
 
 
 def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str, np.ndarray]:
@@ -108,14 +122,14 @@ def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str
     known = {"iteration", "objective", "seconds", *HISTORY}
     panels = {objective_label: np.array([row.objective for row in rows])}
     for name, (label, factor) in HISTORY.items():
-        if hasattr(rows[0], name):
+        limited = name == "max_deviation" and "deviation" in getattr(rows[0], "constraints", {})
+        if hasattr(rows[0], name) and not limited:  # its limit has a panel of the same values
             panels[label] = factor * _numbers([getattr(row, name) for row in rows])
     for name, value in vars(rows[0]).items():
         if isinstance(value, Mapping):
             for key in value:
-                panels[constraint_label(str(key))] = _numbers(
-                    [getattr(row, name).get(key) for row in rows]
-                )
+                label, factor = _drawn(str(key))
+                panels[label] = factor * _numbers([getattr(row, name).get(key) for row in rows])
         elif name not in known and isinstance(value, (int, float)):
             panels[name.replace("_", " ")] = _numbers([getattr(row, name) for row in rows])
     return {label: v for label, v in panels.items() if np.isfinite(v).any()}

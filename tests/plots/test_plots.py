@@ -330,6 +330,20 @@ def test_history_has_a_panel_for_every_column_there_is():
 
 
 @pytest.mark.serial
+def test_limits_have_panels_in_millimetres_and_megapascals():
+    found = {"deviation": 0.02, "stress": 90e6}
+    rows = [HistoryRow(k, 2.0, 0.02, 0.5, 0.5, 0.1, 1.0, constraints=found) for k in range(3)]
+    panels = curves.history_panels(rows, "mass of the arms [kg]")
+    np.testing.assert_allclose(panels["deviation [mm]"], 20.0)
+    np.testing.assert_allclose(panels["stress [MPa]"], 90.0)
+    assert "maximal deviation [mm]" not in panels
+    figure = curves.history_figure(rows, "mass", {"deviation": 0.008, "stress": 60e6})
+    lines = {axes.get_title(loc="left"): axes.lines for axes in figure.axes if axes.get_visible()}
+    assert set(lines["deviation [mm]"][1].get_ydata()) == {8.0}
+    assert set(lines["stress [MPa]"][1].get_ydata()) == {60.0}
+
+
+@pytest.mark.serial
 def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
     t = np.linspace(0.0, 3.0, 301)
     optimised = 0.007 * np.sin(t)[:, None] * [0.6, 0.8]
