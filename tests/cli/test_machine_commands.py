@@ -39,6 +39,7 @@ def write_scene(scene, folder):
 SCENES = {"slider": loop, "pin": lambda: loop("pin"), "control": controlled}
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("kind", SCENES)
 def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     path, out = write_scene(SCENES[kind](), shared_tmp_path), shared_tmp_path / "out"

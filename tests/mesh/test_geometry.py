@@ -76,6 +76,7 @@ def test_bores_are_interfaces_in_solid_rings(shape, passive, ring):
     assert np.array_equal(mesh.outboard_point, [LENGTH, 0.0])
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("shape", SHAPES)
 def test_area_of_the_arm_with_bores_converges(shape):
     """Polygons in place of circles: order 2."""
@@ -480,6 +481,7 @@ def lifted(make, z, thickness):
     return solid
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("z", [0.0, -0.005, 0.3])
 def test_prismatic_solid_is_taken_by_its_planar_face(shared_tmp_path, z):
     path = step_file(shared_tmp_path / "arm.step", arm=lifted(plate, z, 0.01))

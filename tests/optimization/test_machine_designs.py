@@ -93,6 +93,7 @@ VARIANTS = {
 }
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("name", VARIANTS)
 def test_goes_with(name):
     """The objective falls at once, with a gradient that is that of all variants together."""
@@ -103,6 +104,7 @@ def test_goes_with(name):
         assert objectives[-1] < 0.95 * objectives[0], objectives
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(
     ("path", "changes"),
     [

@@ -370,6 +370,7 @@ def scaled(problem, objective, constraints) -> Problem:
     return in_other_units
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("objective", [2.0**20, 2.0**-20])
 def test_powers_of_two_give_the_same_bits(objective):
     n = 50

@@ -193,6 +193,7 @@ REMEMBERED = [
 OPTIONS = pytest.mark.parametrize("overrides", REMEMBERED, ids=" ".join)
 
 
+@pytest.mark.serial
 @OPTIONS
 def test_every_option_resumes_in_the_same_bits(overrides, shared_tmp_path):
     """Eigenvectors of every arm and place, the projection's sharpness, all are remembered."""

@@ -276,6 +276,7 @@ def small(monkeypatch):
     return ["reproduce", *(word for value in TINY for word in ("--set", value))]
 
 
+@pytest.mark.serial
 def test_pipeline(small, shared_tmp_path, capsys):
     """Cases, figures' data, and the verdict; the second time nothing is computed."""
     out = shared_tmp_path / "o"

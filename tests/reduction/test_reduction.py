@@ -119,6 +119,7 @@ def own_arm():
 # -- against dense algebra ------------------------------------------------------------------------
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("design", DESIGNS)
 def test_constraint_modes_are_statically_exact(shared_arm, own_arm, design):
     shared_arm, own_arm = (
@@ -349,6 +350,7 @@ def rows(arm, basis):
     return np.vstack([interior, basis.outboard])
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("method", sorted(SUBSPACES))
 @pytest.mark.parametrize("design", DESIGNS)
 @pytest.mark.parametrize("q", [3, 4, 8, 12])
@@ -651,6 +653,7 @@ def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
         assert np.abs(ours[k] - slope).max() < 4e-3 * np.abs(slope).max()
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(
     ("q", "shifts"), [(3, [0.0]), (4, [0.0]), (8, [0.0]), (13, [0.0]), (8, [0.0, 30.0])], ids=str
 )

@@ -123,6 +123,7 @@ def test_a_new_response_is_minimised() -> None:
     assert result.counts.simulations == 0
 
 
+@pytest.mark.serial
 def test_a_new_response_is_a_limit() -> None:
     """Of the stiffest design that is nearly even: the limit is met and in its row's name."""
     options = [*QUICK, "optimizer.max_iterations=60", "objective.kind=static"]
@@ -153,6 +154,7 @@ def test_a_new_response_of_the_motion_has_an_exact_gradient() -> None:
     assert test.passed, test
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("name", ["deviation", "mean_square"])
 def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     """The same class on the other side: value over limit less 1, with the gradient of that."""

@@ -285,6 +285,7 @@ LOADED = ["motion.gravity=[0.5,-9.81]", "payload.inertia=0.05"]
 EFFORT = ["objective.kind=effort", "constraints.compliance=1e6"]
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -409,6 +410,7 @@ def random_scene(seed: int) -> Scene:
         return drawn
 
 
+@pytest.mark.serial
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_gradient_is_one_in_random_scenes(seed: int) -> None:

@@ -29,6 +29,7 @@ def folder(tmp_path_factory):
     return WORLD.bcast(path, root=0)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(
     ("path", "key", "values"),
     [

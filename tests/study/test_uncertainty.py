@@ -108,6 +108,7 @@ def test_nominal_values():
 # -- what comes out --------------------------------------------------------------------------
 
 
+@pytest.mark.serial
 def test_command(folder, capsys):
     """Statistics are those of the samples in the file; the second time nothing is computed."""
     arguments = (TWO_ARM, "--random", MASS, "--random", YOUNG, "--samples", 32, *SETTINGS,
