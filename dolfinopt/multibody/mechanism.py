@@ -108,7 +108,52 @@ BARE = JointHardware()
 
 
 @dataclass(frozen=True, eq=False)
-class Mechanism:
+class ElasticBodies:
+    """Bodies whose elastic coordinates stand one after the other in one vector.
+
+    Attributes:
+        bodies: q coordinates each.
+    """
+
+    bodies: tuple[ShapeIntegrals, ...]
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Each body's place in the vector of all elastic coordinates."""
+        ends = np.cumsum([0, *(body.num_modes for body in self.bodies)])
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @property
+    def num_coordinates(self) -> int:
+        """Number N of elastic coordinates of all bodies."""
+        return sum(body.num_modes for body in self.bodies)
+
+    @cached_property
+    def stiffnesses(self) -> tuple[np.ndarray, ...]:
+        """Every body's stiffness (q, q), or its diagonal (q,) where there is nothing else."""
+        return tuple(_diagonal_or_matrix(body.K) for body in self.bodies)
+
+    def norm(self, q: np.ndarray) -> np.ndarray:
+        """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
+        norms = []
+        for part, K in zip(self.slices, self.stiffnesses, strict=True):
+            e = q[..., part]
+            unit = K.ndim == 1 and (K == 1.0).all()
+            loads = e if unit else product(e, K)
+            squares = np.einsum("...nk,...nk->...n", loads, e)
+            norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
+        return np.stack(norms, axis=-1)
+
+    def stiffness(self) -> np.ndarray:
+        """Return the block-diagonal stiffness (N, N)."""
+        K = np.zeros((self.num_coordinates, self.num_coordinates))
+        for part, body in zip(self.slices, self.bodies, strict=True):
+            K[part, part] = body.K
+        return K
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism(ElasticBodies):
     """A cart on a horizontal rail that carries a chain of arms and a payload.
 
     Payload, gravity and scales may differ from instant to instant: several mechanisms in one.
@@ -124,7 +169,6 @@ class Mechanism:
         cart_mass: kg.
     """
 
-    bodies: tuple[ShapeIntegrals, ...]
     payload_mass: PerInstant
     payload_inertia: PerInstant
     gravity: tuple[PerInstant, PerInstant]
@@ -132,17 +176,6 @@ class Mechanism:
     scales: tuple[Scale, ...] = ()
     joints: tuple[JointHardware, ...] = ()
     cart_mass: float = 0.0
-
-    @cached_property
-    def slices(self) -> tuple[slice, ...]:
-        """Each body's place in the vector of all elastic coordinates."""
-        ends = np.cumsum([0, *(body.num_modes for body in self.bodies)])
-        return tuple(slice(a, b) for a, b in pairwise(ends))
-
-    @property
-    def num_coordinates(self) -> int:
-        """Number N of elastic coordinates of all bodies."""
-        return sum(body.num_modes for body in self.bodies)
 
     @cached_property
     def modal_constants(self) -> tuple[ModalConstants, ...]:
@@ -178,24 +211,6 @@ class Mechanism:
         """Mass of the cart and reflected inertia of the joints' rotors (1 + arms,), kg, kg m2."""
         joints = self.joints or (BARE,) * len(self.bodies)
         return np.array([self.cart_mass, *(joint.rotor for joint in joints)])
-
-    def norm(self, q: np.ndarray) -> np.ndarray:
-        """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
-        norms = []
-        for part, constants in zip(self.slices, self.modal_constants, strict=True):
-            e = q[..., part]
-            unit = constants.K.ndim == 1 and (constants.K == 1.0).all()
-            loads = e if unit else product(e, constants.K)
-            squares = np.einsum("...nk,...nk->...n", loads, e)
-            norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
-        return np.stack(norms, axis=-1)
-
-    def stiffness(self) -> np.ndarray:
-        """Return the block-diagonal stiffness (N, N)."""
-        K = np.zeros((self.num_coordinates, self.num_coordinates))
-        for part, body in zip(self.slices, self.bodies, strict=True):
-            K[part, part] = body.K
-        return K
 
 
 def compliance(

@@ -1,0 +1,6 @@
+"""Machines in space: trees of rigid and flexible bodies, their forces, tangents and gradients.
+
+`rotations` (rotation vectors), `mechanism` (bodies and joints), `motion` (prescribed joints),
+`kinematics` (from body to body), `inverse_dynamics` (forces), `tangent` (their derivative by the
+coordinates), `body_gradient` (by the bodies), `end_effector`. Plane machines need none of it.
+"""

@@ -1,0 +1,147 @@
+"""Recursive Newton-Euler in space: joint forces and elastic residual of a motion, n instants.
+
+One pass out along the tree for the motion of every frame, one back for forces and moments. Source:
+Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 5; Schwertassek & Wallrapp (1999).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.spatial.body_motion import BodyMotion
+from dolfinopt.multibody.spatial.kinematics import Interface, Load, Motion, MovingJoint
+from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
+from dolfinopt.multibody.spatial.motion import JointMotion
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """One body of the tree as it moves.
+
+    Attributes:
+        joint: that holds it.
+        body: itself.
+        interface: its outboard one; None where nothing hangs on it.
+        carried: what it carries there, as it moves; or None.
+    """
+
+    joint: MovingJoint
+    body: BodyMotion
+    interface: Interface | None
+    carried: BodyMotion | None
+
+
+def outward_pass(mechanism: SpatialMechanism, motion: JointMotion, rates: Rates) -> list[Link]:
+    """Return all bodies as they move, in the mechanism's order."""
+    count = len(motion.q)
+    none = np.zeros((count, 0))
+    ground: Motion = (np.tile(-mechanism.gravity, (count, 1)), *np.zeros((2, count, 3)))
+    links: dict[int, Link] = {}
+    for i in mechanism.order:
+        joint, own = mechanism.joints[i], None
+        if (k := joint.coordinate) is not None:
+            own = (motion.q[:, k], motion.qd[:, k], motion.qdd[:, k])
+        inner = ground
+        if joint.parent != GROUND:
+            outboard = links[joint.parent].interface
+            assert outboard is not None
+            inner = outboard.motion
+        moving = MovingJoint(joint, inner, own)
+        part = mechanism.slices[i]
+        e, ed, edd = (x[:, part] for x in rates)
+        body = BodyMotion(mechanism.constants[i], moving.motion, (e, ed, edd))
+        load, interface, carried = mechanism.loads[i], None, None
+        if mechanism.children[i] or load is not None:
+            interface = Interface(body)
+        if load is not None:
+            assert interface is not None
+            carried = BodyMotion(load, interface.motion, (none, none, none))
+        links[i] = Link(moving, body, interface, carried)
+    return [links[i] for i in range(len(links))]
+
+
+@dataclass(frozen=True, eq=False)
+class Loads:
+    """What loads the bodies of a tree; (force, moment), each (n, 3).
+
+    Attributes:
+        outboard: on every body's interface, in the body's components; None where nothing is.
+        joints: on every body's frame by all that hangs on it, itself included.
+    """
+
+    outboard: list[Load | None]
+    joints: list[Load]
+
+
+def inward_pass(mechanism: SpatialMechanism, links: list[Link]) -> Loads:
+    """Return the loads of all bodies as they move."""
+    outboard: list[Load | None] = [None] * len(links)
+    joints: dict[int, Load] = {}
+    for i in reversed(mechanism.order):
+        link = links[i]
+        force, moment = link.body.load
+        if link.interface is not None:
+            parts = [links[k].joint.at_interface(joints[k]) for k in mechanism.children[i]]
+            if link.carried is not None:
+                parts.append(link.carried.load)
+            total = (sum(part[0] for part in parts), sum(part[1] for part in parts))
+            outboard[i] = load = link.interface.in_body(total)  # type: ignore[arg-type]
+            more = link.interface.at_origin(load)
+            force, moment = force + more[0], moment + more[1]
+        joints[i] = (force, moment)
+    return Loads(outboard, [joints[i] for i in range(len(links))])
+
+
+def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
+    """Return the elastic residual (n, N)."""
+    rows = [np.zeros((len(links[0].body.a), 0))]
+    for link, load in zip(links, loads.outboard, strict=True):
+        if not link.body.is_flexible:
+            continue
+        own = link.body.rows
+        if load is not None:
+            assert link.interface is not None
+            own = own + link.interface.rows(load)
+        rows.append(own)
+    return np.concatenate(rows, axis=1)
+
+
+def inverse_dynamics(
+    mechanism: SpatialMechanism,
+    motion: JointMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the generalised force of every coordinate.
+
+    Args:
+        mechanism: N elastic coordinates.
+        motion: joints at n instants.
+        q, qd, qdd: (n, N) elastic coordinates and derivatives.
+
+    Returns:
+        Elastic residual (n, N), zero when the equations of motion hold, and what drives the joints
+        (n, joints), N m of revolute and N of prismatic ones.
+    """
+    links = outward_pass(mechanism, motion, (q, qd, qdd))
+    loads = inward_pass(mechanism, links)
+    drives = [links[i].joint.drive(loads.joints[i]) for i in mechanism.movable]
+    forces = np.stack(drives, axis=1) if drives else np.zeros((len(q), 0))
+    forces = forces + mechanism.rotors * motion.qdd
+    return elastic_rows(links, loads), forces
+
+
+def elastic_residual(
+    mechanism: SpatialMechanism,
+    motion: JointMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+) -> np.ndarray:
+    """Return the elastic residual (n, N) of `inverse_dynamics` alone."""
+    links = outward_pass(mechanism, motion, (q, qd, qdd))
+    return elastic_rows(links, inward_pass(mechanism, links))

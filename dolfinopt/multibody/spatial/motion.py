@@ -1,0 +1,24 @@
+"""Motion of a spatial machine's joints at given instants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Joint coordinates at n instants, with derivatives.
+
+    Attributes:
+        q, qd, qdd: (n, joints); rad or m, per s, per s2.
+    """
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+
+    def __getitem__(self, part: slice | np.ndarray) -> JointMotion:
+        """Return it at some of the instants."""
+        return JointMotion(self.q[part], self.qd[part], self.qdd[part])

@@ -1,0 +1,361 @@
+"""Tangent of inverse dynamics in space: derivative of joint forces and elastic residual.
+
+Both passes of `inverse_dynamics` are differentiated by the coordinates that are asked for. A body
+feels those inboard of it through the nine numbers (a, w, wd) of its frame, those outboard of it
+through the six of the load on its interface: its rows are a block of its own coordinates and a
+rank of fifteen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.spatial.inverse_dynamics import (
+    Link,
+    Loads,
+    inward_pass,
+    outward_pass,
+)
+from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
+from dolfinopt.multibody.spatial.motion import JointMotion
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTangent:
+    """Derivative of one body's q elastic rows by S coordinates; arrays over n instants.
+
+    r' = K e' + D ed' + M edd' + left (right y') with y = [q, qd, qdd] of all S coordinates.
+
+    Attributes:
+        rows, columns: its place among all rows and among the S columns.
+        kept: those of its coordinates that have a column.
+        K, D: (n, q, q).
+        M: (q, q).
+        left: (n, q, r).
+        right: (n, r, 3 S).
+    """
+
+    rows: slice
+    columns: slice
+    kept: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    M: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+
+    def at(self, part: slice) -> BodyTangent:
+        """Return it at some of the instants."""
+        changed = {name: getattr(self, name)[part] for name in ("K", "D", "left", "right")}
+        return replace(self, **changed)
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialTangent:
+    """Derivative of the rows [joint forces asked for (R), elastic residual (N)], see `Tangent`.
+
+    The S coordinates are the R joints, then those elastic ones that are kept; n instants.
+
+    Attributes:
+        bodies: the flexible ones, in the order of their rows.
+        size: S.
+        drives: (n, R, 3 S) of the forces of the joints, columns ordered q, qd, qdd.
+    """
+
+    bodies: tuple[BodyTangent, ...]
+    size: int
+    drives: np.ndarray
+
+    def window(self, first: int, last: int) -> SpatialTangent:
+        """Return the instants first..last - 1."""
+        part = slice(first, last)
+        bodies = tuple(body.at(part) for body in self.bodies)
+        return replace(self, bodies=bodies, drives=self.drives[part])
+
+    def dense(self) -> np.ndarray:
+        """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
+        size = self.size
+        jacobian = np.empty((len(self.drives), size, 3 * size))
+        jacobian[:, : self.drives.shape[1]] = self.drives
+        for part in self.bodies:
+            rows, own = jacobian[:, part.columns], np.ix_(part.kept, part.kept)
+            np.matmul(part.left[:, part.kept], part.right, out=rows)
+            blocks = (part.K[:, own[0], own[1]], part.D[:, own[0], own[1]], part.M[own])
+            for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
+                rows[:, :, columns] += block
+        return jacobian
+
+    def times(
+        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of W wanted rows (m, W) by one of the S coordinates, each (m, S).
+
+        With m a multiple of the n instants, each of them stands for as many rows in turn.
+        """
+        count, rigid = self.drives.shape[:2]
+        change = np.concatenate([q, qd, qdd], axis=1).reshape(count, -1, 3 * self.size)
+        change = change.swapaxes(1, 2)  # (n, 3 S, times)
+        out = []
+        if rigid:
+            out.append(self.drives[:, wanted[wanted < rigid]] @ change)
+        for part in self.bodies:
+            own = wanted[(wanted >= part.rows.start) & (wanted < part.rows.stop)] - part.rows.start
+            e, ed, edd = (change[:, columns] for columns in _columns(part.columns, self.size))
+            rows = part.left[:, own] @ (part.right @ change)
+            rows += part.K[:, own[:, None], part.kept] @ e
+            rows += part.D[:, own[:, None], part.kept] @ ed
+            rows += part.M[own[:, None], part.kept] @ edd
+            out.append(rows)
+        found: np.ndarray = np.concatenate(out, axis=1).swapaxes(1, 2)
+        return found.reshape(len(q), len(wanted))
+
+    def transposed(self, rows: np.ndarray) -> Rates:
+        """Return the gradient of sum_n rows_n . [forces, residual]_n by q, qd, qdd, each (n, S)."""
+        size, rigid = self.size, self.drives.shape[1]
+        gradient = (rows[:, None, :rigid] @ self.drives)[:, 0]
+        for part in self.bodies:
+            y = rows[:, None, part.rows]
+            gradient += ((y @ part.left) @ part.right)[:, 0]
+            blocks = (part.K[:, :, part.kept], part.D[:, :, part.kept], part.M[:, part.kept])
+            for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
+                gradient[:, columns] += (y @ block)[:, 0]
+        by_q, by_v, by_a = np.split(gradient, 3, axis=1)
+        return by_q, by_v, by_a
+
+
+def _columns(part: slice, size: int) -> tuple[slice, slice, slice]:
+    a, b = part.start, part.stop
+    return slice(a, b), slice(size + a, size + b), slice(2 * size + a, 2 * size + b)
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Where the coordinates asked for stand among the S columns.
+
+    Attributes:
+        size: S.
+        rigid: (R,) joint coordinates asked for, ascending.
+        kept: of every body, those of its coordinates that have a column.
+        bodies: of every body, their place among the S.
+    """
+
+    size: int
+    rigid: np.ndarray
+    kept: list[np.ndarray]
+    bodies: list[slice]
+
+    def of_body(self, i: int) -> tuple[slice, slice, slice]:
+        """Return a body's columns in [q, qd, qdd]."""
+        return _columns(self.bodies[i], self.size)
+
+    def of_joint(self, link: Link) -> tuple[int, int, int] | None:
+        """Return the columns of a joint's coordinate, if any."""
+        place = np.flatnonzero(self.rigid == link.joint.joint.coordinate)
+        if link.joint.joint.coordinate is None or len(place) == 0:
+            return None
+        return int(place[0]), self.size + int(place[0]), 2 * self.size + int(place[0])
+
+
+def _places(
+    mechanism: SpatialMechanism, keep: np.ndarray | None, rigid: np.ndarray | None
+) -> _Places:
+    rigid = np.zeros(0, dtype=int) if rigid is None else rigid
+    keep = np.arange(mechanism.num_coordinates) if keep is None else keep
+    ends = np.searchsorted(keep, [0, *(part.stop for part in mechanism.slices)])
+    parts = zip(pairwise(ends), mechanism.slices, strict=True)
+    kept = [keep[a:b] - part.start for (a, b), part in parts]
+    bodies = [slice(a, b) for a, b in pairwise(ends + len(rigid))]
+    return _Places(len(rigid) + len(keep), rigid, kept, bodies)
+
+
+def linearise(
+    mechanism: SpatialMechanism,
+    motion: JointMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    keep: np.ndarray | None = None,
+    rigid: np.ndarray | None = None,
+) -> SpatialTangent:
+    """Return the derivative of `inverse_dynamics` by the coordinates asked for and their rates.
+
+    Args:
+        mechanism, motion, q, qd, qdd: as for `inverse_dynamics`; n instants.
+        keep: ascending elastic coordinates by which to differentiate; all by default.
+        rigid: ascending joint coordinates (R,) that have columns and whose forces have rows; none
+            by default.
+    """
+    links = outward_pass(mechanism, motion, (q, qd, qdd))
+    loads = inward_pass(mechanism, links)
+    places = _places(mechanism, keep, rigid)
+    motions, ends = _outward_derivatives(mechanism, links, places)
+    return _inward_derivatives(mechanism, links, loads, places, motions, ends)
+
+
+_Derivatives = list[np.ndarray | None]  # None: nothing moves
+
+
+def _outward_derivatives(
+    mechanism: SpatialMechanism, links: list[Link], places: _Places
+) -> tuple[_Derivatives, _Derivatives]:
+    """Return the derivatives of the motion of every body and interface (n, 9, 3 S)."""
+    count, width = len(links[0].body.a), 3 * places.size
+    motions: _Derivatives = [None] * len(links)
+    ends: _Derivatives = [None] * len(links)
+    for i in mechanism.order:
+        link, parent = links[i], mechanism.joints[i].parent
+        inner = None if parent == GROUND else ends[parent]
+        moved = None if inner is None else link.joint.motion_by_interface @ inner
+        if (columns := places.of_joint(link)) is not None:
+            moved = np.zeros((count, 9, width)) if moved is None else moved
+            for column, one in zip(columns, link.joint.motion_by_joint, strict=True):
+                moved[:, :, column] += one
+        motions[i] = moved
+        if link.interface is None:
+            continue
+        end = None if moved is None else link.interface.motion_by_body @ moved
+        if len(places.kept[i]):
+            end = np.zeros((count, 9, width)) if end is None else end
+            parts = zip(places.of_body(i), link.interface.motion_by_rates, strict=True)
+            for place, derivative in parts:
+                end[:, :, place] += derivative[:, :, places.kept[i]]
+        ends[i] = end
+    return motions, ends
+
+
+def _inward_derivatives(
+    mechanism: SpatialMechanism,
+    links: list[Link],
+    loads: Loads,
+    places: _Places,
+    motions: _Derivatives,
+    ends: _Derivatives,
+) -> SpatialTangent:
+    """Return the tangent from the derivatives of all motions."""
+    count, size, rigid = len(links[0].body.a), places.size, places.rigid
+    drives = np.zeros((count, len(rigid), 3 * size))
+    on_joints: dict[int, np.ndarray] = {}  # derivative of every joint's load (n, 6, 3 S)
+    tangents: list[BodyTangent] = []
+    for i in reversed(mechanism.order):
+        link, moved = links[i], motions[i]
+        felt = rigid.size > 0 or _is_felt(mechanism, i)
+        if not (felt or link.body.is_flexible):
+            continue
+        load = np.zeros((count, 6, 3 * size))
+        outboard: np.ndarray | None = None
+        if link.interface is not None:
+            outboard = _on_interface(mechanism, links, loads, places, i, on_joints, ends[i])
+            load += outboard
+            lever = np.broadcast_to(link.interface.place, link.body.a.shape)
+            load[:, 3:] += _cross(lever, outboard[:, :3])
+        if link.body.is_flexible:
+            tangents.append(_body_tangent(mechanism, link, loads, places, i, outboard, moved))
+        if not felt:
+            continue
+        if moved is not None:
+            load += link.body.load_by_motion @ moved
+        if len(kept := places.kept[i]):
+            own = link.body.load_by_rates
+            for place, derivative in zip(places.of_body(i), own, strict=True):
+                load[:, :, place] += derivative[:, :, kept]
+            if link.interface is not None:
+                outer = loads.outboard[i]
+                assert outer is not None
+                displaced = np.broadcast_to(link.interface.B, (count, *link.interface.B.shape[-2:]))
+                load[:, 3:, places.of_body(i)[0]] -= _cross(outer[0], displaced[:, :3, kept])
+        on_joints[i] = load
+        if (columns := places.of_joint(link)) is not None:
+            drives[:, columns[0]] = link.joint.driven @ load
+            drives[:, columns[0], columns[2]] += link.joint.joint.rotor
+    tangents.sort(key=lambda part: part.rows.start)
+    return SpatialTangent(tuple(tangents), size, drives)
+
+
+def _is_felt(mechanism: SpatialMechanism, i: int) -> bool:
+    """Return whether a body inboard of body i deforms under its load."""
+    parent = mechanism.joints[i].parent
+    if parent == GROUND:
+        return False
+    return mechanism.constants[parent].num_modes > 0 or _is_felt(mechanism, parent)
+
+
+def _on_interface(
+    mechanism: SpatialMechanism,
+    links: list[Link],
+    loads: Loads,
+    places: _Places,
+    i: int,
+    on_joints: dict[int, np.ndarray],
+    end: np.ndarray | None,
+) -> np.ndarray:
+    """Return the derivative of the load on body i's interface, in the body's components."""
+    link, count = links[i], len(links[0].body.a)
+    assert link.interface is not None
+    total = np.zeros((count, 6, 3 * places.size))
+    for k in mechanism.children[i]:
+        joint = links[k].joint
+        total += joint.load_by_body @ on_joints[k]
+        if (columns := places.of_joint(links[k])) is not None:
+            total[:, :, columns[0]] += joint.load_by_joint(loads.joints[k])
+    if link.carried is not None and end is not None:
+        total += link.carried.load_by_motion @ end
+    if not link.body.is_flexible:
+        return total
+    shape = total.shape
+    turned = link.interface.turning.R[:, None] @ total.reshape(count, 2, 3, -1)
+    total = turned.reshape(shape)
+    if len(kept := places.kept[i]):
+        outer = loads.outboard[i]
+        assert outer is not None
+        by_e = link.interface.load_by_displacement(outer) @ link.interface.B
+        total[:, :, places.of_body(i)[0]] += by_e[:, :, kept]
+    return total
+
+
+def _body_tangent(
+    mechanism: SpatialMechanism,
+    link: Link,
+    loads: Loads,
+    places: _Places,
+    i: int,
+    outboard: np.ndarray | None,
+    moved: np.ndarray | None,
+) -> BodyTangent:
+    """Return the derivative of body i's rows."""
+    part, body = mechanism.slices[i], link.body
+    K, D = body.rows_by_rates
+    count, q = body.rates[0].shape
+    left, right = [np.zeros((count, q, 0))], [np.zeros((count, 0, 3 * places.size))]
+    if link.interface is not None and outboard is not None:
+        outer = loads.outboard[i]
+        assert outer is not None
+        K = K + link.interface.rows_by_e(outer)
+        left.append(link.interface.rows_by_load)
+        right.append(outboard)
+    if moved is not None:
+        left.append(body.rows_by_motion)
+        right.append(moved)
+    first = len(places.rigid)
+    return BodyTangent(
+        rows=slice(first + part.start, first + part.stop),
+        columns=places.bodies[i],
+        kept=places.kept[i],
+        K=K,
+        D=D,
+        M=body.constants.M,
+        left=np.concatenate(left, axis=2),
+        right=np.concatenate(right, axis=1),
+    )
+
+
+def _cross(u: np.ndarray, V: np.ndarray) -> np.ndarray:
+    """Return u x every column of V, (n, 3) and (n, 3, m)."""
+    u = u[:, :, None]
+    out = np.empty(V.shape)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[:, i] = u[:, j] * V[:, k] - u[:, k] * V[:, j]
+    return out

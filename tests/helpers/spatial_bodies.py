@@ -1,0 +1,271 @@
+"""Trees of bodies made of point masses in space, and plane bodies posed as spatial ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import expm
+
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.multibody.spatial.mechanism import (
+    GROUND,
+    Joint,
+    SpatialMechanism,
+    rigid_spatial_body,
+)
+from dolfinopt.multibody.spatial.motion import JointMotion
+from dolfinopt.multibody.spatial.rotations import exponential, skew
+
+STEP = 1e-30  # of a complex step
+
+
+@dataclass(frozen=True)
+class SpatialCloud:
+    """Point masses that move by linear modes in a body's frame.
+
+    Attributes:
+        points: (n, 3) reference positions X, m.
+        masses: (n,) kg.
+        modes: (n, 3, q) displacement of every point.
+        K, D: (q, q).
+        outboard: (6, q) displacement and rotation vector of the outboard interface.
+        outboard_point: (3,) m.
+    """
+
+    points: np.ndarray
+    masses: np.ndarray
+    modes: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    outboard: np.ndarray
+    outboard_point: np.ndarray
+
+    def body(self) -> ShapeIntegrals:
+        """Return the shape integrals as sums over the points."""
+        N = np.concatenate([self.points[:, :, None], self.modes], axis=2)
+        q = len(self.K)
+        W = np.einsum("n,nak,nbl->abkl", self.masses, N, N).reshape(9, 1 + q, 1 + q)
+        w = np.einsum("n,nak->ak", self.masses, N)
+        none = np.zeros((0, q, q))
+        geometry = self.outboard, self.outboard_point
+        return ShapeIntegrals(self.masses.sum(), w, W, self.K, self.D, *geometry, none, none)
+
+
+def spatial_cloud(rng: np.random.Generator, q: int) -> SpatialCloud:
+    """Return a body without any symmetry, of about 1 kg and 1 m."""
+    root, damping = rng.normal(size=(2, q, q))
+    return SpatialCloud(
+        points=rng.normal(loc=(0.5, 0.1, 0.0), scale=0.4, size=(9, 3)),
+        masses=rng.uniform(0.05, 0.15, size=9),
+        modes=rng.normal(scale=0.3, size=(9, 3, q)),
+        K=root @ root.T + np.eye(q),
+        D=damping @ damping.T,
+        outboard=rng.normal(scale=0.3, size=(6, q)),
+        outboard_point=np.array([1.0, 0.2, -0.1]),
+    )
+
+
+def random_joint(
+    rng: np.random.Generator, kind: str, parent: int, coordinate: int | None, rotor: float = 0.0
+) -> Joint:
+    """Return a joint anywhere, its axis in any direction."""
+    axis, origin, turn = rng.normal(size=(3, 3))
+    return Joint(
+        "joint", kind, parent, coordinate, axis / np.linalg.norm(axis), 0.3 * origin,
+        exponential(turn), rotor,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CloudTree:
+    """Clouds in a tree by Newton's law, point by point; y = (joints, elastic coordinates)."""
+
+    clouds: tuple[SpatialCloud, ...]
+    joints: tuple[Joint, ...]
+    carried: tuple[SpatialCloud | None, ...]
+    gravity: np.ndarray
+    end: int
+
+    def mechanism(self) -> SpatialMechanism:
+        """Return the same tree of shape integrals."""
+        carried = tuple(None if one is None else one.body() for one in self.carried)
+        bodies = tuple(cloud.body() for cloud in self.clouds)
+        return SpatialMechanism(bodies, self.joints, carried, self.gravity, self.end)
+
+    def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+        """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
+        masses, _, second = self._points(y, yd, ydd)
+        none = np.zeros_like(y)
+        steps = 1j * STEP * np.eye(len(y))
+        J = [self._points(y + step, none, none)[1].imag / STEP for step in steps]
+        out = np.einsum("n,kni,ni->k", masses, J, second - self.gravity)
+        for joint in self.joints:
+            if joint.coordinate is not None:
+                out[joint.coordinate] += joint.rotor * ydd[joint.coordinate]
+        first = sum(joint.coordinate is not None for joint in self.joints)
+        for cloud in self.clouds:
+            part = slice(first, first + len(cloud.K))
+            out[part] += cloud.K @ y[part] + cloud.D @ yd[part]
+            first = part.stop
+        return out
+
+    def _points(
+        self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return masses (n,), places and accelerations (n, 3) of all points.
+
+        Every frame is the product of exponentials of 4 x 4 matrices along y + yd t + ydd t^2 / 2,
+        taken as polynomials of t by blocks: exp of a block Toeplitz matrix holds its series.
+        """
+        series = (y, yd, 0.5 * ydd)
+        ends: dict[int, np.ndarray] = {GROUND: _polynomial(np.eye(4))}
+        first = sum(joint.coordinate is not None for joint in self.joints)
+        masses, places, second = [], [], []
+        for i, (joint, cloud) in enumerate(zip(self.joints, self.clouds, strict=True)):
+            part = slice(first, first + len(cloud.K))
+            first = part.stop
+            frame = ends[joint.parent] @ _polynomial(_place(joint.rotation, joint.origin))
+            if (k := joint.coordinate) is not None:
+                generator = _place(0.0 * np.eye(3), joint.axis)
+                if joint.kind == "revolute":
+                    generator = _place(skew(joint.axis), np.zeros(3))
+                generator[3, 3] = 0.0
+                frame = frame @ expm(_polynomial(*(generator * c[k] for c in series)))
+            moved = [c[part] for c in series]
+            u = [cloud.outboard[:3] @ e for e in moved]
+            theta = [skew(cloud.outboard[3:] @ e) for e in moved]
+            u[0] = u[0] + cloud.outboard_point
+            shift = _polynomial(
+                _place(np.eye(3), u[0]), *(_place(0.0 * np.eye(3), x) for x in u[1:])
+            )
+            turn = [np.pad(x, (0, 1)) for x in theta]
+            ends[i] = frame @ shift @ expm(_polynomial(*turn))
+            X = [cloud.points + cloud.modes @ moved[0], *(cloud.modes @ e for e in moved[1:])]
+            bodies = [(frame, cloud.masses, X)]
+            if (load := self.carried[i]) is not None:
+                bodies.append((ends[i], load.masses, [load.points, *(0.0 * load.points,) * 2]))
+            for place, mass, points in bodies:
+                c0, c1, c2 = (place[:4, 4 * j : 4 * j + 4] for j in range(3))
+                R0, R1, R2 = (c[:3, :3] for c in (c0, c1, c2))
+                masses.append(mass)
+                places.append(points[0] @ R0.T + c0[:3, 3])
+                acceleration = points[0] @ R2.T + points[1] @ R1.T + points[2] @ R0.T + c2[:3, 3]
+                second.append(2.0 * acceleration)
+        return np.concatenate(masses), np.concatenate(places), np.concatenate(second)
+
+
+def _place(R: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    out = np.zeros((4, 4), dtype=np.result_type(R, origin))
+    out[:3, :3], out[:3, 3] = R, origin
+    if R.any():
+        out[3, 3] = 1.0
+    return out
+
+
+def _polynomial(*coefficients: np.ndarray) -> np.ndarray:
+    """Return c_0 + c_1 t + c_2 t^2 as a block Toeplitz matrix (12, 12)."""
+    out = np.zeros((12, 12), dtype=np.result_type(*coefficients))
+    for k, c in enumerate(coefficients):
+        for i in range(3 - k):
+            out[4 * i : 4 * i + 4, 4 * (i + k) : 4 * (i + k) + 4] = c
+    return out
+
+
+def random_tree(rng: np.random.Generator) -> CloudTree:
+    """Return two branches with every kind of joint, rigid and flexible bodies, and loads."""
+    rigid = spatial_cloud(rng, 0)
+    clouds = (rigid, spatial_cloud(rng, 3), spatial_cloud(rng, 2), spatial_cloud(rng, 3), rigid)
+    kinds = (
+        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3), ("prismatic", 1, 1, 0.4),
+        ("fixed", 1, None, 0.0), ("revolute", 3, 2, 0.0),
+    )  # fmt: skip
+    joints = tuple(random_joint(rng, *one) for one in kinds)
+    loads = (None, spatial_cloud(rng, 0), None, None, spatial_cloud(rng, 0))
+    return CloudTree(clouds, joints, loads, rng.normal(size=3), 4)
+
+
+def stiffened(rng: np.random.Generator, body: ShapeIntegrals) -> ShapeIntegrals:
+    """Return a body with some geometric stiffness."""
+    K0 = rng.normal(scale=0.2, size=(18, body.num_modes, body.num_modes))
+    K0 = K0 + K0.swapaxes(1, 2)
+    return replace(body, K0=K0[:12], K0_outboard=K0[12:])
+
+
+def changes(rng: np.random.Generator, body: ShapeIntegrals) -> dict[str, np.ndarray]:
+    """Return a change of every integral that keeps its symmetries."""
+    found = {}
+    for one in TABLE:
+        value = np.asarray(getattr(body, one.name))
+        change = rng.normal(size=value.shape)
+        if one.name[0] in "KD":
+            change = change + change.swapaxes(-1, -2)
+        if one.name == "W":  # W_ba = W_ab'
+            blocks = change.reshape(3, 3, *change.shape[1:])
+            change = (blocks + blocks.transpose(1, 0, 3, 2)).reshape(change.shape)
+        if one.name != "outboard_point":
+            found[one.name] = change
+    return found
+
+
+def derivative(function: Callable[[complex], np.ndarray]) -> np.ndarray:
+    """Return the derivative at 0 by a complex step."""
+    return np.imag(function(1j * STEP)) / STEP
+
+
+# -- plane machines in space -----------------------------------------------------------------
+
+
+def posed(body: ShapeIntegrals) -> ShapeIntegrals:
+    """Return a plane body as a spatial one that turns about z.
+
+    Plane motion feels W_xx + W_yy and W_yx - W_xy alone: each half of them is as good as any.
+    """
+    q = body.num_modes
+    W, K0 = np.zeros((9, 1 + q, 1 + q)), np.zeros((12 if body.is_stiffened else 0, q, q))
+    K0_outboard = np.zeros((6 if body.is_stiffened else 0, q, q))
+    W[0] = W[4] = 0.5 * body.W[0]
+    W[3], W[1] = 0.5 * body.W[1], -0.5 * body.W[1]
+    if body.is_stiffened:
+        K0[:2], K0[3], K0[7] = body.K0[:2], 0.5 * body.K0[3], 0.5 * body.K0[3]
+        K0[6], K0[4] = 0.5 * body.K0[2], -0.5 * body.K0[2]
+        K0_outboard[[0, 1, 5]] = body.K0_outboard
+    outboard = np.zeros((6, q))
+    outboard[[0, 1, 5]] = body.outboard
+    return replace(
+        body,
+        w=np.vstack([body.w, np.zeros((1, 1 + q))]),
+        W=W,
+        outboard=outboard,
+        outboard_point=np.append(body.outboard_point, 0.0),
+        K0=K0,
+        K0_outboard=K0_outboard,
+    )
+
+
+def posed_machine(plane: Mechanism) -> SpatialMechanism:
+    """Return a plane machine in space: a cart on the x axis, joints about z."""
+    x, _, z = np.eye(3)
+    still = np.eye(3)
+    cart = rigid_spatial_body(0.0, np.zeros(3), np.zeros(6))
+    height = np.array([0.0, plane.joint_height, 0.0])
+    joints = [Joint("cart", "prismatic", GROUND, 0, x, rotor=float(plane.rotors[0]))]
+    carried: list[ShapeIntegrals | None] = [None]
+    for k in range(len(plane.bodies)):
+        origin = height if k == 0 else np.zeros(3)
+        rotor = float(plane.rotors[1 + k])
+        joints.append(Joint(f"joint{k}", "revolute", k, 1 + k, z, origin, still, rotor))
+        load = plane.carried(k)
+        inertia = None if load is None else (0.0, 0.0, load[1], 0.0, 0.0, 0.0)
+        carried.append(None if load is None else rigid_spatial_body(load[0], np.zeros(3), inertia))
+    bodies = (cart, *map(posed, plane.bodies))
+    gravity = np.array([*plane.gravity, 0.0])
+    return SpatialMechanism(bodies, tuple(joints), tuple(carried), gravity, len(plane.bodies))
+
+
+def posed_motion(motion: RigidMotion) -> JointMotion:
+    """Return a plane machine's motion as that of the joints in space."""
+    return JointMotion(motion.q, motion.qd, motion.qdd)
