@@ -42,7 +42,7 @@ from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.design import read_design
 from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
-from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms
+from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import limits_by_column
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
@@ -58,6 +58,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+    from dolfinopt.part.part import Part
+
 Densities = Mapping[str, np.ndarray]
 
 
@@ -72,6 +74,7 @@ class SimulationResult:
             cells in the order of `Model.centroids`. On rank 0, empty elsewhere.
         trajectory: the motion over time; None but on rank 0.
         views: cells, densities and modes of all arms, for pictures; empty but on rank 0.
+        filtered: what an optimised, projected design was projected from, as `design`; else empty.
     """
 
     scene: Scene
@@ -79,6 +82,7 @@ class SimulationResult:
     design: dict[str, np.ndarray]
     trajectory: Trajectory | None
     views: list[ArmView]
+    filtered: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def objective(self) -> float:
@@ -360,6 +364,7 @@ class Model:
             self._gathered(found.x_phys, found.partition),
             found.trajectory,
             gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
+            self._gathered(found.x_filtered or {}, found.partition),
             found.iterations,
             found.converged,
             found.stop_reason,
@@ -368,6 +373,47 @@ class Model:
             found.initial_deviation,
             found.certificate,
         )
+
+    def make_parts(
+        self,
+        x: Densities | SimulationResult,
+        folder: str | Path | None = None,
+        *,
+        tool_radius: float | None = None,
+        tolerance: float | None = None,
+        arcs: bool = False,
+    ) -> dict[str, Part]:
+        """Make parts for the workshop of a design, as `dolfinopt part` does.
+
+        Args:
+            x: a result or its design.
+            folder: for the files of `dolfinopt part`, but for the picture; None: none are written.
+            tool_radius: of concave corners, m; None: a fifth of a cell.
+            tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
+            arcs: lines and arcs alone, no splines.
+
+        Returns:
+            The parts by the names of the arms with a design of their own; empty but on rank 0.
+
+        Raises:
+            InputError: no part can be made of the design, or the folder holds files already.
+        """
+        from dolfinopt.output.folders import check_unused, prepare_folder
+        from dolfinopt.part.files import file_names, write_parts
+        from dolfinopt.part.part import make_parts
+
+        out = None if folder is None else Path(folder)
+        if out is not None:
+            on_root(self._world, check_unused, out, file_names(self.scene))
+        with self._folder(None) as place:
+            self._design_file(x, place / "design.npz")
+            found = make_parts(self.scene, place, tool_radius, tolerance, arcs, self._world)
+        if out is not None:
+            with together(self._world):
+                if self._world.rank == 0:
+                    prepare_folder(out)
+                    write_parts(out, self.scene, found)
+        return {self.scene.arms[k].name: part for k, part in found.items()}
 
     def study(
         self,
@@ -394,7 +440,9 @@ class Model:
             InputError: something asked for is not possible.
         """
         with self._folder(folder) as place:
-            paths = [self._design_file(one, place, k) for k, one in enumerate(designs, 1)]
+            paths = [
+                self._design_file(one, place / f"design{k}.npz") for k, one in enumerate(designs, 1)
+            ]
             found = study(
                 self.scene, preset, vary, paths, place, self._world,
                 reoptimize=reoptimize, shown=shown,
@@ -483,10 +531,8 @@ class Model:
             for one in held:
                 one.cleanup()
 
-    def _design_file(
-        self, x: Densities | SimulationResult | str | Path, folder: Path, number: int
-    ) -> Path:
-        """Return the path of a design.npz with the design (collective)."""
+    def _design_file(self, x: Densities | SimulationResult | str | Path, path: Path) -> Path:
+        """Return the path of a file with the design, this one if it is in none yet (collective)."""
         if isinstance(x, (str, os.PathLike)):
             return Path(x)
         self._arms()
@@ -494,10 +540,11 @@ class Model:
         def write() -> Path:
             values = x.design if isinstance(x, SimulationResult) else x
             self._checked(values)
-            path = folder / f"design{number}.npz"
-            folder.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             arrays = {f"{name}/density": np.asarray(one) for name, one in values.items()}
             arrays |= {f"{name}/centroid": one for name, one in self._centroids.items()}
+            if isinstance(x, SimulationResult):
+                arrays |= {f"{name}/filtered": one for name, one in x.filtered.items()}
             write_arrays(path, arrays)
             return path
 

@@ -57,7 +57,7 @@ class Partition:
         return bool(self.arms) and self.comm.rank == 0
 
 
-def partition_arms(world: MPI.Comm, cells: Mapping[int, int]) -> Partition:
+def partition_arms(world: MPI.Comm, cells: Mapping[int, int], *, whole: bool = False) -> Partition:
     """Deal arms with a design of their own out over the ranks of `world` (collective).
 
     Up to as many ranks as arms, whole arms are dealt out and need no communication. Further
@@ -68,12 +68,13 @@ def partition_arms(world: MPI.Comm, cells: Mapping[int, int]) -> Partition:
     Args:
         world: all ranks.
         cells: number of cells of every such arm, by its index in the scene.
+        whole: share no arm between ranks, however large.
     """
     arms = sorted(cells)
     if world.size <= len(arms):
         mine = tuple(arms[world.rank :: world.size])
         color = world.rank
-    elif max(cells.values()) >= SPLIT_CELLS:
+    elif max(cells.values()) >= SPLIT_CELLS and not whole:
         color = world.rank * len(arms) // world.size
         mine = (arms[color],)
     else:

@@ -106,17 +106,24 @@ class Arm:
         """Return the physical densities of design variables x: filtered, solid and void kept."""
         return self.filtered(x).x_phys
 
+    def smoothed(self, x: np.ndarray) -> np.ndarray:
+        """Return design variables x (n_cells,) filtered, smooth also around what stays as it is.
+
+        Collective on the arm.
+        """
+        x = self.mesh.keep(x)
+        with self.profile.phase("filter"):
+            if self.symmetry is not None:
+                x = self.symmetry.forward(x)
+            return self.filter.forward(x)
+
     def filtered(self, x: np.ndarray) -> PhysicalDesign:
         """Return the design of design variables x without projection.
 
         Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
         what is cut off there has no derivative, and `backward` knows.
         """
-        x = self.mesh.keep(x)
-        with self.profile.phase("filter"):
-            if self.symmetry is not None:
-                x = self.symmetry.forward(x)
-            x_filtered = self.filter.forward(x)
+        x_filtered = self.smoothed(x)
         clipped = None
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
             clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)

@@ -53,9 +53,7 @@ def part(
     millimetres; part.toml is the machine with these parts, to be simulated like any scene.
     """
     world = start()
-    if world.size > 1:
-        raise InputError("part: runs on one process alone; start it without mpirun")
-    from dolfinopt.parallel import on_root
+    from dolfinopt.parallel import on_root, together
     from dolfinopt.part.files import file_names
     from dolfinopt.part.part import make_parts
 
@@ -63,13 +61,12 @@ def part(
     target = out or folder / "part"
     claim(world, target, overwrite, file_names(scene))
 
-    def make() -> None:
-        parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs")
-        _write(scene, target, parts, plots)
-
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
-    on_root(world, make)
+    parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)
+    with together(world):
+        if world.rank == 0:
+            _write(scene, target, parts, plots)
 
 
 def _write(scene: Scene, target: Path, parts: dict[int, Part], plots: bool) -> None:

@@ -16,7 +16,7 @@ import click
 
 from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
-from dolfinopt.output.folders import RUN_FILES, check_unused, prepare_folder
+from dolfinopt.output.folders import CHECKPOINT, RUN_FILES, check_unused, prepare_folder
 from dolfinopt.units import NOT_MET, with_unit
 
 if TYPE_CHECKING:
@@ -119,10 +119,21 @@ def scene_of(folder: Path) -> Scene:
             del data["reduction"]["tolerance"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"{path}: cannot be read ({type(error).__name__}); name the folder of a finished "
-            "optimize or simulate run"
+            f"{path}: cannot be read ({type(error).__name__}); {_instead(folder)}"
         ) from None
     return scene_from_dict(data, source=str(path))
+
+
+def _instead(folder: Path) -> str:
+    """Return what to do about a folder without the summary of a run."""
+    if (folder / CHECKPOINT).exists():
+        return (
+            "this optimisation has not come to its end: go on with dolfinopt optimize SCENE --out "
+            f"{folder} --resume"
+        )
+    if (folder / "cases").is_dir():
+        return f"this is a study: name the folder of one of its cases, {folder / 'cases'}/..."
+    return "name the folder of a finished optimize or simulate run"
 
 
 def design_of(

@@ -79,6 +79,12 @@ class Continuation:
         repeats = [k for k in self.arms if k in self.patterns.repeats]
         return designs | {k: tuple(PhysicalDesign(x[k], None) for x in spread) for k in repeats}
 
+    def smoothed(self, x: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+        """Return what is projected, of all arms of this rank (collective)."""
+        with together(self.partition.world):
+            smooth = {k: self.arms[k].smoothed(x[k]) for k in self.thresholds}
+        return self.patterns.spread(smooth)
+
     def advance(self, x: Mapping[int, np.ndarray]) -> None:
         """Raise beta, and move the thresholds so that the volume of x stays (collective).
 

@@ -261,6 +261,7 @@ class _Run:
             partition=self.partition,
             arms=self.arms,
             x_phys=self.nominal.x_phys,
+            x_filtered=self._filtered(),
             evaluation=final.evaluation,
             crisp=final.crisp,
             trajectory=self.evaluator.trajectory,
@@ -279,6 +280,12 @@ class _Run:
             counts=counts,
             choice=final.selection,
         )
+
+    def _filtered(self) -> dict[int, np.ndarray] | None:
+        """Return what the final design was projected from (collective), None if it was not."""
+        if not self.scene.design.projection:
+            return None
+        return self.evaluator.continuation.smoothed(self.variables.split(self.x))
 
     def _further(self, problem: Problem, count: int) -> Iterator[Problem]:
         """Go on from x with the exact gradient, until converged; yield what it comes to.

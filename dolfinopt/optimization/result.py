@@ -28,6 +28,8 @@ class Result:
     Attributes:
         partition, arms: which ranks did what, and this rank's arms with the final design reduced.
         x_phys: physical densities (n_cells,) of this rank's arms.
+        x_filtered: (n_cells,) what they were projected from, smooth from cell to cell; None without
+            a projection.
         evaluation: of the final design.
         trajectory: of the final design; on the root only.
         crisp: evaluation of the final design cut at x_phys = 1/2; None without a projection.
@@ -50,6 +52,7 @@ class Result:
     partition: Partition
     arms: Mapping[int, Arm]
     x_phys: Mapping[int, np.ndarray]
+    x_filtered: Mapping[int, np.ndarray] | None
     evaluation: Evaluation
     crisp: Evaluation | None
     trajectory: Trajectory | None

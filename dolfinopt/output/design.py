@@ -18,15 +18,21 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.mesh.arm_mesh import ArmMesh
 
 
 def write_design(folder: Path, views: Sequence[ArmView]) -> None:
-    """Write design.npz: centroids and physical densities of every arm."""
+    """Write design.npz: centroids and physical densities of every arm.
+
+    Of projected designs what they were projected from, too: outlines are drawn by it.
+    """
     arrays = {}
     for view in designed(views):
         arrays[f"{view.name}/centroid"] = view.centroid
         arrays[f"{view.name}/density"] = view.density
-    arrays["units"] = np.array(["centroid: m", "density: -"])
+        if view.filtered is not None:
+            arrays[f"{view.name}/filtered"] = view.filtered
+    arrays["units"] = np.array(["centroid: m", "density: -", "filtered: -"])
     write_arrays(folder / "design.npz", arrays)
 
 
@@ -85,23 +91,34 @@ def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> di
         InputError: the file is missing, damaged, or made for other arms.
     """
     arrays = on_root(partition.world, _load_design, path)
-    for index, arm in arms.items():
-        scene = arm.scene
-        if index in scene.patterns:
-            _repeat(scene.arms[index], scene.arms[scene.patterns[index]], arrays)
     with together(partition.world):
-        return {index: _fit(path, arm, arrays) for index, arm in arms.items()}
+        return {k: _fit(path, arm.scene, k, arm.mesh, arrays)[0] for k, arm in arms.items()}
+
+
+def read_smooth_design(
+    path: Path, scene: Scene, partition: Partition, meshes: Mapping[int, ArmMesh]
+) -> dict[int, tuple[np.ndarray, np.ndarray | None]]:
+    """Return physical densities as `read_design` does, and what they were projected from.
+
+    Collective. The latter is None where the file does not hold it.
+    """
+    arrays = on_root(partition.world, _load_design, path)
+    with together(partition.world):
+        return {k: _fit(path, scene, k, mesh, arrays) for k, mesh in meshes.items()}
 
 
 def _repeat(arm: ArmKeys, pattern: ArmKeys, arrays: dict[str, np.ndarray]) -> None:
     """Add an arm that repeats another's design to the arrays of a file that has the latter."""
     centroid, density = (f"{pattern.name}/{key}" for key in ("centroid", "density"))
+    filtered = f"{pattern.name}/filtered"
     points = arrays.get(centroid, np.empty(0))
     if f"{arm.name}/density" in arrays or density not in arrays or points.ndim != 2:
         return
     scale = [arm.length / pattern.length, arm.height / pattern.height]
     arrays[f"{arm.name}/centroid"] = points[:, :2] * scale
     arrays[f"{arm.name}/density"] = arrays[density]
+    if filtered in arrays:
+        arrays[f"{arm.name}/filtered"] = arrays[filtered]
 
 
 def _load_design(path: Path) -> dict[str, np.ndarray]:
@@ -121,11 +138,15 @@ def _zip_error() -> type[Exception]:
     return BadZipFile
 
 
-def _fit(path: Path, arm: Arm, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the file's densities on the arm's cells by nearest centroid."""
+def _fit(
+    path: Path, scene: Scene, index: int, mesh: ArmMesh, arrays: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the file's densities, and the filtered ones if any, of a mesh by nearest centroid."""
     from scipy.spatial import cKDTree
 
-    name = arm.mesh.name
+    if index in scene.patterns:
+        _repeat(scene.arms[index], scene.arms[scene.patterns[index]], arrays)
+    name = mesh.name
     keys = (f"{name}/centroid", f"{name}/density")
     missing = [key for key in keys if key not in arrays]
     if missing:
@@ -152,16 +173,28 @@ def _fit(path: Path, arm: Arm, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
             f"{path}: {keys[1]} = {density[outside][0]:g} at cell {np.flatnonzero(outside)[0]}: "
             "physical densities lie in [0, 1]"
         )
-    return density[_nearest(path, arm, centroid, cKDTree)]
+    place = _nearest(path, mesh, centroid, cKDTree)
+    filtered = arrays.get(f"{name}/filtered")
+    if filtered is None:
+        return density[place], None
+    if filtered.shape != density.shape or not _are_finite(filtered):
+        raise InputError(
+            f"{path}: '{name}/filtered' has shape {filtered.shape}: expected {len(density)} finite "
+            "numbers, one a cell"
+        )
+    return density[place], filtered.astype(float)[place]
 
 
-def _nearest(path: Path, arm: Arm, centroid: np.ndarray, tree: Any) -> np.ndarray:
+def _are_finite(values: np.ndarray) -> bool:
+    return values.dtype.kind in "fiu" and bool(np.isfinite(values).all())
+
+
+def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.ndarray:
     """Return the nearest design point of each cell; both must cover the same region."""
-    cells = arm.mesh.centroid
-    comm = arm.mesh.comm
+    cells, comm = mesh.centroid, mesh.comm
     low = np.min(comm.allgather(cells.min(axis=0)), axis=0)
     high = np.max(comm.allgather(cells.max(axis=0)), axis=0)
-    size = np.sqrt(comm.allreduce(arm.mesh.area.max(), op=max))
+    size = np.sqrt(comm.allreduce(mesh.area.max(), op=max))
     points = tree(centroid)
     spacing = points.query(centroid, k=2)[0][:, 1].max() if len(centroid) > 1 else np.inf
     reach = 2.0 * (size + min(spacing, np.ptp(centroid, axis=0).max()))
@@ -170,7 +203,7 @@ def _nearest(path: Path, arm: Arm, centroid: np.ndarray, tree: Any) -> np.ndarra
     if np.abs(edge).max() > reach or distance.max() > reach:
         a, b = centroid.min(axis=0), centroid.max(axis=0)
         raise InputError(
-            f"{path}: the design of arm {arm.mesh.name!r} covers x {a[0]:.4g}..{b[0]:.4g} m, "
+            f"{path}: the design of arm {mesh.name!r} covers x {a[0]:.4g}..{b[0]:.4g} m, "
             f"y {a[1]:.4g}..{b[1]:.4g} m, its mesh x {low[0]:.4g}..{high[0]:.4g} m, "
             f"y {low[1]:.4g}..{high[1]:.4g} m; give a design made for these arms"
         )

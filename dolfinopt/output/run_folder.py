@@ -47,6 +47,7 @@ class Simulated:
         choice: what `reduction.coordinates = "auto"` came to.
         counts: this rank's, where not all of the profile's belong to the run.
         crisp: evaluation of the design cut at one half.
+        x_filtered: what `x_phys` was projected from, see `Result`.
         iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
         certificate: of the optimised design.
         limits: the constraints; by default those of `evaluation` and `x_phys`.
@@ -63,6 +64,7 @@ class Simulated:
     choice: OrderSelection | None = None
     counts: Counts | None = None
     crisp: Evaluation | None = None
+    x_filtered: Mapping[int, np.ndarray] | None = None
     iterations: int = 0
     converged: bool = True
     stop_reason: str = "simulated"
@@ -100,7 +102,7 @@ def write_simulation(
     begun = time.perf_counter() - wall
     one = simulated
     stress = stress_report(one.partition, one.arms, one.trajectory, one.profile)
-    views = gather_views(one.scene, one.partition, one.arms, one.x_phys, stress)
+    views = gather_views(one.scene, one.partition, one.arms, one.x_phys, stress, one.x_filtered)
     summary = summarise(one, wall, stress)
     with together(one.partition.world):
         if one.trajectory is None:
@@ -149,6 +151,7 @@ def write_result(
         choice=result.choice,
         counts=result.counts,
         crisp=result.crisp,
+        x_filtered=result.x_filtered,
         iterations=result.iterations,
         converged=result.converged,
         stop_reason=result.stop_reason,

@@ -37,6 +37,7 @@ class ArmView:
         regions: what the scene keeps solid or void: kind and outline (n, 2), m, of every region.
         stress: (n_cells,) largest von Mises stress along the motion, Pa; None if not known.
         stress_instant: (n_cells,) when it is reached, s; likewise.
+        filtered: (n_cells,) densities before the projection, smooth from cell to cell; likewise.
     """
 
     name: str
@@ -49,6 +50,7 @@ class ArmView:
     regions: tuple[tuple[str, np.ndarray], ...] = ()
     stress: np.ndarray | None = None
     stress_instant: np.ndarray | None = None
+    filtered: np.ndarray | None = None
 
 
 def gather_views(
@@ -57,12 +59,14 @@ def gather_views(
     arms: Mapping[int, Arm],
     x_phys: Mapping[int, np.ndarray],
     stress: Mapping[int, ArmStress] | None = None,
+    x_filtered: Mapping[int, np.ndarray] | None = None,
 ) -> list[ArmView]:
     """Collect every arm on the root (collective); empty list elsewhere.
 
     Args:
         scene, partition, arms, x_phys: the designs.
         stress: what `stress_report` returned of their motion, if it is known.
+        x_filtered: what the designs were projected from, if it is known; on all ranks or none.
     """
 
     def collect(values: Any) -> dict[int, np.ndarray]:
@@ -86,10 +90,11 @@ def gather_views(
     corners = collect(points)
     centroids = collect(lambda _, arm: arm.mesh.centroid)
     densities = collect(lambda index, _: x_phys[index])
+    smooth = collect(lambda index, _: x_filtered[index]) if x_filtered is not None else {}
     shapes = collect(modes)
     with together(partition.world):
         if partition.world.rank == 0:
-            return _views(scene, corners, centroids, densities, shapes, stress or {})
+            return _views(scene, corners, centroids, densities, smooth, shapes, stress or {})
         return []
 
 
@@ -98,6 +103,7 @@ def _views(
     corners: Mapping[int, np.ndarray],
     centroids: Mapping[int, np.ndarray],
     densities: Mapping[int, np.ndarray],
+    smooth: Mapping[int, np.ndarray],
     shapes: Mapping[int, np.ndarray],
     stress: Mapping[int, ArmStress],
 ) -> list[ArmView]:
@@ -123,6 +129,7 @@ def _views(
                 regions=_outlines(scene, index),
                 stress=None if known is None else known.by_cell[order],
                 stress_instant=None if known is None else known.when[order],
+                filtered=smooth[owner][order] if owner in smooth else None,
             )
         )
     return views

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dolfinopt.part.curves import Arc, Curve, Line, Spline, direction
+from dolfinopt.part.shape import Shape
 
 SAMPLES = 9  # points of a spline at which a pair of arcs is compared with it
 DEEPEST = 14  # bisections of a spline
 STRAIGHT = 1e-9  # height of an arc over its chord, relative, below which it is a line
+
+
+def with_arcs(shape: Shape, tolerance: float) -> Shape:
+    """Return the shape with lines and arcs within a distance, m, of its splines."""
+    loops = tuple(
+        tuple(
+            replace(piece, curve=one, run=None)
+            for piece in loop
+            for one in (
+                biarcs(piece.curve, tolerance) if isinstance(piece.curve, Spline) else [piece.curve]
+            )
+        )
+        for loop in shape.loops
+    )
+    return Shape(loops, apart=shape.distance() + tolerance)
 
 
 def biarcs(spline: Spline, tolerance: float) -> list[Curve]:

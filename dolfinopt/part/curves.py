@@ -235,6 +235,11 @@ def direction(curve: Curve, t: float) -> np.ndarray:
     return d / size
 
 
+def angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle between two unit vectors (2,), rad."""
+    return float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
+
+
 def _inside(ends: np.ndarray) -> np.ndarray:
     """Return both ends of every piece, a hair inside: where a derivative may jump."""
     hair = 1e-9 * np.diff(ends)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,13 @@ MARGIN = 5.0  # mm around a picture
 
 def dxf_text(shape: Shape) -> str:
     """Return a DXF of version R2010: lines, arcs, circles and splines on two layers."""
-    document = _document("R2010")
-    model = document.modelspace()
-    for k, loop in enumerate(shape.loops):
-        for piece in loop:
-            _draw(model, piece.curve, {"layer": HOLES if k else OUTLINE})
-    return _text(document)
+    with _undated():
+        document = _document("R2010")
+        model = document.modelspace()
+        for k, loop in enumerate(shape.loops):
+            for piece in loop:
+                _draw(model, piece.curve, {"layer": HOLES if k else OUTLINE})
+        return _text(document)
 
 
 def r12_text(shape: Shape, tolerance: float) -> str:
@@ -32,18 +35,30 @@ def r12_text(shape: Shape, tolerance: float) -> str:
         shape: m.
         tolerance: of chords in place of splines, m; arcs stay arcs, as bulges.
     """
-    document = _document("R12")
-    model = document.modelspace()
-    for k, loop in enumerate(shape.loops):
-        look = {"layer": HOLES if k else OUTLINE}
-        if _is_circle(loop):
-            _draw(model, loop[0].curve, look)
-            continue
-        corners: list[tuple[float, float, float]] = []
-        for piece in loop:
-            corners += _corners(piece.curve, tolerance)
-        model.add_polyline2d(corners, format="xyb", close=True, dxfattribs=look)
-    return _text(document)
+    with _undated():
+        document = _document("R12")
+        model = document.modelspace()
+        for k, loop in enumerate(shape.loops):
+            look = {"layer": HOLES if k else OUTLINE}
+            if _is_circle(loop):
+                _draw(model, loop[0].curve, look)
+                continue
+            corners = [one for piece in loop for one in _corners(piece.curve, tolerance)]
+            model.add_polyline2d(corners, format="xyb", close=True, dxfattribs=look)
+        return _text(document)
+
+
+@contextmanager
+def _undated() -> Iterator[None]:
+    """Have documents made and written without dates and random numbers: a shape gives its bytes."""
+    from ezdxf import options
+
+    before = options.write_fixed_meta_data_for_testing
+    options.write_fixed_meta_data_for_testing = True
+    try:
+        yield
+    finally:
+        options.write_fixed_meta_data_for_testing = before
 
 
 def _document(version: str) -> Any:
@@ -59,6 +74,9 @@ def _document(version: str) -> Any:
 
 
 def _text(document: Any) -> str:
+    classes = document.classes
+    classes.add_required_classes(document.dxfversion)  # from a set
+    classes.classes = dict(sorted(classes.classes.items()))
     stream = io.StringIO()
     document.write(stream)
     return stream.getvalue()

@@ -17,10 +17,11 @@ from dolfinopt.part.drawings import dxf_text, r12_text, svg_text
 from dolfinopt.part.part import Part
 from dolfinopt.part.scene_file import scene_text
 from dolfinopt.part.solid import stl_bytes
-from dolfinopt.part.step import use_millimetres, write_step
+from dolfinopt.part.step import face_text, solid_text
 from dolfinopt.scene.load import Scene
 
 FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl")
+STAGE = ".part-"  # folder of files about to be renamed
 SCENE, FIGURES, PICTURE = "part.toml", "part.json", "part.png"
 
 
@@ -55,8 +56,8 @@ def write_parts(
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
 
-    They are made in a folder beside them and moved when all are there, part.json last: whoever
-    finds it finds all.
+    They are made in a temporary folder, then copied beside the old ones and renamed, part.json
+    last: whoever finds it finds all. What a killed command has left beside them goes.
 
     Args:
         folder: exists.
@@ -67,25 +68,36 @@ def write_parts(
     Raises:
         OutputError: the disk is full, for instance.
     """
-    names = file_names(scene)
-    with writing(folder):
-        temporary = Path(tempfile.mkdtemp(prefix=".part-", dir=folder))
-    try:
-        _write_drawings(temporary, scene, parts)
-        _write_steps(temporary, scene, parts)
-        write_text(temporary / SCENE, scene_text(scene, parts, folder))
+    with tempfile.TemporaryDirectory(prefix="dolfinopt-part-") as name:
+        made = Path(name)
+        _write_drawings(made, scene, parts)
+        _write_steps(made, scene, parts)
+        write_text(made / SCENE, scene_text(scene, parts, folder))
         if picture is not None:
-            picture(temporary / PICTURE)
+            picture(made / PICTURE)
         figures = figures_of(scene, parts)
-        write_text(temporary / FIGURES, json.dumps(figures, indent=1) + "\n")
+        write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
+        _publish(made, folder, file_names(scene))
+    return figures
+
+
+def _publish(made: Path, folder: Path, names: Sequence[str]) -> None:
+    """Replace the files of a folder by those made elsewhere: all or none, the first name last."""
+    for left in folder.glob(f"{STAGE}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with writing(folder):
+        stage = Path(tempfile.mkdtemp(prefix=STAGE, dir=folder))
+    try:
+        with writing(folder):
+            present = [name for name in reversed(names) if (made / name).exists()]
+            for name in present:
+                shutil.copyfile(made / name, stage / name)
         remove_stale(folder, names)
         with writing(folder):
-            for name in reversed(names):
-                if (temporary / name).exists():
-                    os.replace(temporary / name, folder / name)
+            for name in present:
+                os.replace(stage / name, folder / name)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-    return figures
+        shutil.rmtree(stage, ignore_errors=True)
 
 
 def _of_arms(scene: Scene, parts: Mapping[int, Part]) -> Sequence[tuple[str, Part]]:
@@ -112,11 +124,6 @@ def _copy(data: bytes, stream: IO[bytes]) -> None:
 
 
 def _write_steps(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> None:
-    from mpi4py import MPI
-
-    from dolfinopt.mesh.gmsh_session import gmsh_on_root, silent_terminal
-
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh, silent_terminal():
-        use_millimetres(gmsh, folder)
-        for name, part in _of_arms(scene, parts):
-            write_step(gmsh, folder, part.shape, part.domain.thickness, name)
+    for name, part in _of_arms(scene, parts):
+        write_text(folder / f"{name}_face.step", face_text(part.shape, name))
+        write_text(folder / f"{name}.step", solid_text(part.shape, part.domain.thickness, name))

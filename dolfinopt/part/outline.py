@@ -8,26 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.curves import sampled
-from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
+from dolfinopt.part.domain import Domain
 from dolfinopt.part.levels import Raster, rasterise
+from dolfinopt.part.polygons import QUADRANT, is_kept, polygons_of, rounded, without_necks
+from dolfinopt.part.regions import INBOARD, OUTBOARD
+from dolfinopt.part.search import search
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
 
 AREA = 1e-4  # relative: up to which the level is sought
 LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leaves at one level
-NARROW = 5e-5  # bracket of the level, of the field's range
-STEPS = 60  # of the search for the level
 CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
-QUADRANT = 12  # sides of a quarter of the tool's circle
 STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
-SLIVER = 2e-3  # area of a corner that is rounded, squares of the radius: turns of 20 degrees
 TOOL = 0.2  # default radius of the tool, cells
 # Material along an interface that the design leaves void, in cells: the interface is rigid.
 STRIP = 0.5
@@ -131,7 +130,7 @@ def draw_outline(
         )
 
     if target > given.arm.area * (1.0 - AREA):
-        polygon = max(_parts(given.arm), key=lambda p: p.area)
+        polygon = max(polygons_of(given.arm), key=lambda p: p.area)
         return Outline(domain, polygon, 0.0, 0.0, tool_radius, radius, CHORD * tolerance, 0, 0.0, 0)
     if float(np.ptp(domain.field)) < UNIFORM:
         raise InputError(
@@ -188,16 +187,16 @@ def _at(
     if offset:
         above = above.buffer(offset, quad_segs=QUADRANT)
     whole = shapely.union_all([above.intersection(given.arm), given.stays, given.links])
-    before = _parts(whole)
+    before = polygons_of(whole)
     if tool > 0.0:
-        whole = _rounded(whole, tool, chord).intersection(given.arm)
-    whole = _without_necks(whole, NECK * chord / CHORD, chord)
-    parts = _parts(whole)
+        whole = rounded(whole, tool, chord).intersection(given.arm)
+    whole = without_necks(whole, NECK * chord / CHORD, chord)
+    parts = polygons_of(whole)
     near = 1e-6 * domain.extent
     kept = [p for p in parts if all(p.distance(i) < near for i in (given.inboard, given.outboard))]
     main = max(kept, key=lambda p: p.area) if kept else shapely.Polygon()
     pinhole = 0.25 * np.pi * (PINHOLE * domain.cell) ** 2
-    holes = [ring for ring in main.interiors if _is_kept(ring, given.arm, pinhole)]
+    holes = [ring for ring in main.interiors if is_kept(ring, given.arm, pinhole)]
     dropped = [p for p in parts if p is not main]
     closed = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in dropped)
     return Outline(
@@ -214,53 +213,13 @@ def _at(
     )
 
 
-def _rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
-    """Return the polygons with all that a disc cannot reach from without added to them.
-
-    Elsewhere their sides stay what they are to the bit.
-    """
-    import shapely
-
-    closed = whole.buffer(radius, quad_segs=QUADRANT).buffer(-radius, quad_segs=QUADRANT)
-    added = shapely.get_parts(closed.difference(whole))
-    # The rounding of numbers, and every corner of the polygon, leave slivers all along.
-    added = added[shapely.area(added) > SLIVER * radius * radius]
-    return shapely.union_all([whole, *shapely.buffer(added, 0.1 * chord, join_style="mitre")])
-
-
-def _without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
-    """Return the polygons without what is narrower than a width and joins wider parts."""
-    import shapely
-
-    opened = whole.buffer(-0.5 * width, quad_segs=QUADRANT).buffer(
-        0.5 * width + 0.1 * chord, quad_segs=QUADRANT
-    )
-    pieces = shapely.get_parts(whole.difference(opened))
-    necks = []
-    for piece in pieces[shapely.area(pieces) > 0.01 * width * width]:
-        touched = piece.buffer(chord).intersection(opened)
-        if len(_parts(touched)) != 1:  # a corner touches one wider part
-            necks.append(piece.buffer(chord, join_style="mitre"))
-    return whole.difference(shapely.union_all(necks)) if necks else whole
-
-
-def _is_kept(ring: Any, arm: Geometry, least: float) -> bool:
-    """Return whether a hole is a bore of the arm or no mere pinhole."""
-    import shapely
-
-    hole = shapely.Polygon(ring)
-    return bool(hole.area > least or not arm.covers(hole.representative_point()))
-
-
-def _parts(geometry: Geometry) -> list[Polygon]:
-    import shapely
-
-    return [p for p in shapely.get_parts(geometry) if p.geom_type == "Polygon" and p.area > 0.0]
+def _excess(outline: Outline) -> float:
+    """Return by how much the area is above the volume, relative."""
+    return outline.area / outline.domain.volume - 1.0
 
 
 def _off(outline: Outline) -> float:
-    """Return by how much the area is off the volume, relative."""
-    return abs(outline.area / outline.domain.volume - 1.0)
+    return abs(_excess(outline))
 
 
 def _at_level(at: Callable[[float], Outline], domain: Domain, raster: Raster) -> Outline:
@@ -271,60 +230,12 @@ def _at_level(at: Callable[[float], Outline], domain: Domain, raster: Raster) ->
     last = min(int(np.searchsorted(filled, domain.volume)), len(order) - 1)
     first = domain.field[order[last]]
     step = 0.02 * (high - low)
-    return _root(lambda level: at(level), float(first), step, (low - step, high + step), -1.0)
+    span = (-high - step, step - low)  # a lower level has more material
+    return search(lambda number: at(-number), _excess, -float(first), step, span, AREA)
 
 
 def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline:
     """Return the outline at the level of `found`, moved so that it has the volume's area."""
     step, most = 0.02 * found.domain.cell, 2.0 * found.domain.cell
-    moved = _root(lambda offset: at(found.level, offset), 0.0, step, (-most, most), 1.0)
+    moved = search(lambda offset: at(found.level, offset), _excess, 0.0, step, (-most, most), AREA)
     return min(found, moved, key=_off)
-
-
-def _root(
-    at: Callable[[float], Outline],
-    first: float,
-    step: float,
-    span: tuple[float, float],
-    sign: float,
-) -> Outline:
-    """Return the outline whose area is the volume, or the nearest one where the area leaps.
-
-    Args:
-        at: the outline by a number.
-        first: where to begin.
-        step: by which to look for a bracket at first.
-        span: what the number may be.
-        sign: 1 where the area grows with it, -1 where it falls.
-    """
-    tried: list[tuple[float, float]] = []
-    best: Outline | None = None
-    place = min(max(first, span[0]), span[1])
-    for _ in range(STEPS):
-        one = at(place)
-        off = one.area / one.domain.volume - 1.0
-        if best is None or abs(off) < _off(best):
-            best = one
-        if abs(off) < AREA:
-            break
-        tried.append((place, off * sign))
-        over = min((p for p in tried if p[1] > 0.0), default=None)
-        under = max((p for p in tried if p[1] <= 0.0), default=None)
-        if over is None or under is None:
-            if place in span:
-                break
-            if len(tried) > 1 and tried[-1][1] != tried[-2][1]:  # where a straight line ends
-                (a, f), (b, g) = tried[-2:]
-                step = min(max(abs(1.3 * g * (b - a) / (g - f)), 0.5 * step), 4.0 * step)
-            place = min(max(place - np.sign(off) * sign * step, span[0]), span[1])
-        else:
-            if abs(over[0] - under[0]) < NARROW * (span[1] - span[0]):
-                break
-            share = -under[1] / (over[1] - under[1])
-            # Every third step halves the bracket, for an area may leap; as it does to nothing.
-            leaps = len(tried) % 3 == 0 or max(over[1], -under[1]) > 0.5
-            place = under[0] + (0.5 if leaps else min(max(share, 0.03), 0.97)) * (
-                over[0] - under[0]
-            )
-    assert best is not None
-    return best

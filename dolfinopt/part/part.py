@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain, read_domains
 from dolfinopt.part.outline import Outline, default_tool, draw_outline
-from dolfinopt.part.shape import Shape, make_shape
+from dolfinopt.part.shape import Shape
+from dolfinopt.part.smooth import make_shape
 from dolfinopt.part.widths import thinnest_member
 from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
 LEAST = 1e-7  # m, the finest tolerance: that of CAD programs
@@ -48,6 +52,11 @@ class Part:
                 f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
                 "the material is in cells that are neither solid nor void; the part is another "
                 'design than the optimised one; optimise with design.projection = "robust"'
+            )
+        if one.crisp:
+            found.append(
+                f"arm {one.name!r}: design.npz does not tell what its densities were projected "
+                "from, as that of an optimisation does; the outline is that of the cells, blurred"
             )
         if outline.islands:
             share = 100.0 * outline.islands_area / one.volume
@@ -98,8 +107,9 @@ def make_parts(
     tool_radius: float | None = None,
     tolerance: float | None = None,
     arcs: bool = False,
+    world: MPI.Comm | None = None,
 ) -> dict[int, Part]:
-    """Return the parts of the arms that have a design of their own, by their place in the chain.
+    """Make the parts of the arms that have a design of their own (collective on `world`).
 
     Args:
         scene: of the run.
@@ -107,10 +117,33 @@ def make_parts(
         tool_radius: of concave corners, m; default a fifth of a cell.
         tolerance: of the curves, m; default 0.1 mm or a tenth of a cell, the smaller.
         arcs: lines and arcs in place of splines.
+        world: the ranks that share the arms; by default this one alone.
+
+    Returns:
+        Parts by their place in the chain, the same on any number of ranks; on the root, none
+        elsewhere.
 
     Raises:
-        InputError: no design in the folder, or no part can be made of it with these values.
+        InputError: no design in the folder, or no part can be made of it with these values; on all
+            ranks.
     """
+    from mpi4py import MPI
+
+    from dolfinopt.parallel import on_root, together
+
+    world = MPI.COMM_SELF if world is None else world
+    on_root(world, _check, folder, tool_radius, tolerance)
+    domains = read_domains(scene, folder, world)
+    with together(world):
+        mine = {k: make_part(one, tool_radius, tolerance, arcs) for k, one in domains.items()}
+    found: dict[int, Part] = {}
+    for pieces in world.gather(mine, root=0) or ():
+        found.update(pieces)
+    return {k: found[k] for k in sorted(found)}
+
+
+def _check(folder: Path, tool_radius: float | None, tolerance: float | None) -> None:
+    """Raise InputError unless the folder has a design and the options are in range."""
     for name, value, least in (
         ("--tool-radius", tool_radius, 0.0),
         ("--tolerance", tolerance, LEAST),
@@ -122,10 +155,6 @@ def make_parts(
             f"{folder / 'design.npz'}: no design there; name the folder of a finished optimize or "
             "simulate run"
         )
-    return {
-        k: make_part(domain, tool_radius, tolerance, arcs)
-        for k, domain in read_domains(scene, folder).items()
-    }
 
 
 def make_part(

@@ -33,7 +33,7 @@ def design() -> Callable[..., Domain]:
     def make(density: Callable, *changes: str) -> Domain:
         one, arm = built(*ONE, *changes)
         values = np.asarray(density(*arm.mesh.centroid.T), dtype=float)
-        return domain_of(one, 0, arm, arm.mesh.keep(values))
+        return domain_of(one, 0, arm.mesh, arm.mesh.keep(values))
 
     return make
 

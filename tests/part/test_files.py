@@ -260,7 +260,7 @@ def test_interrupted_command_leaves_what_was_there(tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "write_step", interrupted)
+    monkeypatch.setattr(files, "solid_text", interrupted)
     with pytest.raises(click.Abort):
         run("part", folder, "--no-plots")
     assert [path.name for path in (folder / "part").iterdir()] == ["note.txt"]

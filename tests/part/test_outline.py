@@ -53,7 +53,7 @@ def test_frame(design):
     assert part.shape.control_points < 40 * 4
     # Flanges of 15 mm, struts of 25 mm; the level rounds corners and widens the windows for it.
     assert part.thinnest == pytest.approx(0.015, rel=0.05)
-    assert part.warnings == []
+    assert len(part.warnings) == 1 and "blurred" in part.warnings[0]  # densities of cells alone
 
 
 @pytest.mark.parametrize("radius", [0.001, 0.003, 0.006])
@@ -95,7 +95,7 @@ def test_island_is_dropped(design):
     part = make_part(design(density), None, None)
     check(part, holes=4)
     assert part.outline.islands == 1
-    assert "1 pieces without a joint to both interfaces" in part.warnings[0]
+    assert "1 pieces without a joint to both interfaces" in " ".join(part.warnings)
 
 
 def test_strut_of_one_cell_stays(design):

@@ -1,0 +1,63 @@
+"""Parts on several processes: the same files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import frame
+from mpi4py import MPI
+from runs import TWO_ARM, run, shell
+
+import dolfinopt as do
+from dolfinopt.mesh.arm_mesh import arm_mesh
+
+pytestmark = pytest.mark.serial  # starts ranks itself
+
+CHANGES = ("arms.0.cells=[50, 6]", "arms.1.cells=[50, 6]", "design.projection=robust")
+WORDS = ("--no-plots", "--tolerance", 5e-4)
+
+
+def two_arms(path):
+    """Write what `dolfinopt part` reads of a run of two arms."""
+    scene = do.load_scene(TWO_ARM, CHANGES)
+    arrays = {}
+    for arm, strut in zip(scene.arms, (0.3, 0.7), strict=True):
+        mesh = arm_mesh(MPI.COMM_SELF, arm)
+        x, y = mesh.centroid.T
+        arrays[f"{arm.name}/centroid"] = mesh.centroid
+        arrays[f"{arm.name}/density"] = (frame(x, y) | (np.abs(x - strut) < 0.02)).astype(float)
+    path.mkdir()
+    np.savez(path / "design.npz", **arrays)
+    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
+    return path
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_two_ranks_write_the_same_bytes(tmp_path):
+    folder = two_arms(tmp_path / "run")
+    run("part", folder, "--out", tmp_path / "one", *WORDS)
+    done = shell("part", folder, "--out", tmp_path / "two", *WORDS, ranks=2)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("arm1: ") == done.stdout.count("arm2: ") == 1
+    here, there = (contents(tmp_path / name) for name in ("one", "two"))
+    assert here.keys() == there.keys() and len(here) == 14
+    assert [name for name in here if here[name] != there[name]] == []
+
+
+def test_bad_design_ends_two_ranks_with_one_line(tmp_path):
+    """The arm of the second rank is the one that no part can be made of."""
+    folder = two_arms(tmp_path / "run")
+    with np.load(folder / "design.npz") as data:
+        arrays = dict(data)
+    arrays["arm2/density"] = (np.abs(arrays["arm2/centroid"][:, 0] - 0.5) > 0.1).astype(float)
+    np.savez(folder / "design.npz", **arrays)
+    done = shell("part", folder, *WORDS, ranks=2)
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if line.startswith("dolfinopt")]
+    assert len(lines) == 1 and "arm 'arm2'" in lines[0] and "hang together" in lines[0]
+    assert not (folder / "part").exists()
