@@ -400,6 +400,7 @@ class Model:
         """
         from dolfinopt.output.folders import check_unused, prepare_folder
         from dolfinopt.part.files import file_names, write_parts
+        from dolfinopt.part.mesh import mesh_parts
         from dolfinopt.part.part import make_parts
 
         out = None if folder is None else Path(folder)
@@ -412,7 +413,7 @@ class Model:
             with together(self._world):
                 if self._world.rank == 0:
                     prepare_folder(out)
-                    write_parts(out, self.scene, found)
+                    write_parts(out, self.scene, found, mesh_parts(found).fine)
         return {self.scene.arms[k].name: part for k, part in found.items()}
 
     def study(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,9 +11,11 @@ import click
 from dolfinopt.cli.options import out_option, overwrite_option, plots_option
 from dolfinopt.cli.shared import claim, elapsed, scene_of, warn
 from dolfinopt.cli.start import start
-from dolfinopt.errors import InputError
+from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
+    from dolfinopt.part.check import Check
+    from dolfinopt.part.mesh import Meshes
     from dolfinopt.part.part import Part
     from dolfinopt.scene.load import Scene
 
@@ -36,6 +39,11 @@ if TYPE_CHECKING:
     default="splines",
     help="splines, or lines and arcs alone for machines that know no splines",
 )
+@click.option(
+    "--check/--no-check",
+    default=True,
+    help="simulate the machine with the parts, beside the densities they are made of",
+)
 @overwrite_option
 @plots_option
 def part(
@@ -44,17 +52,20 @@ def part(
     tool_radius: float | None,
     tolerance: float | None,
     curves: str,
+    check: bool,
     overwrite: bool,
     plots: bool,
 ) -> None:
     """Make parts for the workshop of the arms optimised in DIR.
 
     Each arm as STEP (solid, and its face for arms.mesh), DXF (R2010 and R12), SVG and STL, all in
-    millimetres; part.toml is the machine with these parts, to be simulated like any scene.
+    millimetres; part.toml is the machine with these parts, to be simulated like any scene. A table
+    tells what it does beside the densities, and beside these cut to solid and void.
     """
     world = start()
     from dolfinopt.parallel import on_root, together
     from dolfinopt.part.files import file_names
+    from dolfinopt.part.mesh import mesh_parts
     from dolfinopt.part.part import make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
@@ -66,22 +77,46 @@ def part(
     parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)
     with together(world):
         if world.rank == 0:
-            _write(scene, target, parts, plots)
+            warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
+            meshes = mesh_parts(parts)
+            found = _checked(scene, folder, parts, meshes) if check else None
+            _write(scene, target, parts, meshes, found, plots)
 
 
-def _write(scene: Scene, target: Path, parts: dict[int, Part], plots: bool) -> None:
+def _checked(scene: Scene, folder: Path, parts: dict[int, Part], meshes: Meshes) -> Check | None:
+    """Return what the parts do; None, and a warning, where that cannot be simulated."""
+    from dolfinopt.part.check import check_parts
+
+    try:
+        return check_parts(scene, folder, parts, meshes)
+    except ConvergenceError as error:
+        warn([f"the machine with the parts cannot be compared: {error}"])
+        return None
+
+
+def _write(
+    scene: Scene,
+    target: Path,
+    parts: dict[int, Part],
+    meshes: Meshes,
+    check: Check | None,
+    plots: bool,
+) -> None:
     """Write the files and say what was made (root only)."""
     from dolfinopt.output.folders import prepare_folder
     from dolfinopt.part.files import write_parts
 
-    def picture(path: Path) -> None:
+    def pictures(folder: Path) -> None:
+        from dolfinopt.plots.part_check import draw_check
         from dolfinopt.plots.parts import draw_parts
 
-        draw_parts(path, [parts[k] for k in sorted(parts)], scene.name)
+        draw_parts(folder / "part.png", [parts[k] for k in sorted(parts)], scene.name)
+        if check is not None:
+            draw_check(folder, check, scene)
 
     prepare_folder(target)
-    figures = write_parts(target, scene, parts, picture if plots else None)
-    warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
+    drawn = pictures if plots else None
+    figures = write_parts(target, scene, parts, meshes.fine, check, drawn)
     for name, row in figures["arms"].items():
         points = f" with {row['control_points']} control points" if row["control_points"] else ""
         click.echo(
@@ -92,4 +127,27 @@ def _write(scene: Scene, target: Path, parts: dict[int, Part], plots: bool) -> N
     for arm, owner in zip(scene.arms, scene.owners, strict=True):
         if owner is None:
             click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
+    if check is not None:
+        _tell(check)
     click.echo(f"{elapsed():.1f} s; files in {target}, the machine with these parts in part.toml")
+
+
+def _tell(check: Check) -> None:
+    """Print the table of a check and what it says."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("", "density", "crisp", "part", "unit", "part/crisp"):
+        table.add_column(name, justify="left" if name in ("", "unit") else "right")
+    for name, row in check.table().iterrows():
+        values = [f"{row[form]:.4g}" for form in ("density", "crisp", "part")]
+        ratio = f"{100.0 * row['part/crisp']:+.2f} %"
+        cells = [str(name).replace("_", " "), *values, row["unit"], ratio]
+        table.add_row(*("-" if "nan" in cell else cell for cell in cells))
+    Console(highlight=False, width=None if sys.stdout.isatty() else 100).print(table)
+    for line in (check.loss, *check.notes):
+        click.echo(line)
+    for limit in check.part.limits:
+        click.echo(f"limit {'met' if limit.met else 'missed'}: {limit.sentence}")
+    warn(check.warnings)

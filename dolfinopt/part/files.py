@@ -6,23 +6,29 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from dolfinopt.disk import write_atomically, write_text, writing
 from dolfinopt.output.folders import remove_stale
+from dolfinopt.part.body_mesh import BodyMesh
 from dolfinopt.part.drawings import dxf_text, r12_text, svg_text
+from dolfinopt.part.mesh import write_meshes
 from dolfinopt.part.part import Part
 from dolfinopt.part.scene_file import scene_text
 from dolfinopt.part.solid import stl_bytes
 from dolfinopt.part.step import face_text, solid_text
 from dolfinopt.scene.load import Scene
 
-FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl")
+if TYPE_CHECKING:
+    from dolfinopt.part.check import Check
+
+FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
 STAGE = ".part-"  # folder of files about to be renamed
-SCENE, FIGURES, PICTURE = "part.toml", "part.json", "part.png"
+SCENE, FIGURES = "part.toml", "part.json"
+PICTURES = ("part.png", "deviation.png", "stress.png")
 
 
 def file_names(scene: Scene) -> list[str]:
@@ -30,10 +36,12 @@ def file_names(scene: Scene) -> list[str]:
     arms = [
         arm.name for arm, owner in zip(scene.arms, scene.owners, strict=True) if owner is not None
     ]
-    return [FIGURES, SCENE, PICTURE, *(f"{arm}{kind}" for arm in arms for kind in FORMATS)]
+    return [FIGURES, SCENE, *PICTURES, *(f"{arm}{kind}" for arm in arms for kind in FORMATS)]
 
 
-def figures_of(scene: Scene, parts: Mapping[int, Part]) -> dict[str, Any]:
+def figures_of(
+    scene: Scene, parts: Mapping[int, Part], check: Check | None = None
+) -> dict[str, Any]:
     """Return the content of part.json."""
     arms = {
         arm.name: parts[owner].figures(scene.material_of(owner).density)
@@ -45,14 +53,17 @@ def figures_of(scene: Scene, parts: Mapping[int, Part]) -> dict[str, Any]:
         "tolerance": "m", "tool_radius": "m", "smallest_concave_radius": "m",
         "thinnest_member": "m",
     }  # fmt: skip
-    return {"name": scene.name, "arms": arms, "units": units}
+    checked = {} if check is None else check.to_dict()
+    return {"name": scene.name, "arms": arms, "units": units, **checked}
 
 
 def write_parts(
     folder: Path,
     scene: Scene,
     parts: Mapping[int, Part],
-    picture: Any = None,
+    meshes: Mapping[int, BodyMesh],
+    check: Check | None = None,
+    pictures: Callable[[Path], None] | None = None,
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
 
@@ -63,7 +74,9 @@ def write_parts(
         folder: exists.
         scene: of the arms.
         parts: by their place in the chain.
-        picture: called with the path of part.png, if any.
+        meshes: that the scene of the parts has, likewise.
+        check: what the parts do, if it is known.
+        pictures: draws `PICTURES` into a folder.
 
     Raises:
         OutputError: the disk is full, for instance.
@@ -73,9 +86,11 @@ def write_parts(
         _write_drawings(made, scene, parts)
         _write_steps(made, scene, parts)
         write_text(made / SCENE, scene_text(scene, parts, folder))
-        if picture is not None:
-            picture(made / PICTURE)
-        figures = figures_of(scene, parts)
+        owned = zip(scene.arms, scene.owners, strict=True)
+        write_meshes(made, {arm.name: meshes[k] for arm, k in owned if k is not None})
+        if pictures is not None:
+            pictures(made)
+        figures = figures_of(scene, parts, check)
         write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
         _publish(made, folder, file_names(scene))
     return figures

@@ -12,9 +12,6 @@ import numpy as np
 from dolfinopt.part.part import Part
 from dolfinopt.scene.contents import with_relative_paths
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.arms import Arm
-
-ACROSS = 24  # cells in the height, at least
 
 
 def scene_text(scene: Scene, parts: Mapping[int, Part], folder: Path) -> str:
@@ -25,44 +22,53 @@ def scene_text(scene: Scene, parts: Mapping[int, Part], folder: Path) -> str:
         parts: by their place in the chain.
         folder: where the scene and the parts' files will lie.
     """
-    data = with_relative_paths(scene.to_tree(), folder)
+    head = (
+        "# The arms as parts, meshed along their curves: simulate and study them like any scene.\n"
+        f"# Made of the design of {scene.name}.\n"
+    )
+    return head + toml_text(with_relative_paths(scene_data(scene, parts, folder), folder))
+
+
+def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[str, Any]:
+    """Return the data of `scene_text` with absolute paths.
+
+    Args:
+        scene, parts: as there.
+        meshes: folder of the meshes, NAME.msh.
+    """
+    data = scene.to_tree()
     data["name"] = f"{scene.name}: part"
     for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
         if owner is not None:
-            row.update(_arm(scene.arms[owner].name if arm.design else arm.name, parts[owner]))
+            name = scene.arms[owner].name if arm.design else arm.name
+            row.update(_arm(parts[owner], meshes.absolute() / f"{name}.msh"))
     data["design"].update(
         volume_fraction=1.0,
         shared_volume=False,
         initial=1.0,
+        filter_radius=0.0,
         projection=False,
         minimum_member=0.0,
         minimum_gap=0.0,
     )
-    head = (
-        "# The arms as parts, see their .step files: simulate and study them like any scene.\n"
-        f"# Made of the design of {scene.name}.\n"
-    )
-    return head + toml_text(data)
+    return data
 
 
-def _arm(name: str, part: Part) -> dict[str, Any]:
-    """Return the keys of an arm that is meshed from the face of its part."""
+def _arm(part: Part, mesh: Path) -> dict[str, Any]:
+    """Return the keys of an arm that is a part."""
     corners = np.vstack(part.shape.polygons(part.tolerance))
-    height = float(np.ptp(corners[:, 1]))
-    row: dict[str, Any] = {
-        "mesh": f"{name}_face.step",
-        "mesh_size": min(part.domain.cell, height / ACROSS),
-        "cell_shape": "triangle",
-        "height": height,
+    return {
+        "mesh": str(mesh),
+        "element": "quadratic",
+        "height": float(np.ptp(corners[:, 1])),
+        "mesh_size": None,
+        "cell_shape": None,
         "cells": None,
         "passive": None,
         "pattern": None,
         "regions": None,
         "symmetric": False,  # which its mesh is not to the last cell
     }
-    if "element" in Arm.model_fields:
-        row["element"] = "quadratic"
-    return row
 
 
 def toml_text(data: Mapping[str, Any]) -> str:

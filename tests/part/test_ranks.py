@@ -45,7 +45,7 @@ def test_two_ranks_write_the_same_bytes(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("arm1: ") == done.stdout.count("arm2: ") == 1
     here, there = (contents(tmp_path / name) for name in ("one", "two"))
-    assert here.keys() == there.keys() and len(here) == 14
+    assert here.keys() == there.keys() and len(here) == 16
     assert [name for name in here if here[name] != there[name]] == []
 
 

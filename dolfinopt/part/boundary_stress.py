@@ -1,0 +1,152 @@
+"""Stress of parts where it is largest, on their curved outline.
+
+In quadratic triangles stress is linear. At a node of the outline it is the mean of the triangles
+beside the outline that share the node, weighted by their areas: of second order, where the stress
+at centres is of first order. Where a rigid interface ends at a free edge, and at re-entrant
+corners, stress has no limit: it grows with every refinement, and what is found there says nothing.
+Source: Williams (1952), doi:10.1115/1.4010553.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.sparse as sp
+from mpi4py import MPI
+
+from dolfinopt.fem.stress import stress_operator
+from dolfinopt.mesh import compat
+from dolfinopt.part.body_mesh import CORNER
+from dolfinopt.part.curves import direction
+from dolfinopt.part.shape import Shape
+from dolfinopt.responses.screening import every, maxima, screen
+from dolfinopt.responses.stress_loads import arm_loads, motions_of
+from dolfinopt.responses.stress_report import ArmStress, Peak
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.simulation import Trajectory
+
+VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
+# Of a singular point, in cells of the design: the centre of the design's cell in such a corner,
+# where its stress is known, is as far away.
+APART = np.sqrt(0.5)
+SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
+
+
+@dataclass(frozen=True, eq=False)
+class PartStress:
+    """Von Mises stress of one arm of the chain along the motion, at the corners of its triangles.
+
+    Attributes:
+        peak: the largest further than `APART` cells from every singular point.
+        everywhere: the largest of all, singular points included.
+        cells: for pictures: the largest at any corner of every triangle, and when; at singular
+            points at most `SHOWN` times `peak`.
+    """
+
+    peak: Peak
+    everywhere: Peak
+    cells: ArmStress
+
+
+def singular_points(shape: Shape) -> np.ndarray:
+    """Return re-entrant corners, and where interfaces end (n, 2), m."""
+    found = []
+    for loop in shape.loops:
+        for before, after in zip([loop[-1], *loop[:-1]], loop):
+            a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
+            turn = np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)
+            if turn < -CORNER or before.label != after.label:
+                found.append(after.curve.start)
+    return np.array(found).reshape(-1, 2)
+
+
+def part_stress(
+    arms: Mapping[int, Arm],
+    trajectory: Trajectory,
+    singular: Mapping[int, np.ndarray],
+    apart: Mapping[int, float],
+) -> dict[int, PartStress]:
+    """Return the stress of every part by its place in the chain, on this rank alone.
+
+    Args:
+        arms: meshed in quadratic triangles, of solid material, reduced.
+        trajectory: of these arms; of scenarios the worst counts.
+        singular: points (n, 2) of every arm, m.
+        apart: distance from them that is looked at, m.
+    """
+    scene = next(iter(arms.values())).scene
+    motions = motions_of(trajectory)
+    found: dict[int, PartStress] = {}
+    for k, loads in arm_loads(scene, motions).items():
+        points = _Points(*_at_corners(arms[k]))
+        away = np.ones(len(points.places), dtype=bool)
+        if len(singular[k]):
+            gaps = np.linalg.norm(points.places[:, None] - singular[k], axis=2)
+            away = gaps.min(axis=1) >= apart[k]
+        for one in loads:
+            a, t = one.coefficients, motions[one.motion].t
+            best = points.peak(a, t, np.flatnonzero(away))
+            known = found.get(one.place)
+            if known is not None and known.peak.value >= best.value:
+                continue
+            whole = points.peak(a, t, np.arange(len(away)))
+            found[one.place] = PartStress(best, whole, points.by_cell(a, t, away, best, whole))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Corners of triangles, and their stress by load coefficients.
+
+    Attributes:
+        A: (3, n, m) components of `fem.stress.VON_MISES`, Pa.
+        places: (n, 2) m.
+        corners: (n_cells, 3) of the n.
+    """
+
+    A: np.ndarray
+    places: np.ndarray
+    corners: np.ndarray
+
+    def peak(self, a: np.ndarray, t: np.ndarray, chosen: np.ndarray) -> Peak:
+        """Return the largest stress of the chosen points."""
+        largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
+        x, y = self.places[chosen][largest.point]
+        return Peak(largest.largest, (float(x), float(y)), float(t[largest.instant]))
+
+    def by_cell(
+        self, a: np.ndarray, t: np.ndarray, away: np.ndarray, best: Peak, whole: Peak
+    ) -> ArmStress:
+        """Return the largest stress of every triangle, see `PartStress.cells`."""
+        at, when = maxima(MPI.COMM_SELF, self.A, a)
+        # What has no limit would be all that the colours show.
+        at[~away] = np.minimum(at[~away], SHOWN * best.value)
+        worst = at[self.corners].argmax(axis=1)
+        node = self.corners[np.arange(len(worst)), worst]
+        return ArmStress(best, whole, at[node], t[when[node]])
+
+
+def _at_corners(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `_Points` holds of an arm."""
+    state, mesh = arm.current, arm.mesh
+    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
+    operator = stress_operator(mesh, state.elastic.operators, VERTICES)
+    A = state.load_fields.stress(state.solid.young_modulus * operator)
+    points = mesh.mesh.geometry.x[:, :2]
+    columns = np.arange(corners.size)
+    # Of a node of the outline the triangles beside the outline count: others know less of it.
+    ends = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [len(points), 1]
+    _, which, count = np.unique(ends, return_inverse=True, return_counts=True)
+    rim = (count == 1)[which.ravel()].reshape(-1, 3)
+    outer = np.zeros(len(points), dtype=bool)
+    outer[corners[rim]] = outer[np.roll(corners, -1, axis=1)[rim]] = True
+    counts = rim.any(axis=1)[:, None] | ~outer[corners]
+    area = (mesh.area[:, None] * counts).ravel()
+    share = area / np.bincount(corners.ravel(), area, len(points))[corners.ravel()]
+    mean = sp.csr_matrix((share, (corners.ravel(), columns)), (len(points), corners.size))
+    return np.stack([mean @ one for one in A]), points, corners

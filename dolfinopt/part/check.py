@@ -1,0 +1,264 @@
+"""What parts do in the moving machine, beside the densities that they were made of.
+
+The same scene is simulated with three forms of the arms: the physical densities; the crisp design,
+cut at the density that keeps the volume, on the design's own cells; and the part, solid, on a mesh
+along its curves. A second, coarser mesh of the part tells how far its figures depend on the mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.output.views import ArmView, gather_views
+from dolfinopt.part.boundary_stress import singular_points
+from dolfinopt.part.forms import (
+    STRESS,
+    Column,
+    design_columns,
+    largest_of,
+    part_column,
+    simulate_bodies,
+    units_of,
+)
+from dolfinopt.part.mesh import Meshes
+from dolfinopt.part.part import Part
+from dolfinopt.responses.stress_report import Peak
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+# Change by the last refinement up to which a figure counts as converged, also that of stress: a
+# method of second order leaves a third of it.
+SETTLED, SETTLED_STRESS = 5e-3, 0.1
+DENSITY, CRISP, PART = "density", "crisp", "part"
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """The machine with the densities, the crisp design and the parts.
+
+    Attributes:
+        units: of the table's rows.
+        density, crisp, part: the forms; None of a crisp design that falls apart.
+        coarse: the part on a mesh with sides twice as long.
+        views: the parts' arms with their stress, for pictures.
+        cells: triangles of the parts by the name of the arm.
+        singular: where stress has no limit on the parts and is larger than the one reported.
+    """
+
+    units: Mapping[str, str]
+    density: Column
+    crisp: Column | None
+    part: Column
+    coarse: Column
+    views: list[ArmView]
+    cells: Mapping[str, int]
+    singular: Peak | None
+    singular_arm: str
+
+    @property
+    def columns(self) -> dict[str, Column]:
+        """The forms by their names."""
+        found = {DENSITY: self.density, CRISP: self.crisp, PART: self.part}
+        return {name: one for name, one in found.items() if one is not None}
+
+    def table(self) -> DataFrame:
+        """Return a row a figure: unit, density, crisp and part, and the part less the crisp one.
+
+        Columns "unit", "density", "crisp", "part", and relative to the first two "part/density",
+        "part/crisp", each less 1.
+        """
+        from pandas import DataFrame, Index
+
+        rows = []
+        for name, unit in self.units.items():
+            values = [
+                float("nan") if one is None else one.values[name]
+                for one in (self.density, self.crisp, self.part)
+            ]
+            ratios = [_ratio(values[2], other) - 1.0 for other in values[:2]]
+            rows.append([unit, *values, *ratios])
+        names = ["unit", DENSITY, CRISP, PART, "part/density", "part/crisp"]
+        return DataFrame(rows, columns=names, index=Index(self.units, name="figure"))
+
+    @cached_property
+    def refinement(self) -> dict[str, float]:
+        """Relative change of every figure of the part by the last refinement of its mesh."""
+        return {
+            name: _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
+            for name in self.units
+        }
+
+    @property
+    def converged(self) -> bool:
+        """Whether compliance and deviation do not depend on the mesh."""
+        return all(abs(self.refinement[name]) <= SETTLED for name in self._judged)
+
+    @property
+    def _judged(self) -> list[str]:
+        """The figures that tell what a part loses: a pinned end has no deviation."""
+        return [name for name in ("compliance", "deviation") if name in self.units]
+
+    @property
+    def stress_converged(self) -> bool:
+        """Whether the part's largest stress does not depend on the mesh."""
+        return abs(self.refinement[STRESS]) <= SETTLED_STRESS
+
+    @property
+    def loss(self) -> str:
+        """What making parts of the densities costs, in one line."""
+        words = [self._against(self.density, "the densities")]
+        if self.crisp is not None:
+            words.append(self._against(self.crisp, "the crisp design"))
+        return "; ".join(words)
+
+    def _against(self, other: Column, name: str) -> str:
+        change = {
+            key: 100.0 * (_ratio(self.part.values[key], other.values[key]) - 1.0)
+            for key in (*self._judged, "mass")
+        }
+        # Twice the strain energy under the loads of the motion: what is stiffer has less.
+        size = abs(change["compliance"])
+        stiff = "as stiff as" if size < 0.05 else f"{size:.2g} % {_word(change)} than"
+        others = ", ".join(f"{k} {_percent(v)}" for k, v in change.items() if k != "compliance")
+        return f"the part is {stiff} {name} ({others})"
+
+    @property
+    def notes(self) -> list[str]:
+        """What is said of the mesh and of stress, a sentence each."""
+        change = ", ".join(
+            f"{name} by {_percent(100.0 * self.refinement[name])}"
+            for name in (*self._judged, STRESS)
+        )
+        found = [f"mesh: the last refinement changed {change}"]
+        if self.part.stress is not None:
+            found.append(
+                f"largest stress of the part: {_told(self.part.stress, self.part.stressed)}"
+            )
+        return found
+
+    @property
+    def warnings(self) -> list[str]:
+        """What makes the figures doubtful, a sentence each."""
+        found = []
+        if not self.converged:
+            found.append(
+                f"the part's {' or '.join(self._judged)} still depends on the mesh: "
+                f"{self.notes[0].removeprefix('mesh: ')}"
+            )
+        if not self.stress_converged:
+            found.append(
+                "the part's largest stress is not converged: the last refinement changed it by "
+                f"{_percent(100.0 * self.refinement[STRESS])}"
+            )
+        if self.singular is not None:
+            found.append(
+                f"stress of the part has no limit at {_told(self.singular, self.singular_arm)}: "
+                "at a re-entrant corner or the end of a rigid interface it grows with every "
+                "refinement; give it a radius, or judge it by the load of the joint"
+            )
+        if self.crisp is None:
+            found.append(
+                "the design cut at the density that keeps the volume falls apart: it cannot be "
+                "compared with the part"
+            )
+        found += [
+            f"the part misses a limit: {one.sentence}" for one in self.part.limits if not one.met
+        ]
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entries of part.json."""
+        table = {
+            name: {"unit": unit} | {form: one.values[name] for form, one in self.columns.items()}
+            for name, unit in self.units.items()
+        }
+        places = {
+            form: one.stress.to_dict(one.stressed)
+            for form, one in self.columns.items()
+            if one.stress is not None
+        }
+        limits = {
+            limit.name: limit.to_dict() | {"excess": limit.excess} for limit in self.part.limits
+        }
+        singular = None if self.singular is None else self.singular.to_dict(self.singular_arm)
+        found = {
+            "table": table,
+            "check": {
+                "loss": self.loss,
+                "triangles": dict(self.cells),
+                "refinement": self.refinement,
+                "converged": self.converged,
+                "stress": places,
+                "stress_converged": self.stress_converged,
+                "singular": singular,
+                "limits": limits,
+                "warnings": self.warnings,
+            },
+        }
+        return dict(_finite(found))
+
+
+def _finite(value: Any) -> Any:
+    """Return JSON data without numbers that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _word(change: Mapping[str, float]) -> str:
+    return "stiffer" if change["compliance"] < 0.0 else "softer"
+
+
+def _ratio(value: float, other: float) -> float:
+    return value / other if other else float("nan")
+
+
+def _percent(value: float) -> str:
+    return f"{value:+.1f} %" if abs(value) < 9.95 else f"{value:+.0f} %"
+
+
+def _told(peak: Peak, arm: str) -> str:
+    x, y = peak.place
+    return f"{1e-6 * peak.value:.4g} MPa in {arm} at ({x:.4g}, {y:.4g}) m and {peak.instant:.3f} s"
+
+
+def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: Meshes) -> Check:
+    """Simulate the densities of a run, the crisp design and the parts, on this rank alone.
+
+    Args:
+        scene: of the run.
+        folder: with its design.npz.
+        parts: by their place in the chain.
+        meshes: what `mesh_parts` returned of them.
+
+    Raises:
+        ConvergenceError: the motion of the densities or of the parts cannot be simulated.
+    """
+    density, crisp = design_columns(scene, folder)
+    singular = {k: singular_points(one.shape) for k, one in parts.items()}
+    coarse = simulate_bodies(scene, parts, meshes.coarse)
+    coarse_column, _ = part_column(scene, coarse, parts, singular)
+    fine = simulate_bodies(scene, parts, meshes.fine)
+    column, stress = part_column(scene, fine, parts, singular)
+    cells = {place: one.cells for place, one in stress.items()}
+    worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
+    grows = column.stress is not None and worst is not None and worst.value > column.stress.value
+    return Check(
+        units=units_of(scene, column),
+        density=density,
+        crisp=crisp,
+        part=column,
+        coarse=coarse_column,
+        views=gather_views(fine.scene, fine.partition, fine.arms, fine.x_phys, cells),
+        cells={scene.arms[k].name: fine.arms[k].mesh.num_cells for k in parts},
+        singular=worst if grows else None,
+        singular_arm=at,
+    )

@@ -1,0 +1,114 @@
+"""Parts in the moving machine, beside the densities that they were made of."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import folder_with, frame
+from runs import run
+
+import dolfinopt as do
+from dolfinopt.cli.shared import scene_of
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.part import check as checks
+from dolfinopt.part.check import check_parts
+from dolfinopt.part.forms import crisp
+from dolfinopt.part.mesh import mesh_parts
+from dolfinopt.part.part import make_parts
+
+pytestmark = pytest.mark.serial
+
+SMALL = ("arms.cells=[100,6]", "simulation.sample=0.005", "constraints.stress=13e6")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of a run with its parts, and their check."""
+    folder = folder_with(tmp_path_factory.mktemp("check") / "run", frame, *SMALL)
+    scene = scene_of(folder)
+    parts = make_parts(scene, folder)
+    return folder, parts, check_parts(scene, folder, parts, mesh_parts(parts))
+
+
+def test_table_has_the_figures_of_all_forms(made):
+    table = made[2].table()
+    assert list(table.columns[:4]) == ["unit", "density", "crisp", "part"]
+    assert {"mass", "first_frequency_arm1", "compliance", "deviation", "settling", "stress",
+            "drive_peak_cart", "drive_peak_arm1"} <= set(table.index)  # fmt: skip
+    assert table.loc["compliance", "unit"] == "N m" and table.loc["stress", "unit"] == "Pa"
+    # The design is crisp already.
+    assert table["crisp"].to_numpy() == pytest.approx(table["density"].to_numpy(), rel=1e-6)
+    assert table.loc["mass", "part"] == pytest.approx(table.loc["mass", "density"], rel=5e-4)
+    for name in ("compliance", "deviation", "first_frequency_arm1"):
+        assert table.loc[name, "part"] == pytest.approx(table.loc[name, "density"], rel=0.03)
+
+
+def test_part_is_converged_and_says_what_it_loses(made):
+    check = made[2]
+    assert check.converged
+    assert 0.0 < abs(check.refinement["compliance"]) < 5e-3
+    assert abs(check.refinement["stress"]) < 0.15
+    change = 100.0 * (check.part.values["compliance"] / check.density.values["compliance"] - 1.0)
+    assert f"{abs(change):.2g} % {'stiffer' if change < 0 else 'softer'}" in check.loss
+    assert "deviation" in check.loss and len(check.loss.splitlines()) == 1
+
+
+def test_limits_are_those_of_the_outline(made):
+    check = made[2]
+    (limit,) = check.part.limits
+    assert limit.quantity == "stress" and limit.value == check.part.values["stress"]
+    assert not limit.met
+    assert any("misses a limit: stress" in text for text in check.warnings)
+    x, y = check.part.stress.place
+    assert 0.0 < x < 1.0 and abs(y) <= 0.03 + 1e-6
+
+
+def test_command_prints_and_keeps_the_table(made, capsys, tmp_path):
+    folder, _, check = made
+    run("part", folder, "--out", tmp_path / "part")
+    printed = capsys.readouterr().out
+    assert check.loss in printed and "first frequency arm1" in printed
+    assert "limit missed: stress" in printed
+    found = json.loads((tmp_path / "part" / "part.json").read_text())
+    values = {name: row["part"] for name, row in found["table"].items()}
+    assert values == pytest.approx(check.part.values, rel=1e-6)
+    assert found["check"]["loss"] == check.loss and found["check"]["converged"]
+    assert not found["check"]["limits"]["stress"]["met"]
+    for name in ("part.png", "deviation.png", "stress.png"):
+        assert (tmp_path / "part" / name).stat().st_size > 5000
+    # The scene of the parts is the machine of the table.
+    out = tmp_path / "out"
+    run("simulate", tmp_path / "part" / "part.toml", "--no-plots", "--out", out)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["compliance"] == pytest.approx(check.part.values["compliance"], rel=1e-6)
+    assert summary["max_deviation"] == pytest.approx(check.part.values["deviation"], rel=1e-6)
+
+
+def test_part_that_cannot_be_simulated_has_files_all_the_same(made, monkeypatch, capsys, tmp_path):
+    def fail(*_, **__):
+        raise ConvergenceError("too weak")
+
+    monkeypatch.setattr(checks, "simulate_bodies", fail)
+    run("part", made[0], "--out", tmp_path / "part", "--no-plots")
+    assert "the machine with the parts cannot be compared: too weak" in capsys.readouterr().err
+    found = json.loads((tmp_path / "part" / "part.json").read_text())
+    assert "table" not in found and (tmp_path / "part" / "arm1.step").exists()
+
+
+def test_crisp_design_keeps_the_volume():
+    x, area = np.array([0.0, 0.2, 0.55, 0.7, 1.0]), np.array([1.0, 1.0, 1.0, 1.0, 0.5])
+    cut = crisp(x, area)
+    assert cut.tolist() == [0.0, 0.0, 0.0, 1.0, 1.0]  # 1.5 of 1.95 m2, nearer than 2.5
+    assert crisp(np.array([1.0, 1.0]), np.ones(2)).tolist() == [1.0, 1.0]
+    same = crisp(np.array([0.5, 0.5, 1.0]), np.ones(3))
+    assert same.tolist() in ([0.0, 0.0, 1.0], [1.0, 1.0, 1.0])
+
+
+def test_scene_of_parts_has_solid_arms(made, tmp_path):
+    run("part", made[0], "--out", tmp_path / "part", "--no-plots", "--no-check")
+    scene = do.load_scene(tmp_path / "part" / "part.toml")
+    assert scene.arms[0].mesh == str(tmp_path / "part" / "arm1.msh")
+    assert scene.arms[0].element == "quadratic" and scene.design.radius == 0.0
+    assert "table" not in json.loads((tmp_path / "part" / "part.json").read_text())

@@ -1,0 +1,134 @@
+"""Meshes along the curves of parts, and the stress on their outline."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import scene
+
+from dolfinopt.arms.arm import Arm
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.part.body_mesh import triangle_areas
+from dolfinopt.part.boundary_stress import _at_corners, singular_points
+from dolfinopt.part.curves import Arc, Line, Spline
+from dolfinopt.part.mesh import body_mesh, write_mesh
+from dolfinopt.part.shape import Piece, Shape
+from dolfinopt.profiling import Profile
+
+pytestmark = pytest.mark.serial
+
+LENGTH, HEIGHT, RADIUS = 0.3, 0.06, 0.015
+
+
+def strip(radius=RADIUS):
+    """A rectangle with a round hole in its middle."""
+    corners = np.array([[0, -1], [2, -1], [2, 1], [0, 1]]) * [0.5 * LENGTH, 0.5 * HEIGHT]
+    labels = ("", "outboard", "", "inboard")
+    ends = zip(corners, np.roll(corners, -1, axis=0), labels, strict=True)
+    outer = tuple(Piece(Line(a, b), label) for a, b, label in ends)
+    hole = Arc(np.array([0.5 * LENGTH, 0.0]), radius, 0.0, -2.0 * np.pi)
+    return Shape((outer, (Piece(hole),)))
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        coarse = body_mesh(gmsh, strip(), 0.005)
+    return coarse, coarse.refined()
+
+
+def test_area_is_that_of_the_curves(meshes):
+    exact = LENGTH * HEIGHT - np.pi * RADIUS**2
+    assert strip().area == pytest.approx(exact, rel=1e-12)
+    for mesh, off in zip(meshes, (5e-4, 3e-5), strict=True):  # of fourth order in the sides
+        assert mesh.area == pytest.approx(exact, rel=off)
+        assert triangle_areas(mesh.points, mesh.triangles).min() > 0.0
+
+
+def test_sides_close_the_outline(meshes):
+    for mesh in meshes:
+        assert (np.sort(mesh.sides[:, 0]) == np.sort(mesh.sides[:, 1])).all()
+        ends = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        keys, count = np.unique(ends, axis=0, return_counts=True)
+        alone = {tuple(pair) for pair in keys[count == 1]}
+        assert alone == {tuple(sorted(pair)) for pair in mesh.sides.tolist()}
+        inboard = mesh.points[mesh.sides[mesh.labelled("inboard")]]
+        assert np.abs(inboard[..., 0]).max() == 0.0
+        assert np.ptp(inboard[..., 1]) == pytest.approx(HEIGHT)
+    assert len(meshes[1].triangles) == 4 * len(meshes[0].triangles)
+
+
+def test_sides_are_short_where_the_outline_bends_and_members_are_thin(meshes):
+    mesh = meshes[0]
+    length = np.linalg.norm(np.diff(mesh.points[mesh.sides], axis=1)[:, 0], axis=1)
+    hole = mesh.piece == 4
+    assert length[hole].max() < 0.9 * RADIUS
+    near = np.abs(mesh.points[mesh.sides[:, 0], 0] - 0.5 * LENGTH) < 0.5 * RADIUS
+    assert length[near & ~hole].max() < length[~near & ~hole].max()
+
+
+def test_mesh_follows_curves_that_move():
+    points = np.array([[0, -0.01], [0.1, -0.01], [0.1, 0.01], [0, 0.01]])
+    knots = np.array([0, 0, 0, 0, 1, 1, 1, 1.0])
+
+    def bar(sag):
+        bottom = Spline(knots, np.array([[0, -0.01], [0.03, -sag], [0.07, -sag], [0.1, -0.01]]))
+        return Shape(
+            (
+                (
+                    Piece(bottom, free=True),
+                    Piece(Line(points[1], points[2]), "outboard"),
+                    Piece(Line(points[2], points[3])),
+                    Piece(Line(points[3], points[0]), "inboard"),
+                ),
+            )
+        )
+
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        mesh = body_mesh(gmsh, bar(0.01), 0.004)
+    moved = mesh.morphed(bar(0.012))
+    assert moved.area == pytest.approx(bar(0.012).area, rel=1e-4)
+    assert triangle_areas(moved.points, moved.triangles).min() > 0.0
+    inner = np.setdiff1d(np.arange(len(mesh.points)), mesh.sides)
+    step = np.linalg.norm((moved.points - mesh.points), axis=1)
+    assert 0.0 < step[inner].max() < step[mesh.sides].max()
+
+
+def test_corners_and_ends_of_interfaces_are_singular():
+    assert len(singular_points(strip())) == 4
+    hole = [[0.1, 0.01], [0.12, 0.01], [0.12, -0.01], [0.1, -0.01]]  # clockwise
+    ends = zip(np.array(hole), np.roll(hole, -1, axis=0), strict=True)
+    square = tuple(Piece(Line(a, b)) for a, b in ends)
+    found = singular_points(Shape((*strip().loops[:1], square)))
+    assert len(found) == 8
+
+
+def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
+    """Strip with a hole of half its width in tension: Howland (1930), doi:10.1098/rsta.1930.0002.
+
+    2.16 times the stress of the net section.
+    """
+    found = []
+    for k, mesh in enumerate(meshes):
+        with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+            write_mesh(gmsh, tmp_path / f"{k}.msh", mesh)
+        one = scene(
+            "arms.1.rigid=true",
+            f"arms.0.mesh={tmp_path / f'{k}.msh'}",
+            "arms.0.element=quadratic",
+            f"arms.0.length={LENGTH}",
+            "design.filter_radius=0.0",
+        )
+        arm = Arm(one, 0, MPI.COMM_SELF, Profile())
+        assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=5e-4)
+        arm.set_design(np.ones(arm.mesh.num_cells))
+        A, places, _ = _at_corners(arm)
+        q = arm.current.load_fields.V.shape[2]
+        at_hole = np.linalg.norm(places - [0.5 * LENGTH, 0.0], axis=1) < 1.1 * RADIUS
+        stress = np.linalg.norm(A[:, :, q + 4], axis=0)  # of a unit force along the arm
+        nominal = 1.0 / ((HEIGHT - 2.0 * RADIUS) * one.arms[0].thickness)
+        found.append(stress[at_hole].max() / nominal)
+    coarse, fine = found
+    assert fine == pytest.approx(2.16, rel=0.025)
+    assert abs(fine - 2.16) < abs(coarse - 2.16)
