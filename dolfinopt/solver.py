@@ -18,6 +18,7 @@ NESTED_ROWS = 30_000
 # LAPACK factorises wider bands block by block, which is faster in the lower triangle; narrower ones
 # entry by entry, faster in the upper triangle. Solutions with the upper one take 60 to 80 %.
 UNBLOCKED = 64
+ROUNDING = 1e-14  # relative residual beyond which conjugate gradients find nothing more
 
 
 class Factor(Protocol):
@@ -155,6 +156,28 @@ def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str) -> PETSc.KSP:
         pc.setFactorOrdering(ordering if mat.getSize()[0] < NESTED_ROWS else "nd")
     else:
         pc.setFactorSolverType("mumps")
+    with obeying_options(prefix):
+        ksp.setFromOptions()
+    return ksp
+
+
+def conjugate_gradients(mat: PETSc.Mat, prefix: str) -> PETSc.KSP:
+    """Return conjugate gradients to rounding with the diagonal as preconditioner.
+
+    For well-conditioned matrices; the same on any number of ranks. PETSc's error if they do not
+    converge.
+
+    Args:
+        mat: symmetric positive definite, marked so.
+        prefix: of PETSc options that replace these choices.
+    """
+    ksp = PETSc.KSP().create(mat.comm)
+    ksp.setOptionsPrefix(prefix)
+    ksp.setOperators(mat)
+    ksp.setType(PETSc.KSP.Type.CG)
+    ksp.getPC().setType(PETSc.PC.Type.JACOBI)
+    ksp.setTolerances(rtol=ROUNDING, atol=0.0, max_it=10_000)
+    ksp.setErrorIfNotConverged(True)
     with obeying_options(prefix):
         ksp.setFromOptions()
     return ksp

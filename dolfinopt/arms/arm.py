@@ -17,11 +17,11 @@ from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
-from dolfinopt.density.symmetry import AxisSymmetry
+from dolfinopt.density.symmetry import AxisSymmetry, Extrusion
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of
-from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
 from dolfinopt.multibody.standard_input import load_body
@@ -60,6 +60,7 @@ class Arm:
     Attributes:
         mesh: see `ArmMesh`.
         solid: the arm's solid material.
+        averages: over cells whose design is the same, applied before the filter.
         substructure: finite elements whatever the design.
         coordinates: number q of the basis; None until `set_order`, where the scene says "auto".
         stiffening: whether its bodies have geometric stiffness; None until `set_stiffening`.
@@ -75,13 +76,13 @@ class Arm:
         self.solid = scene.material_of(index)
         with profile.phase("mesh"):
             self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
-            self.symmetry = AxisSymmetry(self.mesh) if arm.symmetric else None
+            self.averages = _averages(self.mesh, arm)
         with profile.phase("element operators"):
             try:
                 element = element_of(self.mesh, arm.element)
             except InputError as error:
                 raise InputError(f"{scene.source}: {error}") from None
-            operators = element.operators(self.mesh, arm.thickness, self.solid.poisson_ratio)
+            operators = element.operators(self.mesh, arm.depth, self.solid.poisson_ratio)
             self.substructure = Substructure(self.mesh, operators, profile)
             # A design that is another arm's is filtered there.
             radius = scene.filter_radius(index) if pattern is None else 0.0
@@ -123,12 +124,24 @@ class Arm:
         Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
         what is cut off there has no derivative, and `backward` knows.
         """
+<<<<<<< HEAD
         x_filtered = self.smoothed(x)
+=======
+        x = self.mesh.keep(x)
+        with self.profile.phase("filter"):
+            x_filtered = self.filter.forward(self.averaged(x))
+>>>>>>> c8a0f8d (Solid arms: boxes of hexahedra, elements in space, six interface coordinates)
         clipped = None
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
             clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
         x_phys = self.mesh.keep(np.clip(x_filtered, 0.0, 1.0))
         return PhysicalDesign(x_phys, None, clipped)
+
+    def averaged(self, x: np.ndarray) -> np.ndarray:
+        """Return design variables (n_cells,) with the symmetry and extrusion that the arm keeps."""
+        for average in self.averages:
+            x = average.forward(x)
+        return x
 
     def uniform(self, density: float) -> np.ndarray:
         """Return the physical densities of the same design variable in every cell."""
@@ -182,8 +195,8 @@ class Arm:
             gradient = np.where(design.clipped, 0.0, gradient)
         with self.profile.phase("filter"):
             gradient = self.filter.backward(self._active(gradient))
-            if self.symmetry is not None:
-                gradient = self.symmetry.backward(gradient)
+            for average in reversed(self.averages):
+                gradient = average.backward(gradient)
             return self._active(gradient)
 
     def _active(self, values: np.ndarray) -> np.ndarray:
@@ -362,10 +375,22 @@ class Arm:
         return float(volume / total)
 
     def grayness(self, x_phys: np.ndarray) -> float:
-        """Return 4 mean x (1 - x) over the arm's area: 0 is crisp, 1 all grey; eq. (12)."""
+        """Return 4 mean x (1 - x) over the arm's cells: 0 is crisp, 1 all grey; eq. (12)."""
         parts = np.array([self.mesh.area @ (4.0 * x_phys * (1.0 - x_phys)), self.mesh.area.sum()])
         grey, total = self.mesh.comm.allreduce(parts)
         return float(grey / total)
+
+
+def _averages(mesh: ArmMesh, arm: scenes.Arm) -> list[AxisSymmetry | Extrusion]:
+    """Return the averages that an arm's keys ask for (collective on the arm)."""
+    found: list[AxisSymmetry | Extrusion] = []
+    if arm.symmetric:
+        found.append(AxisSymmetry(mesh))
+    if arm.symmetric_z:
+        found.append(AxisSymmetry(mesh, axis=2))
+    if arm.extruded:
+        found.append(Extrusion(mesh))
+    return found
 
 
 def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> dict[int, Arm]:
@@ -397,7 +422,7 @@ def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, A
     owners = list(scene.cell_counts)
     parts = {}
     for k, arm in arms.items():
-        weight = scene.owners.count(k) * scene.arms[k].thickness
+        weight = scene.owners.count(k) * scene.arms[k].depth
         parts[k] = np.zeros((len(owners), 3))
         cells = np.array([arm.mesh.passive, arm.mesh.void, np.ones(arm.mesh.num_cells)])
         parts[k][owners.index(k)] = weight * cells @ arm.mesh.area

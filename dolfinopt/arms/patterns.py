@@ -85,11 +85,12 @@ def _grid_place(arm: Arm, scene: Scene) -> np.ndarray:
     """Return the place (n_cells,) of a rectangular arm's cells: rows across, from inboard on."""
     one = scene.arms[arm.places[0]]
     assert one.cells is not None
-    along, across = one.cells
-    x, y = arm.mesh.centroid.T
-    column = np.floor(x / one.length * along).astype(int)
-    row = np.floor((y / one.height + 0.5) * across).astype(int)
-    return np.asarray(column * across + row)
+    along, *across = one.cells
+    x, *others = arm.mesh.centroid.T
+    place = np.floor(x / one.length * along).astype(int)
+    for y, size, count in zip(others, (one.height, one.thickness), across, strict=False):
+        place = place * count + np.floor((y / size + 0.5) * count).astype(int)
+    return np.asarray(place)
 
 
 def uniform_design(

@@ -10,7 +10,8 @@ from petsc4py import PETSc
 
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
-from dolfinopt.solver import direct_solver
+from dolfinopt.mesh.cells import facet_areas, facet_corners
+from dolfinopt.solver import conjugate_gradients, direct_solver
 
 # Distance of a facet's midpoint from the foot of the perpendicular through the cell's centroid, in
 # lengths of the facet, up to which a cell counts as a rectangle or an equilateral triangle. Gmsh
@@ -77,14 +78,14 @@ class HelmholtzFilter:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """The sides of owned cells, k = 3 or 4 a cell.
+    """The sides of owned cells, k = 3 or 4 a cell, 4 or 6 in space with areas and volumes.
 
     Attributes:
         facet: (n, k) local numbers.
-        length: (n, k) m.
-        normal: (n, k, 2) outward unit normals.
-        arm: (n, k, 2) from the cell's centroid to the side's midpoint, m.
-        area: (n,) of the cells, m2.
+        length: (n, k) m; the face's area in space, m2.
+        normal: (n, k, d) outward unit normals.
+        arm: (n, k, d) from the cell's centroid to the side's midpoint, m.
+        area: (n,) of the cells, m2; their volume in space, m3.
         open: (n, k) where r dy/dn = -y.
     """
 
@@ -104,6 +105,9 @@ class _Sides:
     @property
     def skew(self) -> np.ndarray:
         """Offset (n, k) of the midpoint from the foot of the perpendicular, in side lengths."""
+        if self.arm.shape[2] == 3:
+            normal = np.einsum("nki,nki->nk", self.normal, self.arm)[..., None] * self.normal
+            return np.linalg.norm(self.arm - normal, axis=2) / np.sqrt(self.length)
         tangential = self.arm[..., 0] * self.normal[..., 1] - self.arm[..., 1] * self.normal[..., 0]
         return np.abs(tangential) / self.length
 
@@ -111,7 +115,10 @@ class _Sides:
 def _sides(mesh: ArmMesh, open_edges: bool) -> _Sides:
     owned, ghosts = compat.local_cell_counts(mesh.mesh)
     facet = compat.cell_facets(mesh.mesh, owned + ghosts)
-    corners = compat.cell_coordinates(mesh.mesh, owned)[:, :, :2]
+    corners = compat.cell_coordinates(mesh.mesh, owned)[:, :, : mesh.dim]
+    if mesh.dim == 3:
+        length, normal, arm = _faces(corners)
+        return _Sides(facet[:owned], length, normal, arm, mesh.area, _open(mesh, facet, open_edges))
     if corners.shape[1] == 3:
         ends, around = [(1, 2), (0, 2), (0, 1)], [0, 1, 2]
     else:  # a tensor product
@@ -123,13 +130,39 @@ def _sides(mesh: ArmMesh, open_edges: bool) -> _Sides:
     arm = 0.5 * (a + b) - centroid[:, None]
     normal = np.stack([along[..., 1], -along[..., 0]], axis=2) / length[..., None]
     normal *= np.where(np.einsum("nki,nki->nk", normal, arm) < 0.0, -1.0, 1.0)[..., None]
-    is_open = np.zeros(facet[:owned].shape, dtype=bool)
-    if open_edges:
-        # Every neighbour of an owned cell is a ghost at least.
-        count = np.bincount(facet.ravel())
-        interfaces = np.concatenate([mesh.inboard_facets, mesh.outboard_facets])
-        is_open = (count[facet[:owned]] == 1) & ~np.isin(facet[:owned], interfaces)
-    return _Sides(facet[:owned], length, normal, arm, area, is_open)
+    return _Sides(facet[:owned], length, normal, arm, area, _open(mesh, facet, open_edges))
+
+
+def _open(mesh: ArmMesh, facet: np.ndarray, open_edges: bool) -> np.ndarray:
+    """Return (n, k) True for the open sides of owned cells, given those of ghosts, too."""
+    owned = facet[: mesh.num_cells]
+    if not open_edges:
+        return np.zeros(owned.shape, dtype=bool)
+    # Every neighbour of an owned cell is a ghost at least.
+    count = np.bincount(facet.ravel())
+    interfaces = np.concatenate([mesh.inboard_facets, mesh.outboard_facets])
+    return (count[owned] == 1) & ~np.isin(owned, interfaces)
+
+
+def _faces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return area (n, k), normals and arms (n, k, 3) of cells in space, see `_Sides`."""
+    centroid = corners.mean(axis=1)
+    vectors, middles = [], []
+    for face in facet_corners(3, corners.shape[1]):
+        around = corners[:, list(face)]
+        vectors.append(facet_areas(around))
+        if len(face) == 3:
+            middles.append(around.mean(axis=1))
+            continue
+        # Two triangles on either side of a diagonal.
+        parts = around[:, [0, 1, 3]], around[:, [0, 2, 3]]
+        weight = [np.linalg.norm(facet_areas(part), axis=1)[:, None] for part in parts]
+        middle = sum(w * part.mean(axis=1) for w, part in zip(weight, parts, strict=True))
+        middles.append(middle / (weight[0] + weight[1]))
+    vector, arm = np.stack(vectors, axis=1), np.stack(middles, axis=1) - centroid[:, None]
+    area = np.linalg.norm(vector, axis=2)
+    outward = np.where(np.einsum("nki,nki->nk", vector, arm) < 0.0, -1.0, 1.0)
+    return area, vector * (outward / area)[..., None], arm
 
 
 def _area_and_centroid(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +186,7 @@ class _TwoPoint:
         self.area = mesh.area
         leak = np.where(sides.open, r * r * sides.length / (sides.distance + r), 0.0).sum(axis=1)
         matrix = _two_point_operator(mesh, r, leak)
-        self._solver = direct_solver(matrix, "rcm", "dolfinopt_filter_")
+        self._solver = _solver(mesh, matrix)
         self._b, self._x = matrix.createVecs()
 
     def forward(self, x: np.ndarray) -> np.ndarray:
@@ -220,12 +253,12 @@ class _Hybrid:
         c = flux / whole[:, None]
         A = W - whole[:, None, None] * c[:, :, None] * c[:, None, :]
         A[:, np.arange(size), np.arange(size)] += np.where(sides.open, r * sides.length, 0.0)
-        facets = mesh.mesh.topology.index_map(1)
+        facets = mesh.mesh.topology.index_map(mesh.dim - 1)
         number = facets.local_to_global(sides.facet.ravel().astype(np.int32))
         number = number.astype(PETSc.IntType).reshape(sides.facet.shape)
         self._C = _matrix(mesh, c[:, None, :], np.arange(mesh.num_cells)[:, None], number)
         self._A = _positive_definite(_matrix(mesh, A, number, number))
-        self._solver = direct_solver(self._A, "rcm", "dolfinopt_filter_")
+        self._solver = _solver(mesh, self._A)
         self._y, self._u = self._C.createVecLeft(), self._C.createVecRight()
         self._b = self._u.duplicate()
 
@@ -253,7 +286,7 @@ def _matrix(mesh: ArmMesh, blocks: np.ndarray, rows: np.ndarray, columns: np.nda
         rows: (n, i) global numbers of facets; or (n, 1) local ones of the cells themselves.
         columns: (n, j) global numbers of facets.
     """
-    facets = mesh.mesh.topology.index_map(1)
+    facets = mesh.mesh.topology.index_map(mesh.dim - 1)
     by_cell = rows.shape[1] == 1
     owned = mesh.num_cells if by_cell else facets.size_local
     first = mesh.comm.exscan(owned) or 0
@@ -276,6 +309,13 @@ def _matrix(mesh: ArmMesh, blocks: np.ndarray, rows: np.ndarray, columns: np.nda
     )
     mat.assemble()
     return mat
+
+
+def _solver(mesh: ArmMesh, matrix: PETSc.Mat) -> PETSc.KSP:
+    """Return a direct solver; in space conjugate gradients, which need some 20 to 50 steps."""
+    if mesh.dim == 3:
+        return conjugate_gradients(matrix, "dolfinopt_filter_")
+    return direct_solver(matrix, "rcm", "dolfinopt_filter_")
 
 
 def _positive_definite(mat: PETSc.Mat) -> PETSc.Mat:

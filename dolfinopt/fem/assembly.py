@@ -63,9 +63,9 @@ def interior_entries(
     """Select the interior entries of a pattern.
 
     Args:
-        pattern: of the matrix over local dofs, or over local nodes when `components` is 2
-            and the matrix acts on both displacement components alike.
-        components: 1 or 2, see `pattern`.
+        pattern: of the matrix over local dofs; or over local nodes, when it acts on so many
+            displacement `components` alike.
+        components: 1, or the number of directions, see `pattern`.
         numbers: (n_local_dofs,) global interior number of each local dof, -1 for others.
     """
     rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))

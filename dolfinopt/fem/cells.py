@@ -1,4 +1,7 @@
-"""Nodal fields on cells, and energies cell by cell: derivatives by the material of each cell."""
+"""Nodal fields on cells, and energies cell by cell: derivatives by the material of each cell.
+
+d is the number of directions.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,13 @@ from dolfinopt.fem.elements import ElementOperators
 
 
 def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
-    """Return the cells' nodal values (n_cells, 2n, k) less their mean, which has no energy.
+    """Return the cells' nodal values (n_cells, dn, k) less their mean, which has no energy.
 
     Rounding is then relative to the differences within a cell, not to its displacement.
 
     Args:
         operators: of the arm.
-        field: (n_nodes, 2, k).
+        field: (n_nodes, d, k).
     """
     num_cells, num_nodes = operators.cells.shape
     flat = field.reshape(len(field), -1)
@@ -28,11 +31,11 @@ def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
     values = np.empty((num_cells, num_nodes, flat.shape[1]))
     for k, corner in enumerate(corners):
         np.subtract(corner, mean, out=values[:, k])
-    return values.reshape(num_cells, 2 * num_nodes, field.shape[2])
+    return values.reshape(num_cells, field.shape[1] * num_nodes, field.shape[2])
 
 
 def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
-    """Return the nodal field (n_nodes, 2, k) of the cells' forces (n_cells, n, 2, k)."""
+    """Return the nodal field (n_nodes, d, k) of the cells' forces (n_cells, n, d, k)."""
     cells, shape = operators.cells, forces.shape[2:]
     corners = sp.csr_matrix(
         (np.ones(cells.size), cells.ravel(), np.arange(cells.size + 1)),
@@ -44,16 +47,16 @@ def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
 def stiffness_products(
     operators: ElementOperators, left: np.ndarray, right: np.ndarray
 ) -> np.ndarray:
-    """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+    """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
     return _products(
         operators.stiffness, cell_values(operators, left), cell_values(operators, right)
     )
 
 
 def mass_products(operators: ElementOperators, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+    """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
     cells = operators.cells
-    shape = (*cells.shape, -1)  # both components and all columns alike
+    shape = (*cells.shape, -1)  # all components and columns alike
     return _products(operators.mass, left[cells].reshape(shape), right[cells].reshape(shape))
 
 

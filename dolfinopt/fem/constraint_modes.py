@@ -26,14 +26,14 @@ POWER_STEPS = 6  # of the estimate; four give two digits
 
 @dataclass(frozen=True, eq=False)
 class ConstraintModes:
-    """One arm under unit displacements (u_x, u_y, theta) of its outboard interface.
+    """One arm under unit displacements of its outboard interface: b of them, 3 or 6 in space.
 
     Attributes:
-        interior: (num_interior, 3) owned interior rows.
-        field: (n_nodes, 2, 3) nodal field.
-        stiffness: (3, 3) S, force and moment at the interface by its displacement.
-        coupling: (num_interior, 3) K_Ib.
-        corner: (3, 3) K_bb.
+        interior: (num_interior, b) owned interior rows.
+        field: (n_nodes, d, b) nodal field.
+        stiffness: (b, b) S, force and moment at the interface by its displacement.
+        coupling: (num_interior, b) K_Ib.
+        corner: (b, b) K_bb.
     """
 
     interior: np.ndarray
@@ -44,7 +44,7 @@ class ConstraintModes:
 
 
 def static_modes(arm: ElasticArm) -> ConstraintModes:
-    """Return Psi = [-K_II^-1 K_Ib; I] and S = Psi' K Psi: three solves with the factor at hand.
+    """Return Psi = [-K_II^-1 K_Ib; I] and S = Psi' K Psi: b solves with the factor at hand.
 
     Collective on the arm's ranks.
 
@@ -69,7 +69,7 @@ def floats(arm: ElasticArm) -> bool:
 def _with_energies(
     arm: ElasticArm, interior: np.ndarray, coupling: np.ndarray, corner: np.ndarray
 ) -> ConstraintModes:
-    field = arm.expand(interior, np.eye(3))
+    field = arm.expand(interior, np.eye(len(corner)))
     return ConstraintModes(interior, field, arm.energy_matrix(field), coupling, corner)
 
 
@@ -88,7 +88,7 @@ def _refined(arm: ElasticArm, modes: ConstraintModes) -> ConstraintModes:
     operators = arm.operators
     values = cell_values(operators, modes.field)
     forces = (operators.stiffness @ values) * arm.young[:, None, None]
-    forces = forces.reshape(*operators.cells.shape, 2, 3)
+    forces = forces.reshape(*operators.cells.shape, *modes.field.shape[1:])
     residual, _ = arm.restrict(sum_at_nodes(operators, forces))
     better = modes.interior - arm.solve(residual)
     refined = _with_energies(arm, better, modes.coupling, modes.corner)
@@ -108,7 +108,7 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
     """
     operators = arm.operators
     diagonal = np.einsum("eii->ei", operators.stiffness) * arm.young[:, None]
-    diagonal = diagonal.reshape(*operators.cells.shape, 2, 1)
+    diagonal = diagonal.reshape(*operators.cells.shape, arm.mesh.dim, 1)
 
     def weighted(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return T' D T u."""
@@ -118,12 +118,13 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
         return arm.restrict(sum_at_nodes(operators, forces))
 
     kept = 1.0 - TRANSLATION
-    x, y = arm.points.T / arm.mesh.outboard_point[0]
+    places = arm.points.T / arm.mesh.outboard_point[0]
     # By place, so that numbers are random and yet the same on any number of ranks.
-    noise = np.sin(np.outer(1e4 * x + 7e4 * y + 1.0, [12.9898, 78.233])) * 43758.5453
+    line = sum(factor * x for factor, x in zip((1e4, 7e4, 3e4), places, strict=False)) + 1.0
+    noise = np.sin(np.outer(line, [12.9898, 78.233, 37.719][: len(places)])) * 43758.5453
     guess = (np.modf(np.abs(noise))[0] - 0.5)[:, :, None]
     loads, outboard = weighted(
-        arm.expand(guess[arm.interior_nodes].reshape(-1, 1), np.full((3, 1), 0.5))
+        arm.expand(guess[arm.interior_nodes].reshape(-1, 1), np.full((len(modes.corner), 1), 0.5))
     )
     ratio = np.inf
     for _ in range(POWER_STEPS):

@@ -1,6 +1,7 @@
 """K(x) and M(x) of one arm: what lasts for the run (`Substructure`), and one design of it.
 
-Nodal fields are arrays (n_nodes, 2, columns) over this rank's nodes, ghosts included. Products
+Nodal fields are arrays (n_nodes, d, columns) over this rank's nodes, ghosts included, with d = 2
+directions in plane stress and 3 in space; b = 3 or 6 outboard coordinates. Products
 with K and M hold the contributions of this rank's cells only, so that u . (K v), summed over the
 ranks, needs no further communication; `restrict` adds the contributions of all ranks.
 """
@@ -56,10 +57,12 @@ class Substructure:
         self.operators = operators = self.uniform.operators if self.uniform else operators
         self.profile = profile
         size = len(operators.points)
-        dofs = np.repeat(2 * operators.cells, 2, axis=1)
-        dofs[:, 1::2] += 1
+        dim = mesh.dim
+        dofs = np.repeat(dim * operators.cells, dim, axis=1)
+        for component in range(1, dim):
+            dofs[:, component::dim] += component
         with together(mesh.comm):
-            self._stiffness = AffineMatrix(dofs, operators.stiffness, 2 * size)
+            self._stiffness = AffineMatrix(dofs, operators.stiffness, dim * size)
             self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
         self.interior = InteriorSystem(self.T, self._stiffness.pattern, self._mass.pattern, profile)
@@ -69,24 +72,29 @@ class Substructure:
     def connectivity(self) -> Connectivity:
         """Which cells share a facet, and which lie at the interfaces."""
         operators, T = self.operators, self.T
-        return Connectivity(T.comm, operators.space, operators.cells, T.inboard, T.outboard)
+        nodes = operators.cells
+        if T.dim == 3:
+            nodes = nodes[:, : compat.cell_corner_count(self.mesh.mesh)]
+        return Connectivity(T.comm, operators.space, nodes, T.inboard, T.outboard)
 
     @cached_property
     def _rigid_forces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cells at the outboard interface, and k_e times its unit motions there (cells, 2n, 3)."""
+        """Cells at the outboard interface, and k_e times its unit motions there (cells, dn, b)."""
         cells = self.operators.cells
         near = np.flatnonzero(self.T.outboard[cells].any(axis=1))
-        values = self.T.rigid[cells[near]].reshape(len(near), 2 * cells.shape[1], 3)
+        b = self.T.num_coordinates
+        values = self.T.rigid[cells[near]].reshape(len(near), self.T.dim * cells.shape[1], b)
         return near, self.operators.stiffness[near] @ values
 
     def rigid_forces(self, young: np.ndarray) -> np.ndarray:
-        """Return K times unit motions of the outboard interface (n_nodes, 2, 3), of these cells.
+        """Return K times unit motions of the outboard interface (n_nodes, d, b), of these cells.
 
         Only the cells at the interface contribute.
         """
         near, forces = self._rigid_forces
-        forces = (forces * young[near, None, None]).reshape(-1, 2, 3)
-        field = np.zeros((len(self.operators.points), 2, 3))
+        shape = self.T.rigid.shape
+        forces = (forces * young[near, None, None]).reshape(-1, *shape[1:])
+        field = np.zeros(shape)
         np.add.at(field, self.operators.cells[near].ravel(), forces)
         return field
 
@@ -97,8 +105,9 @@ class Substructure:
 
     @cached_property
     def stress_operator(self) -> np.ndarray:
-        """That of `fem.stress` at the element centres (n_cells, 3, 2 n), 1/m."""
-        centres = element_centres(compat.cell_geometry_nodes(self.mesh.mesh, 0).shape[1])
+        """That of `fem.stress` at the element centres (n_cells, s, dn), 1/m."""
+        corners = compat.cell_corner_count(self.mesh.mesh)
+        centres = element_centres(corners, self.mesh.dim)
         return stress_operator(self.mesh, self.operators, centres)
 
     @cached_property
@@ -177,7 +186,7 @@ class ElasticArm:
         mesh, operators, profile: of the substructure.
         comm, inboard, outboard, rigid, interior_nodes, num_interior, num_dofs, expand, restrict:
             of its `InterfaceTransformation`.
-        points: (n_nodes, 2) reference positions, m.
+        points: (n_nodes, d) reference positions, m.
     """
 
     def __init__(self, substructure: Substructure, K: AssembledMatrix, M: AssembledMatrix):
@@ -211,17 +220,17 @@ class ElasticArm:
     # -- products ----------------------------------------------------------------------------
 
     def stiffness_times(self, field: np.ndarray) -> np.ndarray:
-        """Return K u (n_nodes, 2, k) of this rank's cells; N for u in m."""
+        """Return K u (n_nodes, d, k) of this rank's cells; N for u in m."""
         return (self.K.matrix @ field.reshape(-1, field.shape[2])).reshape(field.shape)
 
     def mass_times(self, field: np.ndarray) -> np.ndarray:
-        """Return M u (n_nodes, 2, k) of this rank's cells; kg m for u in m."""
-        flat = field.reshape(len(field), 2 * field.shape[2])
+        """Return M u (n_nodes, d, k) of this rank's cells; kg m for u in m."""
+        flat = field.reshape(len(field), field.shape[1] * field.shape[2])
         return (self.M.matrix @ flat).reshape(field.shape)
 
     @cached_property
     def rigid_inertia(self) -> np.ndarray:
-        """M [1, X] (n_nodes, 2, 2), component by component, of this rank's cells; kg, kg m."""
+        """M [1, X] (n_nodes, d, 2), component by component, of this rank's cells; kg, kg m."""
         return self.mass_times(np.stack([np.ones_like(self.points), self.points], axis=2))
 
     def energy_matrix(self, field: np.ndarray) -> np.ndarray:
@@ -242,7 +251,7 @@ class ElasticArm:
         return 0.5 * (energy + energy.T)
 
     def cell_stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, 2, k).
+        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
 
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
@@ -252,7 +261,7 @@ class ElasticArm:
         return cells.stiffness_products(self.operators, left, right)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, 2, k).
+        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
 
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
@@ -306,7 +315,7 @@ class ElasticArm:
             self.interior_mass().mult(x, y)
             return y.array_r
         nodes = self.substructure.interior.node_mass(self.M.matrix)
-        return (nodes @ vector.reshape(-1, 2)).ravel()
+        return (nodes @ vector.reshape(-1, self.mesh.dim)).ravel()
 
     @cached_property
     def _constraint_modes(self) -> ConstraintModes:

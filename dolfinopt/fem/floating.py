@@ -23,7 +23,8 @@ def extremes(comm: MPI.Comm, values: np.ndarray) -> tuple[float, float]:
 class Connectivity:
     """Which cells share a facet, and which of them lie at the interfaces (collective on `comm`).
 
-    Cells that touch at a corner alone are not connected: such a hinge does not stop rotation.
+    Cells that touch at a corner or an edge alone are not connected: such a hinge does not stop
+    rotation.
     """
 
     def __init__(
@@ -39,15 +40,16 @@ class Connectivity:
         Args:
             comm: the arm's ranks.
             space: its `dofmap.index_map` numbers the nodes.
-            cells: (n_cells, n) local nodes of the owned cells.
+            cells: (n_cells, n) local nodes of the owned cells, corners alone in space.
             inboard, outboard: (n_nodes,) True for the nodes of the interface.
         """
         self.comm = comm
         nodes = space.dofmap.index_map.local_to_global(cells.ravel().astype(np.int32))
         everywhere = np.concatenate(comm.allgather(nodes.reshape(cells.shape)))
-        # A facet has at least two nodes on any mesh, and no two cells share two but by a facet.
+        # A facet has at least so many nodes on any mesh, and no two cells share as many but by one.
+        least = space.mesh.topology.dim
         ends = [
-            np.concatenate(comm.allgather(mask[cells].sum(axis=1) >= 2))
+            np.concatenate(comm.allgather(mask[cells].sum(axis=1) >= least))
             for mask in (inboard, outboard)
         ]
         count, width = everywhere.shape
@@ -56,7 +58,7 @@ class Connectivity:
             shape=(count, space.dofmap.index_map.size_global),
         )
         shared = sp.triu(incidence @ incidence.T, k=1).tocoo()
-        facets = shared.data >= 2.0
+        facets = shared.data >= least
         # Two more nodes of the graph stand for the interfaces. The outboard one is rigid: it
         # connects the cells at it with each other, but does not hold them.
         pairs = [(shared.row[facets], shared.col[facets])]

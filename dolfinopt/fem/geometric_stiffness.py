@@ -2,10 +2,13 @@
 
 A body in its tangent frame is loaded by seven unit loads ("pushes"): the inertia of unit
 accelerations a_x, a_y of the frame, of its angular acceleration and of -w^2, and unit forces and
-moment at the outboard interface. Each has a static field u_p, K u_p = f_p, whose stress stiffens
-the body in its modes:
+moment at the outboard interface. In space they are 18: three accelerations, the nine entries A_ab
+of the accelerations A X by rotation, three forces and three moments. Each has a static field u_p,
+K u_p = f_p, whose stress stiffens the body in its modes:
 
     K0_p[i, j] = int t sigma(u_p)_ab (d_a phi_i . d_b phi_j) dA
+
+with p unit loads, d directions and b outboard coordinates.
 
 Source: Wallrapp & Schwertassek, Int. J. Numer. Methods Eng. 32 (1991) 1751-1766,
 doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
@@ -26,8 +29,8 @@ from dolfinopt.fem.uniform_stress import StiffenedModes
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
 
-NUM_INERTIAL = 4  # loads by the arm's own inertia come first; the others act on the interface
-NUM_LOADS = 7
+# Loads by the arm's own inertia, which come first, by the number of directions.
+NUM_INERTIAL = {2: 4, 3: 12}
 # Entries of the products of gradients that are held at a time, so that they stay in the cache.
 CHUNK = 200_000
 STRESS_CELLS = 1000  # likewise, at a time
@@ -39,26 +42,41 @@ class UnitLoads:
 
     Attributes:
         arm: the design.
-        fields: (n_nodes, 2, 7) u_p, m per unit load: m/s2, m/s2, 1/s2, 1/s2, N, N, N m.
+        fields: (n_nodes, d, p) u_p, m per unit load: m/s2, 1/s2, N, N m.
     """
 
     arm: ElasticArm
     fields: np.ndarray
 
+    @property
+    def num_loads(self) -> int:
+        """Number p of unit loads: 7 in the plane, 18 in space."""
+        return self.fields.shape[2]
+
+    @property
+    def num_inertial(self) -> int:
+        """Number of those by the arm's own inertia."""
+        return NUM_INERTIAL[self.fields.shape[1]]
+
+    @cached_property
+    def _terms(self) -> Sequence[Sequence[tuple[int, int, int]]]:
+        return _TERMS if self.fields.shape[1] == 2 else _SOLID_TERMS
+
     @cached_property
     def stresses(self) -> np.ndarray:
-        """Stress xx, yy, xy times t dA at the quadrature points (3, 7, n_cells p), N."""
+        """Stress times t dA at the quadrature points (s, p, n_cells points), N; N m in space."""
         operator, young = self.arm.substructure.quadrature.stress, self.arm.young
-        count, p = len(operator), operator.shape[1] // 3
-        out = np.empty((3 * NUM_LOADS, count * p))
+        kinds = len(self._terms)
+        count, p = len(operator), operator.shape[1] // kinds
+        out = np.empty((kinds * self.num_loads, count * p))
         for cells in _runs(count, STRESS_CELLS):
             stress = operator[cells] @ self._cell_values(cells)
             stress *= young[cells, None, None]
-            out[:, p * cells.start : p * cells.stop] = stress.reshape(-1, 3 * NUM_LOADS).T
-        return out.reshape(3, NUM_LOADS, -1)
+            out[:, p * cells.start : p * cells.stop] = stress.reshape(-1, len(out)).T
+        return out.reshape(kinds, self.num_loads, -1)
 
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
-        """Return K0 (7, q, q) in modes V (n_nodes, 2, q) (collective on the arm's ranks)."""
+        """Return K0 (p, q, q) in modes V (n_nodes, d, q) (collective on the arm's ranks)."""
         arm, q = self.arm, V.shape[2]
         i, j = np.triu_indices(q)
         if arm.substructure.uniform_stress is not None:
@@ -66,7 +84,7 @@ class UnitLoads:
         else:
             packed = self._stiffness(V)
         packed = arm.comm.allreduce(packed)
-        K0 = np.empty((NUM_LOADS, q, q))
+        K0 = np.empty((self.num_loads, q, q))
         K0[:, i, j] = K0[:, j, i] = packed
         return K0
 
@@ -84,11 +102,11 @@ class UnitLoads:
         return known[1]
 
     def _stiffness(self, V: np.ndarray) -> np.ndarray:
-        """Return K0 (7, pairs i <= j) of this rank's cells."""
-        packed = np.zeros((NUM_LOADS, V.shape[2] * (V.shape[2] + 1) // 2))
+        """Return K0 (p, pairs i <= j) of this rank's cells."""
+        packed = np.zeros((self.num_loads, V.shape[2] * (V.shape[2] + 1) // 2))
         for _, points, H in self._parts(V):
             pairs = np.empty((packed.shape[1], H.shape[3]))
-            for stress, terms in zip(self.stresses[:, :, points], _TERMS, strict=True):
+            for stress, terms in zip(self.stresses[:, :, points], self._terms, strict=True):
                 packed += stress @ _pairs(H, terms, pairs).T
         return packed
 
@@ -107,11 +125,11 @@ class UnitLoads:
         u_F = Psi S^-1 with S = Psi'K Psi.
 
         Args:
-            V: (n_nodes, 2, q) as given to `geometric_stiffness`.
-            by_K0: (7, q, q) derivatives.
+            V: (n_nodes, d, q) as given to `geometric_stiffness`.
+            by_K0: (p, q, q) derivatives.
             static: whether V begins with the constraint modes, by which `by_modes` then
                 differentiates u_F, too, and `by_stiffness` by S.
-            by_fields: (n_nodes, 2, 7) derivatives of the same function by `fields`, where it
+            by_fields: (n_nodes, d, p) derivatives of the same function by `fields`, where it
                 depends on them otherwise, too; contributions of this rank's cells.
         """
         arm = self.arm
@@ -133,42 +151,44 @@ class UnitLoads:
         """Differentiate by modes, fields and Young's modulus, see `UniformStress.gradient`."""
         arm, q = self.arm, V.shape[2]
         quadrature, (count, n) = arm.substructure.quadrature, arm.operators.cells.shape
+        dim, loads = V.shape[1], self.num_loads
         i, j = np.triu_indices(q)
         by_pairs = by_K0[:, i, j] + np.where(i == j, 0.0, by_K0[:, j, i])
         by_young = np.empty(count)
-        by_modes, by_nodes = np.empty((count, n, 2, q)), np.empty((count, n, 2, NUM_LOADS))
+        by_modes, by_nodes = np.empty((count, n, dim, q)), np.empty((count, n, dim, loads))
         for cells, points, H in self._parts(V):
             size, pairs = cells.stop - cells.start, np.empty((len(i), H.shape[3]))
-            by_stress = [by_pairs @ _pairs(H, terms, pairs) for terms in _TERMS]
-            forces = np.concatenate(by_stress).T.reshape(size, -1, NUM_LOADS)
+            by_stress = [by_pairs @ _pairs(H, terms, pairs) for terms in self._terms]
+            forces = np.concatenate(by_stress).T.reshape(size, -1, loads)
             nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
             by_young[cells] = np.einsum("ekp,ekp->e", self._cell_values(cells), nodal)
             nodal *= arm.young[cells, None, None]
-            by_nodes[cells] = nodal.reshape(size, n, 2, NUM_LOADS)
-            by_H = _pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points])
-            by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, 2 * q)
+            by_nodes[cells] = nodal.reshape(size, n, dim, loads)
+            by_H = _pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points], self._terms)
+            by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, dim * q)
             nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
-            by_modes[cells] = nodal.reshape(size, n, 2, q)
+            by_modes[cells] = nodal.reshape(size, n, dim, q)
         by_V = sum_at_nodes(arm.operators, by_modes)
         return by_V, sum_at_nodes(arm.operators, by_nodes), by_young
 
     def _through_fields(
         self, forces: np.ndarray, by_V: np.ndarray, by_young: np.ndarray, static: bool
     ) -> GeometricGradient:
-        """Add the part through the fields u_p, given derivatives `forces` (n_nodes, 2, 7) by them.
+        """Add the part through the fields u_p, given derivatives `forces` (n_nodes, d, p) by them.
 
         Args:
             forces: contributions of this rank's cells.
             by_V, by_young: the other parts; changed in place.
             static: see `gradient`.
         """
-        arm, by_stiffness = self.arm, np.zeros((3, 3))
-        solved = slice(0, NUM_LOADS)
+        arm, inertial = self.arm, self.num_inertial
+        b = self.num_loads - inertial
+        by_stiffness, solved = np.zeros((b, b)), slice(0, self.num_loads)
         if static:
-            solved = slice(0, NUM_INERTIAL)
-            modes, outboard = arm.constraint_modes(), forces[:, :, NUM_INERTIAL:]
+            solved = slice(0, inertial)
+            modes, outboard = arm.constraint_modes(), forces[:, :, inertial:]
             compliance = np.linalg.inv(modes.stiffness)
-            by_V[:, :, :3] += outboard @ compliance
+            by_V[:, :, :b] += outboard @ compliance
             work = arm.comm.allreduce(np.tensordot(modes.field, outboard, ((0, 1), (0, 1))))
             by_stiffness = 0.0 - compliance @ work @ compliance
         adjoint = static_response(arm, *arm.restrict(forces[:, :, solved]))
@@ -176,27 +196,29 @@ class UnitLoads:
         return GeometricGradient(
             by_modes=by_V,
             by_young=by_young,
-            by_density=arm.cell_mass_products(adjoint[:, :, :NUM_INERTIAL], accelerations(arm)),
+            by_density=arm.cell_mass_products(adjoint[:, :, :inertial], accelerations(arm)),
             by_stiffness=by_stiffness,
         )
 
     def _cell_values(self, cells: slice) -> np.ndarray:
-        """Return the fields at the nodes of these cells (cells, 2n, 7)."""
+        """Return the fields at the nodes of these cells (cells, dn, p)."""
         nodes = self.arm.operators.cells[cells]
-        return _centred(self.fields[nodes]).reshape(len(nodes), -1, NUM_LOADS)
+        return _centred(self.fields[nodes]).reshape(
+            len(nodes), nodes.shape[1] * self.fields.shape[1], self.num_loads
+        )
 
     def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
         """Yield runs of cells: cells, points, modes' gradients there.
 
-        The gradients are d_a phi_c as (2, 2, q, points).
+        The gradients are d_a phi_c as (d, d, q, points).
         """
         derivatives = self.arm.substructure.quadrature.derivatives
-        count, q = len(derivatives), V.shape[2]
-        p = derivatives.shape[1] // 2
+        count, (dim, q) = len(derivatives), V.shape[1:]
+        p = derivatives.shape[1] // dim
         for cells in _runs(count, max(1, CHUNK // (p * q * (q + 1)))):
             values = _centred(V[self.arm.operators.cells[cells]])
-            H = derivatives[cells] @ values.reshape(*values.shape[:2], 2 * q)
-            H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, 2, 2, q), 0, 3))
+            H = derivatives[cells] @ values.reshape(*values.shape[:2], dim * q)
+            H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, dim, dim, q), 0, 3))
             yield cells, slice(p * cells.start, p * cells.stop), H
 
 
@@ -205,10 +227,10 @@ class GeometricGradient:
     """Derivatives of a function of K0.
 
     Attributes:
-        by_modes: (n_nodes, 2, q) by the modes, contributions of this rank's cells.
+        by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         by_young: (n_cells,) by Young's modulus, modes held.
         by_density: (n_cells,) by mass density, modes held.
-        by_stiffness: (3, 3) by S of the constraint modes; zero where they were not to be used.
+        by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
     """
 
     by_modes: np.ndarray
@@ -220,6 +242,7 @@ class GeometricGradient:
 def unit_loads(arm: ElasticArm) -> UnitLoads:
     """Return the static fields of the unit loads: four solves with the factor at hand.
 
+    Twelve in space.
     Collective on the arm's ranks.
     """
     modes = arm.constraint_modes()
@@ -230,16 +253,26 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
 
 
 def accelerations(arm: ElasticArm) -> np.ndarray:
-    """Return the fields (n_nodes, 2, 4) whose inertia loads the body: 1_x, 1_y, S X and X."""
+    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body.
+
+    1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
+    space.
+    """
     return _accelerations(np.ones_like(arm.points), arm.points)
 
 
 def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return 1_x, 1_y, S X and X (n, 2, 4) of (n, 2) each, or M times them: M knows no direction.
+    """Return these fields of 1 and X (n, d), or M times them: M knows no direction.
 
     M (-y, x) is (-(M X)_y, (M X)_x), as M treats the components alike.
     """
-    fields = np.zeros((*ones.shape, NUM_INERTIAL))
+    dim = ones.shape[1]
+    fields = np.zeros((*ones.shape, NUM_INERTIAL[dim]))
+    if dim == 3:
+        for a in range(3):
+            fields[:, a, a] = ones[:, a]
+            fields[:, a, 3 + 3 * a : 6 + 3 * a] = places
+        return fields
     fields[:, 0, 0], fields[:, 1, 1] = ones.T
     fields[:, 0, 2], fields[:, 1, 2] = -places[:, 1], places[:, 0]
     fields[:, :, 3] = places
@@ -247,12 +280,12 @@ def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
-    """Return the displacements (n_nodes, 2, k) of static loads, outboard interface free.
+    """Return the displacements (n_nodes, d, k) of static loads, outboard interface free.
 
     Args:
         arm: clamped inboard.
         interior: (num_interior, k) loads on the interior dofs, N; zero columns cost nothing.
-        outboard: (3, k) force and moment at the outboard interface, N, N m.
+        outboard: (b, k) force and moment at the outboard interface, N, N m.
     """
     modes = arm.constraint_modes()
     loaded = arm.comm.allreduce(np.any(interior, axis=0))
@@ -264,7 +297,7 @@ def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray)
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
-    """Return nodal values (n_cells, n, 2, k) less their mean, see `cells.cell_values`."""
+    """Return nodal values (n_cells, n, d, k) less their mean, see `cells.cell_values`."""
     return values - values.mean(axis=1, keepdims=True)
 
 
@@ -294,16 +327,23 @@ _TERMS = (
     ((1, 1, 0), (1, 1, 1)),
     ((0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1)),
 )
+# Of stress xx, yy, zz, xy, yz, zx.
+_SOLID_TERMS = tuple(
+    tuple((d, e, c) for d, e in sorted({(a, b), (b, a)}) for c in range(3))
+    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
+)
 
 
-def _pairs_transposed(H: np.ndarray, by_pairs: np.ndarray) -> np.ndarray:
-    """Return the derivatives (2, 2, q, points) by H, given those by `_pairs` (3, pairs, points).
+def _pairs_transposed(
+    H: np.ndarray, by_pairs: np.ndarray, kinds: Sequence[Sequence[tuple[int, int, int]]]
+) -> np.ndarray:
+    """Return the derivatives (d, d, q, points) by H, given those by `_pairs` (s, pairs, points).
 
     The latter are scaled in place.
     """
     by_H, term = np.zeros_like(H), np.empty(H.shape[3])
     for place, (i, j) in enumerate(zip(*np.triu_indices(H.shape[2]), strict=True)):
-        for weight, terms in zip(by_pairs[:, place], _TERMS, strict=True):
+        for weight, terms in zip(by_pairs[:, place], kinds, strict=True):
             if i == j:  # both factors are the same: once, twice as heavy
                 weight *= 2.0
             for a, b, c in terms:

@@ -1,6 +1,7 @@
-"""The interface transformation T of an arm: interior dofs and three outboard coordinates.
+"""The interface transformation T of an arm: interior dofs and the outboard coordinates.
 
-Nodal fields are arrays (n_nodes, 2, columns) over this rank's nodes, ghosts included.
+Nodal fields are arrays (n_nodes, d, columns) over this rank's nodes, ghosts included; d directions.
+There are b = 3 outboard coordinates in the plane, 6 in space.
 """
 
 from __future__ import annotations
@@ -22,17 +23,20 @@ class InterfaceTransformation:
     """u = T [interior dofs; u_x, u_y, theta]: inboard clamped, outboard rigid.
 
     The inboard interface is clamped in the tangent frame; the outboard interface is rigid with
-    three coordinates about its reference point. "Interior" are all other dofs.
+    displacements and rotations of its reference point as coordinates: u_x, u_y, theta in the plane,
+    u_x, u_y, u_z and a rotation vector in space. "Interior" are all other dofs.
 
     Attributes:
         comm: the arm's ranks.
-        points: (n_nodes, 2) reference positions, m.
+        points: (n_nodes, d) reference positions, m.
+        dim: d.
+        num_coordinates: b, outboard.
         inboard, outboard: (n_nodes,) True for the nodes of the interface.
-        rigid: (n_nodes, 2, 3) nodal fields of unit u_x, u_y, theta, zero in the interior.
+        rigid: (n_nodes, d, b) nodal fields of unit outboard coordinates, zero in the interior.
         interior_nodes: owned ones, in the order of the interior dofs.
         num_interior: interior dofs that this rank owns.
         num_dofs: of all ranks, the outboard coordinates included.
-        numbers: (2 n_nodes,) global interior number of each dof, -1 for others.
+        numbers: (d n_nodes,) global interior number of each dof, -1 for others.
     """
 
     def __init__(self, mesh: ArmMesh, operators: ElementOperators, graph: sp.csr_matrix):
@@ -49,16 +53,15 @@ class InterfaceTransformation:
         self.comm = mesh.comm
         self._space = operators.space
         self.points = operators.points
+        self.dim = self.points.shape[1]
         self._ghosted = fem.Function(operators.space)
         self.inboard = self._nodes_of(mesh, mesh.inboard_facets, "inboard")
         self.outboard = self._nodes_of(mesh, mesh.outboard_facets, "outboard")
-        self.rigid = np.zeros((len(self.points), 2, 3))
         nodes = np.flatnonzero(self.outboard)
-        arm = self.points[nodes] - mesh.outboard_point
-        self.rigid[nodes, 0, 0] = 1.0
-        self.rigid[nodes, 1, 1] = 1.0
-        self.rigid[nodes, 0, 2] = -arm[:, 1]
-        self.rigid[nodes, 1, 2] = arm[:, 0]
+        motions = rigid_motions(self.points[nodes] - mesh.outboard_point)
+        self.num_coordinates = motions.shape[2]
+        self.rigid = np.zeros((len(self.points), self.dim, self.num_coordinates))
+        self.rigid[nodes] = motions
         self._number_interior(graph)
 
     def _nodes_of(self, mesh: ArmMesh, facets: np.ndarray, side: str) -> np.ndarray:
@@ -71,7 +74,7 @@ class InterfaceTransformation:
         if self.comm.allreduce(int(mask.sum())) == 0:
             raise InputError(
                 f"arm {mesh.name!r}: the mesh has no facets of physical group {side!r}; "
-                "name the interface's curves so in the geometry"
+                f"name the interface's {'curves' if mesh.dim == 2 else 'faces'} so in the geometry"
             )
         return mask
 
@@ -82,14 +85,14 @@ class InterfaceTransformation:
         if len(nodes):
             nodes = nodes[_narrow_order(graph[nodes][:, nodes], self.points[nodes])]
         self.interior_nodes = nodes
-        self.num_interior = 2 * len(nodes)
+        self.num_interior = self.dim * len(nodes)
         first = self.comm.exscan(len(nodes)) or 0
         number = np.full((len(self.points), 1), -1.0)
         number[nodes, 0] = first + np.arange(len(nodes))
         node_number = self._from_owners(number)[:, 0].astype(np.int64)
-        both = 2 * node_number[:, None] + np.arange(2)
-        self.numbers = np.where(node_number[:, None] >= 0, both, -1).ravel()
-        self.num_dofs = 2 * self.comm.allreduce(len(nodes)) + 3
+        each = self.dim * node_number[:, None] + np.arange(self.dim)
+        self.numbers = np.where(node_number[:, None] >= 0, each, -1).ravel()
+        self.num_dofs = self.dim * self.comm.allreduce(len(nodes)) + self.num_coordinates
 
     def _from_owners(self, values: np.ndarray) -> np.ndarray:
         """Overwrite the ghosts' rows of nodal `values` (n_nodes, columns) by their owners'."""
@@ -98,23 +101,23 @@ class InterfaceTransformation:
         out = np.empty_like(values)
         work = self._ghosted.x.array
         for k in range(values.shape[1]):
-            work[0::2] = values[:, k]
+            work[0 :: self.dim] = values[:, k]
             compat.scatter_forward(self._ghosted)
-            out[:, k] = work[0::2]
+            out[:, k] = work[0 :: self.dim]
         return out
 
     def expand(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
-        """Return the nodal field (n_nodes, 2, k) = T [interior; outboard].
+        """Return the nodal field (n_nodes, d, k) = T [interior; outboard].
 
         Args:
             interior: (num_interior, k) owned interior dofs, m.
-            outboard: (3, k) coordinates (u_x m, u_y m, theta rad) of the outboard interface.
+            outboard: (b, k) coordinates of the outboard interface, m and rad.
         """
         columns = interior.shape[1]
-        field = np.zeros((len(self.points), 2, columns))
-        field[self.interior_nodes] = interior.reshape(-1, 2, columns)
+        field = np.zeros((len(self.points), self.dim, columns))
+        field[self.interior_nodes] = interior.reshape(-1, self.dim, columns)
         if self.comm.size > 1:
-            flat = self._from_owners(field.reshape(len(field), 2 * columns))
+            flat = self._from_owners(field.reshape(len(field), self.dim * columns))
             field = flat.reshape(field.shape)
         rigid = np.flatnonzero(self.outboard)
         field[rigid] = self.rigid[rigid] @ outboard
@@ -124,10 +127,10 @@ class InterfaceTransformation:
         """Return T' field, the transpose of `expand`, summed over the ranks.
 
         Args:
-            field: (n_nodes, 2, k) contributions of this rank's cells.
+            field: (n_nodes, d, k) contributions of this rank's cells.
 
         Returns:
-            Owned interior rows (num_interior, k) and the outboard rows (3, k).
+            Owned interior rows (num_interior, k) and the outboard rows (b, k).
         """
         columns = field.shape[2]
         rigid = np.flatnonzero(self.outboard)
@@ -143,8 +146,28 @@ class InterfaceTransformation:
         for k in range(field.shape[2]):
             self._ghosted.x.array[:] = field[:, :, k].ravel()
             compat.scatter_reverse_add(self._ghosted)
-            out[:, :, k] = self._ghosted.x.array.reshape(-1, 2)
+            out[:, :, k] = self._ghosted.x.array.reshape(-1, self.dim)
         return out
+
+
+def rigid_motions(points: np.ndarray) -> np.ndarray:
+    """Return rigid motions (n, d, b) of points (n, d): translations, then unit rotations.
+
+    In the plane about z; in space about x, y, z: e_k x X. About the origin, m and m/rad.
+    """
+    dim = points.shape[1]
+    motions = np.zeros((len(points), dim, 3 if dim == 2 else 6))
+    motions[:, range(dim), range(dim)] = 1.0
+    if dim == 2:
+        motions[:, 0, 2], motions[:, 1, 2] = -points[:, 1], points[:, 0]
+    else:
+        for k in range(3):
+            after, before = (k + 1) % 3, (k + 2) % 3
+            motions[:, before, 3 + k], motions[:, after, 3 + k] = (
+                points[:, after],
+                -points[:, before],
+            )
+    return motions
 
 
 def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> np.ndarray:
@@ -155,12 +178,12 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> np.ndarray:
 
     Args:
         graph: (n, n) with an entry where two nodes share a cell.
-        points: (n, 2) m.
+        points: (n, d) m.
     """
     x = points[:, 0]
     along = np.round((x - x.min()) / max(np.ptp(x), np.finfo(float).tiny) * SAME_PLACE)
     orders = (
-        np.lexsort((points[:, 1], along)),
+        np.lexsort((*points.T[1:], along)),
         reverse_cuthill_mckee(graph, symmetric_mode=True),
     )
     rows, columns = graph.nonzero()

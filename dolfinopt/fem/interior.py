@@ -68,7 +68,7 @@ class InteriorSystem:
     def _mass(self) -> InteriorMatrix:
         T = self._T
         return InteriorMatrix(
-            T.comm, interior_entries(self._patterns[1], 2, T.numbers), T.num_interior
+            T.comm, interior_entries(self._patterns[1], T.dim, T.numbers), T.num_interior
         )
 
     @cached_property
@@ -111,13 +111,14 @@ class InteriorSystem:
 
     @cached_property
     def _nodes(self) -> InteriorEntries:
-        numbers = self._T.numbers[0::2]
-        return interior_entries(self._patterns[1], 1, np.where(numbers < 0, -1, numbers // 2))
+        dim = self._T.dim
+        numbers = self._T.numbers[0::dim]
+        return interior_entries(self._patterns[1], 1, np.where(numbers < 0, -1, numbers // dim))
 
     def node_mass(self, M: sp.csr_matrix) -> sp.csr_matrix:
         """Return M_II of one displacement component, on the arm's only rank; M acts on nodes."""
         if self._node_mass_of is not M:
-            nodes, size = self._nodes, self._T.num_interior // 2
+            nodes, size = self._nodes, self._T.num_interior // self._T.dim
             starts = np.searchsorted(nodes.rows, np.arange(size + 1))
             values = M.data[nodes.source]
             self._node_mass = sp.csr_matrix((values, nodes.columns, starts), (size, size))

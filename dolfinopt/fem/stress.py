@@ -19,7 +19,8 @@ import basix
 import numpy as np
 
 from dolfinopt.fem.cells import sum_at_nodes
-from dolfinopt.fem.elements import ElementOperators, gauss_points, plane_stress
+from dolfinopt.fem.elements import ElementOperators, elasticity, gauss_points
+from dolfinopt.fem.elements.geometry import KINDS, by_cells
 from dolfinopt.fem.geometric_stiffness import UnitLoads, static_response
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -28,43 +29,80 @@ if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
 
 # Components whose length is von Mises's stress, of stresses xx, yy, xy:
-# s^2 = ((xx + yy) / 2)^2 + 3/4 (xx - yy)^2 + 3 xy^2.
+# s^2 = ((xx + yy) / 2)^2 + 3/4 (xx - yy)^2 + 3 xy^2. In space, of xx, yy, zz, xy, yz, zx:
+# s^2 = ((xx - yy)^2 + (yy - zz)^2 + (zz - xx)^2) / 2 + 3 (xy^2 + yz^2 + zx^2), with the first sum
+# that of ((xx + yy) / 2 - zz)^2 and 3/4 (xx - yy)^2.
 VON_MISES = np.array([[0.5, 0.5, 0.0], [0.75**0.5, -(0.75**0.5), 0.0], [0.0, 0.0, 3.0**0.5]])
 
+SOLID_VON_MISES = np.zeros((5, 6))
+SOLID_VON_MISES[0, :3], SOLID_VON_MISES[1, :2] = (0.5, 0.5, -1.0), (0.75**0.5, -(0.75**0.5))
+SOLID_VON_MISES[2:, 3:] = 3.0**0.5 * np.eye(3)
 
-def element_centres(corners: int) -> np.ndarray:
-    """Return the centre (1, 2) of the reference cell with so many corners."""
-    return np.full((1, 2), 1.0 / 3.0 if corners == 3 else 0.5)
+
+def element_centres(corners: int, dim: int = 2) -> np.ndarray:
+    """Return the centre (1, d) of the reference cell with so many corners."""
+    return np.full((1, dim), 1.0 / (dim + 1.0) if corners == dim + 1 else 0.5)
 
 
-def stress_points(corners: int) -> np.ndarray:
-    """Return centre and 2 x 2 Gauss points (5, 2) of the reference cell with so many corners."""
-    return np.concatenate([element_centres(corners), gauss_points(corners, 2)[0]])
+def stress_points(corners: int, dim: int = 2) -> np.ndarray:
+    """Return centre and 2 x 2 (x 2) Gauss points (p, d) of the reference cell."""
+    return np.concatenate([element_centres(corners, dim), gauss_points(corners, 2, dim)[0]])
 
 
 def places_of(mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
-    """Return where points (p, 2) of the reference cell are in every cell (n_cells, p, 2), m."""
-    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
-    kind = basix.CellType.triangle if corners.shape[1] == 3 else basix.CellType.quadrilateral
-    element = basix.create_element(basix.ElementFamily.P, kind, 1)
+    """Return where points (p, d) of the reference cell are in every cell (n_cells, p, d), m."""
+    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
+    element = basix.create_element(basix.ElementFamily.P, KINDS[mesh.dim, corners.shape[1]], 1)
     return element.tabulate(0, points)[0, :, :, 0] @ corners
 
 
 def stress_operator(mesh: ArmMesh, operators: ElementOperators, points: np.ndarray) -> np.ndarray:
-    """Return the components `VON_MISES` of unit E by nodal displacements (n_cells, 3 p, 2 n), 1/m.
+    """Return the components `VON_MISES` of unit E by nodal displacements (n_cells, s p, dn), 1/m.
+
+    Their number s is 3, in space 5.
 
     Args:
         mesh, operators: of the arm.
-        points: (p, 2) of the reference cell.
+        points: (p, d) of the reference cell.
     """
-    strain = operators.element.strain_operator(mesh, operators, points)
-    stress = (VON_MISES @ plane_stress(operators.poisson_ratio)) @ strain
-    return np.ascontiguousarray(stress.reshape(len(stress), -1, stress.shape[-1]))
+    components = VON_MISES if mesh.dim == 2 else SOLID_VON_MISES
+    law = components @ elasticity(mesh.dim, operators.poisson_ratio)
+
+    def stress(strain: np.ndarray) -> np.ndarray:
+        found = law @ strain
+        return np.ascontiguousarray(found.reshape(len(found), -1, found.shape[-1]))
+
+    return by_cells(stress, operators.element.strain_operator(mesh, operators, points))
 
 
 def rotated(field: np.ndarray) -> np.ndarray:
     """Return S times every node's vectors (n, 2, k): turned by 90 degrees."""
     return np.stack([-field[:, 1], field[:, 0]], axis=1)
+
+
+def moved(field: np.ndarray) -> np.ndarray:
+    """Return a field (n, d, k) as rotating frames accelerate it: (n, d, 2 k), in space (n, 3, 9 k).
+
+    Itself and S times it, turned by 90 degrees; in space the nine fields whose direction a has the
+    component b of the field, b running faster.
+    """
+    if field.shape[1] == 2:
+        return np.concatenate([field, rotated(field)], axis=2)
+    n, _, k = field.shape
+    found = np.zeros((n, 3, 3, 3, k))
+    for a in range(3):
+        found[:, a, a] = field
+    return found.reshape(n, 3, 9 * k)
+
+
+def moved_transposed(field: np.ndarray) -> np.ndarray:
+    """Return the transpose of `moved`, (n, d, k) of (n, d, 2 k) or (n, 3, 9 k)."""
+    n, dim, columns = field.shape
+    if dim == 2:
+        q = columns // 2
+        return field[:, :, :q] - rotated(field[:, :, q:])
+    parts = field.reshape(n, 3, 3, 3, columns // 9)
+    return np.asarray(parts[:, 0, 0] + parts[:, 1, 1] + parts[:, 2, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +111,9 @@ class LoadFields:
 
     Attributes:
         loads: the unit loads of frame and outboard interface, with their fields.
-        V: (n_nodes, 2, q) modes.
-        elastic: (n_nodes, 2, 2 q) K^-1 [M V, M S V], m per modal acceleration.
+        V: (n_nodes, d, q) modes.
+        elastic: (n_nodes, d, 2 q) K^-1 [M V, M S V], m per modal acceleration; in space K^-1 M of
+            the 9 q fields `moved`.
     """
 
     loads: UnitLoads
@@ -88,7 +127,7 @@ class LoadFields:
 
     @property
     def columns(self) -> np.ndarray:
-        """[V, Z] (n_nodes, 2, q + 7 + 2 q)."""
+        """[V, Z] (n_nodes, d, q + 7 + 2 q), in space q + 18 + 9 q."""
         return np.concatenate([self.V, self.loads.fields, self.elastic], axis=2)
 
     def split(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,27 +137,28 @@ class LoadFields:
         return columns[..., : ends[0]], columns[..., ends[0] : ends[1]], columns[..., ends[1] :]
 
     def stress(self, operator: np.ndarray) -> np.ndarray:
-        """Return what an operator (n_cells, 3 p, 2 n) makes of the columns (3, n_cells p, columns).
+        """Return what an operator (n_cells, s p, dn) makes of the columns (s, n_cells p, columns).
 
-        In Pa per unit of the columns for an operator times Young's modulus.
+        s is 3, in space 5. In Pa per unit of the columns for an operator times Young's modulus.
         """
         cells, columns = self.arm.operators.cells, self.columns
         values = columns[cells].reshape(*operator.shape[::2], -1)
-        found = np.empty((3, len(cells), operator.shape[1] // 3, columns.shape[2]))
+        kinds = 3 if columns.shape[1] == 2 else len(SOLID_VON_MISES)
+        found = np.empty((kinds, len(cells), operator.shape[1] // kinds, columns.shape[2]))
         for component, out in enumerate(found):
-            np.matmul(operator[:, component::3], values, out=out)
-        return found.reshape(3, -1, columns.shape[2])
+            np.matmul(operator[:, component::kinds], values, out=out)
+        return found.reshape(kinds, -1, columns.shape[2])
 
     def stress_transposed(self, operator: np.ndarray, by_stress: np.ndarray) -> np.ndarray:
         """Return the derivatives by the columns' nodal values, given those by `stress`.
 
         Returns:
-            (n_nodes, 2, columns), contributions of this rank's cells.
+            (n_nodes, d, columns), contributions of this rank's cells.
         """
-        count, columns = len(operator), by_stress.shape[2]
-        forces = np.moveaxis(by_stress.reshape(3, count, -1, columns), 0, 2)
+        count, (kinds, _, columns) = len(operator), by_stress.shape
+        forces = np.moveaxis(by_stress.reshape(kinds, count, -1, columns), 0, 2)
         nodal = operator.swapaxes(1, 2) @ forces.reshape(count, -1, columns)
-        return sum_at_nodes(self.arm.operators, nodal.reshape(count, -1, 2, columns))
+        return sum_at_nodes(self.arm.operators, nodal.reshape(count, -1, self.V.shape[1], columns))
 
     def gradient(self, by_elastic: np.ndarray) -> ElasticFieldGradient:
         """Differentiate a function of `elastic`, given its derivatives (collective on the arm).
@@ -126,16 +166,15 @@ class LoadFields:
         K Z = M [V, S V], so with K mu = dJ/dZ:  dJ = mu . (dM [V, S V] + M [dV, S dV] - dK Z).
 
         Args:
-            by_elastic: (n_nodes, 2, 2 q), contributions of this rank's cells.
+            by_elastic: (n_nodes, d, 2 q or 9 q), contributions of this rank's cells.
         """
-        arm, q = self.arm, self.V.shape[2]
+        arm = self.arm
         mu = static_response(arm, *arm.restrict(by_elastic))
         weighted = arm.mass_times(mu)
-        moved = np.concatenate([self.V, rotated(self.V)], axis=2)
         return ElasticFieldGradient(
-            by_modes=weighted[:, :, :q] - rotated(weighted[:, :, q:]),
+            by_modes=moved_transposed(weighted),
             by_young=-arm.cell_stiffness_products(mu, self.elastic),
-            by_density=arm.cell_mass_products(mu, moved),
+            by_density=arm.cell_mass_products(mu, moved(self.V)),
         )
 
 
@@ -144,7 +183,7 @@ class ElasticFieldGradient:
     """Derivatives of a function of the fields of the elastic motion's inertia.
 
     Attributes:
-        by_modes: (n_nodes, 2, q), contributions of this rank's cells.
+        by_modes: (n_nodes, d, q), contributions of this rank's cells.
         by_young, by_density: (n_cells,) modes held.
     """
 
@@ -154,15 +193,14 @@ class ElasticFieldGradient:
 
 
 def load_fields(loads: UnitLoads, V: np.ndarray, MV: np.ndarray) -> LoadFields:
-    """Return the static fields of a design: 2 q solves with the factor at hand.
+    """Return the static fields of a design: 2 q solves (9 q in space) with the factor at hand.
 
     Collective on the arm's ranks.
 
     Args:
         loads: of the design.
-        V: (n_nodes, 2, q) modes.
+        V: (n_nodes, d, q) modes.
         MV: mass matrix times V, contributions of this rank's cells.
     """
     arm = loads.arm
-    inertia = np.concatenate([MV, rotated(MV)], axis=2)
-    return LoadFields(loads, V, static_response(arm, *arm.restrict(inertia)))
+    return LoadFields(loads, V, static_response(arm, *arm.restrict(moved(MV))))

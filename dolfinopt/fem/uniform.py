@@ -1,6 +1,7 @@
 """Meshes whose cells are all alike: one element matrix for all, and dense products with it.
 
-Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells.
+Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells;
+d is the number of directions.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
     count = comm.allreduce(len(matrices))
     if count == 0:
         return None
+    one = len(matrices) == 0 or (len(matrices) > 1 and matrices.strides[0] == 0)
+    if comm.allreduce(one, op=MPI.LAND):  # computed once on every rank already
+        matrices, count = matrices[:1], comm.allreduce(min(len(matrices), 1))
     some = comm.allgather(matrices[0].copy() if len(matrices) else None)
     first = next(one for one in some if one is not None)
     mean = first + comm.allreduce((matrices - first).sum(axis=0)) / count
@@ -39,7 +43,7 @@ class UniformCells:
 
     Attributes:
         operators: of the arm.
-        stiffness: (2n, 2n) of any cell, see `ElementOperators`.
+        stiffness: (dn, dn) of any cell, see `ElementOperators`.
         mass: (n, n).
     """
 
@@ -53,7 +57,7 @@ class UniformCells:
         )
 
     def values(self, field: np.ndarray) -> np.ndarray:
-        """Return the cells' nodal values (n, 2, k, n_cells) of a field (n_nodes, 2, k)."""
+        """Return the cells' nodal values (n, d, k, n_cells) of a field (n_nodes, d, k)."""
         nodes, columns = self._corners, field.shape[1] * field.shape[2]
         flat = np.ascontiguousarray(field.reshape(len(field), columns).T)
         out = np.empty((len(nodes), columns, nodes.shape[1]))
@@ -62,13 +66,13 @@ class UniformCells:
         return out.reshape(len(nodes), *field.shape[1:], nodes.shape[1])
 
     def sum_at_nodes(self, forces: np.ndarray) -> np.ndarray:
-        """Return the nodal field (n_nodes, 2, k) of the cells' forces (n, 2, k, n_cells)."""
+        """Return the nodal field (n_nodes, d, k) of the cells' forces (n, d, k, n_cells)."""
         n, *shape, count = forces.shape
         rows = forces.reshape(n, -1, count).swapaxes(1, 2).reshape(n * count, -1)
         return (self._sum @ rows).reshape(-1, *shape)
 
     def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
         values = self.centred(right)
         products = self.stiffness @ values.reshape(len(self.stiffness), -1)
         if left is not right:
@@ -76,7 +80,7 @@ class UniformCells:
         return _sum_of_products(values, products)
 
     def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, 2, k)."""
+        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
         values = self.values(right)
         return _sum_of_products(self.values(left), self.mass @ values.reshape(len(values), -1))
 

@@ -28,20 +28,24 @@ class UniformStress:
     Attributes:
         cells: which.
         gradients: (r, n) amplitudes of the gradients by nodal values of one component.
-        stresses: (m, 2n) amplitudes of the stresses by nodal displacements, unit E.
+        stresses: (m, dn) amplitudes of the stresses by nodal displacements, unit E.
         tensor: (m, r (r + 1) / 2) T, b <= c.
     """
 
     def __init__(self, cells: UniformCells, derivatives: np.ndarray, stress: np.ndarray):
-        """Set up from the operators of one cell, see `Quadrature`: (2p, n) and (3p, 2n)."""
+        """Set up from the operators of one cell, see `Quadrature`: (dp, n) and (sp, dn)."""
         self.cells = cells
         D, self.gradients = _factors(derivatives)
         S, self.stresses = _factors(stress)
-        D, S = D.reshape(-1, 2, D.shape[1]), S.reshape(-1, 3, S.shape[1])
+        dim = cells.operators.points.shape[1]
+        kinds = 3 if dim == 2 else 6
+        D, S = D.reshape(-1, dim, D.shape[1]), S.reshape(-1, kinds, S.shape[1])
         products = np.einsum("pxb,pyc->pxybc", D, D)
         T = np.einsum("ps,pbc->sbc", S[:, 0], products[:, 0, 0])
-        T += np.einsum("ps,pbc->sbc", S[:, 1], products[:, 1, 1])
-        T += np.einsum("ps,pbc->sbc", S[:, 2], products[:, 0, 1] + products[:, 1, 0])
+        for k in range(1, dim):
+            T += np.einsum("ps,pbc->sbc", S[:, k], products[:, k, k])
+        for k, (x, y) in enumerate(((0, 1), (1, 2), (2, 0))[: kinds - dim], dim):
+            T += np.einsum("ps,pbc->sbc", S[:, k], products[:, x, y] + products[:, y, x])
         b, c = np.triu_indices(len(self.gradients))
         self.tensor = T[:, b, c]
 
@@ -49,14 +53,14 @@ class UniformStress:
         """Return the geometric stiffness of modes by the stress of fields.
 
         Args:
-            fields: (n_nodes, 2, loads) whose stress stiffens.
+            fields: (n_nodes, d, loads) whose stress stiffens.
             young: (n_cells,).
-            V: (n_nodes, 2, q) modes.
+            V: (n_nodes, d, q) modes.
         """
         return StiffenedModes(self, fields, young, V)
 
     def gradients_of(self, V: np.ndarray) -> np.ndarray:
-        """Return a (r, 2, q, n_cells)."""
+        """Return a (r, d, q, n_cells)."""
         values = self.cells.centred(V)
         a = self.gradients @ values.reshape(len(values), -1)
         return a.reshape(len(a), *values.shape[1:])
@@ -68,10 +72,10 @@ class UniformStress:
         return s.reshape(len(s), *values.shape[2:])
 
     def at_nodes(self, operator: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Return the nodal field (n_nodes, 2, k) of derivatives by what `operator` gives."""
+        """Return the nodal field (n_nodes, d, k) of derivatives by what `operator` gives."""
         nodal = operator.T @ by.reshape(len(by), -1)
-        n = len(self.cells.operators.cells[0])
-        return self.cells.sum_at_nodes(nodal.reshape(n, 2, -1, by.shape[-1]))
+        n, dim = self.cells.operators.cells.shape[1], self.cells.operators.points.shape[1]
+        return self.cells.sum_at_nodes(nodal.reshape(n, dim, -1, by.shape[-1]))
 
 
 class StiffenedModes:
@@ -103,7 +107,7 @@ class StiffenedModes:
         """Differentiate a function of K0, given its derivative by K0 (loads, q, q), any symmetry.
 
         Returns:
-            Its derivatives by the modes (n_nodes, 2, q) and by the fields (n_nodes, 2, loads),
+            Its derivatives by the modes (n_nodes, d, q) and by the fields (n_nodes, d, loads),
             contributions of this rank's cells, and by Young's modulus (n_cells,), both held.
         """
         tensor, (i, j) = self._tensor, (self._i, self._j)
@@ -136,28 +140,32 @@ class StiffenedModes:
         """Return a_ib . a_jc + a_ic . a_jb, half of it for b = c (bc, pairs i <= j, cells)."""
         size = a.shape[3]
         out = np.empty((len(self._pairs), len(self._i), size))
-        first, second = term = np.empty((2, size))
+        first, second, *third = term = np.empty((a.shape[1], size))
         for found, (b, c) in zip(out, self._pairs, strict=True):
             for one, i, j in zip(found, self._i, self._j, strict=True):
                 np.multiply(a[b, :, i], a[c, :, j], out=term)
                 np.add(first, second, out=one)
+                for more in third:
+                    one += more
                 if b != c:
                     if i == j:
                         one *= 2.0
                     else:
                         np.multiply(a[c, :, i], a[b, :, j], out=term)
                         one += np.add(first, second, out=first)
+                        for more in third:
+                            one += more
         return out
 
     def _add_transposed(self, by_a: np.ndarray, a: np.ndarray, weights: np.ndarray) -> None:
-        """Add the derivatives by a (r, 2, q, cells), given those by `_products`.
+        """Add the derivatives by a (r, d, q, cells), given those by `_products`.
 
         Args:
             by_a: to which they are added.
             a: amplitudes.
             weights: (bc, pairs i <= j, cells), doubled for i = j.
         """
-        term = np.empty((2, a.shape[3]))
+        term = np.empty(a.shape[1::2])
         for weight, (b, c) in zip(weights, self._pairs, strict=True):
             for w, i, j in zip(weight, self._i, self._j, strict=True):
                 # b and c, and i and j, change places, unless they are the same.

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
+from dolfinopt.mesh.cells import cell_areas, cell_volumes, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import gmsh_on_root, mesh_geo
 from dolfinopt.mesh.groups import INBOARD, OUTBOARD, PASSIVE
@@ -32,12 +33,12 @@ class ArmMesh:
         name: the arm's name in the scene.
         comm: ranks that share this arm.
         mesh: DOLFINx mesh; the body frame is the mesh's frame, origin on the inboard joint axis.
-        centroid: (n_cells, 2) of the owned cells, m.
-        area: (n_cells,) of the owned cells, m2.
+        centroid: (n_cells, d) of the owned cells, d = 2 in the plane, 3 in space; m.
+        area: (n_cells,) of the owned cells, m2; in space their volume, m3.
         passive: (n_cells,) True where the cell stays solid.
         void: (n_cells,) True where the cell stays void.
         inboard_facets, outboard_facets: facets of the interfaces, local numbers.
-        outboard_point: (2,) reference point of the outboard interface, m.
+        outboard_point: (d,) reference point of the outboard interface, m.
         notes: what is doubtful about its file, a sentence each.
     """
 
@@ -52,6 +53,11 @@ class ArmMesh:
     outboard_facets: np.ndarray
     outboard_point: np.ndarray
     notes: tuple[str, ...] = ()
+
+    @property
+    def dim(self) -> int:
+        """Number of directions d: 2 of an arm in plane stress, 3 of a solid one."""
+        return len(self.outboard_point)
 
     @property
     def num_cells(self) -> int:
@@ -80,6 +86,7 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         InputError: the mesh file cannot be the arm, or the arm have its regions.
     """
     like = arm if pattern is None else pattern
+    scales = [like.length / arm.length, like.height / arm.height, like.thickness / arm.thickness]
     if arm.mesh is not None:
         mesh = file_arm(comm, arm)
     else:
@@ -87,8 +94,13 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         ends = like.solid_ends
         if pattern is not None:
             ends = like.passive_columns * arm.length / arm.cells[0]
+        if len(arm.cells) == 3:
+            from dolfinopt.mesh.box import box_arm
+
+            size = arm.length, arm.height, arm.thickness
+            return with_regions(box_arm(comm, arm.name, size, arm.cells, ends), like, scales)
         mesh = structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, ends)
-    return with_regions(mesh, like, [like.length / arm.length, like.height / arm.height])
+    return with_regions(mesh, like, scales)
 
 
 def structured_arm(
@@ -122,12 +134,12 @@ def structured_arm(
                 mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
     with together(comm):
-        _snap(parts[0].geometry.x[:, 0], 0.0, length / cells[0])
-        _snap(parts[0].geometry.x[:, 1], -0.5 * height, height / cells[1])
+        snap(parts[0].geometry.x[:, 0], 0.0, length / cells[0])
+        snap(parts[0].geometry.x[:, 1], -0.5 * height, height / cells[1])
         return _arm_mesh(comm, name, length, *parts)
 
 
-def _snap(values: np.ndarray, first: float, step: float) -> None:
+def snap(values: np.ndarray, first: float, step: float) -> None:
     """Move coordinates that lie on a grid but for Gmsh's rounding, 1e-14 m, to its very lines."""
     lines = first + step * np.rint((values - first) / step)
     near = np.abs(values - lines) < SNAP * step
@@ -156,7 +168,8 @@ def _arm_mesh(
     comm: MPI.Comm, name: str, length: float, mesh: Any, cell_tags: Any, facet_tags: Any
 ) -> ArmMesh:
     owned, _ = compat.local_cell_counts(mesh)
-    corners = compat.cell_coordinates(mesh, owned)[:, :, :2]
+    dim = mesh.geometry.dim
+    corners = compat.cell_coordinates(mesh, owned)[:, :, :dim]
     solid = np.zeros(owned, dtype=bool)
     tagged = cell_tags.indices[cell_tags.values == PASSIVE]
     solid[tagged[tagged < owned]] = True
@@ -165,12 +178,12 @@ def _arm_mesh(
         comm=comm,
         mesh=mesh,
         centroid=corners.mean(axis=1),
-        area=_cell_area(corners),
+        area=cell_areas(corners) if dim == 2 else cell_volumes(corners),
         passive=solid,
         void=np.zeros(owned, dtype=bool),
         inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
         outboard_facets=facet_tags.indices[facet_tags.values == OUTBOARD],
-        outboard_point=np.array([length, 0.0]),
+        outboard_point=np.array([length, 0.0, 0.0])[:dim],
     )
 
 
@@ -180,7 +193,7 @@ def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmM
     Args:
         mesh: of the arm, or of one that repeats it.
         arm: has the regions.
-        scale: factors (2,) from the mesh's coordinates to the arm's.
+        scale: factors (3,) from the mesh's coordinates to the arm's.
 
     Raises:
         InputError: the arm of a mesh file cannot have them; scenes know it of rectangular ones.
@@ -189,7 +202,7 @@ def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmM
         return mesh
     from dolfinopt.scene.regions import region_cells, region_problem
 
-    centroid = mesh.centroid * scale
+    centroid = mesh.centroid * scale[: mesh.dim]
     if arm.mesh is not None and (problem := region_problem(arm, _all_cells(mesh))):
         number, reason = problem
         raise InputError(f"arm {arm.name!r}: region {number} of arms.regions: {reason}")
@@ -225,33 +238,28 @@ def _distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def _cell_area(corners: np.ndarray) -> np.ndarray:
-    """Return the area (n,) of straight triangles or quadrilaterals in DOLFINx's corner order."""
-    if corners.shape[1] == 3:
-        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    else:  # tensor-product order: 0-3 and 1-2 are the diagonals
-        first, second = corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]
-    return 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-
-
 def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the facets between two cells this rank knows, ghost cells included.
 
     Returns:
-        Local numbers of the two cells, the facet's length and the distance of the cells'
-        centroids, each (n_facets,); m.
+        Local numbers of the two cells, the facet's length (area in space) and the distance of the
+        cells' centroids, each (n_facets,); m, m2.
     """
     owned, ghosts = compat.local_cell_counts(mesh)
     nodes = compat.cell_geometry_nodes(mesh, owned + ghosts)
-    corners = mesh.geometry.x[nodes][:, :, :2]
-    # DOLFINx's corner order: a tensor product for quadrilaterals.
-    sides = ((0, 1), (0, 2), (1, 2)) if nodes.shape[1] == 3 else ((0, 1), (0, 2), (1, 3), (2, 3))
+    dim = mesh.geometry.dim
+    corners = mesh.geometry.x[nodes][:, :, :dim]
+    sides = facet_corners(dim, nodes.shape[1])
     ends = np.concatenate([np.sort(nodes[:, side], axis=1) for side in sides])
     cell = np.tile(np.arange(len(nodes)), len(sides))
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    order = np.lexsort(ends.T[::-1])
     twice = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
     first, second = cell[order[twice]], cell[order[twice + 1]]
-    a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
     centroid = corners.mean(axis=1)
-    length = np.linalg.norm(a - b, axis=1)
-    return first, second, length, np.linalg.norm(centroid[first] - centroid[second], axis=1)
+    distance = np.linalg.norm(centroid[first] - centroid[second], axis=1)
+    if dim == 3:
+        around = np.concatenate([nodes[:, side] for side in sides])[order[twice]]
+        area = np.linalg.norm(facet_areas(mesh.geometry.x[around]), axis=1)
+        return first, second, area, distance
+    a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
+    return first, second, np.linalg.norm(a - b, axis=1), distance

@@ -83,8 +83,12 @@ def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
     return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
 
 
+# Facets of a cell by its number of corners, in the plane and in space.
+FACETS = {(2, 3): 3, (2, 4): 4, (3, 4): 4, (3, 8): 6}
+
+
 def cell_corner_count(mesh: Any) -> int:
-    """Return the corners of a cell, 3 or 4; cells have straight sides."""
+    """Return the corners of a cell, 3, 4 or 8; cells have straight sides."""
     return int(mesh.geometry.cmap.create_dof_layout().num_dofs)  # a rank may have no cell
 
 
@@ -101,14 +105,33 @@ def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:
 def cell_facets(mesh: Any, num_cells: int) -> np.ndarray:
     """Return the facets' local numbers (num_cells, facets a cell) of the first cells.
 
-    In the order of the reference cell: triangles opposite to corners 0, 1, 2; quadrilaterals
-    between corners 01, 02, 13, 23.
+    In the order of the reference cell, see `cells.facet_corners`.
     """
     dim = mesh.topology.dim
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim, dim - 1)
     links = mesh.topology.connectivity(dim, dim - 1)
-    return _rows(links, cell_corner_count(mesh))[:num_cells].astype(np.int32)
+    facets = FACETS[dim, cell_corner_count(mesh)]
+    return _rows(links, facets)[:num_cells].astype(np.int32)
+
+
+def facets_on(mesh: Any, plane: float, tolerance: float) -> np.ndarray:
+    """Return the local numbers of this rank's boundary facets on the plane x = `plane`."""
+    found = dolfinx.mesh.locate_entities_boundary(
+        mesh, mesh.topology.dim - 1, lambda x: np.abs(x[0] - plane) < tolerance
+    )
+    return np.asarray(found, dtype=np.int32)
+
+
+def box_mesh(comm: MPI.Comm, low: np.ndarray, high: np.ndarray, cells: tuple[int, ...]) -> Any:
+    """Return a grid of hexahedra between two corners, ghosted as by `model_to_mesh`."""
+    return dolfinx.mesh.create_box(
+        comm,
+        [np.asarray(low, dtype=float), np.asarray(high, dtype=float)],
+        list(cells),
+        dolfinx.mesh.CellType.hexahedron,
+        ghost_mode=GhostMode.shared_facet,
+    )
 
 
 def local_cell_counts(mesh: Any) -> tuple[int, int]:

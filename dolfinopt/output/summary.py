@@ -389,7 +389,7 @@ def _unstiffened(stiffening: Stiffening | None) -> list[str]:
 def _volume(scene: Scene, index: int, arm: Arm) -> float:
     """Return the volume of all arms with one design, m3."""
     area = arm.mesh.comm.allreduce(arm.mesh.area.sum())
-    return float(len(arm.places) * scene.arms[index].thickness * area)
+    return float(len(arm.places) * scene.arms[index].depth * area)
 
 
 def _figures(evaluation: Motion) -> dict[str, float]:

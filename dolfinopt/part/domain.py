@@ -151,7 +151,7 @@ def domain_of(
         outline=region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool)),
         solid=region_of(mesh, cells, mesh.passive),
         void=region_of(mesh, cells, mesh.void),
-        grid=entry.cells,
+        grid=None if entry.cells is None else entry.cells[:2],
         length=entry.length,
         thickness=entry.thickness,
         symmetric=like.symmetric,

@@ -28,13 +28,13 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """u(X, t) = V(X) q(t) on one arm; q coordinates.
+    """u(X, t) = V(X) q(t) on one arm; q coordinates, d directions, b outboard coordinates.
 
     Attributes:
-        V: (n_nodes, 2, q) nodal values of the modes on this rank, ghosts included.
-        MV: (n_nodes, 2, q) mass matrix times V, contributions of this rank's cells.
+        V: (n_nodes, d, q) nodal values of the modes on this rank, ghosts included.
+        MV: (n_nodes, d, q) mass matrix times V, contributions of this rank's cells.
         stiffness: (q, q) V' K V.
-        outboard: (3, q) coordinates (u_x, u_y, theta) of the outboard interface in each mode.
+        outboard: (b, q) coordinates of the outboard interface in each mode.
         start: (interior dofs, k) eigenvectors, from which the next design's search starts.
     """
 
@@ -53,8 +53,8 @@ class AdjointFields:
     rigid motions R of `frame_fields`.
 
     Attributes:
-        stiffness, mass: (n_nodes, 2, q).
-        frame: (n_nodes, 2, 3), or None where the basis does not depend on M R.
+        stiffness, mass: (n_nodes, d, q).
+        frame: (n_nodes, d, b), or None where the basis does not depend on M R.
     """
 
     stiffness: np.ndarray
@@ -69,6 +69,9 @@ def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
     neither symmetric nor antisymmetric modes give zero.
     """
     x = arm.points[:, 0] / arm.mesh.outboard_point[0]
-    weight = np.stack([1.0 + x, 1.0 + x], axis=1)
+    weight = np.stack([1.0 + x] * arm.mesh.dim, axis=1)
+    if arm.mesh.dim == 3:  # torsion has no mean, bending in z and in y may have the same
+        y, z = (arm.points[:, 1:] / arm.mesh.outboard_point[0]).T
+        weight += np.stack([0.3 * z, -7.0 * z, 1.3 + 7.0 * y], axis=1)
     mean = arm.comm.allreduce(np.einsum("ni,nik->k", weight, MV))
     return np.where(mean < 0.0, -1.0, 1.0)

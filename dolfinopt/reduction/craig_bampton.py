@@ -13,33 +13,34 @@ from dolfinopt.reduction.eigenproblem import complement_solve, interior_pencil, 
 
 
 def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
-    """Reduce to 3 constraint modes and q - 3 fixed-interface normal modes.
+    """Reduce to b constraint modes and q - b fixed-interface normal modes; b is 3, in space 6.
 
     Psi = [-K_II^-1 K_Ib; I],  K_II Phi = M_II Phi diag(lambda). The stiffness is block diagonal:
     Psi' K Psi and diag(lambda).
 
     Args:
         arm: with its design set.
-        options: coordinates q >= 3; with q = 3 no eigenproblem is solved.
+        options: coordinates q >= b; with q = b no eigenproblem is solved.
         start: `Basis.start` of a nearby design, or None.
     """
     arm.profile.counts.reductions += 1
-    normal = options.coordinates - 3
     static = arm.constraint_modes()
+    b = len(static.stiffness)
+    normal = options.coordinates - b
     modes = np.empty((arm.num_interior, 0))
     if normal > 0:
         _, modes = lowest_eigenpairs(interior_pencil(arm), normal, start)
-    outboard = np.hstack([np.eye(3), np.zeros((3, normal))])
+    outboard = np.hstack([np.eye(b), np.zeros((b, normal))])
     V = arm.expand(np.hstack([static.interior, modes]), outboard)
     MV = arm.mass_times(V)
     sign = np.ones(options.coordinates)
-    sign[3:] = orient(arm, V[:, :, 3:], MV[:, :, 3:])
+    sign[b:] = orient(arm, V[:, :, b:], MV[:, :, b:])
     # Constraint and normal modes are K-orthogonal, normal modes among themselves, too.
     stiffness = np.zeros((options.coordinates, options.coordinates))
-    stiffness[:3, :3] = static.stiffness
+    stiffness[:b, :b] = static.stiffness
     if normal > 0:
-        stiffness[3:, 3:] = np.diag(np.diag(arm.energy_matrix(V[:, :, 3:])))
-    return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[3:])
+        stiffness[b:, b:] = np.diag(np.diag(arm.energy_matrix(V[:, :, b:])))
+    return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[b:])
 
 
 def craig_bampton_adjoint(
@@ -57,13 +58,14 @@ def craig_bampton_adjoint(
     Args:
         arm, basis, options: of the current design.
         interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (3, q) cotangents of its outboard rows; without effect here.
+        outboard: (b, q) cotangents of its outboard rows; without effect here.
     """
-    mu = arm.solve(interior[:, :3])
-    values = np.concatenate([np.zeros(3), np.diag(basis.stiffness)[3:]])
-    if interior.shape[1] > 3:
+    b = len(basis.outboard)
+    mu = arm.solve(interior[:, :b])
+    values = np.concatenate([np.zeros(b), np.diag(basis.stiffness)[b:]])
+    if interior.shape[1] > b:
         pencil = interior_pencil(arm)
-        normal = complement_solve(pencil, basis.start, values[3:], interior[:, 3:])
+        normal = complement_solve(pencil, basis.start, values[b:], interior[:, b:])
         mu = np.hstack([mu, normal])
     field = arm.expand(mu, np.zeros_like(outboard))
     return AdjointFields(field, field * values)

@@ -8,9 +8,10 @@ import numpy as np
 from petsc4py import PETSc
 
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.interface import rigid_motions
 from dolfinopt.reduction.eigenproblem import Pencil
 
-Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (3, k) outboard rows
+Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
 
 class FreeArm:
@@ -21,8 +22,8 @@ class FreeArm:
 
     Attributes:
         arm: with its design set.
-        psi: (num_interior, 3) interior rows of the constraint modes.
-        schur_inverse: (3, 3) compliance of the outboard interface.
+        psi: (num_interior, b) interior rows of the constraint modes.
+        schur_inverse: (b, b) compliance of the outboard interface.
     """
 
     def __init__(self, arm: ElasticArm):
@@ -32,7 +33,7 @@ class FreeArm:
         self.schur_inverse = np.linalg.inv(modes.stiffness)
 
     def solve(self, right: Rows) -> np.ndarray:
-        """Return (T'KT)^-1 right as a nodal field (n_nodes, 2, k); no solve for zero rows."""
+        """Return (T'KT)^-1 right as a nodal field (n_nodes, d, k); no solve for zero rows."""
         interior, outboard = right
         if self.arm.comm.allreduce(int(interior.any())):
             lift = self.arm.comm.allreduce(self.psi.T @ interior)
@@ -43,36 +44,34 @@ class FreeArm:
 
 
 def interface_loads(free: FreeArm) -> Rows:
-    """Return unit loads (N, N, N m) at the outboard interface."""
-    return np.zeros((free.arm.num_interior, 3)), np.eye(3)
+    """Return unit forces and moments (N, N m) at the outboard interface."""
+    b = len(free.corner)
+    return np.zeros((free.arm.num_interior, b)), np.eye(b)
 
 
 def frame_loads(free: FreeArm) -> Rows:
-    """Return M [1_y, S X, 1_x]: inertia loads of unit accelerations of the frame.
-
-    Transverse ones first: they bend the arm.
-    """
+    """Return M times `frame_fields`: inertia loads of unit accelerations of the frame."""
     return free.arm.restrict(free.arm.mass_times(frame_fields(free.arm)))
 
 
 def frame_fields(arm: ElasticArm) -> np.ndarray:
-    """Return the rigid motions [1_y, S X, 1_x] of the frame (n_nodes, 2, 3)."""
-    fields = np.zeros((len(arm.points), 2, 3))
-    fields[:, 1, 0] = 1.0
-    fields[:, 0, 1], fields[:, 1, 1] = -arm.points[:, 1], arm.points[:, 0]
-    fields[:, 0, 2] = 1.0
-    return fields
+    """Return the rigid motions [1_y, S X, 1_x] of the frame (n_nodes, d, b).
+
+    Transverse ones first: they bend the arm. In space 1_y, 1_z, e_z x X, e_y x X, e_x x X, 1_x.
+    """
+    order = [1, 2, 0] if arm.mesh.dim == 2 else [1, 2, 5, 4, 3, 0]
+    return np.ascontiguousarray(rigid_motions(arm.points)[:, :, order])
 
 
 class FreeOperators:
     """T'KT, T'MT and the inverse of the former as operators that are never assembled.
 
-    Vectors are the owned interior dofs; the three outboard coordinates follow those of the last
+    Vectors are the owned interior dofs; the b outboard coordinates follow those of the last
     rank.
     """
 
     def __init__(self, arm: ElasticArm, carried: np.ndarray | None = None):
-        """Set up; `carried` (3, 3) is the inertia of what is fixed to the outboard interface."""
+        """Set up; `carried` (b, b) is the inertia of what is fixed to the outboard interface."""
         self.arm = arm
         self.last = arm.comm.rank == arm.comm.size - 1
         self.free = FreeArm(arm)
@@ -81,7 +80,7 @@ class FreeOperators:
         self.pencil = Pencil(arm, self.solve, self.mass_times, self._matrices)
 
     def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the interior rows and the outboard coordinates (3, ...), the latter everywhere."""
+        """Return the interior rows and the outboard coordinates (b, ...), the latter everywhere."""
         outboard = rows[self.arm.num_interior :] if self.last else None
         if self.arm.comm.size > 1:
             outboard = self.arm.comm.bcast(outboard, root=self.arm.comm.size - 1)
@@ -120,7 +119,7 @@ class FreeOperators:
 
     def _matrices(self) -> tuple[PETSc.Mat, PETSc.Mat]:
         """Return T'KT and T'MT as PETSc's Python matrices."""
-        rows = self.arm.num_interior + (3 if self.last else 0)
+        rows = self.arm.num_interior + (len(self.free.corner) if self.last else 0)
         size, found = ((rows, None), (rows, None)), []
         for times in (self.stiffness_times, self.mass_times):
             mat = PETSc.Mat().createPython(size, _Product(times), comm=self.arm.comm)

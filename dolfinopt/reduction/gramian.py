@@ -86,13 +86,16 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
 
 
 def _inputs(free: FreeArm) -> Rows:
-    """Return the six inputs (.., 6), all for the same unit of acceleration."""
+    """Return the inputs (.., 2 b), all for the same unit of acceleration."""
     arm = free.arm
     fields = frame_fields(arm)
     mass = dot(arm, fields, arm.mass_times(fields))[0, 0]  # of the arm
     length = float(np.linalg.norm(arm.mesh.outboard_point))
     loads, inertia = interface_loads(free), frame_loads(free)
-    by_load, by_frame = mass * np.array([1.0, 1.0, length]), np.array([1.0, 1.0 / length, 1.0])
+    turns = [1.0, 1.0 / length, 1.0] if arm.mesh.dim == 2 else [1.0, 1.0, *(1.0 / length,) * 3, 1.0]
+    shift = arm.mesh.dim
+    by_load = mass * np.array([*(1.0,) * shift, *(length,) * (len(turns) - shift)])
+    by_frame = np.array(turns)
     return (
         np.hstack([loads[0] * by_load, inertia[0] * by_frame]),
         np.hstack([loads[1] * by_load, inertia[1] * by_frame]),

@@ -28,8 +28,9 @@ def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -
     With K_w = K - w^2 M the subspace of one shift is spanned by K_w^-1 B, K_w^-1 M K_w^-1 B, ...,
     for the inputs B: unit loads of the outboard interface, then M times unit accelerations of the
     frame. Projection onto k complete blocks matches 2 k moments of B' (K - s M)^-1 B about
-    s = w^2, as K and M are symmetric, also under damping proportional to K. Blocks of three are
-    taken in turn: interface loads at all shifts, accelerations at all shifts, then the next power.
+    s = w^2, as K and M are symmetric, also under damping proportional to K. Blocks of three
+    (six in space) are taken in turn: interface loads at all shifts, accelerations at all shifts,
+    then the next power.
 
     The basis of that space are its Ritz vectors, M-orthonormal, by ascending frequency.
 
@@ -61,7 +62,7 @@ def krylov_adjoint(
     Args:
         arm, basis, options: of the current design.
         interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (3, q) cotangents of its outboard rows.
+        outboard: (b, q) cotangents of its outboard rows.
     """
     recursion = _recursion(arm, options)
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
@@ -73,7 +74,7 @@ def krylov_adjoint(
     interior = (interior - weighted[0] @ inner) @ turn.T
     outboard = (outboard - weighted[1] @ inner) @ turn.T
     stiffness, mass = np.zeros_like(basis.V), np.zeros_like(basis.V)
-    frame = np.zeros((*basis.V.shape[:2], 3))
+    frame = np.zeros((*basis.V.shape[:2], len(basis.outboard)))
     for block in reversed(recursion.blocks):
         kept, H = block.expansion.kept, block.expansion.coefficients[:, block.expansion.kept]
         old, new = slice(0, len(H) - len(kept)), slice(len(H) - len(kept), len(H))
@@ -118,7 +119,7 @@ class _Block:
 
 @dataclass(frozen=True, eq=False)
 class _Recursion:
-    """M-orthonormal V (n_nodes, 2, q), M V, and the blocks that made them, in their order."""
+    """M-orthonormal V (n_nodes, d, q), M V, and the blocks that made them, in their order."""
 
     free: FreeArm
     V: np.ndarray
@@ -129,11 +130,13 @@ class _Recursion:
 def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
     """Build exactly q columns."""
     free = FreeArm(arm)
-    V = MV = np.empty((len(arm.points), 2, 0))
+    V = MV = np.empty((*arm.points.shape, 0))
     blocks: list[_Block] = []
     omegas = [2.0 * np.pi * shift for shift in options.shifts]
     chains: list[tuple[float, _Group | None, np.ndarray]] = [
-        (omega, group, np.arange(3)) for group in (interface_loads, frame_loads) for omega in omegas
+        (omega, group, np.arange(len(free.corner)))
+        for group in (interface_loads, frame_loads)
+        for omega in omegas
     ]
     while V.shape[2] < options.coordinates:
         if not chains:

@@ -41,7 +41,7 @@ def modal_adjoint(
     Args:
         arm, basis, options: of the current design.
         interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (3, q) cotangents of its outboard rows.
+        outboard: (b, q) cotangents of its outboard rows.
     """
     operator = FreeOperators(arm)
     values = np.diag(basis.stiffness)

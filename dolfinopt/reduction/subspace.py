@@ -33,7 +33,7 @@ def total(arm: ElasticArm, part: Any) -> Any:
 
 
 def combine(V: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return V coefficients (n_nodes, 2, k), as one matrix product."""
+    """Return V coefficients (n_nodes, d, k), as one matrix product."""
     flat = V.reshape(V.shape[0] * V.shape[1], V.shape[2]) @ coefficients
     return flat.reshape(*V.shape[:2], coefficients.shape[1])
 
@@ -43,7 +43,7 @@ class Expansion:
     """W[kept] = [V, Q] coefficients; what is not kept lies in the span of V and Q.
 
     Attributes:
-        Q, MQ: (n_nodes, 2, k) new columns, M-orthonormal and M-orthogonal to V; M times them.
+        Q, MQ: (n_nodes, d, k) new columns, M-orthonormal and M-orthogonal to V; M times them.
         coefficients: (columns of V + k, columns of W).
         kept: (k,) the columns of W that were independent.
     """
@@ -68,8 +68,8 @@ def orthonormalise(
 
     Args:
         arm: with its design set.
-        W: (n_nodes, 2, k).
-        V, MV: (n_nodes, 2, r) M-orthonormal, and M V.
+        W: (n_nodes, d, k).
+        V, MV: (n_nodes, d, r) M-orthonormal, and M V.
         deflation: share of a column's length below which its remainder is dropped.
 
     Raises:
@@ -101,8 +101,8 @@ def _qr(
     arm: ElasticArm, W: np.ndarray, least: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Q, R, kept with W[kept] = Q R[kept]; remainders up to `least` are dropped."""
-    n_nodes, _, k = W.shape
-    columns = np.ascontiguousarray(W.reshape(2 * n_nodes, k).T)
+    n_nodes, dim, k = W.shape
+    columns = np.ascontiguousarray(W.reshape(dim * n_nodes, k).T)
     Q, MQ = np.empty_like(columns), np.empty_like(columns)
     R, kept = np.zeros((k, k)), list[int]()
     for j, w in enumerate(columns):
@@ -111,14 +111,14 @@ def _qr(
             h = total(arm, MQ[:n] @ w)
             w -= h @ Q[:n]
             R[:n, j] += h
-        Mw = arm.mass_times(w.reshape(n_nodes, 2, 1)).ravel()
+        Mw = arm.mass_times(w.reshape(n_nodes, dim, 1)).ravel()
         length = np.sqrt(max(total(arm, w @ Mw), 0.0))
         if length <= least[j]:
             continue
         Q[n], MQ[n], R[n, j] = w / length, Mw / length, length
         kept.append(j)
     n = len(kept)
-    fields = np.ascontiguousarray(Q[:n].T).reshape(n_nodes, 2, n)
+    fields = np.ascontiguousarray(Q[:n].T).reshape(n_nodes, dim, n)
     return fields, R[:n], np.array(kept, dtype=int)
 
 
@@ -128,13 +128,13 @@ class InverseSpace:
     K^-1 M V_j = V H_j, V' M V = I: with it (K - w^2 M) z = b is a small problem for any w.
 
     Attributes:
-        V, MV: (n_nodes, 2, r) with the newest block last.
+        V, MV: (n_nodes, d, r) with the newest block last.
         H: (r, columns that K^-1 M was applied to).
         start: (r_0, k) coefficients of the first fields in the first r_0 columns.
     """
 
     def __init__(self, free: FreeArm, first: np.ndarray, deflation: float):
-        """Begin with the fields `first` (n_nodes, 2, k)."""
+        """Begin with the fields `first` (n_nodes, d, k)."""
         self.free, self.deflation = free, deflation
         none = np.empty((*first.shape[:2], 0))
         expansion = orthonormalise(free.arm, first, none, none, deflation)
@@ -164,7 +164,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
 
     Args:
         arm: with its design set.
-        V: (n_nodes, 2, q) within the range of T.
+        V: (n_nodes, d, q) within the range of T.
 
     Raises:
         ConvergenceError: the columns of V are dependent.
@@ -201,13 +201,13 @@ def _interior(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
 
 
 def interface_coordinates(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
-    """Return the coordinates (3, k) of the outboard interface in nodal fields that keep it rigid.
+    """Return the coordinates (b, k) of the outboard interface in nodal fields that keep it rigid.
 
     Args:
         arm: the field's.
-        field: (n_nodes, 2, k).
+        field: (n_nodes, d, k).
     """
-    rigid = arm.rigid[arm.outboard].reshape(-1, 3)
+    rigid = arm.rigid[arm.outboard].reshape(-1, arm.rigid.shape[2])
     moved = field[arm.outboard].reshape(len(rigid), field.shape[2])
     # A node that several ranks know counts several times: the fit is exact all the same.
     normal, right = arm.comm.allreduce(rigid.T @ rigid), arm.comm.allreduce(rigid.T @ moved)
@@ -215,7 +215,7 @@ def interface_coordinates(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
 
 
 def solve_at(free: FreeArm, omega: float, right: Rows, tolerance: float, most: int) -> np.ndarray:
-    """Solve (T'KT - omega^2 T'MT) z = right for all columns at once; a field (n_nodes, 2, k).
+    """Solve (T'KT - omega^2 T'MT) z = right for all columns at once; a field (n_nodes, d, k).
 
     Block GMRES preconditioned with the factor of K at hand, in the inner product of M. Above the
     first natural frequency K - omega^2 M is indefinite, but the preconditioned eigenvalues

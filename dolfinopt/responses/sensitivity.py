@@ -53,7 +53,7 @@ def exact_gradient(
     Args:
         state: of the arm.
         cotangents: the function's derivatives by the body's integrals; those by D join K's.
-        by_columns: (n_nodes, 2, q + 7 + 2 q) its derivatives by `LoadFields.columns`, where it
+        by_columns: (n_nodes, d, columns) its derivatives by `LoadFields.columns`, where it
             depends on these, too; contributions of this rank's cells.
 
     Returns:
@@ -78,7 +78,8 @@ def exact_gradient(
             geometric = state.unit_loads.gradient(V, by_K0, static=static, by_fields=by_unit_loads)
             by_V += geometric.by_modes
             if static:  # K's first block is S; the constraint modes' interior is in equilibrium
-                by_K[:3, :3] += geometric.by_stiffness
+                b = len(geometric.by_stiffness)
+                by_K[:b, :b] += geometric.by_stiffness
         interior, outboard = elastic.restrict(by_V)
         method = METHODS[state.scene.reduction.method]
         assert method.adjoint is not None  # the scene refuses the others
@@ -112,7 +113,7 @@ def deflection_gradient(
 
 
 def _static_gradient(state: DesignState, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard displacements (3, k)."""
+    """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard displacements (b, k)."""
     with state.elastic.profile.phase("gradient"):
         field = state.elastic.constraint_modes().field
         energies = state.elastic.cell_stiffness_products(field @ left, field @ right)

@@ -66,7 +66,7 @@ class VolumeFraction(Response):
 def cell_volumes(scene: Scene, meshes: Mapping[int, ArmMesh]) -> dict[int, np.ndarray]:
     """Return the volume (n_cells,) of every arm's cells times the arms that have them, m3."""
     uses = occurrences(scene)
-    return {k: uses[k] * scene.arms[k].thickness * mesh.area for k, mesh in meshes.items()}
+    return {k: uses[k] * scene.arms[k].depth * mesh.area for k, mesh in meshes.items()}
 
 
 def _of_cells(analysis: Analysis) -> dict[int, np.ndarray]:

@@ -35,7 +35,7 @@ class Cells:
     """All cells of one arm, as `region_problem` wants them.
 
     Attributes:
-        centroid: (n_cells, 2), m.
+        centroid: (n_cells, d), m.
         passive: (n_cells,) True where the cell is solid without any region.
         inboard, outboard: (n_cells,) True where the cell has a side on that interface.
         pairs: (k, 2) numbers of cells with a side in common.
@@ -49,11 +49,12 @@ class Cells:
 
 
 def region_cells(arm: Arm, centroid: np.ndarray) -> RegionCells:
-    """Return the cells whose centroids (n_cells, 2), m, are in the arm's regions.
+    """Return the cells whose centroids (n_cells, d), m, are in the arm's regions.
 
-    On an arm with `symmetric` a region stands for its mirror image about y = 0, too.
+    On a solid arm they go through the whole thickness. On an arm with `symmetric` a region stands
+    for its mirror image about y = 0, too.
     """
-    x, y = centroid.T
+    x, y = centroid.T[:2]
     each = []
     for region in arm.regions:
         inside = region.covers(x, y)
@@ -116,7 +117,7 @@ def _falls_apart(cells: Cells, solid: np.ndarray, void: np.ndarray) -> str | Non
 def grid_regions(arm: Arm) -> tuple[RegionCells, tuple[int, str] | None]:
     """Return the cells of a rectangular arm's regions, and `region_problem`."""
     assert arm.cells is not None
-    along, across = arm.cells
+    along, across = arm.cells[:2]  # the same over the thickness
     i, j = (n.ravel() for n in np.mgrid[:along, :across])
     centroid = np.column_stack(
         [(i + 0.5) * arm.length / along, ((j + 0.5) / across - 0.5) * arm.height]
@@ -149,4 +150,5 @@ def grid_shares(arm: Arm) -> tuple[float, float]:
     found, _ = grid_regions(arm)
     columns, across = arm.passive_columns, arm.cells[1]
     inner = found.solid[columns * across : (arm.cells[0] - columns) * across]
-    return float(inner.sum() / arm.n_cells), float(found.void.sum() / arm.n_cells)
+    count = arm.cells[0] * across
+    return float(inner.sum() / count), float(found.void.sum() / count)

@@ -1,4 +1,4 @@
-"""Bilinear quadrilaterals with incompatible modes."""
+"""Bilinear quadrilaterals and trilinear hexahedra with incompatible modes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from dolfinopt.fem.elements.base import ElementOperators, plane_stress, strains
-from dolfinopt.fem.elements.geometry import cell_corners, gauss_points, jacobian
+from dolfinopt.fem.elements.geometry import (
+    by_cells,
+    cell_corners,
+    gauss_points,
+    jacobian,
+    same_corners,
+)
 from dolfinopt.fem.elements.lagrange import LagrangeElement, mass_form
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -20,18 +26,19 @@ CENTRE = np.array([[0.5, 0.5]])
 
 @dataclass(frozen=True)
 class IncompatibleElement:
-    """Bilinear quadrilaterals with Wilson's incompatible modes in Taylor's form: QM6.
+    """Quadrilaterals and hexahedra with Wilson's incompatible modes in Taylor's form: QM6.
 
-    a (1 - a) and b (1 - b), (a, b) in [0, 1]^2, in both components let a cell bend without shear.
+    a (1 - a) and b (1 - b), (a, b) in [0, 1]^2, in both components let a cell bend without shear;
+    in space c (1 - c) joins them, and there are nine amplitudes instead of four.
     Their gradients in the reference cell are mapped by the Jacobian J_0 of the cell's centre and
     scaled by det J_0 / det J: their mean over the cell is then zero, so that constant strain does
-    not excite them (the patch test) on any quadrilateral. Their four amplitudes are no concern of
+    not excite them (the patch test) on any such cell. Their amplitudes are no concern of
     other cells and are condensed,
 
         k_e = k_uu - k_ua k_aa^-1 k_au,
 
-    so that k_e stays proportional to Young's modulus. 2 x 2 Gauss points. The modes move no nodes
-    and carry no mass: m_e is that of the bilinear functions.
+    so that k_e stays proportional to Young's modulus. 2 Gauss points a direction. The modes move
+    no nodes and carry no mass: m_e is that of the bilinear functions.
 
     Source: Taylor, Beresford & Wilson, Int. J. Numer. Methods Eng. 10 (1976) 1211-1219,
     doi:10.1002/nme.1620100602.
@@ -41,6 +48,10 @@ class IncompatibleElement:
 
     def operators(self, mesh: ArmMesh, thickness: float, poisson_ratio: float) -> ElementOperators:
         """Return the condensed matrices, see `Element`."""
+        if mesh.dim == 3:
+            from dolfinopt.fem.elements.solid import solid_operators
+
+            return solid_operators(self, mesh, poisson_ratio, modes=True)
         space = compat.lagrange_space(mesh.mesh, 1, components=2)
         m_form = mass_form(mesh, 1)
         with together(mesh.comm):
@@ -59,7 +70,7 @@ class IncompatibleElement:
             )
 
     def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
-        """Return those of the bilinear functions, see `Element`."""
+        """Return those of the nodes' functions, see `Element`."""
         return BILINEAR.derivatives(mesh, points)
 
     def strain_operator(
@@ -67,6 +78,17 @@ class IncompatibleElement:
     ) -> np.ndarray:
         """Return B, the condensed modes' strains included, see `Element`."""
         assert operators.recovery is not None
+        if mesh.dim == 3:
+            from dolfinopt.fem.elements.solid import mode_gradients
+
+            corners = same_corners(cell_corners(mesh))
+            own = by_cells(lambda part: strains(mode_gradients(part, points)), corners)
+            return by_cells(
+                lambda gradients, own, recovery: strains(gradients) + own @ recovery[:, None],
+                self.derivatives(mesh, points),
+                own,
+                operators.recovery,
+            )
         own = strains(_mode_gradients(cell_corners(mesh), points))
         return strains(self.derivatives(mesh, points)) + own @ operators.recovery[:, None]
 

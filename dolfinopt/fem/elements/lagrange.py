@@ -1,4 +1,4 @@
-"""Lagrange elements: quadrilaterals and triangles with polynomial displacements."""
+"""Lagrange elements: polynomial displacements on cells with straight sides."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ import ufl
 from dolfinx import fem
 
 from dolfinopt.fem.elements.base import ElementOperators, strains
-from dolfinopt.fem.elements.geometry import cell_corners, jacobian, shape_derivatives
+from dolfinopt.fem.elements.geometry import (
+    by_cells,
+    cell_corners,
+    jacobian,
+    same_corners,
+    shape_derivatives,
+)
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
@@ -18,7 +24,7 @@ from dolfinopt.parallel import together
 
 @dataclass(frozen=True)
 class LagrangeElement:
-    """Quadrilaterals or triangles with straight sides and polynomial displacements.
+    """Quadrilaterals, triangles, hexahedra or tetrahedra with polynomial displacements.
 
     Attributes:
         degree: polynomial degree of the displacement.
@@ -29,8 +35,13 @@ class LagrangeElement:
     def operators(self, mesh: ArmMesh, thickness: float, poisson_ratio: float) -> ElementOperators:
         """Tabulate the element matrices with FFCx's own kernels, see `Element`.
 
-        k_e = int B' C B t dA with E = 1,  m_e = int N' N t dA.
+        k_e = int B' C B t dA with E = 1,  m_e = int N' N t dA. Cells in space have too many dofs
+        for kernels called cell by cell.
         """
+        if mesh.dim == 3:
+            from dolfinopt.fem.elements.solid import solid_operators
+
+            return solid_operators(self, mesh, poisson_ratio)
         vector = compat.lagrange_space(mesh.mesh, self.degree, components=2)
         k_form = compat.compile_form(stiffness_form(vector))
         m_form = mass_form(mesh, self.degree)
@@ -49,6 +60,13 @@ class LagrangeElement:
 
     def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
         """Return those in the reference cell times the inverse Jacobian, see `Element`."""
+        if mesh.dim == 3:
+            from dolfinopt.fem.elements.solid import nodal_gradients
+
+            return by_cells(
+                lambda part: nodal_gradients(part, self.degree, points),
+                same_corners(cell_corners(mesh)),
+            )
         corners = cell_corners(mesh)
         local = shape_derivatives(corners.shape[1], self.degree, points)
         return local @ np.linalg.inv(jacobian(corners, points))
@@ -57,7 +75,7 @@ class LagrangeElement:
         self, mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
     ) -> np.ndarray:
         """Return B from the derivatives of the shape functions, see `Element`."""
-        return strains(self.derivatives(mesh, points))
+        return by_cells(strains, self.derivatives(mesh, points))
 
 
 def stiffness_form(space: Any) -> ufl.Form:

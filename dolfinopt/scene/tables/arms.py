@@ -23,12 +23,16 @@ from dolfinopt.scene.tables.regions import Region
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
-CellShape = Literal["quadrilateral", "triangle"]
+CellShape = Literal["quadrilateral", "triangle", "hexahedron", "tetrahedron"]
 ElementName = Literal["incompatible", "linear", "quadratic"]
 DEFAULT_ELEMENT: dict[CellShape, ElementName] = {
     "quadrilateral": "incompatible",
     "triangle": "quadratic",
+    "hexahedron": "incompatible",
+    "tetrahedron": "quadratic",
 }
+SIMPLICES = ("triangle", "tetrahedron")
+SOLID_SHAPES = ("hexahedron", "tetrahedron")
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MESH_FILES = (".geo", ".msh", ".step", ".stp")
@@ -44,7 +48,7 @@ MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
 # never taken from the arm before
 OWN_KEYS = ("name", "design", "pattern", "rigid", "mass", "inertia", "sid")
 # What an arm with a pattern has from there.
-PATTERN_KEYS = ("passive", "symmetric", "regions")
+PATTERN_KEYS = ("passive", "symmetric", "symmetric_z", "extruded", "regions")
 
 
 def check_arm_name(name: str) -> str:
@@ -71,8 +75,10 @@ class Arm(Table):
     )
     height: Length = Field(description="height in the plane of motion [m]")
     thickness: Length = Field(description="thickness normal to the plane of motion [m]")
-    cells: tuple[CellCount, CellCount] | None = Field(
-        default=(200, 12), description="number of cells along and across a rectangular arm [-]"
+    cells: tuple[CellCount, CellCount] | tuple[CellCount, CellCount, CellCount] | None = Field(
+        default=(200, 12),
+        description="number of cells along and across a rectangular arm in plane stress; along, "
+        "over the height and over the thickness of a solid one [-]",
     )
     mesh: FileName | None = Field(
         default=None, description="geometry or mesh file (.geo, .msh, .step) in place of cells [-]"
@@ -81,12 +87,14 @@ class Arm(Table):
         default=None, description="cell size for a .geo or .step file [m]"
     )
     cell_shape: CellShape | None = Field(
-        default=None, description="cell shape for a .geo or .step file [-]"
+        default=None,
+        description="cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
+        "a solid, with a .msh file, too [-]",
     )
     element: ElementName | None = Field(
         default=None,
-        description='finite element: "incompatible" are bilinear quadrilaterals that bend without '
-        "locking; default: incompatible quadrilaterals, quadratic triangles [-]",
+        description='finite element: "incompatible" are quadrilaterals and hexahedra that bend '
+        "without locking; default: these, quadratic triangles and tetrahedra [-]",
     )
     passive: float | None = Field(
         default=None,
@@ -97,6 +105,13 @@ class Arm(Table):
     )
     symmetric: bool = Field(
         default=False, description="keep the design symmetric about the arm's axis y = 0 [-]"
+    )
+    symmetric_z: bool = Field(
+        default=False, description="keep the design of a solid arm symmetric about z = 0 [-]"
+    )
+    extruded: bool = Field(
+        default=False,
+        description="keep the design of a solid arm made of cells the same over the thickness [-]",
     )
     design: str | None = Field(
         default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
@@ -202,6 +217,15 @@ class Arm(Table):
         return self
 
     @model_validator(mode="after")
+    def _check_thickness(self) -> Arm:
+        for key in ("symmetric_z", "extruded"):
+            if getattr(self, key) and not self.is_solid:
+                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", (key,))
+        if self.extruded and self.cells is None:
+            raise Refusal("expected only with cells = [nx, ny, nz]", ("extruded",), ("mesh",))
+        return self
+
+    @model_validator(mode="after")
     def _check_joint(self) -> Arm:
         for key in ("mass", "inertia"):
             if getattr(self, key) is not None and not self.rigid:
@@ -270,36 +294,63 @@ class Arm(Table):
         if kind not in MESH_FILES:
             raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
         for key in ("mesh_size", "cell_shape"):
-            if kind == ".msh" and getattr(self, key) is not None:
+            told = key == "cell_shape" and self.cell_shape in SOLID_SHAPES
+            if kind == ".msh" and getattr(self, key) is not None and not told:
                 raise Refusal(
                     "expected only with .geo or .step: a .msh file has its cells", (key,), ("mesh",)
                 )
-        if self.element == "incompatible" and self.cell_shape == "triangle":
+        if self.element == "incompatible" and self.cell_shape in SIMPLICES:
+            cells = "triangles" if self.cell_shape == "triangle" else "tetrahedra"
             raise Refusal(
-                'expected "linear" or "quadratic" with triangles', ("element",), ("cell_shape",)
+                f'expected "linear" or "quadratic" with {cells}', ("element",), ("cell_shape",)
             )
         return self
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether the arm is a solid in space; otherwise it is in plane stress."""
+        if self.cells is not None:
+            return len(self.cells) == 3
+        return self.cell_shape in SOLID_SHAPES
+
+    @property
+    def depth(self) -> float:
+        """What the area or volume of a cell is multiplied by to have its volume: m, or 1."""
+        return 1.0 if self.is_solid else self.thickness
+
+    @property
+    def shape(self) -> CellShape:
+        """Shape of the cells, as far as the scene tells."""
+        if self.cell_shape is not None:
+            return self.cell_shape
+        return "hexahedron" if self.is_solid else "quadrilateral"
 
     @property
     def n_cells(self) -> int:
         """Number of cells; of a mesh file an estimate, 0 where there is nothing to go by."""
         if self.cells is not None:
-            return self.cells[0] * self.cells[1]
+            return math.prod(self.cells)
         if self.mesh_size is None:
             return 0
+        if self.is_solid:
+            cubes = self.length * self.height * self.thickness / self.mesh_size**3
+            return round(6.0 * cubes if self.cell_shape == "tetrahedron" else cubes)
         squares = self.length * self.height / self.mesh_size**2
         return round(2.0 * squares if self.cell_shape == "triangle" else squares)
 
     @property
     def nodes_per_cell(self) -> float:
-        """Nodes of a large mesh over its cells, which are quadrilaterals unless `cell_shape` says.
+        """Nodes of a large mesh over its cells, as far as the scene tells their shape.
 
-        Four of them meet at a corner, or six triangles.
+        Four quadrilaterals meet at a corner, or six triangles; eight hexahedra, or some 24
+        tetrahedra, whose edges are 7/6 of them.
         """
-        shape = self.cell_shape or "quadrilateral"
-        element = self.element or DEFAULT_ELEMENT[shape]
-        corners = 0.5 if shape == "triangle" else 1.0
-        return 4.0 * corners if element == "quadratic" else corners
+        element = self.element or DEFAULT_ELEMENT[self.shape]
+        corners = {"triangle": 0.5, "tetrahedron": 1.0 / 6.0}.get(self.shape, 1.0)
+        if element != "quadratic":
+            return corners
+        more = {"tetrahedron": 8.0, "hexahedron": 8.0}
+        return more.get(self.shape, 4.0) * corners
 
     @property
     def solid_ends(self) -> float:
@@ -343,20 +394,21 @@ class Arm(Table):
         """Longest side of a cell, m; None for a mesh file that does not depend on it."""
         if self.cells is None:
             return self.mesh_size
-        return max(self.length / self.cells[0], self.height / self.cells[1])
+        sizes = self.length, self.height, self.thickness
+        return max(size / count for size, count in zip(sizes, self.cells, strict=False))
 
     @property
     def n_reducible(self) -> int | None:
-        """Count the dofs a reduction can keep: interior nodes, and 3 of the outboard interface.
+        """Count the dofs a reduction can keep: interior nodes, 3 or 6 outboard coordinates.
 
         None for a mesh file.
         """
         if self.cells is None:
             return None
-        n_along, n_across = self.cells
-        if self.nodes_per_cell == 4.0:  # also halfway
-            n_along, n_across = 2 * n_along, 2 * n_across
-        return 2 * (n_along - 1) * (n_across + 1) + 3
+        halves = 2 if self.element == "quadratic" else 1  # nodes are also halfway
+        along, *across = (halves * count for count in self.cells)
+        nodes = (along - 1) * math.prod(count + 1 for count in across)
+        return 3 * nodes + 6 if self.is_solid else 2 * nodes + 3
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse a name that is taken, and what does not fit the arm whose design it has."""
@@ -364,6 +416,12 @@ class Arm(Table):
         # Some file systems do not tell capitals apart.
         if self.name.casefold() in (arm.name.casefold() for arm in before):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
+        if self.is_solid and self.flexible and not getattr(scene, "joints", ()):
+            raise Refusal(
+                "expected two integers (along, across) of an arm in plane stress: a solid arm "
+                "moves in space, and needs [[joints]]",
+                (*at, "cells" if self.cells is not None else "cell_shape"),
+            )
         self._check_regions(at)
         if self.pattern is not None:
             self._check_pattern(before, at)

@@ -92,6 +92,18 @@ class Reduction(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse more coordinates than an arm has dofs, and undamped resonances in a Gramian."""
         for i, arm in enumerate(scene.arms):
+            if (
+                arm.flexible
+                and arm.is_solid
+                and self.fewest > 1
+                and 0 < self.count < 2 * self.fewest
+            ):
+                raise Refusal(
+                    f"expected an integer >= {2 * self.fewest} with a solid arm: its outboard "
+                    "interface has six coordinates",
+                    ("reduction", "coordinates"),
+                    ("arms", i, "cells"),
+                )
             if arm.flexible and arm.n_reducible is not None and self.count > arm.n_reducible:
                 raise Refusal(
                     f"expected at most {arm.n_reducible}, the degrees of freedom of "

@@ -1,0 +1,175 @@
+"""Solid arms: their bodies against closed forms, gradients by Taylor tests, averages of designs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_arm
+
+from dolfinopt.arms.arm import Arm
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.responses.sensitivity import exact_gradient
+
+COMM = MPI.COMM_WORLD
+MASS = DENSITY * LENGTH * HEIGHT * THICKNESS
+
+
+def rough(arm: Arm) -> np.ndarray:
+    """Return densities without symmetry, by place."""
+    x, y, z = arm.mesh.centroid.T
+    return 0.6 + 0.3 * np.sin(70.0 * x + 160.0 * y + 210.0 * z)
+
+
+def test_inertia_of_a_box():
+    """Mass, first and second moments to rounding; and the modes' of a beam to shear and clamp."""
+    arm = solid_arm(cells=(30, 4, 2))
+    body = arm.reduce(np.ones(arm.mesh.num_cells))
+    assert body.mass == pytest.approx(MASS, rel=1e-13)
+    assert np.allclose(body.moment, [0.5 * MASS * LENGTH, 0.0, 0.0], atol=1e-14)
+    second = MASS * np.diag([LENGTH**2 / 3.0, HEIGHT**2 / 12.0, THICKNESS**2 / 12.0])
+    assert np.allclose(body.W[:, 0, 0].reshape(3, 3), second, rtol=1e-12, atol=1e-15)
+    assert np.array_equal(body.outboard, np.eye(6))
+    # Craig and Bampton's body of a beam with Hermite's cubics.
+    modes = body.W.reshape(3, 3, 7, 7)[range(3), range(3), 1:, 1:].sum(axis=0) / MASS
+    L = LENGTH
+    beam = {
+        (0, 0): 1.0 / 3.0,
+        (1, 1): 13.0 / 35.0,
+        (2, 2): 13.0 / 35.0,
+        (1, 5): -11.0 / 210.0 * L,
+        (2, 4): 11.0 / 210.0 * L,
+        (4, 4): L**2 / 105.0 + THICKNESS**2 / 36.0,
+        (5, 5): L**2 / 105.0 + HEIGHT**2 / 36.0,
+        (3, 3): (HEIGHT**2 + THICKNESS**2) / 36.0,
+    }
+    for at, value in beam.items():
+        assert modes[at] == pytest.approx(value, rel=0.025), at
+    assert body.C[:, :3] == pytest.approx(0.5 * MASS * np.eye(3), rel=0.01, abs=1e-10)
+
+
+def response(weights: ShapeIntegrals) -> Callable[[ShapeIntegrals], float]:
+    """Return the weighted sum of a body's integrals."""
+    return lambda body: sum(
+        float(np.sum(getattr(weights, one.name) * getattr(body, one.name))) for one in TABLE
+    )
+
+
+def stiffness_with(body: ShapeIntegrals, loads: np.ndarray) -> np.ndarray:
+    """Return K + a M + sum_p loads_p K0_p (q, q), a = 4e5 1/s2."""
+    M = body.W[[0, 4, 8], 1:, 1:].sum(axis=0)
+    K0 = np.concatenate([body.K0, body.K0_outboard])
+    return body.K + 4e5 * M + np.tensordot(loads, K0, 1)
+
+
+def spectrum(body: ShapeIntegrals, loads: np.ndarray) -> float:
+    """Return a function of the basis' span alone: the interface's response at imaginary shifts."""
+    inverse = np.linalg.inv(stiffness_with(body, loads))
+    return float(np.trace(body.outboard @ inverse @ body.outboard.T) * 1e4)
+
+
+def by_spectrum(body: ShapeIntegrals, loads: np.ndarray) -> ShapeIntegrals:
+    """Return its derivatives."""
+    B = body.outboard @ np.linalg.inv(stiffness_with(body, loads))
+    zero = {one.name: 0.0 * np.asarray(getattr(body, one.name)) for one in TABLE} | {"mass": 0.0}
+    zero["K"] = by_K = -1e4 * B.T @ B
+    zero["outboard"] = 2e4 * B
+    zero["W"][[0, 4, 8], 1:, 1:] = 4e5 * by_K
+    if len(loads):
+        by_K0 = loads[:, None, None] * by_K
+        zero["K0"], zero["K0_outboard"] = by_K0[:12], by_K0[12:]
+    return ShapeIntegrals(**zero)
+
+
+def remainders(
+    arm: Arm, function: Callable[[ShapeIntegrals], float], by: ShapeIntegrals
+) -> np.ndarray:
+    """Return rates at which the remainder of first order falls on halved steps."""
+    comm, x = arm.mesh.comm, arm.mesh.keep(rough(arm))
+    along = np.where(arm.mesh.fixed, 0.0, np.cos(90.0 * arm.mesh.centroid @ [1.0, 2.0, -3.0]))
+    slope = comm.allreduce(exact_gradient(arm.state(x), by) @ along)
+    value, steps = function(arm.state(x).body), 0.01 * 0.5 ** np.arange(3)
+    left = [abs(function(arm.state(x + h * along).body) - value - h * slope) for h in steps]
+    return np.log2(np.array(left[:-1]) / left[1:])
+
+
+@pytest.mark.parametrize(("coordinates", "stiffening"), [(6, False), (6, True)])
+def test_gradient_of_a_body(coordinates, stiffening):
+    """Every integral of a body at once, K0 of 18 loads among them: rate 2 in Taylor's test."""
+    arm = solid_arm(cells=(8, 3, 2), coordinates=coordinates, stiffening=stiffening)
+    body = arm.state(arm.mesh.keep(rough(arm))).body
+    assert len(body.K0) + len(body.K0_outboard) == (18 if stiffening else 0)
+    rng = np.random.default_rng(3)
+    parts = {one.name: np.asarray(getattr(body, one.name)) for one in TABLE}
+    scale = {name: np.abs(part).max(initial=1e-30) for name, part in parts.items()}
+    weights = {name: rng.normal(size=part.shape) / scale[name] for name, part in parts.items()}
+    weights["outboard_point"] *= 0.0
+    by = ShapeIntegrals(**weights)
+    assert remainders(arm, response(by), by) == pytest.approx(2.0, abs=0.06)
+
+
+@pytest.mark.parametrize("method", ["craig-bampton", "modal", "krylov"])
+def test_gradient_of_a_basis(method):
+    """With modes, of which the span alone counts."""
+    arm = solid_arm(cells=(8, 3, 2), method=method, coordinates=8, stiffening=True)
+    body = arm.state(arm.mesh.keep(rough(arm))).body
+    K0 = np.concatenate([body.K0, body.K0_outboard])
+    inverse = np.linalg.inv(np.linalg.cholesky(body.K))
+    loads = 0.02 / np.linalg.norm(inverse @ K0 @ inverse.T, axis=(1, 2), ord=2)
+    by = by_spectrum(body, loads)
+    rates = remainders(arm, lambda one: spectrum(one, loads), by)
+    assert rates == pytest.approx(2.0, abs=0.06)
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
+def test_ranks_agree():
+    """One arm on all ranks and on one: body and gradient by place, to 1e-8."""
+
+    def found(comm: MPI.Comm) -> tuple[ShapeIntegrals, np.ndarray]:
+        arm = solid_arm(comm, cells=(8, 3, 2), stiffening=True, filter_radius=0.02)
+        state = arm.state(arm.physical(rough(arm)))
+        gradient = arm.backward(exact_gradient(state, state.body))
+        rows = np.column_stack([np.rint(1e4 * arm.mesh.centroid), gradient])
+        rows = np.concatenate(comm.allgather(rows))
+        return state.body, rows[np.lexsort(rows[:, :3].T)][:, 3]
+
+    (one, by_one), (all_, by_all) = found(MPI.COMM_SELF), found(COMM)
+    for each in TABLE:
+        a, b = np.asarray(getattr(one, each.name)), np.asarray(getattr(all_, each.name))
+        assert np.allclose(a, b, rtol=0.0, atol=1e-8 * np.abs(a).max(initial=1e-30)), each.name
+    assert np.allclose(by_one, by_all, rtol=0.0, atol=1e-8 * np.abs(by_one).max())
+
+
+def test_averages_of_a_design():
+    """Symmetric about both planes, or the same over the thickness; derivatives are transposes."""
+    for keys in ({"symmetric": True, "symmetric_z": True}, {"extruded": True}):
+        arm = solid_arm(cells=(10, 4, 4), filter_radius=0.02, **keys)
+        x = rough(arm)
+        y = arm.physical(x)
+        field = {}
+        for part in COMM.allgather((np.rint(1e4 * arm.mesh.centroid).astype(int), y)):
+            field.update({tuple(place): value for place, value in zip(*part, strict=True)})
+        for (i, j, k), value in field.items():
+            others = [(i, -j, k), (i, j, -k)] if "symmetric" in keys else [(i, j, 75), (i, j, -25)]
+            assert all(field[at] == pytest.approx(value, abs=1e-12) for at in others)
+        w = np.where(arm.mesh.fixed, 0.0, np.cos(300.0 * arm.mesh.centroid @ [1.0, 2.0, 3.0]))
+        along = np.where(arm.mesh.fixed, 0.0, np.roll(w, 3))
+        change = w @ (arm.physical(x + 0.01 * along) - y) / 0.01
+        sums = COMM.allreduce(np.array([change, arm.backward(w) @ along]))
+        assert sums[0] == pytest.approx(sums[1], rel=1e-9)
+
+
+def test_filter_in_space():
+    """Volume and constants kept, second moments those of the cone in all three directions."""
+    arm = solid_arm(cells=(50, 8, 8), filter_radius=0.012, passive=0.0)
+    x, mesh = np.zeros(arm.mesh.num_cells), arm.mesh
+    centre = np.array([0.255, 0.0025, 0.00125])
+    x[np.linalg.norm(mesh.centroid - centre, axis=1) < 1e-6] = 1.0
+    y = arm.filter.forward(x)
+    total = COMM.allreduce(np.array([mesh.area @ x, mesh.area @ y]))
+    assert total[1] == pytest.approx(total[0], rel=1e-12)
+    assert np.allclose(arm.filter.forward(np.ones(len(x))), 1.0, rtol=1e-12)
+    along = COMM.allreduce((mesh.area * y) @ (mesh.centroid[:, 0] - centre[0]) ** 2) / total[1]
+    assert along == pytest.approx(0.012**2 / 6.0, rel=1e-6)
