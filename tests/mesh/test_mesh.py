@@ -177,7 +177,7 @@ def _centroids(mesh):
 
 def test_area_of_distorted_cells():
     # Against the boundary: twice the area is the sum of x dy - y dx around the polygon.
-    from dolfinopt.mesh.arm_mesh import _cell_area
+    from dolfinopt.mesh.cells import cell_areas
 
     rng = np.random.default_rng(1)
     quad = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
@@ -185,7 +185,7 @@ def test_area_of_distorted_cells():
         cells = corners + 0.2 * rng.uniform(-1.0, 1.0, (30, len(corners), 2))
         x, y = cells[:, around, 0], cells[:, around, 1]
         twice = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
-        assert np.allclose(_cell_area(cells), 0.5 * twice, rtol=1e-14)
+        assert np.allclose(cell_areas(cells), 0.5 * twice, rtol=1e-14)
 
 
 # In a process of its own: Gmsh keeps parameters as long as the process lives.
