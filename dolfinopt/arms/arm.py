@@ -114,8 +114,8 @@ class Arm:
         """
         x = self.mesh.keep(x)
         with self.profile.phase("filter"):
-            if self.symmetry is not None:
-                x = self.symmetry.forward(x)
+            for average in self.averages:
+                x = average.forward(x)
             return self.filter.forward(x)
 
     def filtered(self, x: np.ndarray) -> PhysicalDesign:
@@ -124,24 +124,12 @@ class Arm:
         Only [0, 1] is in the laws' domain. On skew cells the filter may leave it next to a jump;
         what is cut off there has no derivative, and `backward` knows.
         """
-<<<<<<< HEAD
         x_filtered = self.smoothed(x)
-=======
-        x = self.mesh.keep(x)
-        with self.profile.phase("filter"):
-            x_filtered = self.filter.forward(self.averaged(x))
->>>>>>> c8a0f8d (Solid arms: boxes of hexahedra, elements in space, six interface coordinates)
         clipped = None
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
             clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
         x_phys = self.mesh.keep(np.clip(x_filtered, 0.0, 1.0))
         return PhysicalDesign(x_phys, None, clipped)
-
-    def averaged(self, x: np.ndarray) -> np.ndarray:
-        """Return design variables (n_cells,) with the symmetry and extrusion that the arm keeps."""
-        for average in self.averages:
-            x = average.forward(x)
-        return x
 
     def uniform(self, density: float) -> np.ndarray:
         """Return the physical densities of the same design variable in every cell."""
