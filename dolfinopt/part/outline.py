@@ -227,7 +227,8 @@ def _at_level(at: Callable[[float], Outline], domain: Domain, raster: Raster) ->
     low, high = float(raster.values.min()), float(raster.values.max())
     order = np.argsort(-domain.field)
     filled = np.cumsum(domain.area[order])
-    last = min(int(np.searchsorted(filled, domain.volume)), len(order) - 1)
+    # Rounding must not make the first void cell of a crisp design the last solid one.
+    last = min(int(np.searchsorted(filled, (1.0 - AREA) * domain.volume)), len(order) - 1)
     first = domain.field[order[last]]
     step = 0.02 * (high - low)
     span = (-high - step, step - low)  # a lower level has more material

@@ -47,10 +47,11 @@ def search(
         above = min((p for p in tried if p[1] > 0.0), default=None)
         below = max((p for p in tried if p[1] <= 0.0), default=None)
         if above is None or below is None:
-            if place in span:
-                break
             step = _length(tried, step)
-            place = min(max(place - np.sign(excess) * step, span[0]), span[1])
+            ahead = min(max(place - np.sign(excess) * step, span[0]), span[1])
+            if ahead == place:  # at the end of what it may be
+                break
+            place = ahead
         else:
             if abs(above[0] - below[0]) < NARROW * (span[1] - span[0]):
                 break
