@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.check import Check
     from dolfinopt.part.mesh import Meshes
     from dolfinopt.part.part import Part
+    from dolfinopt.part.polish import Polished
     from dolfinopt.scene.load import Scene
 
 
@@ -44,6 +45,13 @@ if TYPE_CHECKING:
     default=True,
     help="simulate the machine with the parts, beside the densities they are made of",
 )
+@click.option(
+    "--polish",
+    type=click.IntRange(0, 100),
+    default=0,
+    metavar="N",
+    help="so many steps of shape optimisation of the splines; left out if they bring less than 1 %",
+)
 @overwrite_option
 @plots_option
 def part(
@@ -53,6 +61,7 @@ def part(
     tolerance: float | None,
     curves: str,
     check: bool,
+    polish: int,
     overwrite: bool,
     plots: bool,
 ) -> None:
@@ -79,8 +88,20 @@ def part(
         if world.rank == 0:
             warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
             meshes = mesh_parts(parts)
+            polished = _polished(scene, parts, meshes, polish) if polish else None
+            if polished is not None:
+                parts, meshes = polished.parts, polished.meshes
             found = _checked(scene, folder, parts, meshes) if check else None
-            _write(scene, target, parts, meshes, found, plots)
+            _write(scene, target, parts, meshes, found, polished, plots)
+
+
+def _polished(scene: Scene, parts: dict[int, Part], meshes: Meshes, steps: int) -> Polished:
+    """Return the polished parts, and say what it brought."""
+    from dolfinopt.part.polish import polish
+
+    found = polish(scene, parts, meshes, steps)
+    click.echo(found.sentence)
+    return found
 
 
 def _checked(scene: Scene, folder: Path, parts: dict[int, Part], meshes: Meshes) -> Check | None:
@@ -100,6 +121,7 @@ def _write(
     parts: dict[int, Part],
     meshes: Meshes,
     check: Check | None,
+    polished: Polished | None,
     plots: bool,
 ) -> None:
     """Write the files and say what was made (root only)."""
@@ -116,7 +138,7 @@ def _write(
 
     prepare_folder(target)
     drawn = pictures if plots else None
-    figures = write_parts(target, scene, parts, meshes.fine, check, drawn)
+    figures = write_parts(target, scene, parts, meshes.fine, check, polished, drawn)
     for name, row in figures["arms"].items():
         points = f" with {row['control_points']} control points" if row["control_points"] else ""
         click.echo(

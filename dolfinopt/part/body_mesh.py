@@ -10,6 +10,7 @@ from dolfinopt.part.curves import Curve, Line, direction
 from dolfinopt.part.shape import Shape
 
 CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner
+FOLDED = 1e-3  # area of a triangle over the median's below which it counts as folded
 # Gauss points on [0, 1] and weights, exact for polynomials of degree nine.
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(5), (1.0, 0.0)))
 
@@ -38,6 +39,12 @@ class BodyMesh:
     def area(self) -> float:
         """Area of the triangles, m2."""
         return float(triangle_areas(self.points, self.triangles).sum())
+
+    @property
+    def is_folded(self) -> bool:
+        """Whether a triangle is turned over, or next to nothing beside the others."""
+        areas = np.sort(triangle_areas(self.points, self.triangles))
+        return bool(areas[0] <= FOLDED * areas[len(areas) // 2])
 
     def labelled(self, label: str) -> np.ndarray:
         """Return which sides (k,) belong to pieces of a label."""

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # Change by the last refinement up to which a figure counts as converged, also that of stress: a
 # method of second order leaves a third of it.
 SETTLED, SETTLED_STRESS = 5e-3, 0.1
-LOST = 0.05  # compliance above that of the crisp design from which on parts are another design
+LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART = "density", "crisp", "part"
 
 
@@ -149,12 +149,12 @@ class Check:
     def warnings(self) -> list[str]:
         """What makes the figures doubtful, a sentence each."""
         found = []
-        model = self.density if self.crisp is None else self.crisp
-        lost = _ratio(self.part.values["compliance"], model.values["compliance"]) - 1.0
-        if lost > LOST:
+        softer = _ratio(self.part.values["compliance"], self.density.values["compliance"]) - 1.0
+        if softer > LOST:
             found.append(
-                f"the parts are not the design: they lose {100.0 * lost:.2g} % of its stiffness; "
-                "see part.png, and make the design crisp (design.projection) or its cells finer"
+                f"the machine with the parts is {100.0 * softer:.2g} % softer than with the "
+                "densities; see part.png, and make the design crisp (design.projection) or its "
+                "cells finer"
             )
         if not self.converged:
             found.append(

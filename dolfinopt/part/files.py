@@ -24,6 +24,7 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.part.check import Check
+    from dolfinopt.part.polish import Polished
 
 FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
 STAGE = ".part-"  # folder of files about to be renamed
@@ -40,7 +41,10 @@ def file_names(scene: Scene) -> list[str]:
 
 
 def figures_of(
-    scene: Scene, parts: Mapping[int, Part], check: Check | None = None
+    scene: Scene,
+    parts: Mapping[int, Part],
+    check: Check | None = None,
+    polished: Polished | None = None,
 ) -> dict[str, Any]:
     """Return the content of part.json."""
     arms = {
@@ -54,6 +58,8 @@ def figures_of(
         "thinnest_member": "m",
     }  # fmt: skip
     checked = {} if check is None else check.to_dict()
+    if polished is not None:
+        checked["polish"] = polished.to_dict()
     return {"name": scene.name, "arms": arms, "units": units, **checked}
 
 
@@ -63,6 +69,7 @@ def write_parts(
     parts: Mapping[int, Part],
     meshes: Mapping[int, BodyMesh],
     check: Check | None = None,
+    polished: Polished | None = None,
     pictures: Callable[[Path], None] | None = None,
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
@@ -75,7 +82,7 @@ def write_parts(
         scene: of the arms.
         parts: by their place in the chain.
         meshes: that the scene of the parts has, likewise.
-        check: what the parts do, if it is known.
+        check, polished: what the parts do, and what polishing them brought, if it is known.
         pictures: draws `PICTURES` into a folder.
 
     Raises:
@@ -90,7 +97,7 @@ def write_parts(
         write_meshes(made, {arm.name: meshes[k] for arm, k in owned if k is not None})
         if pictures is not None:
             pictures(made)
-        figures = figures_of(scene, parts, check)
+        figures = figures_of(scene, parts, check, polished)
         write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
         _publish(made, folder, file_names(scene))
     return figures

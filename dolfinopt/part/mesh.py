@@ -77,9 +77,9 @@ def body_mesh(gmsh: Any, shape: Shape, cell: float, coarser: float = 1.0) -> Bod
         outline = _outline(shape, samples, sizes, coarser * TURN)
         if outline.is_simple:  # Gmsh would end the process
             points, triangles = _triangulated(gmsh, outline)
-            return BodyMesh(
-                shape, points, triangles, outline.sides, outline.piece, outline.span
-            ).fitted()
+            mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
+            if not (fitted := mesh.fitted()).is_folded:
+                return fitted
         sizes = [0.5 * size for size in sizes]
     raise ConvergenceError("the outline of a part cannot be meshed: its curves nearly touch")
 
@@ -152,21 +152,34 @@ def _sizes(shape: Shape, samples: Sequence[np.ndarray], cell: float) -> list[np.
     points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
     inward = -np.vstack([normals(c, t) for c, t in zip(curves, samples, strict=True)])
     bend = np.abs(np.concatenate([curvature(c, t) for c, t in zip(curves, samples, strict=True)]))
-    tree = cKDTree(points)
-    apart, near = tree.query(points, k=min(NEAREST, len(points)))
-    to = points[near] - points[:, None]
-    depth = np.einsum("nkd,nd->nk", to, inward)
-    across = np.einsum("nkd,nd->nk", inward[near], inward) < OPPOSED
-    # Diameter of the circle that touches the outline here and goes through the other point.
-    width = np.square(apart) / np.where(across & (depth > 1e-3 * cell), depth, np.nan)
-    wall = np.nan_to_num(
-        np.nanmin(np.c_[width, np.full(len(width), np.inf)], axis=1), posinf=np.inf
-    )
+    apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
+    wall = facing(points, inward, near, 1.0)
     size = np.minimum(WALL * wall, TURN / np.maximum(bend, 1e-9 / cell))
     size = np.clip(size, SMALLEST * cell, LARGEST * cell)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])
+
+
+def facing(points: np.ndarray, inward: np.ndarray, near: np.ndarray, side: float) -> np.ndarray:
+    """Return the width (n,) of members, or of gaps, beside points of an outline, m.
+
+    The diameter of the least circle that touches the outline at the point and goes through another
+    one, whose normal points the other way; infinite where none is near.
+
+    Args:
+        points: (n, 2) m.
+        inward: (n, 2) unit normals into the material.
+        near: (n, k) neighbours of every point.
+        side: 1 of members, -1 of gaps.
+    """
+    to = points[near] - points[:, None]
+    depth = side * np.einsum("nkd,nd->nk", to, inward)
+    across = np.einsum("nkd,nd->nk", inward[near], inward) < OPPOSED
+    square = np.square(to).sum(axis=2)
+    across &= depth > 1e-3 * np.sqrt(square)
+    width = np.divide(square, depth, out=np.full(depth.shape, np.inf), where=across)
+    return width.min(axis=1)
 
 
 def _divided(
