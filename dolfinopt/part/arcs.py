@@ -26,7 +26,7 @@ def with_arcs(shape: Shape, tolerance: float) -> Shape:
         )
         for loop in shape.loops
     )
-    return Shape(loops, apart=shape.distance() + tolerance)
+    return Shape(loops, apart=shape.distance + tolerance)
 
 
 def biarcs(spline: Spline, tolerance: float) -> list[Curve]:

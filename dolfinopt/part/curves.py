@@ -139,12 +139,26 @@ class Spline:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return the points (n, 2) at parameters (n,), m."""
-        return BSpline(self.knots, self.points, DEGREE)(np.asarray(t, dtype=float))
+        whole = BSpline.construct_fast(self.knots, self.points, DEGREE)
+        return whole(np.asarray(t, dtype=float))
 
     def derivative(self, t: np.ndarray, order: int = 1) -> np.ndarray:
         """Return a derivative (n, 2) by t, m."""
-        whole = BSpline(self.knots, self.points, DEGREE)
-        return whole.derivative(order)(np.asarray(t, dtype=float))
+        knots = self.knots[order:-order]
+        slope = BSpline.construct_fast(knots, self.derived(order), DEGREE - order)
+        return slope(np.asarray(t, dtype=float))
+
+    def derived(self, order: int) -> np.ndarray:
+        """Return the control points (n - order, 2) of a derivative by t, m.
+
+        Its knots are the curve's without so many at each end.
+        """
+        knots, points = self.knots, self.points
+        for degree in range(DEGREE, DEGREE - order, -1):
+            width = knots[degree + 1 : -1] - knots[1 : -degree - 1]
+            points = degree * np.diff(points, axis=0) / width[:, None]
+            knots = knots[1:-1]
+        return points
 
     def parameters(self, tolerance: float) -> np.ndarray:
         """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
@@ -152,10 +166,10 @@ class Spline:
         bends = np.linalg.norm(self.derivative(_inside(ends), 2).reshape(-1, 2, 2), axis=2)
         # A second derivative is linear between breaks: largest at one of them.
         count = np.ceil(np.diff(ends) * np.sqrt(bends.max(axis=1) / (8.0 * tolerance)))
-        pieces = zip(ends[:-1], ends[1:], np.maximum(count, 1).astype(int))
-        return np.append(
-            np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in pieces]), 1.0
-        )
+        number = np.maximum(count, 1).astype(int)
+        place = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+        step = np.repeat(np.diff(ends) / number, number)
+        return np.append(np.repeat(ends[:-1], number) + place * step, 1.0)
 
     @property
     def area(self) -> float:

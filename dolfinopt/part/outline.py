@@ -27,6 +27,7 @@ AREA = 1e-4  # relative: up to which the level is sought
 LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leaves at one level
 CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
 STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
+ROUGH = 0.01  # the same while a level is looked for roughly, cells
 TOOL = 0.2  # default radius of the tool, cells
 # Material along an interface that the design leaves void, in cells: the interface is rigid.
 STRIP = 0.5
@@ -141,7 +142,7 @@ def draw_outline(
     def at(level: float, offset: float = 0.0) -> Outline:
         return _at(domain, given, raster, level, offset, radius, CHORD * tolerance)
 
-    found = _at_level(at, domain, raster)
+    found = _at_level(at, lambda level: _rough(given, raster, domain, level), domain, raster)
     if _off(found) > LEAP:  # a large piece joins or leaves: move the outline itself
         found = _at_offset(at, found)
     if _off(found) > LEAP:
@@ -171,6 +172,25 @@ def _given(domain: Domain, chord: float) -> _Given:
     return _Given(arm, stays, links.intersection(arm), interfaces[INBOARD], interfaces[OUTBOARD])
 
 
+def _material(
+    given: _Given, raster: Raster, level: float, offset: float, straight: float
+) -> Geometry:
+    """Return what is solid at a level, before a tool has been there.
+
+    Args:
+        given, raster: of the arm.
+        level: of the field.
+        offset: by which its outline is moved outwards, m.
+        straight: distance from the outline of corners that are left out, m.
+    """
+    import shapely
+
+    above = shapely.simplify(raster.above(level), straight)
+    if offset:
+        above = above.buffer(offset, quad_segs=QUADRANT)
+    return shapely.union_all([above.intersection(given.arm), given.stays, given.links])
+
+
 def _at(
     domain: Domain,
     given: _Given,
@@ -183,10 +203,7 @@ def _at(
     """Return the outline at a level, moved outwards by an offset, m."""
     import shapely
 
-    above = shapely.simplify(raster.above(level), STRAIGHT * chord / CHORD)
-    if offset:
-        above = above.buffer(offset, quad_segs=QUADRANT)
-    whole = shapely.union_all([above.intersection(given.arm), given.stays, given.links])
+    whole = _material(given, raster, level, offset, STRAIGHT * chord / CHORD)
     before = polygons_of(whole)
     if tool > 0.0:
         whole = rounded(whole, tool, chord).intersection(given.arm)
@@ -222,8 +239,24 @@ def _off(outline: Outline) -> float:
     return abs(_excess(outline))
 
 
-def _at_level(at: Callable[[float], Outline], domain: Domain, raster: Raster) -> Outline:
-    """Return the outline of the level at which it has the volume's area."""
+def _rough(given: _Given, raster: Raster, domain: Domain, level: float) -> float:
+    """Return by how much the material's area is above the volume, relative."""
+    return _material(given, raster, level, 0.0, ROUGH * domain.cell).area / domain.volume - 1.0
+
+
+def _at_level(
+    at: Callable[[float], Outline],
+    rough: Callable[[float], float],
+    domain: Domain,
+    raster: Raster,
+) -> Outline:
+    """Return the outline of the level at which it has the volume's area.
+
+    Args:
+        at: the outline by the level.
+        rough: its excess by the level, without all that takes time.
+        domain, raster: of the arm.
+    """
     low, high = float(raster.values.min()), float(raster.values.max())
     order = np.argsort(-domain.field)
     filled = np.cumsum(domain.area[order])
@@ -232,11 +265,22 @@ def _at_level(at: Callable[[float], Outline], domain: Domain, raster: Raster) ->
     first = domain.field[order[last]]
     step = 0.02 * (high - low)
     span = (-high - step, step - low)  # a lower level has more material
-    return search(lambda number: at(-number), _excess, -float(first), step, span, AREA)
+    place, _ = search(
+        lambda number: (number, rough(-number)),
+        lambda tried: tried[1],
+        -float(first),
+        1.0 / (high - low),
+        span,
+        LEAP,
+    )
+    slope = (rough(-place - step) - rough(-place + step)) / (2.0 * step)
+    slope = max(slope, 0.1 / (high - low))
+    return search(lambda number: at(-number), _excess, place, slope, span, AREA)
 
 
 def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline:
     """Return the outline at the level of `found`, moved so that it has the volume's area."""
-    step, most = 0.02 * found.domain.cell, 2.0 * found.domain.cell
-    moved = search(lambda offset: at(found.level, offset), _excess, 0.0, step, (-most, most), AREA)
+    most = 2.0 * found.domain.cell
+    slope = max(float(found.polygon.length), found.domain.length) / found.domain.volume
+    moved = search(lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), AREA)
     return min(found, moved, key=_off)

@@ -79,14 +79,14 @@ class Part:
         """
         one, shape = self.domain, self.shape
         volume = shape.area * one.thickness
-        radius = shape.concave_radius()
+        radius = shape.concave_radius
         return {
             "area": shape.area,
             "volume": volume,
             "mass": density * volume,
             "design_volume": one.volume * one.thickness,
             "level": self.outline.level,
-            "distance": shape.distance(),
+            "distance": shape.distance,
             "tolerance": self.tolerance,
             "curves": len(shape.curves),
             "control_points": shape.control_points,
@@ -173,7 +173,7 @@ def make_part(
     for _ in range(TRIES):
         outline = draw_outline(domain, tool, tolerance, rounding)
         shape = make_shape(outline, tolerance, arcs)
-        radius = shape.concave_radius()
+        radius = shape.concave_radius
         # Where nobody has asked for a tool, curves within the tolerance of its path will do.
         if tool_radius is None or radius >= ENOUGH * tool:
             break

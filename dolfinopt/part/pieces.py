@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.part.curves import Arc, Curve, Line, Spline, angle_between, direction
-from dolfinopt.part.fit import Target, fit
+from dolfinopt.part.fit import fit
+from dolfinopt.part.least_squares import Target
 from dolfinopt.part.recognise import Edge
 from dolfinopt.part.shape import Piece
 from dolfinopt.part.trace import AXIS, SMOOTH, Run, heading, projected, resampled

@@ -5,31 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-import numpy as np
-
 T = TypeVar("T")
 
 NARROW = 5e-5  # bracket at which the search ends, of the span
 STEPS = 60
+BEYOND = 1.15  # of the step to where a straight line ends
 
 
 def search(
     at: Callable[[float], T],
     off: Callable[[T], float],
     first: float,
-    step: float,
+    slope: float,
     span: tuple[float, float],
     enough: float,
 ) -> T:
     """Return what is nearest to the wanted size; no further off than `enough` where nothing leaps.
 
-    A bracket is looked for by steps, then narrowed by the secant and, as sizes may leap, by halves.
+    A bracket is looked for along straight lines, then narrowed by the secant and, as sizes may
+    leap, by halves.
 
     Args:
         at: what comes of a number.
         off: by how much it is too large, relative; it grows with the number.
         first: where to begin.
-        step: by which to look for a bracket at first.
+        slope: about, of what `off` returns.
         span: what the number may be.
         enough: relative.
     """
@@ -47,8 +47,7 @@ def search(
         above = min((p for p in tried if p[1] > 0.0), default=None)
         below = max((p for p in tried if p[1] <= 0.0), default=None)
         if above is None or below is None:
-            step = _length(tried, step)
-            ahead = min(max(place - np.sign(excess) * step, span[0]), span[1])
+            ahead = min(max(place - _step(tried, slope), span[0]), span[1])
             if ahead == place:  # at the end of what it may be
                 break
             place = ahead
@@ -63,9 +62,10 @@ def search(
     return best
 
 
-def _length(tried: list[tuple[float, float]], step: float) -> float:
-    """Return the length of the next step to a bracket: to where a straight line ends."""
-    if len(tried) < 2 or tried[-1][1] == tried[-2][1]:
-        return step
-    (a, f), (b, g) = tried[-2:]
-    return min(max(abs(1.3 * g * (b - a) / (g - f)), 0.5 * step), 4.0 * step)
+def _step(tried: list[tuple[float, float]], slope: float) -> float:
+    """Return the step to the other side of the root: a little further than along the line there."""
+    (place, excess) = tried[-1]
+    if len(tried) > 1 and excess != tried[-2][1]:
+        steepness = (excess - tried[-2][1]) / (place - tried[-2][0])
+        slope = min(max(steepness, 0.25 * slope), 4.0 * slope)
+    return BEYOND * excess / slope

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -64,12 +65,14 @@ class Shape:
         """Number of the splines' control points."""
         return sum(len(c.points) for c in self.curves if isinstance(c, Spline))
 
+    @cached_property
     def distance(self) -> float:
-        """Return the largest distance of free curves from what they were fitted to, m."""
+        """Largest distance of free curves from what they were fitted to, m."""
         return self.apart or max((_apart(p) for p in self.pieces if p.run is not None), default=0.0)
 
+    @cached_property
     def concave_radius(self) -> float:
-        """Return the smallest radius of concave places on free curves, m; infinity without any."""
+        """Smallest radius of concave places on free curves, m; infinity without any."""
         least = np.inf
         for piece in self.pieces:
             if piece.free:

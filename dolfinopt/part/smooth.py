@@ -36,7 +36,7 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     for share in (1.0, 0.75, 0.5, 0.25):
         finest = share * tolerance * (1.0 - ARCS if arcs else 1.0)
         shape = with_area(_follow(outline, finest), outline.domain.volume, change)
-        if shape.distance() <= tolerance and shape.is_simple(0.1 * share * tolerance):
+        if shape.distance <= tolerance and shape.is_simple(0.1 * share * tolerance):
             return shape
     raise InputError(
         f"arm {outline.domain.name!r}: no smooth curves within {tolerance:g} m of the outline; "

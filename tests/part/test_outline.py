@@ -30,7 +30,7 @@ def check(part, holes):
     shape, domain = part.shape, part.domain
     assert shape.area == pytest.approx(domain.volume, rel=1e-5)
     assert part.outline.area == pytest.approx(domain.volume, rel=5e-3)
-    assert shape.distance() <= part.tolerance
+    assert shape.distance <= part.tolerance
     assert shape.is_simple(0.05 * part.tolerance)
     assert len(shape.loops) == 1 + holes
     for loop in shape.loops:
@@ -60,7 +60,7 @@ def test_frame(design):
 def test_concave_corners_have_the_radius_of_the_tool(design, radius):
     part = make_part(design(frame), radius, None)
     check(part, holes=4)
-    assert radius * 0.98 <= part.shape.concave_radius() <= radius + 0.005
+    assert radius * 0.98 <= part.shape.concave_radius <= radius + 0.005
 
 
 def test_tolerance_bounds_the_distance_and_sets_the_number_of_points(design):
@@ -205,7 +205,7 @@ def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
     changes = [f"arms.0.mesh={path}", "arms.0.height=0.08", "arms.0.mesh_size=0.006"]
     part = make_part(design(density, *changes, "arms.0.passive=0.006"), 0.002, None)
     check(part, holes=4)
-    assert part.shape.concave_radius() > 0.98 * 0.002
+    assert part.shape.concave_radius > 0.98 * 0.002
     circles = {p.label: p.curve for p in part.shape.pieces if p.label}
     assert circles["inboard"].radius == pytest.approx(0.015, abs=1e-9)
     assert circles["outboard"].radius == pytest.approx(0.008, abs=1e-9)
