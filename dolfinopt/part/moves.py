@@ -141,7 +141,7 @@ class OutlineMoves:
             return None
         if not self._allowed(shape, part.tolerance):
             return None
-        return replace(shape, offset=part.shape.offset, apart=part.shape.distance())
+        return replace(shape, offset=part.shape.offset, apart=part.shape.distance)
 
     def _piece(self, piece: Piece, k: int, moves: np.ndarray) -> Piece:
         if k not in self.number:

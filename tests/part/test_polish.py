@@ -129,4 +129,4 @@ def test_command_writes_polished_parts(made, tmp_path, capsys, monkeypatch):
     assert found.sentence in capsys.readouterr().out
     figures = json.loads((tmp_path / "part.json").read_text())
     assert figures["polish"]["kept"] and figures["polish"]["gain"] == pytest.approx(found.gain)
-    assert figures["arms"]["arm1"]["distance"] == pytest.approx(parts[0].shape.distance())
+    assert figures["arms"]["arm1"]["distance"] == pytest.approx(parts[0].shape.distance)
