@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from dolfinopt.cli.start import led_by_another
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
 
@@ -28,6 +29,8 @@ TEMPLATES = {
     "--template", type=click.Choice(list(TEMPLATES)), default="two-arm", help="what to start from"
 )
 def init(name: Path, template: str) -> None:
+    if led_by_another():
+        return
     from dolfinopt.output.folders import write_new
     from dolfinopt.scene.json_schema import SCHEMA_FILE, scene_schema
     from dolfinopt.scene.schema import check_scene_name

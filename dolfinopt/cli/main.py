@@ -14,6 +14,7 @@ from dolfinopt.cli.bench import bench
 from dolfinopt.cli.compare import compare
 from dolfinopt.cli.export import export
 from dolfinopt.cli.gradient import gradient
+from dolfinopt.cli.import_robot import import_robot
 from dolfinopt.cli.init import init
 from dolfinopt.cli.keys import keys
 from dolfinopt.cli.optimize import optimize
@@ -96,7 +97,7 @@ def commands(ctx: click.Context) -> None:
         click.echo(ctx.get_help())
 
 
-STARTING = (init, keys, schema)
+STARTING = (init, import_robot, keys, schema)
 WORKING = (optimize, simulate, gradient, part, export, plot)
 STUDYING = (sweep, compare, uncertainty, reproduce, bench)
 for command in (*STARTING, *WORKING, *STUDYING):

@@ -90,6 +90,11 @@ def alone() -> bool:
     return isinstance(click.get_current_context().obj, Start) and launched_rank() is None
 
 
+def led_by_another() -> bool:
+    """Tell whether another rank does the work of a command that never starts MPI."""
+    return isinstance(click.get_current_context().obj, Start) and bool(launched_rank())
+
+
 def end_before_start(error: BaseException) -> int:
     """Report an error that came before MPI was started; return the exit status.
 

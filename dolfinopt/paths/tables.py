@@ -91,6 +91,14 @@ def read_table(file: str, columns: Sequence[str]) -> Table:
     return Table(file, lines, t, values[:, [names.index(name) for name in columns]])
 
 
+def column_names(file: str) -> list[str]:
+    """Return the names of a table's columns; none of an empty file."""
+    for line in _text(file).splitlines():
+        if line.strip() and not line.lstrip().startswith("#"):
+            return _cells(line)
+    return []
+
+
 def last_instant(file: str) -> float | None:
     """Return the last t of a table, s; None where it has no such column, or no number there."""
     lines = [line for line in _text(file).splitlines() if line.strip() and line.lstrip()[0] != "#"]

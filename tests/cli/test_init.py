@@ -7,7 +7,7 @@ import sys
 
 import jsonschema
 import pytest
-from runs import ROOT, run
+from runs import ROOT, run, shell
 
 import dolfinopt
 from dolfinopt.cli.init import TEMPLATES
@@ -39,6 +39,13 @@ def errors(data: object) -> list[str]:
 
 def test_every_template_is_offered():
     assert {path.stem for path in template_folder().glob("*.toml")} == set(TEMPLATES)
+
+
+def test_one_of_two_ranks_writes(tmp_path):
+    done = shell("init", tmp_path / "machine", ranks=2)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "machine.toml").exists()
+    assert done.stdout.count("edit the values") == 1
 
 
 @pytest.mark.parametrize("template", TEMPLATES)

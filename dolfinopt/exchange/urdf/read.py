@@ -1,0 +1,280 @@
+"""A URDF file as a `Robot`: parsed by yourdfpy, checked for what a scene can hold."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.urdf.robot import (
+    MOVABLE,
+    Inertia,
+    Mimic,
+    Robot,
+    RobotJoint,
+    RobotLink,
+)
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+SECTIONS = 64  # flat sides of a cylinder
+
+
+def read_robot(file: Path) -> Robot:
+    """Read a robot and the surfaces of its links.
+
+    Raises:
+        InputError: yourdfpy is not installed; no such file; not URDF; joints that a scene does not
+            have (floating, planar); links that are no tree.
+    """
+    yourdfpy = _library()
+    tree = _parse(file)
+    with _quiet():
+        try:
+            model = yourdfpy.URDF.load(
+                BytesIO(tree), build_scene_graph=False, load_meshes=False
+            ).robot
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(
+                f"{file}: not a robot that yourdfpy can read ({type(error).__name__}: {error}); "
+                "check it with check_urdf"
+            ) from None
+        _check_names(file, "link", [link.name for link in model.links])
+        _check_names(file, "joint", [joint.name for joint in model.joints])
+        joints = [_joint(file, one) for one in model.joints]
+        _check_mimics(file, joints)
+        links = {one.name: _link(file, one) for one in model.links}
+    root, ordered = _ordered(file, list(links), joints)
+    return Robot(model.name, file, links, ordered, root)
+
+
+def _library() -> Any:
+    try:
+        import yourdfpy
+    except ImportError:
+        raise InputError(
+            "robots need the package yourdfpy: pip install 'dolfinopt[robots]'"
+        ) from None
+    return yourdfpy
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what yourdfpy and trimesh log to themselves: errors are told in one line."""
+    loggers = [logging.getLogger(name) for name in ("yourdfpy", "yourdfpy.urdf", "trimesh")]
+    levels = [one.level for one in loggers]
+    for one in loggers:
+        one.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for one, level in zip(loggers, levels, strict=True):
+            one.setLevel(level)
+
+
+def _parse(file: Path) -> bytes:
+    """Return the file's XML, which is that of a robot."""
+    from lxml import etree
+
+    try:
+        root = etree.parse(os.fspath(file), etree.XMLParser(remove_blank_text=True)).getroot()
+    except OSError as error:
+        reason = error.strerror or "no such file"
+        raise InputError(f"{file}: cannot be read ({reason}); name a URDF file") from None
+    except etree.XMLSyntaxError as error:
+        raise InputError(f"{file}: not XML ({error.msg}); name a URDF file") from None
+    if any("xacro" in str(uri) for uri in root.nsmap.values()) or file.suffix == ".xacro":
+        raise InputError(
+            f"{file}: a xacro file; make a URDF of it first: xacro {file.name} > {file.stem}.urdf"
+        )
+    if root.tag != "robot" or "name" not in root.attrib:
+        raise InputError(f"{file}: expected an element <robot name=...>, found <{root.tag}>")
+    text: bytes = etree.tostring(root)
+    return text
+
+
+def _check_names(file: Path, what: str, names: list[str]) -> None:
+    if not names and what == "link":
+        raise InputError(f"{file}: no links")
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise InputError(f"{file}: {what} {name!r} stands there {count} times")
+
+
+# -- joints ----------------------------------------------------------------------------------
+
+
+def _joint(file: Path, one: Any) -> RobotJoint:
+    where = f"{file}: joint {one.name!r}"
+    if one.type not in (*MOVABLE, "fixed"):
+        raise InputError(
+            f"{where}: type {one.type!r}; a scene has joints of type {', '.join(MOVABLE)} and fixed"
+        )
+    axis = np.asarray(one.axis, dtype=float)
+    length = np.linalg.norm(axis) if axis.shape == (3,) else 0.0
+    if one.type != "fixed" and not (math.isfinite(length) and length > 0.0):
+        raise InputError(f"{where}: axis {axis.tolist()}; expected three numbers, not all zero")
+    limit = one.limit
+    lower, upper = (-math.inf, math.inf)
+    if limit is not None and one.type in ("revolute", "prismatic"):
+        lower = 0.0 if limit.lower is None else limit.lower
+        upper = 0.0 if limit.upper is None else limit.upper
+        if limit.lower is None and limit.upper is None:
+            lower, upper = -math.inf, math.inf
+        if lower > upper:
+            raise InputError(f"{where}: limit lower = {lower:g} above upper = {upper:g}")
+    velocity = math.inf if limit is None or not limit.velocity else limit.velocity
+    return RobotJoint(
+        one.name,
+        one.type,
+        one.parent,
+        one.child,
+        _pose(one.origin),
+        axis / length if length else np.array([1.0, 0.0, 0.0]),
+        lower,
+        upper,
+        velocity,
+        _mimic(one.mimic) if one.type != "fixed" else None,
+    )
+
+
+def _mimic(one: Any) -> Mimic | None:
+    if one is None:
+        return None
+    multiplier = 1.0 if one.multiplier is None else float(one.multiplier)
+    return Mimic(one.joint, multiplier, 0.0 if one.offset is None else float(one.offset))
+
+
+def _check_mimics(file: Path, joints: list[RobotJoint]) -> None:
+    by_name = {joint.name: joint for joint in joints}
+    for joint in joints:
+        if joint.mimic is None:
+            continue
+        other = by_name.get(joint.mimic.joint)
+        if other is None or not other.moves or other.mimic is not None:
+            raise InputError(
+                f"{file}: joint {joint.name!r}: follows {joint.mimic.joint!r}; expected a joint "
+                "that moves and follows no other"
+            )
+
+
+def _ordered(
+    file: Path, links: list[str], joints: list[RobotJoint]
+) -> tuple[str, tuple[RobotJoint, ...]]:
+    """Return the root's name, and the joints with every one behind its parent's."""
+    for joint in joints:
+        for word, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in links:
+                raise InputError(f"{file}: joint {joint.name!r}: no link {name!r}, its {word}")
+    for name, count in Counter(joint.child for joint in joints).items():
+        if count > 1:
+            raise InputError(f"{file}: link {name!r} is held by {count} joints; expected a tree")
+    held = {joint.child for joint in joints}
+    roots = [name for name in links if name not in held]
+    if len(roots) != 1:
+        raise InputError(
+            f"{file}: {len(roots)} links that no joint holds ({', '.join(roots) or 'none'}); "
+            "expected one, which stands on the ground"
+        )
+    placed, found = {roots[0]}, []
+    waiting = list(joints)
+    while waiting:
+        more = [joint for joint in waiting if joint.parent in placed]
+        if not more:
+            raise InputError(f"{file}: joint {waiting[0].name!r} is part of a loop")
+        first = more[0]
+        found.append(first)
+        placed.add(first.child)
+        waiting.remove(first)
+    return roots[0], tuple(found)
+
+
+# -- links -----------------------------------------------------------------------------------
+
+
+def _pose(origin: Any) -> np.ndarray:
+    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
+
+
+def _link(file: Path, one: Any) -> RobotLink:
+    shapes, missing = [], []
+    for element in one.collisions or one.visuals:
+        try:
+            shape = _shape(file, element.geometry)
+        except FileNotFoundError:
+            missing.append(element.geometry.mesh.filename)
+            continue
+        shape.apply_transform(_pose(element.origin))
+        shapes.append(shape)
+    return RobotLink(one.name, _inertia(file, one), tuple(shapes), tuple(missing))
+
+
+def _inertia(file: Path, link: Any) -> Inertia | None:
+    one = link.inertial
+    if one is None:
+        return None
+    pose = _pose(one.origin)
+    tensor = np.zeros((3, 3)) if one.inertia is None else one.inertia
+    mass = 0.0 if one.mass is None else float(one.mass)
+    if not (np.isfinite(tensor).all() and math.isfinite(mass) and np.isfinite(pose).all()):
+        raise InputError(f"{file}: link {link.name!r}: inertial holds a number that is not finite")
+    R = pose[:3, :3]
+    return Inertia(mass, pose[:3, 3], R @ tensor @ R.T)
+
+
+def _shape(file: Path, geometry: Any) -> Trimesh:
+    """Return the surface of a geometry element.
+
+    Raises:
+        FileNotFoundError: its mesh is not there, or no mesh.
+    """
+    from trimesh import creation
+
+    if geometry.box is not None:
+        return creation.box(extents=geometry.box.size)
+    if geometry.sphere is not None:
+        return creation.icosphere(subdivisions=4, radius=geometry.sphere.radius)
+    if geometry.cylinder is not None:
+        one = geometry.cylinder
+        return creation.cylinder(radius=one.radius, height=one.length, sections=SECTIONS)
+    return _mesh(file, geometry.mesh)
+
+
+def _mesh(file: Path, mesh: Any) -> Trimesh:
+    import trimesh
+
+    path = mesh_path(file, mesh.filename)
+    if path is None:
+        raise FileNotFoundError(mesh.filename)
+    load: Callable[..., Any] = trimesh.load_mesh
+    try:
+        found = load(os.fspath(path))
+    except Exception as error:  # every format has its own
+        raise FileNotFoundError(mesh.filename) from error
+    if not isinstance(found, trimesh.Trimesh) or not len(found.faces):
+        raise FileNotFoundError(mesh.filename)
+    if mesh.scale is not None:
+        found.apply_scale(mesh.scale)
+    return found
+
+
+def mesh_path(file: Path, name: str) -> Path | None:
+    """Return where a mesh that a URDF file names lies; None where it is not found.
+
+    "package://ROBOT/meshes/a.stl" is looked for beside the file and in the folders above it.
+    """
+    import yourdfpy
+
+    with _quiet():
+        found = Path(yourdfpy.filename_handler_magic(name, os.path.dirname(os.path.abspath(file))))
+    return found if found.is_file() else None

@@ -1,0 +1,167 @@
+"""Robots for tests: URDF texts, and the mechanism that a scene of one describes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dolfinopt.multibody.spatial.mechanism import (
+    GROUND,
+    Joint,
+    SpatialMechanism,
+    rigid_spatial_body,
+)
+from dolfinopt.multibody.spatial.rotations import about, roll_pitch_yaw
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+# Everything that URDF has and a scene must say otherwise: a sensor on a fixed joint, links that a
+# solid carries without a joint, with mass and without, a branch, a finger that follows the other,
+# axes that are no unit vectors, rotated inertias, pitch by a quarter turn, names with a slash.
+UNEVEN = """<?xml version="1.0"?>
+<robot name="uneven">
+  <!-- kept -->
+  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+  <link name="world"/>
+  <link name="foot">{foot}</link>
+  <link name="base/turn">{turn}</link>
+  <link name="cover">{cover}</link>
+  <link name="upper">{upper}
+    <visual><origin xyz="0.02 0.2 0.1" rpy="0.3 0.2 -0.1"/>
+      <geometry><box size="0.1 0.7 0.12"/></geometry><material name="grey"/></visual>
+  </link>
+  <link name="bracket">{bracket}</link>
+  <link name="mark"/>
+  <link name="slide">{slide}</link>
+  <link name="lower">{lower}</link>
+  <link name="hand">{hand}</link>
+  <link name="left">{left}</link>
+  <link name="right">{right}</link>
+  <link name="grip"/>
+  <joint name="stand" type="fixed"><parent link="world"/><child link="foot"/>
+    <origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/></joint>
+  <joint name="yaw" type="continuous"><parent link="foot"/><child link="base/turn"/>
+    <origin xyz="0 0.1 0.4" rpy="0.2 1.5707963267948966 0.5"/><axis xyz="0.1 0.2 2"/></joint>
+  <joint name="screws" type="fixed"><parent link="base/turn"/><child link="cover"/>
+    <origin xyz="0.1 0 0.2" rpy="0.4 0 0.2"/></joint>
+  <joint name="lift" type="revolute"><parent link="cover"/><child link="upper"/>
+    <origin xyz="0.05 0 0.15" rpy="1.2 -0.3 0.7"/><axis xyz="1 0 1"/>
+    <limit lower="-2" upper="2" effort="1" velocity="3"/></joint>
+  <joint name="weld" type="fixed"><parent link="upper"/><child link="bracket"/>
+    <origin xyz="0.1 0.5 0.1" rpy="0.3 -0.2 0.5"/></joint>
+  <joint name="spot" type="fixed"><parent link="upper"/><child link="mark"/>
+    <origin xyz="0.0 0.1 0.2" rpy="0 -1.5707963267948966 0"/></joint>
+  <joint name="rail" type="prismatic"><parent link="mark"/><child link="slide"/>
+    <origin xyz="0.1 0 0"/><axis xyz="0 3 0"/>
+    <limit lower="-0.2" upper="0.3" effort="1" velocity="0.5"/></joint>
+  <joint name="bend" type="revolute"><parent link="bracket"/><child link="lower"/>
+    <origin xyz="0.02 0.1 0.03" rpy="-0.5 0.4 0.2"/><axis xyz="0 -1 0.3"/>
+    <limit lower="-2.5" upper="2.5" effort="1" velocity="3"/></joint>
+  <joint name="roll" type="revolute"><parent link="lower"/><child link="hand"/>
+    <origin xyz="0.4 0.05 0.1" rpy="0.1 0.2 0.3"/><axis xyz="1 0 0"/>
+    <limit lower="-3" upper="3" effort="1" velocity="3"/></joint>
+  <joint name="finger" type="prismatic"><parent link="hand"/><child link="left"/>
+    <origin xyz="0.1 0.02 0"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.04" effort="1" velocity="0.2"/></joint>
+  <joint name="other" type="prismatic"><parent link="hand"/><child link="right"/>
+    <origin xyz="0.1 -0.02 0"/><axis xyz="0 1 0"/>
+    <limit lower="-0.05" upper="0.01" effort="1" velocity="0.2"/>
+    <mimic joint="finger" multiplier="-1" offset="0.005"/></joint>
+  <joint name="tcp" type="fixed"><parent link="hand"/><child link="grip"/>
+    <origin xyz="0.15 0 0.01" rpy="0 0.5 0"/></joint>
+  <gazebo reference="hand"><selfCollide>true</selfCollide></gazebo>
+</robot>
+"""
+UNEVEN_LINKS = (
+    "foot", "turn", "cover", "upper", "bracket", "slide", "lower", "hand", "left", "right",
+)  # fmt: skip
+
+
+def inertial(rng: np.random.Generator) -> str:
+    """Return an element of some body that may be, its inertia turned against the link."""
+    points, masses = rng.normal(scale=0.1, size=(6, 3)), rng.uniform(0.1, 1.0, size=6)
+    r = points - masses @ points / masses.sum()
+    second = np.einsum("n,na,nb->ab", masses, r, r)
+    I = np.trace(second) * np.eye(3) - second  # noqa: E741
+    x, y, z, *turn = (f"{one:.6f}" for one in rng.normal(scale=0.2, size=6))
+    return (
+        f'<inertial><origin xyz="{x} {y} {z}" rpy="{" ".join(turn)}"/>'
+        f'<mass value="{masses.sum()!r}"/><inertia ixx="{I[0, 0]!r}" ixy="{I[0, 1]!r}" '
+        f'ixz="{I[0, 2]!r}" iyy="{I[1, 1]!r}" iyz="{I[1, 2]!r}" izz="{I[2, 2]!r}"/></inertial>'
+    )
+
+
+def write_uneven(folder: Path) -> Path:
+    """Write the robot and return its file."""
+    rng = np.random.default_rng(8)
+    file = folder / "uneven.urdf"
+    file.write_text(UNEVEN.format(**{name: inertial(rng) for name in UNEVEN_LINKS}))
+    return file
+
+
+def tree_of(scene: Path) -> dict[str, Any]:
+    """Return a scene file's tables."""
+    return tomllib.loads(scene.read_text(encoding="utf-8"))
+
+
+def mechanism_of(tree: Mapping[str, Any], solids: Mapping[str, Sequence[Any]]) -> SpatialMechanism:
+    """Return the rigid mechanism of a scene.
+
+    Args:
+        tree: its tables.
+        solids: mass, centre and inertia (6,) of the arms that are not rigid.
+    """
+    names = [arm["name"] for arm in tree["arms"]]
+    bodies, joints = [], {}
+    for arm in tree["arms"]:
+        own = solids[arm["name"]] if arm["name"] in solids else (
+            arm["mass"], arm["centre"], arm["inertia"]
+        )  # fmt: skip
+        bodies.append(rigid_spatial_body(*own, (arm["length"], 0.0, 0.0)))
+    coordinate = 0
+    for joint in tree["joints"]:
+        parent = GROUND if joint["parent"] == "ground" else names.index(joint["parent"])
+        moves = joint["type"] != "fixed"
+        joints[joint["child"]] = Joint(
+            joint["name"],
+            joint["type"],
+            parent,
+            coordinate if moves else None,
+            np.array(joint.get("axis", [0.0, 0.0, 1.0])),
+            np.array(joint["origin"]),
+            roll_pitch_yaw(joint["rpy"]),
+        )
+        coordinate += moves
+    held = tuple(joints[name] for name in names)
+    return SpatialMechanism(tuple(bodies), held, (), GRAVITY, len(bodies) - 1)
+
+
+def frames_of(mechanism: SpatialMechanism, q: np.ndarray) -> list[np.ndarray]:
+    """Return the pose (4, 4) of every body's frame in the world at joint coordinates (k,)."""
+    found: dict[int, np.ndarray] = {}
+    for i in mechanism.order:
+        joint = mechanism.joints[i]
+        outer = np.eye(4)
+        if joint.parent != GROUND:
+            outer = found[joint.parent].copy()
+            outer[:3, 3] += outer[:3, :3] @ mechanism.bodies[joint.parent].outboard_point
+        own = np.eye(4)
+        own[:3, :3], own[:3, 3] = joint.rotation, joint.origin
+        moved = np.eye(4)
+        if joint.coordinate is not None:
+            value = q[joint.coordinate]
+            if joint.kind == "prismatic":
+                moved[:3, 3] = value * joint.axis
+            else:
+                moved[:3, :3] = about(joint.axis, np.array([value]))[0]
+        found[i] = outer @ own @ moved
+    return [found[i] for i in range(len(found))]
