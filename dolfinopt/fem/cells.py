@@ -34,6 +34,12 @@ def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
     return values.reshape(num_cells, field.shape[1] * num_nodes, field.shape[2])
 
 
+def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return nodal fields (n_nodes, d, k) times coefficients (k, m), as one matrix product."""
+    flat = field.reshape(field.shape[0] * field.shape[1], field.shape[2]) @ coefficients
+    return flat.reshape(*field.shape[:2], coefficients.shape[1])
+
+
 def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
     """Return the nodal field (n_nodes, d, k) of the cells' forces (n_cells, n, d, k)."""
     cells, shape = operators.cells, forces.shape[2:]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.fem.cells import sum_at_nodes
+from dolfinopt.fem.cells import combine, sum_at_nodes
 from dolfinopt.fem.uniform_stress import StiffenedModes
 
 if TYPE_CHECKING:
@@ -77,16 +77,12 @@ class UnitLoads:
 
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (p, q, q) in modes V (n_nodes, d, q) (collective on the arm's ranks)."""
-        arm, q = self.arm, V.shape[2]
-        i, j = np.triu_indices(q)
+        arm = self.arm
         if arm.substructure.uniform_stress is not None:
-            packed = self._stiffened(V).stiffness()
+            own = self._stiffened(V).stiffness()
         else:
-            packed = self._stiffness(V)
-        packed = arm.comm.allreduce(packed)
-        K0 = np.empty((self.num_loads, q, q))
-        K0[:, i, j] = K0[:, j, i] = packed
-        return K0
+            own = self._stiffness(V)
+        return own if arm.comm.size == 1 else arm.comm.allreduce(own)
 
     @cached_property
     def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
@@ -102,13 +98,17 @@ class UnitLoads:
         return known[1]
 
     def _stiffness(self, V: np.ndarray) -> np.ndarray:
-        """Return K0 (p, pairs i <= j) of this rank's cells."""
-        packed = np.zeros((self.num_loads, V.shape[2] * (V.shape[2] + 1) // 2))
+        """Return K0 (p, q, q) of this rank's cells."""
+        q = V.shape[2]
+        i, j = np.triu_indices(q)
+        packed = np.zeros((self.num_loads, len(i)))
         for _, points, H in self._parts(V):
             pairs = np.empty((packed.shape[1], H.shape[3]))
             for stress, terms in zip(self.stresses[:, :, points], self._terms, strict=True):
                 packed += stress @ _pairs(H, terms, pairs).T
-        return packed
+        K0 = np.empty((self.num_loads, q, q))
+        K0[:, i, j] = K0[:, j, i] = packed
+        return K0
 
     def gradient(
         self,
@@ -188,17 +188,21 @@ class UnitLoads:
             solved = slice(0, inertial)
             modes, outboard = arm.constraint_modes(), forces[:, :, inertial:]
             compliance = np.linalg.inv(modes.stiffness)
-            by_V[:, :, :b] += outboard @ compliance
+            by_V[:, :, :b] += combine(outboard, compliance)
             work = arm.comm.allreduce(np.tensordot(modes.field, outboard, ((0, 1), (0, 1))))
             by_stiffness = 0.0 - compliance @ work @ compliance
         adjoint = static_response(arm, *arm.restrict(forces[:, :, solved]))
-        by_young -= arm.cell_stiffness_products(adjoint, self.fields[:, :, solved])
-        return GeometricGradient(
-            by_modes=by_V,
-            by_young=by_young,
-            by_density=arm.cell_mass_products(adjoint[:, :, :inertial], accelerations(arm)),
-            by_stiffness=by_stiffness,
-        )
+        by_young -= self._energies(adjoint)
+        by_inertia = _by_inertia(adjoint[:, :, :inertial])
+        return GeometricGradient(arm, by_V, by_young, by_inertia, by_stiffness)
+
+    def _energies(self, left: np.ndarray) -> np.ndarray:
+        """Return sum_p left_p' k_e u_p (n_cells,) of the first loads, left (n_nodes, d, k)."""
+        known = self._last.get("modes")
+        if known is None:
+            return self.arm.cell_stiffness_products(left, self.fields[:, :, : left.shape[2]])
+        self.arm.profile.counts.energy_fields += left.shape[2]
+        return known[1].energies(left)
 
     def _cell_values(self, cells: slice) -> np.ndarray:
         """Return the fields at the nodes of these cells (cells, dn, p)."""
@@ -227,16 +231,44 @@ class GeometricGradient:
     """Derivatives of a function of K0.
 
     Attributes:
+        arm: the design.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         by_young: (n_cells,) by Young's modulus, modes held.
-        by_density: (n_cells,) by mass density, modes held.
+        by_inertia: (n_nodes, d, 2) fields whose products with dM 1_x and dM X are the part by the
+            mass, modes held.
         by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
     """
 
+    arm: ElasticArm
     by_modes: np.ndarray
     by_young: np.ndarray
-    by_density: np.ndarray
+    by_inertia: np.ndarray
     by_stiffness: np.ndarray
+
+    @property
+    def by_density(self) -> np.ndarray:
+        """By mass density (n_cells,), modes held."""
+        unit = np.zeros_like(self.arm.points)
+        unit[:, 0] = 1.0
+        inertia = np.stack([unit, self.arm.points], axis=2)
+        return self.arm.cell_mass_products(self.by_inertia, inertia)
+
+
+def _by_inertia(adjoint: np.ndarray) -> np.ndarray:
+    """Return what the adjoints of the inertial loads multiply dM 1_x and dM X by (n_nodes, d, 2).
+
+    M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
+    """
+    out = np.zeros((*adjoint.shape[:2], 2))
+    if adjoint.shape[1] == 3:
+        for a in range(3):
+            out[:, 0, 0] += adjoint[:, a, a]
+            out[:, :, 1] += adjoint[:, a, 3 + 3 * a : 6 + 3 * a]
+        return out
+    out[:, 0, 0] = adjoint[:, 0, 0] + adjoint[:, 1, 1]
+    out[:, 0, 1] = adjoint[:, 0, 3] + adjoint[:, 1, 2]
+    out[:, 1, 1] = adjoint[:, 1, 3] - adjoint[:, 0, 2]
+    return out
 
 
 def unit_loads(arm: ElasticArm) -> UnitLoads:
@@ -248,7 +280,7 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
     modes = arm.constraint_modes()
     ones, places = np.moveaxis(arm.rigid_inertia, 2, 0)
     inertial = static_response(arm, *arm.restrict(_accelerations(ones, places)))
-    interface = modes.field @ np.linalg.inv(modes.stiffness)
+    interface = combine(modes.field, np.linalg.inv(modes.stiffness))
     return UnitLoads(arm, np.concatenate([inertial, interface], axis=2))
 
 
@@ -288,9 +320,12 @@ def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray)
         outboard: (b, k) force and moment at the outboard interface, N, N m.
     """
     modes = arm.constraint_modes()
-    loaded = arm.comm.allreduce(np.any(interior, axis=0))
-    particular = np.zeros_like(interior)
-    particular[:, loaded] = arm.solve(interior[:, loaded])
+    loaded = arm.comm.allreduce(np.array([column.any() for column in interior.T]))
+    if loaded.all():
+        particular = arm.solve(interior)
+    else:
+        particular = np.zeros_like(interior)
+        particular[:, loaded] = arm.solve(interior[:, loaded])
     load = outboard + arm.comm.allreduce(modes.interior.T @ interior)
     tip = np.linalg.solve(modes.stiffness, load)
     return arm.expand(particular + modes.interior @ tip, tip)

@@ -7,6 +7,7 @@ d is the number of directions.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -70,6 +71,64 @@ class UniformCells:
         n, *shape, count = forces.shape
         rows = forces.reshape(n, -1, count).swapaxes(1, 2).reshape(n * count, -1)
         return (self._sum @ rows).reshape(-1, *shape)
+
+    # -- without translations ----------------------------------------------------------------
+
+    @property
+    def num_nodes(self) -> int:
+        """Number n of a cell's nodes."""
+        return len(self._corners)
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return self._corners.shape[1]
+
+    def by_component(self, *fields: np.ndarray) -> np.ndarray:
+        """Return fields (n_nodes, d, k), side by side, as `differences` takes them."""
+        ends = np.cumsum([0, *(field.shape[2] for field in fields)])
+        out = np.empty((fields[0].shape[1], ends[-1], len(fields[0])))
+        for field, first, last in zip(fields, ends, ends[1:], strict=False):
+            out[:, first:last] = field.transpose(1, 2, 0)
+        return out.reshape(-1, len(fields[0]))
+
+    def differences(self, rows: np.ndarray, cells: slice = slice(None)) -> np.ndarray:
+        """Return values of the cells' nodes but the first, less the first's (n - 1, d k, cells).
+
+        They are what strains a cell: rounding is relative to them.
+
+        Args:
+            rows: (d k, n_nodes), see `by_component`.
+            cells: which.
+        """
+        first, *others = self._corners[:, cells]
+        out = np.empty((len(others), len(rows), len(first)))
+        origin = rows.take(first, axis=1, mode="clip")
+        for corner, found in zip(others, out, strict=True):
+            np.take(rows, corner, axis=1, out=found, mode="clip")
+            found -= origin
+        return out
+
+    def cell_rows(self, columns: int) -> np.ndarray:
+        """Return room for derivatives by `differences`, (n - 1, n_cells, columns)."""
+        return np.empty((self.num_nodes - 1, self.count, columns))
+
+    def sum_of_differences(self, rows: np.ndarray) -> np.ndarray:
+        """Return nodal derivatives (n_nodes, columns) of those by `differences`, `cell_rows`."""
+        return self._sum_differences @ rows.reshape(-1, rows.shape[2])
+
+    @cached_property
+    def _sum_differences(self) -> sp.csr_matrix:
+        first = self._sum[:, : self.count]
+        return sp.csr_matrix(self._sum[:, self.count :] - sp.hstack([first] * (self.num_nodes - 1)))
+
+    def difference_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return what `stiffness_products` does, given both fields' `differences`."""
+        dim = self.operators.points.shape[1]
+        stiffness = self.stiffness[dim:, dim:]
+        return _sum_of_products(left, stiffness @ right.reshape(len(stiffness), -1))
+
+    # -- energies ----------------------------------------------------------------------------
 
     def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.cells import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import Basis, Options
 from dolfinopt.reduction.free_arm import (
@@ -20,7 +21,7 @@ from dolfinopt.reduction.free_arm import (
     frame_loads,
     interface_loads,
 )
-from dolfinopt.reduction.subspace import InverseSpace, combine, dot, ritz
+from dolfinopt.reduction.subspace import InverseSpace, dot, ritz
 
 # Relative residual of the responses in the band, after multiplication by K^-1, in energy.
 RESPONSE_TOLERANCE = 1e-10

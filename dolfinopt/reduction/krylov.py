@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.cells import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
 from dolfinopt.reduction.free_arm import FreeArm, Rows, frame_loads, interface_loads
-from dolfinopt.reduction.subspace import Expansion, combine, dot, orthonormalise, ritz, solve_at
+from dolfinopt.reduction.subspace import Expansion, dot, orthonormalise, ritz, solve_at
 
 # Relative residual of solutions at a shift, in the norm of M after multiplication by K^-1.
 SHIFT_TOLERANCE = 1e-12

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.cells import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import Basis, orient
 from dolfinopt.reduction.free_arm import FreeArm, Rows
@@ -30,12 +31,6 @@ def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
 def total(arm: ElasticArm, part: Any) -> Any:
     """Return the sum over the arm's ranks; without the detour through MPI on a single one."""
     return part if arm.comm.size == 1 else arm.comm.allreduce(part)
-
-
-def combine(V: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return V coefficients (n_nodes, d, k), as one matrix product."""
-    flat = V.reshape(V.shape[0] * V.shape[1], V.shape[2]) @ coefficients
-    return flat.reshape(*V.shape[:2], coefficients.shape[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ import numpy as np
 
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
+from dolfinopt.fem.cells import combine
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, mass_partners, rigid_body
 from dolfinopt.reduction import METHODS, frame_fields
-from dolfinopt.reduction.subspace import combine
 from dolfinopt.responses.statics import StaticResponse
 
 # Directions of A below this share of its largest are the rounding of its sums.
@@ -88,13 +88,17 @@ def exact_gradient(
         )
         energies = elastic.cell_stiffness_products(combine(V, by_K.T) - fields.stiffness, V)
         partners.left[:, :, 1:-1] += fields.mass
+        if geometric is not None:  # the partners of 1_x and X stand at the ends
+            partners.left[:, :, -1] += geometric.by_inertia[:, :, 0]
+            partners.left[:, :, 0] += geometric.by_inertia[:, :, 1]
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        for part in (geometric, inertial):
-            if part is not None:
-                energies += part.by_young
-                masses += part.by_density
+        if geometric is not None:
+            energies += geometric.by_young
+        if inertial is not None:
+            energies += inertial.by_young
+            masses += inertial.by_density
         return state.young_slope * energies + state.density_slope * masses
 
 

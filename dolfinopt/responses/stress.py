@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.design_state import DesignState
+from dolfinopt.fem.cells import combine
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
-from dolfinopt.reduction.subspace import combine
 from dolfinopt.responses.cell_stress import CellStress, cell_stress
 from dolfinopt.responses.response import (
     Analysis,
