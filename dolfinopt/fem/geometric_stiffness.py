@@ -284,18 +284,11 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
     return UnitLoads(arm, np.concatenate([inertial, interface], axis=2))
 
 
-def accelerations(arm: ElasticArm) -> np.ndarray:
-    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body.
+def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them.
 
     1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
-    space.
-    """
-    return _accelerations(np.ones_like(arm.points), arm.points)
-
-
-def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return these fields of 1 and X (n, d), or M times them: M knows no direction.
-
+    space. Of 1 and X (n_nodes, d), or M times these: M knows no direction.
     M (-y, x) is (-(M X)_y, (M X)_x), as M treats the components alike.
     """
     dim = ones.shape[1]
