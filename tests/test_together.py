@@ -471,11 +471,10 @@ def test_tables(monkeypatch, shared_tmp_path):
 
 # -- as a command ----------------------------------------------------------------------------
 
+# What fails, on which rank, in which command; the other places above end in the same two handlers.
 COMMANDS = {
-    "reduction": ("dolfinopt.arms.design_state", "shape_integrals", 1, "simulate"),
     "mesh": ("dolfinopt.mesh.arm_mesh", "mesh_geo", 1, "simulate"),
     "simulation": ("dolfinopt.responses.evaluation", "simulate_batch", 0, "simulate"),
-    "writing": ("dolfinopt.output.run_folder", "write_summary", 0, "simulate"),
     "checkpoint": ("dolfinopt.output.checkpoint", "write_arrays", 0, "optimize"),
 }
 SCRIPT = """
@@ -497,8 +496,12 @@ main()
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
 @pytest.mark.parametrize(
     ("place", "kind"),
-    [(place, "ConvergenceError") for place in COMMANDS]
-    + [(place, "ZeroDivisionError") for place in ("mesh", "simulation")],
+    [
+        ("mesh", "ConvergenceError"),
+        ("checkpoint", "ConvergenceError"),
+        ("mesh", "ZeroDivisionError"),
+        ("simulation", "ZeroDivisionError"),
+    ],
 )
 def test_commands(place, kind, tmp_path):
     """All ranks end by themselves, with one message: nobody has to be aborted."""

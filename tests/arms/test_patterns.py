@@ -74,7 +74,11 @@ def test_the_same_arm_again_is_the_shared_design():
     np.testing.assert_allclose(histories[1], histories[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["esl", "static", "eigenfrequency", "deviation"])
+@pytest.mark.parametrize(
+    "kind",
+    ["static", *(pytest.param(k, marks=pytest.mark.serial)  # one shows how ranks add up
+                 for k in ("esl", "eigenfrequency", "deviation"))],
+)  # fmt: skip
 def test_gradients_add_up(kind):
     """The Taylor test moves one design, and both arms with it."""
     quick = ("motion.horizon=2.0", "simulation.tolerance=1e-6", "arms.symmetric=true")
@@ -117,7 +121,7 @@ def test_constraints_of_both_arms_bind_one_design():
     np.testing.assert_allclose(slopes, differences, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["stress", "peak_force"])
+@pytest.mark.parametrize("kind", [pytest.param("stress", marks=pytest.mark.serial), "peak_force"])
 def test_gradients_of_extremes_know_void_cells(kind):
     """A void cell has no stress and no say; central differences by the design of both arms."""
     exact = ("objective.gradient=exact", "simulation.tolerance=1e-7", "motion.horizon=2.2")

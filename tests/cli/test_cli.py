@@ -50,6 +50,7 @@ def test_optimize_writes_every_file(optimised):
     assert {path.name for path in optimised.iterdir()} == expected
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_time_is_the_time_one_waited(optimised):
     """Pictures are part of it, and the animation is drawn on request only."""
     seconds = json.loads((optimised / "summary.json").read_text())["seconds"]
@@ -215,6 +216,7 @@ def test_a_project_can_be_moved(tmp_path):
         run(*resume)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("words", "kind"),
     [

@@ -60,6 +60,7 @@ def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     assert (out / "drives.png").stat().st_size > 5000
 
 
+@pytest.mark.serial  # ranks: the same in test_optimization
 @pytest.mark.parametrize("kind", SCENES)
 def test_optimisation_goes_on_to_the_same_bits(kind, shared_tmp_path):
     path = write_scene(SCENES[kind](), shared_tmp_path)

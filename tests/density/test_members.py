@@ -50,6 +50,7 @@ DRAWN = [  # solid by column and row; member and gap in cells
 ]
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("triangles", [False, True], ids=["squares", "triangles"])
 @pytest.mark.parametrize(("name", "solid", "member", "gap"), DRAWN, ids=[d[0] for d in DRAWN])
 def test_widths_of_drawn_designs(name, solid, member, gap, triangles):
@@ -66,11 +67,13 @@ def test_widths_of_drawn_designs(name, solid, member, gap, triangles):
         assert found_gap is None
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_nothing_solid_has_no_widths():
     corners, i, _ = cells(10, 4)
     assert thinnest(corners, i < 0) == (None, None)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_corners_are_no_members():
     """A triangular island in the middle of a wide field: its corners are thin, it is not."""
     corners, i, j = cells(60, 60)
@@ -102,6 +105,7 @@ def test_the_radius_of_a_width(erosion):
     assert np.diff(y[order]).max() > 0.0
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("member", "gap"), [(0.04, 0.08), (0.05, 0.025), (0.05, 0.05)])
 @pytest.mark.parametrize("erosion", [0.05, 0.1, 0.25])
 def test_a_member_and_a_gap_of_two_widths(member, gap, erosion):
@@ -123,6 +127,7 @@ def test_a_member_and_a_gap_of_two_widths(member, gap, erosion):
         assert (y > 0.5).sum() * cell == pytest.approx(wanted, abs=3.0 * cell)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("key", ["minimum_member", "minimum_gap"])
 def test_one_width_is_that_of_members_and_gaps(key):
     design = do.load_scene(TWO_ARM, ("design.projection=robust", f"design.{key}=0.018")).design
@@ -131,6 +136,7 @@ def test_one_width_is_that_of_members_and_gaps(key):
     assert design.radius == other.design.radius and other.design.controls_widths
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_what_repeats_a_design_smaller_keeps_the_width():
     """The filter of the pattern is wider by as much as the smallest copy is smaller."""
     width = ("design.projection=robust", "design.minimum_member=0.015")
@@ -176,6 +182,7 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
         assert gap >= width - cell
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_a_gap_of_its_own_widens_the_gaps():
     """The gaps of a nearly full arm are as wide as asked, and were thinner with members alone."""
     full = ("design.volume_fraction=0.75", "design.initial=0.75", "design.minimum_member=0.01")
@@ -212,6 +219,7 @@ def test_which_design_carries_the_volume(width):
     np.testing.assert_allclose(problem.dfdx, expected * factor[:, None], rtol=1e-14)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
@@ -272,6 +280,7 @@ def test_widths_that_cannot_be(overrides, reason):
         do.load_scene(TWO_ARM, overrides)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("radius", "count"), [(0.0075, 1), (0.01, 0), (0.0, 1)])
 def test_a_filter_of_less_than_two_cells_warns(radius, count):
     scene = do.load_scene(TWO_ARM, (f"design.filter_radius={radius}",))

@@ -22,6 +22,8 @@ from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
 
+pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
+
 CRANK, ROD = 0.15, 0.30  # m
 CRANK_MASS, ROD_MASS, SLIDER_MASS = 0.36, 0.151104, 0.075552  # kg
 CRANK_INERTIA, ROD_INERTIA = 0.002727, 0.0045339259  # about their first joints, kg m2

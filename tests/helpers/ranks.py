@@ -8,15 +8,19 @@ wait for it inside a collective call would wait for ever: after a grace period i
 from __future__ import annotations
 
 import faulthandler
+import gc
 import os
+import re
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from mpi4py import MPI
 
 TIME_LIMIT = 180.0  # s a test, unless marked timeout(seconds)
 GRACE = 10.0  # s a failed rank waits for the others
+SERIAL_FILE = re.compile(r"^pytestmark = pytest\.mark\.serial\b", re.MULTILINE)
 
 
 class Ranks:
@@ -40,12 +44,24 @@ class Ranks:
             reporter = session.config.pluginmanager.get_plugin("terminalreporter")
             reporter._tw._file = open(os.devnull, "w")  # for the life of the process
 
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Skip tests marked `serial` when there are more ranks."""
-        if self.comm.size > 1:
-            for item in items:
-                if item.get_closest_marker("serial"):
-                    item.add_marker(pytest.mark.skip(reason="needs a single rank"))
+    def pytest_ignore_collect(self, collection_path: Path) -> bool | None:
+        """Do not even import files whose tests are all marked `serial` when there are more ranks.
+
+        A file that is named on the command line is read all the same.
+        """
+        if self.comm.size == 1 or not collection_path.match("test_*.py"):
+            return None
+        return True if SERIAL_FILE.search(collection_path.read_text(encoding="utf-8")) else None
+
+    def pytest_collection_modifyitems(
+        self, config: pytest.Config, items: list[pytest.Item]
+    ) -> None:
+        """Leave out tests marked `serial` when there are more ranks."""
+        if self.comm.size == 1:
+            return
+        serial = [item for item in items if item.get_closest_marker("serial")]
+        items[:] = [item for item in items if not item.get_closest_marker("serial")]
+        config.hook.pytest_deselected(items=serial)
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         """Keep what went wrong in reading a test file."""
@@ -53,13 +69,18 @@ class Ranks:
             self.unread.append(report.longreprtext)
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Stop unless all ranks run the same tests: else they would wait for one another."""
+        """Stop unless all ranks run the same tests: else they would wait for one another.
+
+        What is there now stays to the end: the garbage collector need not look at it again.
+        """
         plan = [item.nodeid for item in session.items], len(self.unread)
         plans = self.comm.allgather(plan)
         if any(other != plans[0] for other in plans):
             print(*self.unread, sep="\n", file=self.stderr, flush=True)
             status = pytest.ExitCode.USAGE_ERROR
             pytest.exit("the ranks collected different tests", returncode=status)
+        gc.collect()
+        gc.freeze()
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:

@@ -16,6 +16,7 @@ from dolfinopt.responses.evaluation import Evaluation, constraint_gradients
 from dolfinopt.scene.load import Scene
 
 Cells = Mapping[int, np.ndarray]
+Named = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,26 @@ def uneven(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def tip(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the direction that fills the outer fifth of the last of two arms."""
     return ((x > 0.8) & (k == 1)).astype(float)
+
+
+def by_number(model: do.Model) -> tuple[Named, Named]:
+    """Return a design in [0.2, 0.8] and a random direction in [-1, 1], by arm and cell number."""
+    rng = np.random.default_rng(0)
+    x = {
+        name: 0.5 + 0.3 * np.sin(1.7 * np.arange(len(one)))
+        for name, one in model.uniform(0.5).items()
+    }
+    return x, {name: rng.uniform(-1.0, 1.0, len(one)) for name, one in x.items()}
+
+
+def product(a: Named, b: Named) -> float:
+    """Return the product over all arms of one rank."""
+    return float(sum(a[name] @ b[name] for name in a))
+
+
+def objective_along(model: do.Model, x: Named, direction: Named) -> Callable[[float], float]:
+    """Return h -> the objective at x + h direction."""
+    return lambda h: model.simulate({name: x[name] + h * direction[name] for name in x}).objective
 
 
 def rates(

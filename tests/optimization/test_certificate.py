@@ -105,6 +105,7 @@ class TwoBars:
 FORCE = np.array([2.0, 1.0])
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_derivatives_of_two_bars():
     bars, k, h = TwoBars(FORCE, 0.3), np.array([1.2, 0.7]), 1e-6
     for i, unit in enumerate(np.eye(2)):
@@ -144,6 +145,7 @@ def test_two_bars_rest_where_no_optimum_is(w2):
     assert further.excess > 1e-3
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_two_bars_in_slow_motion():
     """Without inertia nothing is lost by freezing the loads."""
     bars = TwoBars(FORCE, 1e-9)
@@ -153,6 +155,7 @@ def test_two_bars_in_slow_motion():
     assert found.sentence.startswith("residual ")
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_two_bars_above_resonance():
     """Stiffness brings the bars nearer to resonance: frozen loads ask for what is worst."""
     bars = TwoBars(FORCE, 1.5)
@@ -169,6 +172,7 @@ def test_two_bars_above_resonance():
     assert further.excess > 1.0  # the optimum is less than half as compliant
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_two_bars_after_an_impact():
     """The sum of the largest displacements u_i = v_i / sqrt(k_i): frozen loads overrate stiffness
     by two, u_i / k_i in place of u_i / (2 k_i), for both bars alike. They end in the optimum."""
@@ -185,6 +189,7 @@ def test_two_bars_after_an_impact():
     assert found.ratio == pytest.approx(2.0, rel=1e-12)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_variables_at_bounds_have_no_part_in_the_angle():
     exact, frozen = np.array([1.0, 0.0, 5.0, 7.0]), np.array([1.0, 1.0, -5.0, -7.0])
     x, low, high = np.array([0.5, 0.5, 0.0, 1.0]), np.zeros(4), np.ones(4)
@@ -197,6 +202,7 @@ def test_variables_at_bounds_have_no_part_in_the_angle():
     assert np.isnan(alone.angle) and alone.kkt == found.kkt
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_best_of_what_keeps_the_constraints():
     def at(f0, met=True):
         limit = Limit("mass", "", 1.0 if met else 2.0, 1.0, "kg")
@@ -261,6 +267,7 @@ POSED = {
 }
 
 
+@pytest.mark.serial  # ranks: test_same_certificate_on_any_number_of_ranks
 @pytest.mark.parametrize("posed", POSED)
 def test_residual_is_of_the_problem_as_posed(posed):
     """The certificate of frozen loads is the exact run's residual; both tell the same angle."""
@@ -276,6 +283,7 @@ def test_residual_is_of_the_problem_as_posed(posed):
     assert esl.certificate.further is None and esl.certificate.seconds > 0.0
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_limits_of_the_motion_have_frozen_loads():
     """The objective, a mass, has no loads to freeze; the residual is of limits by the motion."""
     posed = ["objective.kind=mass", "constraints.deviation=0.05", "design.initial=0.6"]
@@ -295,6 +303,7 @@ def test_without_motion_the_gradient_is_exact(kind):
     assert result.certificate.sentence == f"residual {result.kkt:.2g} under the exact gradient"
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -306,7 +315,7 @@ def test_without_motion_the_gradient_is_exact(kind):
     ],
 )
 def test_no_exact_gradient_is_told(change, reason):
-    result = do.optimize(scene(change))
+    result = do.optimize(scene(change, "simulation.tolerance=0.1"))
     found = result.certificate
     assert np.isnan(found.kkt) and found.missing == reason and reason in found.sentence
     assert found.to_dict()["kkt"] is None
@@ -329,12 +338,12 @@ def test_failing_gradient_does_not_lose_the_design(monkeypatch):
 
 @pytest.mark.serial
 def test_light_payload_pays_for_frozen_loads():
-    """With 0.2 kg the loads are the arms' own: frozen, they end twice as compliant.
+    """With 0.2 kg the loads are the arms' own: frozen, they end half as compliant again.
 
     The design stays as it is, whatever is learnt of it.
     """
-    plain = do.optimize(scene(LIGHT, iterations=25))
-    result = do.optimize(scene(LIGHT, "optimizer.exact_iterations=30", iterations=25))
+    plain = do.optimize(scene(LIGHT, iterations=12))
+    result = do.optimize(scene(LIGHT, "optimizer.exact_iterations=15", iterations=12))
     for k, x in plain.x_phys.items():
         np.testing.assert_array_equal(result.x_phys[k], x)
     assert result.evaluation == plain.evaluation
@@ -342,18 +351,18 @@ def test_light_payload_pays_for_frozen_loads():
     found, further = result.certificate, result.certificate.further
     assert replace(found, further=None, seconds=0.0) == replace(plain.certificate, seconds=0.0)
     assert found.kkt > 0.1 and found.angle > 20.0
-    assert further.iterations == 30 and further.feasible
+    assert further.iterations == 15 and further.feasible
     assert further.begun == pytest.approx(result.evaluation.objective, rel=1e-12)
     assert further.excess > 0.3
-    assert "above the best of 30 further iterations" in found.sentence
+    assert "above the best of 15 further iterations" in found.sentence
     # It is no worse than what the exact gradient finds by itself.
-    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", iterations=55))
+    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", iterations=27))
     assert further.objective < 1.1 * exact.evaluation.objective
 
 
 @pytest.mark.serial
 def test_heavy_payload_loses_little():
-    result = do.optimize(scene("optimizer.exact_iterations=20", iterations=40))
+    result = do.optimize(scene("optimizer.exact_iterations=10", iterations=20))
     assert result.certificate.further.excess < 0.05
 
 

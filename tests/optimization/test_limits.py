@@ -100,10 +100,11 @@ def test_limits_that_conflict_are_named():
     assert "nothing stands against deviation <= 0.008 m" in result.stop_reason
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_limits_hold_for_the_worst_scenario():
     loads = '[{changes=["payload.mass=3"], weight=5.0}, {changes=["payload.mass=6"]}]'
     changes = ["objective.kind=mass", "constraints.deviation=0.01", f"scenarios={loads}"]
-    result = do.optimize(scene(*changes, "objective.scenarios=sum", iterations=40))
+    result = do.optimize(scene(*changes, "objective.scenarios=sum", iterations=25))
     light, heavy = (one.max_deviation for one in result.evaluation.scenarios)
     assert light < heavy == values(result)["deviation"].value
     assert heavy == pytest.approx(0.01, rel=1e-3) and not result.violated
@@ -140,6 +141,7 @@ def evaluator_of(built):
     return Evaluator(built, partition, do.build_arms(built, partition, profile), profile)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_an_objective_turned_round_rises():
     """The tips are to move as far as they can: as in a compliant machine."""
     changes = ["objective.kind=tip_deflection", "objective.direction=maximize"]
@@ -155,6 +157,7 @@ def test_an_objective_turned_round_rises():
     assert all(one.least and one.met for one in found.values())
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_limits_by_the_columns_of_the_history():
     built = scene("constraints.first_frequency=[0.5,1.0]", "constraints.mass=2.0", iterations=1)
     names = ["volume_fraction_arm1", "volume_fraction_arm2", "mass"]
@@ -182,6 +185,7 @@ def test_a_run_that_ends_just_beyond_a_limit_lands(monkeypatch):
         ]
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_steps_that_lead_astray():
     """Twice the value before, or twice the limit; what is well within it may come to it."""
     assert leaps(np.array([4.0, -0.5]), np.array([9.1, -0.5]))
@@ -190,6 +194,7 @@ def test_steps_that_lead_astray():
     assert not leaps(np.array([-0.9]), np.array([0.9]))
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_asymptotes_begin_no_wider_than_they_may_become():
     x = np.full(4, 0.5)
     given = x, np.ones(4), np.zeros(1), np.ones((1, 4)), 0.0, 1.0, initial_state(x)

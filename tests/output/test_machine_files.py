@@ -6,43 +6,40 @@ import numpy as np
 import pytest
 from machines import controlled, loop
 from mpi4py import MPI
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.output.run_folder import Simulated, write_simulation
+
+pytestmark = pytest.mark.serial  # the root writes; what ranks gather for it: test_results
 
 WORLD = MPI.COMM_WORLD
 
 
 def left_by(scene, folder):
-    """Return trajectory.npz, trajectory.csv and summary.json of a simulation, on the root."""
+    """Return trajectory.npz, trajectory.csv, summary.json and trajectory of a simulation.
+
+    Every array and column has its unit, and both files of the trajectory hold the same.
+    """
     partition, profile = do.partition_arms(WORLD, scene.cell_counts), do.Profile()
     arms = do.build_arms(scene, partition, profile)
     x = {k: arm.uniform(0.5) for k, arm in arms.items()}
     evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
     one = Simulated(scene, partition, arms, x, evaluation, trajectory, profile)
-    if write_simulation(folder, one, 0.0, paraview=False) is None:
-        return None
+    write_simulation(folder, one, 0.0, paraview=False)
     with np.load(folder / "trajectory.npz") as data:
         arrays = {name: data[name] for name in data.files}
     table = np.genfromtxt(folder / "trajectory.csv", delimiter=",", names=True)
-    return arrays, table, json.loads((folder / "summary.json").read_text()), trajectory
-
-
-def check_tables(arrays, table, summary):
-    """Every array and column has its unit, and both files hold the same."""
+    summary = json.loads((folder / "summary.json").read_text())
     named = dict(text.split(": ", 1) for text in arrays["units"].tolist())
     assert set(named) == set(arrays) - {"units"} and all(named.values())
     assert list(summary["units"]["trajectory.csv"]) == list(table.dtype.names)
     np.testing.assert_allclose(table["t"], arrays["t"], atol=1e-12)
+    return arrays, table, summary, trajectory
 
 
-def test_control_leaves_desired_and_actual_coordinates_and_its_forces(shared_tmp_path):
-    scene = controlled()
-    left = left_by(scene, shared_tmp_path)
-    if left is None:
-        return
-    arrays, table, summary, trajectory = left
-    check_tables(arrays, table, summary)
+def test_control_leaves_desired_and_actual_coordinates_and_its_forces(tmp_path):
+    arrays, table, summary, trajectory = left_by(controlled(), tmp_path)
     error = arrays["q_r"] - arrays["q_r_desired"]
     assert 0.0 < np.abs(error[:, 0]).max() < 1e-3  # m
     np.testing.assert_allclose(table["q_r_desired_arm2"], arrays["q_r_desired"][:, 2], rtol=1e-9)
@@ -64,12 +61,8 @@ def test_control_leaves_desired_and_actual_coordinates_and_its_forces(shared_tmp
     assert summary["settling"] < summary["max_deviation"]
 
 
-def test_slider_leaves_its_place_and_the_force_of_its_guide(shared_tmp_path):
-    left = left_by(loop(), shared_tmp_path)
-    if left is None:
-        return
-    arrays, table, summary, _ = left
-    check_tables(arrays, table, summary)
+def test_slider_leaves_its_place_and_the_force_of_its_guide(tmp_path):
+    arrays, table, summary, _ = left_by(loop(), tmp_path)
     assert arrays["closure_force"].shape == (101, 1)
     np.testing.assert_allclose(table["closure_force_normal"], arrays["closure_force"][:, 0])
     np.testing.assert_allclose(table["slider_position"], arrays["slider_position"], rtol=1e-9)
@@ -87,32 +80,24 @@ def test_slider_leaves_its_place_and_the_force_of_its_guide(shared_tmp_path):
     assert summary["closure_force_peak"] == pytest.approx(peak, rel=1e-12)
 
 
-def test_force_of_the_guide_is_positive_on_the_side_that_is_documented(shared_tmp_path):
+def test_force_of_the_guide_is_positive_on_the_side_that_is_documented(tmp_path):
     """A standing slider-crank under gravity: the guide holds up part of the slider's weight."""
     still = {"speed": 1e-3, "start_angle": 1.0, "gravity": [0.0, -9.81]}
     for direction, sign in (([1.0, 0.0], 1.0), ([-1.0, 0.0], -1.0)):
         closure = {"kind": "slider", "direction": direction, "side": -1}
         scene = loop(motion=still, closure=closure)
-        folder = shared_tmp_path / f"side{sign:+.0f}"
-        if WORLD.rank == 0:
-            folder.mkdir()
-        WORLD.barrier()
-        left = left_by(scene, folder)
-        if left is None:
-            continue
-        force, rod = left[0]["closure_force"][:, 0], left[2]["mass"]["rod"]
+        folder = tmp_path / f"side{sign:+.0f}"
+        folder.mkdir()
+        arrays, _, summary, _ = left_by(scene, folder)
+        force, rod = arrays["closure_force"][:, 0], summary["mass"]["rod"]
         # Moments about the crank pin: the slider's weight, and half the rod's.
         expected = sign * 9.81 * (0.5 + 0.5 * rod)
         np.testing.assert_allclose(force, expected, rtol=2e-3)
-        assert np.sign(left[0]["slider_position"][0]) == sign
+        assert np.sign(arrays["slider_position"][0]) == sign
 
 
-def test_pin_leaves_its_force_along_x_and_y(shared_tmp_path):
-    left = left_by(loop("pin"), shared_tmp_path)
-    if left is None:
-        return
-    arrays, table, summary, _ = left
-    check_tables(arrays, table, summary)
+def test_pin_leaves_its_force_along_x_and_y(tmp_path):
+    arrays, table, summary, _ = left_by(loop("pin"), tmp_path)
     assert arrays["closure_force"].shape == (101, 2)
     np.testing.assert_allclose(table["closure_force_y"], arrays["closure_force"][:, 1])
     assert "slider_position" not in arrays
@@ -123,14 +108,9 @@ def test_pin_leaves_its_force_along_x_and_y(shared_tmp_path):
     assert summary["stiffening"]["on"] in (True, False)
 
 
-def test_prescribed_motion_leaves_what_it_left(shared_tmp_path):
-    scene = do.load_scene(
-        "demos/two_arm.toml", ["arms.cells=[16,2]", "motion.base=fixed", "motion.radius=0.4"]
-    )
-    left = left_by(scene, shared_tmp_path)
-    if left is None:
-        return
-    arrays, table, summary, _ = left
+def test_prescribed_motion_leaves_what_it_left(tmp_path):
+    scene = do.load_scene(TWO_ARM, ["arms.cells=[16,2]", "motion.base=fixed", "motion.radius=0.4"])
+    arrays, table, summary, _ = left_by(scene, tmp_path)
     assert "q_r_desired" not in arrays and "closure_force" not in arrays
     assert arrays["joint_forces"].shape[1] == 3
     assert [name for name in table.dtype.names if name.startswith("joint_force")] == [

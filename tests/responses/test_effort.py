@@ -72,6 +72,7 @@ def test_rigid_limit_is_newtons_law(
     assert result.objective == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_work_of_the_drives_is_what_damping_takes() -> None:
     """From rest to rest the forces that the effort is made of do no other work."""
     changes = ["motion.horizon=4.0", "damping.stiffness_proportional=2e-2"]
@@ -105,6 +106,7 @@ def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
         assert result.unit == "-"
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -126,6 +128,7 @@ def test_refusals(changes: list[str], expected: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("kind", ["effort", "peak_force"])
 def test_without_a_limit_no_arm_would_be_left(kind: str) -> None:
     """What the drives carry least is nothing."""
@@ -166,6 +169,7 @@ def test_weighted_sum_of_peak_forces_as_objective() -> None:
         assert result.objective == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "limit", ["effort=7.4", "peak_force=[100.0,15.0,7.0]"], ids=["effort", "peak force"]
 )
@@ -184,16 +188,17 @@ def test_a_limit_of_the_drives_is_met(limit: str) -> None:
 @pytest.mark.slow
 def test_least_effort_at_the_accuracy_of_least_compliance() -> None:
     """Lighter arms do as well, and the drives feel it."""
-    changes = ["arms.cells=[30,4]", "payload.mass=0.5", "design.filter_radius=0.05"]
-    changes += ["simulation.tolerance=1e-3", "optimizer.max_iterations=40"]
+    changes = ["arms.cells=[24,3]", "payload.mass=0.5", "design.filter_radius=0.05"]
+    changes += ["simulation.tolerance=1e-3", "motion.horizon=2.2", "optimizer.max_iterations=15"]
     stiff = do.optimize(scene(*changes, "constraints.effort=1e3"))
     kept = f"constraints.deviation={stiff.evaluation.max_deviation}"
     lazy = do.optimize(scene(*changes, EFFORT, kept))
     assert not lazy.violated
     before = stiff.evaluation.values_of("effort")[0]
-    assert lazy.evaluation.objective < 0.95 * before  # 0.923
+    assert lazy.evaluation.objective < 0.95 * before  # 0.912
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_effort_demo(shared_tmp_path: Path) -> None:
     """Runs, tables and draws on few cells."""
     path = ROOT / "demos" / "demo_effort.py"

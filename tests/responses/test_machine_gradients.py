@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reference_machines import GAINS, Tree, four_bar, slider_crank, two_arm, with_keys
-from remainders import rates
+from remainders import by_number, objective_along, product, rates
 
 from dolfinopt import Model
 from dolfinopt.fem.elements import ELEMENTS
@@ -138,11 +138,6 @@ KINDS = (
 )
 
 
-def slope(gradient: dict[str, np.ndarray], direction: dict[str, np.ndarray]) -> float:
-    """Return the product over all arms."""
-    return float(sum(gradient[name] @ direction[name] for name in direction))
-
-
 @pytest.mark.parametrize(
     "kind", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else ()) for k in KINDS]
 )
@@ -152,20 +147,12 @@ def test_exact_gradient(kind: str, tmp_path: Path) -> None:
     Of drive forces there is no gradient by ESL, and the exact one stands in its place.
     """
     model = Model(scene_from_dict(scenes(tmp_path)[kind]))
-    rng = np.random.default_rng(0)
-    x = {
-        name: np.clip(0.5 + 0.3 * np.sin(1.7 * np.arange(len(one))), 0.1, 1.0)
-        for name, one in model.uniform(0.5).items()
-    }
-    direction = {name: rng.uniform(-1.0, 1.0, len(one)) for name, one in x.items()}
+    x, direction = by_number(model)
     exact = model.gradient(x, "exact")
-
-    def objective(h: float) -> float:
-        return model.simulate({name: x[name] + h * direction[name] for name in x}).objective
-
-    order = rates(objective, slope(exact, direction), steps=(1e-2, 1e-3))
+    objective = objective_along(model, x, direction)
+    order = rates(objective, product(exact, direction), steps=(1e-2, 1e-3))
     assert order == pytest.approx(2.0, abs=0.06)
     esl = model.gradient(x, "esl")
-    cosine = slope(esl, exact) / np.sqrt(slope(esl, esl) * slope(exact, exact))
+    cosine = product(esl, exact) / np.sqrt(product(esl, esl) * product(exact, exact))
     assert np.isfinite(cosine)
     assert cosine > COSINE.get(kind, 0.9)

@@ -210,26 +210,30 @@ def test_trajectory_slopes(
 
     slopes = seen_gradient(problem, base, t, what, weights * here)
     value = 0.5 * np.sum(weights * here**2)
-    for arm, body in enumerate(problem.mechanism.bodies):
-        for name in CONSTANTS:
-            changes = list(unit_changes(body, name))
-            if not changes:  # a linear body has no geometric stiffness
-                continue
-            # One direction, in which every entry moves by the constant's size; of the stiffness
-            # by its softest mode's.
+    bodies = problem.mechanism.bodies
+    for name in CONSTANTS:
+        if np.size(getattr(bodies[0], name)) == 0:  # a linear body has no geometric stiffness
+            continue
+        # One direction, in which every entry of every body moves by the constant's size; of the
+        # stiffness by its softest mode's.
+        changes = []
+        for body in bodies:
             value_of = getattr(body, name)
             size = np.linalg.norm(value_of, -2) if name == "K" else np.abs(value_of).max()
             size = max(float(size), 1e-3)
-            change = size * sum(rng.uniform(-1.0, 1.0) * c for c in changes)
+            changes.append(size * sum(rng.uniform(-1.0, 1.0) * c for c in unit_changes(body, name)))
 
-            def function(t_: float, arm: int = arm, name: str = name, c: np.ndarray = change):
-                return solve(changed(problem.mechanism, arm, name, t_ * c))
+        def function(t_: float, name: str = name, changes: list[np.ndarray] = changes) -> float:
+            model = problem.mechanism
+            for arm, change in enumerate(changes):
+                model = changed(model, arm, name, t_ * change)
+            return solve(model)
 
-            # Newton leaves 1e-12 of the value, of which this step makes 1e-8. Squares of rates and
-            # accelerations are less smooth in the bodies.
-            expected = derivative(function, 1e-4 if what == "rates" else 2e-4)
-            found = np.sum(getattr(slopes[arm], name) * change)
-            assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * value), name
+        # Newton leaves 1e-12 of the value, of which this step makes 1e-8. Squares of rates and
+        # accelerations are less smooth in the bodies.
+        expected = derivative(function, 1e-4 if what == "rates" else 2e-4)
+        found = sum(np.sum(getattr(slope, name) * change) for slope, change in zip(slopes, changes))
+        assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * value), name
 
 
 # -- the whole chain -------------------------------------------------------------------------

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from reference_machines import GAINS, slider_crank, two_arm, with_keys
-from remainders import Built, build, rates, uneven, wave
+from remainders import (
+    Built,
+    build,
+    by_number,
+    objective_along,
+    product,
+    rates,
+    uneven,
+    wave,
+)
 from runs import TWO_ARM
 
 import dolfinopt as do
@@ -229,7 +238,10 @@ KINDS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", KINDS)
+# With scenarios all that ranks exchange is exchanged.
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=() if k == "scenarios" else pytest.mark.serial) for k in KINDS]
+)
 def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The remainder of Taylor's formula has order 2, on any number of ranks.
 
@@ -265,18 +277,9 @@ def test_exact_gradient_of_machines(kind: str) -> None:
         }
         tree = with_keys(slider_crank(0.008, (24, 3)), keys)
     model = do.Model(scene_from_dict(tree))
-    rng = np.random.default_rng(0)
-    x = {
-        name: np.clip(0.5 + 0.3 * np.sin(1.7 * np.arange(len(one))), 0.1, 1.0)
-        for name, one in model.uniform(0.5).items()
-    }
-    direction = {name: rng.uniform(-1.0, 1.0, len(one)) for name, one in x.items()}
-    exact = model.gradient(x, "exact")
-    slope = float(sum(exact[name] @ direction[name] for name in x))
-
-    def value(h: float) -> float:
-        return model.simulate({name: x[name] + h * direction[name] for name in x}).objective
-
+    x, direction = by_number(model)
+    slope = product(model.gradient(x, "exact"), direction)
+    value = objective_along(model, x, direction)
     h = 1e-4
     # Instants near the limit of those that count come and go.
     assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
