@@ -202,6 +202,7 @@ def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
 # -- what other programs have computed -------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("name", "value"), [("NUMERICS", -1), ("__version__", "0.0.0")])
 def test_results_of_another_program_are_computed_anew(name, value, tmp_path, monkeypatch):
     scene = load_scene(paper_scene(), COARSE)

@@ -96,6 +96,12 @@ def made_small(scene: str) -> str:
             scene += f"\n[{table}]\n{line}\n"
         elif line.split()[0] not in scene:
             scene = scene.replace(f"[{table}]", f"[{table}]\n{line}")
+    if 'projection = "' in scene:
+        # A design cut at one half after two iterations falls apart, which takes long to find out,
+        # unless it is dense.
+        scene = re.sub(r"^(volume_fraction|initial) = .*\n", "", scene, flags=re.MULTILINE)
+        dense = "[design]\nvolume_fraction = 0.7\ninitial = 0.7"
+        scene = scene.replace("[design]", dense)
     if "cells =" not in scene and "mesh =" not in scene:
         first = scene.index("\n", scene.index("[[arms]]")) + 1
         scene = f"{scene[:first]}cells = {SETTINGS['cells']}\n{scene[first:]}"

@@ -56,6 +56,7 @@ def test_a_design_comes_back_in_the_order_it_was_given(model: Model) -> None:
     assert again.evaluation == found.evaluation
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_gradient_predicts_the_change(model: Model) -> None:
     """Central differences of the objective along a direction that tells the cells apart."""
     step = {n: 1e-3 * (1.0 + np.sin(7.0 * p[:, 0] + 40.0 * p[:, 1])) for n, p in

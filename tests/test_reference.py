@@ -20,6 +20,8 @@ from dolfinopt.responses.objective import load_cases
 from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.scene.load import load_scene
 
+pytestmark = pytest.mark.serial  # ranks have no part in it
+
 COMM = MPI.COMM_WORLD
 REFERENCE = Path(__file__).parent / "reference"
 TWO_ARM_VALUES = json.loads((REFERENCE / "two_arm_200x12.json").read_text())

@@ -150,7 +150,16 @@ CASES: dict[tuple[str, ...], Counts] = {
 }
 
 
-@pytest.mark.parametrize("overrides", CASES, ids=" ".join)
+# What ranks add up, and designs that belong to one of them.
+ON_RANKS = [(), (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0"),
+            (SHARED, EXACT), (RIGID,)]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [pytest.param(o, marks=() if o in ON_RANKS else pytest.mark.serial) for o in CASES],
+    ids=" ".join,
+)
 def test_only_what_the_scene_needs(run: Run, overrides: tuple[str, ...]) -> None:
     found = counts(run("optimize", *overrides))
     expected = CASES[overrides]
@@ -187,6 +196,7 @@ def test_nothing_moves_unless_asked(kind: str) -> None:
 # -- load cases ------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("gradient", ["esl", "exact"])
 def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
     """From as many load cases as coordinates on their number changes no count.
@@ -255,6 +265,7 @@ def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
     return {key: both[key] - first[key] for key in both}, cold
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_a_trajectory_starts_from_the_last_designs(run: Run) -> None:
     """Half of the iterations or fewer: from cold it takes a second grid, too."""
     warm, cold = warm_and_cold(run)
@@ -262,6 +273,7 @@ def test_a_trajectory_starts_from_the_last_designs(run: Run) -> None:
     assert 0 < 2 * warm["newton_iterations"] <= cold["newton_iterations"]
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "overrides",
     [(), ("reduction.method=modal", "arms.cells=[50,4]"), ("reduction.coordinates=6",)],

@@ -10,6 +10,8 @@ from runs import TWO_ARM
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 
+pytestmark = pytest.mark.serial  # ranks have no part in it
+
 
 def small_arm(*overrides: str) -> Arm:
     scene = do.load_scene(TWO_ARM, ("arms.cells=[16,3]", *overrides))

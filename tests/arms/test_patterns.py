@@ -62,6 +62,7 @@ def test_cells_have_the_densities_of_their_partners(projection):
         assert 0.0 in known[0] and 1.0 in known[0]  # regions and solid ends, too
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks_ends_in_the_same_design
 def test_the_same_arm_again_is_the_shared_design():
     """A pattern of the same size ends where `arms.design` does, which has one mesh for both."""
     histories = []
@@ -180,6 +181,7 @@ def test_the_uniform_design():
     assert np.ptp(WORLD.allreduce(volume)) < 1e-12
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks_ends_in_the_same_design
 def test_a_run_resumes_to_the_same_bits(shared_tmp_path):
     folders = [shared_tmp_path / name for name in ("whole", "parts")]
     options = ["--no-plots", *overrides(*SCALED, REGIONS)]

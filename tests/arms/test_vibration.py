@@ -226,6 +226,7 @@ def euler_values(carried: RigidIntegrals, height: float, count: int) -> np.ndarr
     return roots**4 * bending / line
 
 
+@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
 @pytest.mark.parametrize(
     "carried",
     [
@@ -319,6 +320,7 @@ def slopes_at(
     return modes, period_gradient(arm.current, found, by_values).cells
 
 
+@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
 @pytest.mark.parametrize("exponent", [4.0, 20.0])
 @pytest.mark.parametrize("direction", [uneven, wave])
 def test_p_mean_where_modes_coincide(direction: Field, exponent: float) -> None:
@@ -387,6 +389,7 @@ def test_following_a_mode_through_a_crossing() -> None:
 RIGID = "arms.arm{}.rigid=true"
 
 
+@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
 @pytest.mark.parametrize(
     "overrides",
     [

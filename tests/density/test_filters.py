@@ -90,6 +90,7 @@ def test_radius_zero_is_the_identity(mesh):
         assert y is not x  # who changes the result keeps the design
 
 
+@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
 @pytest.mark.parametrize("radius", [0.03, 0.06])
 def test_response_to_a_point_has_the_second_moment_of_the_cone(radius):
     """Along a thin arm the kernel is exp(-|s| / r) / (2 r): variance 2 r^2 = radius^2 / 6.
@@ -134,6 +135,7 @@ def test_response_to_a_point_converges_to_the_exponential_kernel():
     assert 1.75 < rate(errors) < 2.25
 
 
+@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
 def test_filter_does_not_depend_on_the_mesh():
     """A cosine is an eigenfunction: x = cos(k s) gives cos(k s) / (1 + r^2 k^2); order 2."""
     r = 0.02
@@ -221,6 +223,7 @@ def test_what_is_kept_on_any_mesh(kind):
     assert abs(left - right) < 1e-12 * size
 
 
+@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
 @pytest.mark.parametrize("kind", KINDS)
 def test_second_moments_are_those_of_the_cone(kind):
     """Spread of one cell's material: 2 r^2 = radius^2 / 6 along each axis, none across.
@@ -243,6 +246,7 @@ def test_second_moments_are_those_of_the_cone(kind):
     assert moments == pytest.approx(np.eye(2), abs=5e-3)
 
 
+@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ORTHOGONAL])
 def test_bounds_on_skew_cells(kind):
     """A crisp disc: no cell beyond [0, 1] from a radius of two cells on; less than 4 % below.
@@ -275,6 +279,7 @@ def test_ranks_agree_on_any_mesh(kind):
     assert np.allclose(by_place(COMM), by_place(MPI.COMM_SELF), atol=1e-9)
 
 
+@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
 @pytest.mark.parametrize("kind", KINDS)
 def test_open_edges_are_those_of_a_void_around(kind):
     """Solid throughout, a side of length L: 1 - exp(-L / 2 r) cosh(s / r) in the middle of it."""
@@ -289,6 +294,7 @@ def test_open_edges_are_those_of_a_void_around(kind):
     assert COMM.allreduce(error, MPI.MAX) < 4e-3
 
 
+@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
 def test_chain_through_what_is_clipped(shared_tmp_path):
     """Derivative of sum w x_phys^2 on skew triangles, of a crisp design and a narrow filter."""
     path = shared_tmp_path / "skew.geo"

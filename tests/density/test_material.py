@@ -15,6 +15,8 @@ from dolfinopt.density.interpolation import LAWS, SWITCH, interpolate
 from dolfinopt.output.run import optimize
 from dolfinopt.scene.load import Law, load_scene
 
+pytestmark = pytest.mark.serial  # ranks have no part in it
+
 ROOT = Path(__file__).parents[2]
 BOTH_SIDES = SWITCH * (1.0 + np.array([-1e-3, -1e-9, -2e-16, 0.0, 2e-16, 1e-9, 1e-3]))
 X = np.sort(np.concatenate([np.linspace(0.0, 1.0, 101), BOTH_SIDES]))
@@ -167,7 +169,6 @@ def test_unknown_law():
 # -- in a scene ------------------------------------------------------------------------------
 
 
-@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("law", sorted(LAWS))
 def test_every_law_optimises(law):
     overrides = [f"interpolation.law={law}", "arms.cells=[30, 4]", "optimizer.max_iterations=4"]
@@ -188,7 +189,6 @@ def demo() -> ModuleType:
     return module
 
 
-@pytest.mark.serial  # ranks have no part in it
 def test_local_modes_of_a_frame_with_void(shared_tmp_path: Path) -> None:
     """Classic SIMP's lowest modes live in the windows; the other laws' are the frame's."""
     spectra = demo().main(shared_tmp_path, (40, 6), (1e-3, 1e-2, 0.0))

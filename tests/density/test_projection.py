@@ -36,6 +36,7 @@ def mine(*arrays):
 # -- at a fixed threshold --------------------------------------------------------------------
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("eta", ETAS)
 @pytest.mark.parametrize("beta", [0.01, 1.0, 8.0, 64.0])
 def test_published_formula(beta, eta):
@@ -45,6 +46,7 @@ def test_published_formula(beta, eta):
     assert project(X, beta, eta).value == pytest.approx(expected, abs=1e-15 / min(beta, 1.0))
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("eta", ETAS)
 @pytest.mark.parametrize("beta", [0.0, 1e-300, 1e-9, 0.1, 1.0, 32.0, 1e3, 1e5, 1e300])
 def test_bounds_and_order_are_kept(beta, eta):
@@ -56,6 +58,7 @@ def test_bounds_and_order_are_kept(beta, eta):
     assert np.isfinite(y.slope).all() and (y.slope >= 0.0).all()
 
 
+@pytest.mark.serial
 def test_no_sharpness_is_the_identity():
     """For eta = 1/2, y = x + beta^2 x (1 - x) (2 x - 1) / 6 and terms of fourth order."""
     assert np.array_equal(project(X, 0.0, 0.3).value, X)
@@ -66,6 +69,7 @@ def test_no_sharpness_is_the_identity():
     assert project(X, 0.01, 0.5).value - X == pytest.approx(1e-4 * second, abs=1e-9)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("eta", [0.2, 0.5, 0.8])
 def test_infinite_sharpness_is_the_step(eta):
     """At a distance d from the threshold exp(-2 beta d) is left, twice."""
@@ -75,6 +79,7 @@ def test_infinite_sharpness_is_the_step(eta):
     assert project(X, 1e6, eta).value[far] == pytest.approx((X > eta)[far].astype(float), abs=0.0)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("eta", ETAS)
 @pytest.mark.parametrize("beta", [0.01, 1.0, 8.0, 64.0, 1e3])
 def test_slope_is_the_derivative(beta, eta):
@@ -87,6 +92,7 @@ def test_slope_is_the_derivative(beta, eta):
     assert project(x, beta, eta).slope == pytest.approx(difference, abs=2e-10 * size)
 
 
+@pytest.mark.serial
 def test_slopes_at_the_ends():
     """From the closed form: beta (1 - tanh^2) / (tanh + tanh)."""
     beta, eta = 5.0, 0.4
@@ -96,11 +102,13 @@ def test_slopes_at_the_ends():
     assert ends == pytest.approx(expected, rel=1e-14)
 
 
+@pytest.mark.serial
 def test_backward_at_a_fixed_threshold():
     y = project(X, 4.0, 0.5)
     assert np.array_equal(y.backward(2.0 + X), (2.0 + X) * y.slope)
 
 
+@pytest.mark.serial
 def test_input_is_left_alone():
     x, area = cells()
     before = x.copy(), area.copy()
@@ -110,6 +118,7 @@ def test_input_is_left_alone():
     assert np.array_equal(x, before[0]) and np.array_equal(area, before[1])
 
 
+@pytest.mark.serial
 def test_robust_designs_lie_within_one_another():
     thresholds = robust_thresholds(0.1, 0.1)
     assert thresholds == (0.6, 0.5, 0.4)
@@ -132,6 +141,7 @@ def test_volume_is_kept(beta, scale):
     assert abs(projected - volume) < 1e-12 * total
 
 
+@pytest.mark.serial
 @given(
     x=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=6),
     beta=st.one_of(st.just(0.0), st.floats(1e-3, 1e3)),
@@ -144,11 +154,13 @@ def test_volume_is_kept_whatever_the_design(x, beta):
     assert (y >= 0.0).all() and (y <= 1.0).all()
 
 
+@pytest.mark.serial
 def test_threshold_of_a_symmetric_design_is_one_half():
     x = np.array([0.1, 0.9, 0.3, 0.7])
     assert preserving_threshold(x, np.ones(4), 16.0, SELF) == pytest.approx(0.5, abs=1e-12)
 
 
+@pytest.mark.serial
 def test_threshold_in_closed_form():
     """One cell keeps its density where sinh(b x) cosh(b (1 - eta)) = x sinh(b) cosh(b (x - eta)).
 
@@ -163,6 +175,7 @@ def test_threshold_in_closed_form():
     assert got == pytest.approx(np.arctanh(tanh) / b, rel=1e-12)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("value", [0.0, 1.0])
 @pytest.mark.parametrize("beta", [0.0, 1.0, 1e3])
 def test_crisp_designs_stay(value, beta):
@@ -173,6 +186,7 @@ def test_crisp_designs_stay(value, beta):
         assert np.array_equal(kept(crisp, area[: len(crisp)], beta, SELF), crisp)
 
 
+@pytest.mark.serial
 def test_grayness_falls_with_sharpness():
     x, area = cells()
 
@@ -185,6 +199,7 @@ def test_grayness_falls_with_sharpness():
     assert values[0] > 0.3 and values[-1] < 0.02
 
 
+@pytest.mark.serial
 def test_cells_of_no_area_do_not_count():
     x, area = cells(50)
     solid = np.arange(50) % 3 == 0

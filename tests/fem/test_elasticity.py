@@ -108,6 +108,7 @@ def q4_matrices(corners):
     return k, m
 
 
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize("shear", [0.0, 0.4])
 def test_element_matrices_against_hand_coded_quadrilateral(shear):
     # On parallelograms 2 x 2 points integrate both matrices exactly, as FFCx does.
@@ -125,6 +126,7 @@ def _corners(mesh):
     return compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
 
 
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_rectangular_cells_have_consistent_mass_in_closed_form():
     mesh = make_mesh((5, 2))
     operators = LagrangeElement().operators(mesh, THICKNESS, POISSON)
@@ -163,6 +165,7 @@ def test_patch(distort, degree):
     assert outboard[:, 0] == pytest.approx([pull, 0.0, 0.0], abs=ROUNDING * pull)
 
 
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_quadratic_elements_bend_exactly():
     """Pure bending u = -k x y, v = k (x^2 + nu y^2) / 2: u'Ku = E I L k^2."""
     arm = make_arm(make_mesh((3, 1)), degree=2)
@@ -193,6 +196,7 @@ def test_rigid_motions_and_nothing_else_are_free_of_energy(distort):
     assert values[3] > 1e3 * np.abs(values[:3]).max()
 
 
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize("distort", [None, bulge], ids=["rectangles", "distorted"])
 def test_matrices_against_assembly_of_the_forms(distort):
     """K(x) v and M(x) v against DOLFINx's own assembly with modulus and density as fields."""
@@ -327,6 +331,7 @@ def test_solution_of_the_interior_satisfies_the_assembled_equations():
         assert np.abs(y.array_r - expected).max(initial=0.0) < ROUNDING * scale
 
 
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_nothing_is_assembled_or_factorised_twice_for_a_design():
     substructure = make_arm(make_mesh((6, 2)))
     counts = substructure.profile.counts
@@ -356,6 +361,7 @@ def test_nothing_is_assembled_or_factorised_twice_for_a_design():
     assert work(first) == (4, 3, 20)
 
 
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_designs_of_one_arm_do_not_disturb_each_other():
     """Kept patterns, symbolic factor and shared arrays give what a fresh arm gives."""
     mesh = make_mesh((10, 3))

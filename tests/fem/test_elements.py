@@ -120,6 +120,7 @@ def test_patch(element):
         assert np.abs(found - strain).max(initial=0.0) < 1e-12 * 1e-3
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 @EVERY
 def test_tension(element):
     """Uniaxial stress on distorted cells: the ends carry all of it."""
@@ -132,6 +133,7 @@ def test_tension(element):
     assert outboard[:, 0] == pytest.approx([pull, 0.0, 0.0], abs=ROUNDING * pull)
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 @pytest.mark.parametrize(
     ("element", "exact"), zip(OF_QUADRILATERALS, [True, False, True, True]), ids=repr
 )
@@ -154,6 +156,7 @@ def test_pure_bending_of_the_reduced_arm(element, exact):
     assert np.abs(found[:, :, 1:]).max(initial=0.0) < 1e-9 * HEIGHT / bending
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 def test_incompatible_modes_are_assumed_stresses_on_parallelograms():
     """Two elements of other variational principles are the same there, and stay close elsewhere."""
     nu = 0.33
@@ -173,6 +176,7 @@ def test_incompatible_modes_are_assumed_stresses_on_parallelograms():
         assert least * size <= apart <= most * size
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 @EVERY
 def test_energy_of_the_strain_operator(element):
     """u' k_e u = int (B u)' C B u t dA on parallelograms, also of what was condensed."""
@@ -206,6 +210,7 @@ def smooth(points, nu):
     return np.stack([u * S * C, v * S * C], axis=1), -YOUNG / (1 - nu**2) * np.stack(load, axis=1)
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 @pytest.mark.parametrize("distort", [False, True], ids=["rectangles", "distorted"])
 @pytest.mark.parametrize(("name", "order"), [("incompatible", 2), ("linear", 2), ("quadratic", 4)])
 def test_rates_of_convergence(name, order, distort):
@@ -229,6 +234,7 @@ def test_rates_of_convergence(name, order, distort):
     assert error[-1] < 0.1
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 @pytest.mark.parametrize("name", [*ELEMENTS])
 def test_cantilever(name):
     """Tip compliance of 50 x 3 slender cells: L^3 / (3 E I) + L / (5/6 G A), no lateral strain."""
@@ -271,6 +277,7 @@ def test_ranks(name, triangles):
 # -- by name --------------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 def test_element_of_a_mesh():
     quadrilaterals, triangles = meshed((4, 2)), meshed((4, 2), triangles=True)
     for name, element in ELEMENTS.items():
@@ -283,6 +290,7 @@ def test_element_of_a_mesh():
         element_of(triangles, "incompatible")
 
 
+@pytest.mark.serial  # ranks: test_ranks, test_patch
 @pytest.mark.parametrize("name", ["linear", "quadratic"])
 def test_triangles(name):
     """Constant strain on triangles with bores; the quadrature knows its volume."""

@@ -50,6 +50,7 @@ def frequencies(stiffness, mass):
     return np.sqrt(scipy.linalg.eigh(stiffness, mass, eigvals_only=True)) / UNIT
 
 
+@pytest.mark.serial  # ranks: test_ranks
 @pytest.mark.parametrize(("speed", "first"), [(2.0, 4.1373), (12.0, 13.1702)])
 def test_rotating_beam(beam, speed, first):
     """Out-of-plane frequencies of a rotating beam without hub: Wright et al. (1982), table 1.
@@ -122,6 +123,7 @@ class Case:
         return unit_loads(design), self.V + h * self.dV
 
 
+@pytest.mark.serial  # ranks: test_ranks
 @pytest.mark.parametrize("element", [*ELEMENTS])
 def test_gradient(element):
     """Taylor: what is left of a function of K0 falls with h squared."""
@@ -143,6 +145,7 @@ def test_gradient(element):
     assert (np.abs(rates - 2.0) < 0.1).all()  # the next term is a tenth of it at the first step
 
 
+@pytest.mark.serial  # ranks: test_ranks
 def test_gradient_by_constraint_modes():
     """The interface's loads by way of the constraint modes: as by solves of their own, and fewer.
 

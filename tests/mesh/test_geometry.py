@@ -88,6 +88,7 @@ def test_area_of_the_arm_with_bores_converges(shape):
     assert 1.7 < np.polyfit(np.log(sizes), np.log(errors), 1)[0] < 2.3  # 1.93
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 @pytest.mark.parametrize("shape", SHAPES)
 def test_mesh_size_is_the_size_of_cells(shape):
     for size in (0.01, 0.005):
@@ -97,6 +98,7 @@ def test_mesh_size_is_the_size_of_cells(shape):
         assert 0.6 < np.sqrt(typical) / size < 1.1  # equilateral triangles: sqrt(0.87)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 @pytest.mark.parametrize("shape", SHAPES)
 def test_mesh_with_bores_is_its_mirror_image(shape):
     from scipy.spatial import cKDTree
@@ -167,6 +169,7 @@ def figures(mesh):
     return COMM.allreduce(np.array(parts))
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_own_geometry_without_parameters(write):
     """Groups in capitals; no group "design": all other surfaces are designed."""
     groups = ENDS.upper().replace("PHYSICAL CURVE", "Physical Curve")
@@ -179,11 +182,13 @@ def test_own_geometry_without_parameters(write):
     assert quads[1:3] == pytest.approx([area, solid], rel=1e-9)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_surfaces_in_no_group_are_left_out_if_there_is_a_design(write):
     path = write("own.geo", PLAIN + TIP + ENDS + 'Physical Surface("design") = {1};')
     assert figures(arm_mesh(COMM, entry(path)))[1:3] == pytest.approx([0.03, 0.0], rel=1e-9)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 @pytest.mark.parametrize("name", ["passive2", "Passive boss", "PASSIVE_left"])
 def test_groups_are_told_by_how_their_names_begin(write, name):
     path = write("own.geo", PLAIN + TIP + ENDS + f'Physical Surface("{name}") = {{2}};')
@@ -200,6 +205,7 @@ def test_unknown_groups_of_surfaces_are_listed(write):
     assert 'names of surfaces "boss", "web" have no meaning' in mesh.notes[0]
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_unknown_products_are_listed(shared_tmp_path):
     path = step_file(shared_tmp_path / "arm.step", arm=plate, bush=ring)
     mesh = arm_mesh(COMM, entry(path, mesh_size=0.004))
@@ -215,6 +221,7 @@ def test_passive_cells_lie_within_passive_of_an_interface(write):
     assert 0 < COMM.allreduce(int(mesh.passive.sum())) < COMM.allreduce(mesh.num_cells)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("version", [2.2, 4.1])
 def test_mesh_file_holds_what_its_geometry_did(shared_tmp_path, shape, version):
@@ -277,6 +284,7 @@ def step_file(path, **products):
     return path
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 @pytest.mark.parametrize("shape", SHAPES)
 def test_step_with_bores(shared_tmp_path, shape):
     path = step_file(shared_tmp_path / "arm.step", plate=plate)
@@ -289,6 +297,7 @@ def test_step_with_bores(shared_tmp_path, shape):
         assert len(radius) > 10 and np.abs(radius - r).max() < 1e-9
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_step_with_straight_ends(shared_tmp_path):
     path = step_file(shared_tmp_path / "arm.stp", bar=bar_with_straight_ends)
     mesh = arm_mesh(COMM, entry(path))  # a twelfth of the height
@@ -299,6 +308,7 @@ def test_step_with_straight_ends(shared_tmp_path):
         assert np.abs(nodes[:, 1]).max() == pytest.approx(0.5 * HEIGHT, rel=1e-9)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_step_product_named_passive_stays_solid(shared_tmp_path):
     """Two products that touch without a common curve; the ring's inner circle is the interface."""
     path = step_file(shared_tmp_path / "arm.step", arm=plate, passive=ring)
@@ -310,6 +320,7 @@ def test_step_product_named_passive_stays_solid(shared_tmp_path):
     assert np.abs(np.linalg.norm(nodes, axis=1) - BORE).max() < 1e-9
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_step_names_edges_and_faces(shared_tmp_path):
     """The larger hole is named, though a smaller one is about the same axis."""
     path = step_file(shared_tmp_path / "arm.step", arm=two_faces)
@@ -346,6 +357,7 @@ def named(text, kind, fits):
     return re.sub(rf"{kind}\('\d+'", f"{kind}(''", marked)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_geometry_that_merges_a_step_file_names_its_curves(shared_tmp_path, write):
     step_file(shared_tmp_path / "arm.step", bar=bar_with_straight_ends)
     text = 'SetFactory("OpenCASCADE"); Geometry.OCCTargetUnit = "M"; Merge "arm.step";\n'
@@ -494,6 +506,7 @@ def test_prismatic_solid_is_taken_by_its_planar_face(shared_tmp_path, z):
     assert np.abs(mesh.mesh.geometry.x[:, 2]).max() == 0.0
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_solids_side_by_side(shared_tmp_path):
     path = step_file(
         shared_tmp_path / "arm.step", arm=lifted(plate, 0.1, 0.01), passive2=lifted(ring, 0.1, 0.01)
@@ -594,6 +607,7 @@ def test_check_refuses(changes, reason):
         check_mesh(two_squares(**changes), SQUARES)
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_options_of_one_file_do_not_reach_the_next(write):
     """RecombineAll, sizes and parameters of an arm before leave the next one as it is alone."""
     path = write("own.geo", PLAIN + ENDS)
@@ -604,6 +618,7 @@ def test_options_of_one_file_do_not_reach_the_next(write):
     assert np.array_equal(figures(bores()), figures(bores(mesh_size=HEIGHT / 12.0)))
 
 
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_a_refused_file_does_not_reach_the_next(write):
     """Gmsh's parser would go on with the rest of a text it gave up."""
     path = write("own.geo", PLAIN + ENDS)

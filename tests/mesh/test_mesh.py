@@ -88,6 +88,7 @@ def test_interfaces_are_the_short_sides(shaped):
 
 
 # A cell is passive when its centre is nearer to an end than `passive`; on the border it is not.
+@pytest.mark.serial  # ranks: test_ranks_that_share_an_arm_with_bores_agree
 @pytest.mark.parametrize(
     ("along", "passive", "columns"),
     [
@@ -267,6 +268,7 @@ def solid(size, shape, comm=COMM):
     return np.sqrt(squares.min()) / (2.0 * np.pi), flexibility, body
 
 
+@pytest.mark.serial  # ranks: test_ranks_that_share_an_arm_with_bores_agree
 def test_arm_with_bores_converges_to_the_same_frequency():
     """Triangles and quadrilaterals, clamped at one bore and rigid at the other: order 2."""
     limits = []
@@ -279,6 +281,7 @@ def test_arm_with_bores_converges_to_the_same_frequency():
     assert limits[0] == pytest.approx(limits[1], rel=1e-3)
 
 
+@pytest.mark.serial  # ranks: test_ranks_that_share_an_arm_with_bores_agree
 @pytest.mark.parametrize("shape", SHAPED)
 def test_arm_with_bores_is_a_beam_between_them(shape):
     """u_x, u_y and theta of the outboard bore about its centre; pulling does not bend."""

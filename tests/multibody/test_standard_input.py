@@ -37,6 +37,8 @@ from dolfinopt.multibody.standard_input import (
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
+pytestmark = pytest.mark.serial  # ranks have no part in it
+
 COMM = MPI.COMM_WORLD
 # Sums of some dozens of products of numbers of size one; measured: 1e-15.
 ROUNDING = 1e-12

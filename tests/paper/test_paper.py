@@ -32,6 +32,8 @@ from dolfinopt.paper.statements import (
 )
 from dolfinopt.study import cases
 
+pytestmark = pytest.mark.serial  # cases are dealt out to ranks in test_cases
+
 ROOT = Path(__file__).parents[2]
 WORLD = MPI.COMM_WORLD
 TINY = (
@@ -302,7 +304,6 @@ def computed_cases(said):
     return int(re.search(r"(\d+) cases computed", said)[1])
 
 
-@pytest.mark.serial
 def test_pipeline(small, whole, capsys):
     """Cases, figures' data, and the verdict; the second time nothing is computed."""
     capsys.readouterr()
@@ -340,7 +341,6 @@ main()
 """
 
 
-@pytest.mark.serial
 @pytest.mark.slow
 def test_killed_run_continues(small, whole, tmp_path, capsys):
     """Killed on two ranks: the next call does the rest, and all files are those of one run."""

@@ -15,6 +15,8 @@ from dolfinopt.paper import page as report
 from dolfinopt.paper import reproduction as paper
 from dolfinopt.paper.statements import check_paper, failed_checks
 
+pytestmark = pytest.mark.serial  # the root writes it
+
 WORLD = MPI.COMM_WORLD
 VOID = {"meta", "link", "img", "input", "br", "path", "rect", "circle"}
 PHONE, DESK = (390, 844), (1280, 900)  # px
@@ -68,7 +70,6 @@ def page(folder):
     return Reader((folder / "report.html").read_text(encoding="utf-8"))
 
 
-@pytest.mark.serial
 def test_page_says_where_the_scene_is_not_the_papers(folder):
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert "two flexible arms that move 6 kg along a semicircle." in text
@@ -130,7 +131,6 @@ def test_every_statement_is_told(made, folder):
         assert check.holds or check.reason in text
 
 
-@pytest.mark.serial
 def test_page_without_some_results(made, tmp_path):
     """Cases that failed are named; nothing that needs them holds, and the rest is told."""
     (plan, outcomes, _), _ = made
@@ -207,7 +207,6 @@ in_browser = pytest.mark.skipif(browser() is None, reason="needs Chromium")
 
 
 @in_browser
-@pytest.mark.serial
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 def test_page_in_a_browser(folder, window, size):
     """No complaint, no request, all pictures there, and nothing wider than the window."""
@@ -229,7 +228,6 @@ def test_page_in_a_browser(folder, window, size):
 
 
 @in_browser
-@pytest.mark.serial
 def test_tables_scroll_in_their_boxes(folder, window):
     """On a phone figures are wider than their boxes, which scroll; the checks are read down."""
     window.open(folder / "report.html", *PHONE)
@@ -243,7 +241,6 @@ def test_tables_scroll_in_their_boxes(folder, window):
 
 
 @in_browser
-@pytest.mark.serial
 def test_text_is_legible(folder, window):
     """At least 12 px on a phone, and pictures scaled by no more than a third."""
     window.open(folder / "report.html", *PHONE)
@@ -258,7 +255,6 @@ def test_text_is_legible(folder, window):
 
 
 @in_browser
-@pytest.mark.serial
 def test_player(folder, window):
     """The slider moves the mechanism; the button plays and pauses."""
     window.open(folder / "report.html", *DESK)

@@ -371,6 +371,7 @@ def stubby_arm():
     return make_arm((10, 6), length=0.1)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("design", [uniform, graded])
 @pytest.mark.parametrize("blocks", [1, 2, 3])
 @pytest.mark.parametrize("places", [(0,), (1,), (0, 2)], ids=str)
@@ -434,6 +435,7 @@ def dense_gramian(arm, options):
     return K, P
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("design", DESIGNS)
 @pytest.mark.parametrize("band", [(0.0, 1000.0), (1000.0, 4000.0)])
 def test_balanced_is_the_dense_gramians_dominant_space(stubby_arm, design, band):
@@ -741,6 +743,7 @@ def rates_and_limit(values):
     return rates, values[-1] + steps[-1] / (2.0 ** rates[-1] - 1.0)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_tip_compliance_converges_to_timoshenko(beams):
     """Clamped bar with a rigid end face under forces and moment there."""
     theory = np.array(
@@ -786,6 +789,7 @@ def timoshenko_frequencies(count):
     return np.array([brentq(end, grid[i], grid[i + 1]) for i in change]) / (2.0 * np.pi)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_frequencies_converge_to_timoshenko(beams):
     """Clamped-free: the rigid end face without mass hardly differs from a free one."""
     _, modes, reduced = beams

@@ -146,6 +146,7 @@ def test_estimate_of_other_bases(method):
     assert estimate == pytest.approx(true, rel=0.1)
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks
 def test_scenarios_count():
     """The worst of them, each posed by itself."""
     heavy = "payload.mass=9"
@@ -192,6 +193,7 @@ def test_fewest_that_meet_the_tolerance(overrides, tolerance):
         assert arm.reduce(x[k]).num_modes == choice.coordinates
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks
 def test_shared_design_counts_like_two():
     """Two arms of one design err as if each had its own."""
     shared, own = auto("arms.arm2.design=arm1"), auto()
@@ -252,6 +254,7 @@ def small(*overrides: str, iterations: int = 3):
     return do.load_scene(TWO_ARM, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks
 def test_optimises_with_the_choice():
     """As with the number; the choice is looked at again in the end."""
     found = do.optimize(small())
@@ -267,6 +270,7 @@ def test_optimises_with_the_choice():
     assert found.choice.error != dict(found.choice.tried)[count]
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks
 def test_resumes_in_the_same_bits(shared_tmp_path):
     whole = do.optimize(small(iterations=2))
     do.optimize(small(iterations=1), shared_tmp_path)
@@ -306,6 +310,7 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
 # -- other uses ------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks: test_any_number_of_ranks
 def test_cases():
     """Every scene has its own choice: a light payload shakes the arms more than a heavy one."""
     scenes = [small(f"payload.mass={mass}") for mass in (0.5, 9.0)]

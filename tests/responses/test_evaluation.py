@@ -42,7 +42,13 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("overrides", CASES, ids=" ".join)
+# On ranks: of a basis' modes, of adjoints, and of every arm's own limits.
+@pytest.mark.parametrize(
+    "overrides",
+    [pytest.param(o, marks=() if k in (1, 2, 7) else pytest.mark.serial)
+     for k, o in enumerate(CASES)],
+    ids=" ".join,
+)  # fmt: skip
 def test_a_shared_design_is_two_equal_ones(overrides: list[str]) -> None:
     """The same figures, and the sum of both gradients; the work is counted in test_skip."""
     found = []
@@ -74,6 +80,7 @@ def test_a_shared_design_is_two_equal_ones(overrides: list[str]) -> None:
 # -- rigid arms ------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
     """The solid arm beside its stiffer and stiffer twin: the difference falls as 1 / E."""
     quick = ["motion.horizon=2.0", "arms.arm2.young_modulus=70e9", "simulation.tolerance=1e-6"]
@@ -119,6 +126,7 @@ def gauss_cloud(length: float, height: float, mass: float) -> Cloud:
     )
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_joint_forces_of_rigid_arms() -> None:
     """A stiff arm behind a rigid one: Lagrange's equations of two bars, to what it still bends.
 
@@ -143,6 +151,7 @@ def test_joint_forces_of_rigid_arms() -> None:
         np.testing.assert_allclose(trajectory.joint_forces[i] / size, expected / size, atol=5e-3)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_a_rigid_bar_is_the_solid_arm() -> None:
     """Mass, centre and inertia of the meshed solid bar, with the arm's own density."""
     built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
@@ -171,6 +180,7 @@ def body_of(*overrides: str, index: int = 1) -> ShapeIntegrals:
     return arm.reduce(wave(index, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0])))
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_own_material_scales_one_body() -> None:
     """A mass density scales all integrals of the mass, a modulus the stiffness, of one arm only."""
     base = body_of()
@@ -205,7 +215,10 @@ def test_own_materials_of_all_arms_are_the_scenes() -> None:
 
 
 @pytest.mark.parametrize("overrides", [[], [SHARED], ["arms.arm1.rigid=true"]], ids=str)
-@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
+@pytest.mark.parametrize(
+    "kind",
+    ["esl", *(pytest.param(k, marks=pytest.mark.serial) for k in ("compliance", "deviation"))],
+)
 def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: list[str]) -> None:
     """Loads f_j = K q_j, modes and instants held: q_j(x) = (V' K(x) V)^-1 f_j, remainders of 2."""
     built = build(f"objective.kind={kind}", "payload.mass=1.0", *overrides)
@@ -271,6 +284,7 @@ def value_close(a: float, b: float) -> bool:
 # -- projections -----------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("kind", ["heaviside", "robust"])
 @pytest.mark.parametrize("objective_kind", ["static", "eigenfrequency"])
 def test_gradient_by_the_variables_through_a_projection(kind: str, objective_kind: str) -> None:
@@ -312,6 +326,7 @@ def test_gradient_by_the_variables_through_a_projection(kind: str, objective_kin
 # -- load cases ------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("worst", ["compliance", "deviation"])
 def test_load_cases_are_the_worst_instants(worst: str) -> None:
     """One an interval, found by going through all samples; the objective sums their compliance."""
@@ -358,6 +373,7 @@ def test_constraints_say_how_far_a_bound_is_exceeded() -> None:
         assert 1.0 + tips[k] <= 2.0 ** (1.0 / 20.0) * largest / 1e-4
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None:
     """An arm set on a mode that is not the lowest: the objective follows it, the bound does not."""
     built = build(
@@ -443,6 +459,7 @@ def test_arms_under_another_scene_keep_their_own_design() -> None:
         np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("gradient", "more"), [("esl", 4), ("exact", 8)])
 def test_solves_of_geometric_stiffness(gradient, more):
     """Four static solves an arm and design, four more for the exact gradient; none without it.

@@ -36,6 +36,7 @@ def scenarios(*changes, weights=None):
     return f"scenarios=[{', '.join(rows)}]"
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("method", ["craig-bampton", "modal", "krylov", "balanced"])
 def test_scaled_bodies_are_those_reduced_anew(method):
     """Denser, stiffer, more damped: all integrals scale, whatever the basis.
@@ -69,6 +70,7 @@ def test_scaled_bodies_are_those_reduced_anew(method):
             np.testing.assert_allclose(got, expected, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_a_body_without_change_stays():
     arm = build().arms
     for k, one in arm.items():
@@ -79,7 +81,10 @@ def test_a_body_without_change_stays():
             assert np.array_equal(getattr(same, name), getattr(body, name))
 
 
-@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
+@pytest.mark.parametrize(
+    "kind",
+    ["esl", *(pytest.param(k, marks=pytest.mark.serial) for k in ("compliance", "deviation"))],
+)
 def test_figures_are_those_of_the_scenes_alone(kind):
     """Each scenario is what its scene gives alone; the objective is their weighted sum."""
     changes = [PATH, (DAMPING,)]
@@ -112,7 +117,8 @@ def test_one_reduction_for_all_scenarios():
     assert counts[0] == counts[1] == counts[2]
 
 
-@pytest.mark.parametrize("combination", [pytest.param("sum", marks=pytest.mark.serial), "worst"])
+@pytest.mark.serial  # ranks: scenarios of test_every_option_gives_the_same_bits_...
+@pytest.mark.parametrize("combination", ["sum", "worst"])
 @pytest.mark.parametrize(
     "options",
     [
@@ -136,6 +142,7 @@ def test_gradient_of_all_scenarios(combination, options):
     assert test.passed, [row.rate for row in test.rows]
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_frozen_gradient_adds_up():
     changes, weights = [PATH, MATERIAL], [1.0, 0.25]
     several = build(scenarios(*changes, weights=weights))
@@ -151,6 +158,7 @@ def test_frozen_gradient_adds_up():
         assert np.isfinite(several.dot(slopes, several.fields(direction)))
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_worst_case_bounds_and_slopes():
     values = [3.0, 2.9, 0.1]
     worst, slopes = worst_of(values, 20.0)
@@ -164,6 +172,7 @@ def test_worst_case_bounds_and_slopes():
     assert worst_of([5.0], 20.0) == (5.0, [1.0])
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_weights_scale_the_worst_case():
     data = build(
         scenarios(PATH, MATERIAL, weights=[2.0, 1.0]), "objective.scenarios=worst"

@@ -22,6 +22,7 @@ def vibration(rng: np.random.Generator, n: int, m: int) -> np.ndarray:
     return slow + 0.2 * fast * rng.uniform(0.0, 1.0, m)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("seed", range(12))
 def test_no_maximum_is_missed(seed: int) -> None:
     """Against all points at all instants; with columns that cancel, and ones without stress."""

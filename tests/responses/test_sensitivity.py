@@ -85,6 +85,7 @@ def random_instants(
     return RigidMotion(*rigid), rng.normal(scale=0.7, size=(4, count, model.num_coordinates))
 
 
+@pytest.mark.serial  # ranks have no part in it
 @ARMS
 @pytest.mark.parametrize("name", CONSTANTS)
 def test_body_slopes_are_those_of_the_rows(rng: np.random.Generator, arms: int, name: str) -> None:
@@ -105,6 +106,7 @@ def test_body_slopes_are_those_of_the_rows(rng: np.random.Generator, arms: int, 
         assert_close(found, derivative(work), 10.0 * DIFFERENCES, size=10.0)
 
 
+@pytest.mark.serial  # ranks have no part in it
 @ARMS
 @pytest.mark.parametrize("bent", [False, True], ids=["linear", "bent"])
 def test_end_effector_slopes(rng: np.random.Generator, arms: int, bent: bool) -> None:
@@ -311,7 +313,7 @@ def test_gradient_is_one(overrides: list[str]) -> None:
     assert_passed(taylor(scene(*overrides), wave))
 
 
-@pytest.mark.parametrize("kind", ["static", "compliance"])
+@pytest.mark.parametrize("kind", ["static", pytest.param("compliance", marks=pytest.mark.serial)])
 def test_gradient_on_skew_triangles(kind: str, shared_tmp_path: Path) -> None:
     """Gmsh's transfinite triangles, where the filter couples cells through their facets."""
     path = shared_tmp_path / "skew.geo"
@@ -369,6 +371,7 @@ def test_nothing_to_check(overrides: list[str], expected: str) -> None:
     assert "\n" not in str(caught.value) and str(TWO_ARM) in str(caught.value)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_frozen_deviation_stands_beside_the_exact_one() -> None:
     """Static loads tell most of a heavy payload's deviation, but not its sign everywhere."""
     test = taylor(scene("objective.kind=deviation"), wave)

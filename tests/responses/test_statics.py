@@ -31,6 +31,7 @@ def solid(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SEL
 # -- closed forms ----------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("element", ["linear", "incompatible", "quadratic"])
 def test_beam_under_refinement(element: str) -> None:
     """Without Poisson's effect a beam under an end moment or pull is exact in two dimensions.
@@ -139,6 +140,7 @@ def test_an_arm_cut_in_two() -> None:
 LENGTHS = st.floats(1e-9, 1.0).flatmap(lambda a: st.sampled_from([a, -a, 0.0]))
 
 
+@pytest.mark.serial  # ranks have no part in it
 @given(
     st.lists(st.tuples(LENGTHS, LENGTHS, LENGTHS), min_size=1, max_size=6).filter(
         lambda rows: any(any(row[:2]) for row in rows)

@@ -30,6 +30,9 @@ from dolfinopt.responses.stress_loads import arm_loads, motions_of
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import scene_from_dict
 
+# Ranks: limits of the stress in test_every_option_gives_the_same_bits_on_any_number_of_ranks.
+pytestmark = pytest.mark.serial
+
 QUICK = "simulation.sample=0.01", "simulation.tolerance=1e-7", "objective.gradient=exact"
 
 
@@ -97,7 +100,6 @@ def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
     return cells.state.solid.young_modulus * cells.root * np.linalg.norm(found, axis=1)
 
 
-@pytest.mark.serial
 def test_both_ways_to_the_loads_agree() -> None:
     """From the passes of inverse dynamics, and from the rows of coordinates that never move."""
     built = build("simulation.stiffening=true", "motion.gravity=[0,-9.81]", "arms.joint_mass=0.3")
@@ -112,7 +114,6 @@ def test_both_ways_to_the_loads_agree() -> None:
         np.testing.assert_allclose(whole[n] / scale, other / scale, atol=1e-12)
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("element", ["incompatible", "quadratic"])
 @pytest.mark.parametrize("method", ["craig-bampton", "modal"])
 def test_static_solution_of_all_loads(method: str, element: str) -> None:
@@ -145,7 +146,6 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
     assert worst > (0.05 if method == "modal" else 1e-4)
 
 
-@pytest.mark.serial
 def test_static_solution_of_the_stiffened_arm() -> None:
     """With stiffening, K less the loads' geometric stiffness: 0.2 % of the stress, 2 % allowed."""
     built = build("simulation.stiffening=true", "simulation.tolerance=1e-7",
@@ -174,7 +174,6 @@ def test_static_solution_of_the_stiffened_arm() -> None:
     assert effect > 0.01  # it is there
 
 
-@pytest.mark.serial
 def test_largest_of_all_samples_and_cells() -> None:
     """The true value is the largest of all, however few instants are looked at; so is the map."""
     built = build("simulation.sample=0.002")
@@ -198,7 +197,6 @@ def test_largest_of_all_samples_and_cells() -> None:
     assert 0.05 * largest < measured.smooth[0] < largest
 
 
-@pytest.mark.serial
 def test_cells_near_an_interface_may_be_left_out() -> None:
     """The stress grows at the clamped corners; objective.stress_margin takes them out."""
     built = build("objective.stress_margin=0.1", cells=(40, 4))
@@ -212,7 +210,6 @@ def test_cells_near_an_interface_may_be_left_out() -> None:
         assert 0.1 <= one.peak.place[0] <= length - 0.1
 
 
-@pytest.mark.serial
 def test_void_has_no_stress() -> None:
     """Nor an infinite derivative."""
     built = build(*QUICK)
@@ -238,12 +235,9 @@ KINDS = {
 }  # fmt: skip
 
 
-# With scenarios all that ranks exchange is exchanged.
-@pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=() if k == "scenarios" else pytest.mark.serial) for k in KINDS]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The remainder of Taylor's formula has order 2, on any number of ranks.
+    """The remainder of Taylor's formula has order 2.
 
     All instants count, so that none comes or goes on the way.
     """
@@ -259,7 +253,6 @@ def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert rates(value, slope, (4e-3, 1e-3)) == pytest.approx(2.0, abs=0.04)
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("kind", ["control", "slider"])
 def test_exact_gradient_of_machines(kind: str) -> None:
     """Loads through free rigid coordinates and the closure's force are differentiated, too."""
@@ -285,7 +278,6 @@ def test_exact_gradient_of_machines(kind: str) -> None:
     assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
 
 
-@pytest.mark.serial
 def test_gradient_with_frozen_loads() -> None:
     """That of the static solutions under the loads of the instants, by differences."""
     built = build("simulation.sample=0.05", "simulation.stiffening=false",
@@ -332,7 +324,6 @@ def cell_stress_of_fields(arm) -> CellStress:
 # -- as limit and objective ---------------------------------------------------------------------
 
 
-@pytest.mark.serial
 def test_work_is_done_once() -> None:
     """Value and gradient share fields and search."""
     built = build(*QUICK, "simulation.stiffening=false", "reduction.coordinates=4",
@@ -349,7 +340,6 @@ def test_work_is_done_once() -> None:
     assert built.profile.counts.solves - before >= 2 * (adjoint + modes)
 
 
-@pytest.mark.serial
 def test_stress_in_python() -> None:
     """Asked for, a simulation knows it and draws it; an optimisation knows it anyway."""
     model = do.Model(do.load_scene(TWO_ARM, ["arms.cells=[20,3]", "simulation.sample=0.01"]))
@@ -359,7 +349,6 @@ def test_stress_in_python() -> None:
     assert asked.plot_stress() is not None
 
 
-@pytest.mark.serial
 @pytest.mark.slow
 def test_lightest_arms_below_a_stress() -> None:
     """The true stress meets the limit that the lightest arms run into; history and summary say."""

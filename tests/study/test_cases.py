@@ -51,11 +51,13 @@ def forbid(monkeypatch):
 # -- keys ------------------------------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_name_is_no_part_of_the_key():
     assert Case(scene()).key == Case(scene('name="another"')).key
     assert Case(scene(), label="a") == Case(scene('name="b"'), label="b")
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "change",
     [
@@ -79,6 +81,7 @@ def test_every_value_is_part_of_the_key(change):
     assert Case(scene()).key != Case(scene(change)).key
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_every_table_is_tried_above():
     tried = set(scene_content(scene()))
     assert tried == {
@@ -88,6 +91,7 @@ def test_every_table_is_tried_above():
     }  # fmt: skip
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_action_and_design_are_part_of_the_key(tmp_path):
     first, second = tmp_path / "a.npz", tmp_path / "b.npz"
     first.write_bytes(b"one")
@@ -108,6 +112,7 @@ def test_action_and_design_are_part_of_the_key(tmp_path):
     assert Case(base, "simulate", first).key != Case(base, "simulate", second).key
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_files_of_the_scene_count_by_content(tmp_path):
     def key(path):
         return Case(scene('motion.path="points"', f'motion.file="{path}"')).key
@@ -120,6 +125,7 @@ def test_files_of_the_scene_count_by_content(tmp_path):
     assert key(tmp_path / "a.csv") != key(tmp_path / "b.csv")
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_merged_geometry_counts(tmp_path):
     (tmp_path / "arm.geo").write_text('Include "part.geo";\n')
     (tmp_path / "part.geo").write_text("a = 1;\n")
@@ -229,6 +235,7 @@ def assert_close(one, other):
     assert one.max_deviation == pytest.approx(other.max_deviation, rel=2.0 * tolerance)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_scenarios_share_what_they_can():
     """One mesh and factorisation, one basis and batch a reduction; results as if alone."""
     scenes = [
@@ -263,6 +270,7 @@ def batches(monkeypatch):
     return sizes
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_sweep_of_nine_is_one_batch(tmp_path, batches):
     masses = np.linspace(4.0, 8.0, 9)
     sweep = [Case(scene(f"payload.mass={mass}")) for mass in masses]
@@ -280,6 +288,7 @@ def test_sweep_of_nine_is_one_batch(tmp_path, batches):
     assert again.computed == 0 and batches == [9]
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "key", ["material.density", "material.young_modulus", "arms.arm1.thickness"]
 )
@@ -294,6 +303,7 @@ def test_what_scales_the_arms_is_one_batch(tmp_path, batches, key):
         assert_close(outcomes[case], alone.evaluation)
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_batches_have_one_basis():
     """A basis that depends on frequencies, or a frequency that is asked for, is not scaled."""
     key = Case(scene()).batch_key
@@ -311,6 +321,7 @@ def test_batches_have_one_basis():
     assert Case(scene(gramian, damped)).batch_key != Case(scene(gramian)).batch_key
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_chosen_coordinates_are_those_of_each_scene():
     """Nothing that "auto" came to in one scene is left in the next."""
     auto = "reduction.coordinates=auto"
@@ -322,6 +333,7 @@ def test_chosen_coordinates_are_those_of_each_scene():
     assert Case(strict).batch_key == Case(strict).key
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batches):
     """What is there stays as it is, and all are right to the tolerance in any company."""
     _, outcomes = done
@@ -384,6 +396,7 @@ def test_damaged_summary_is_done_anew(plan, done, shared_tmp_path):
 # -- interruptions and failures --------------------------------------------------------------
 
 
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("where", ["before the first iteration", "between two", "at the end"])
 def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
     """What is computed again begins at the last checkpoint and ends in the same bits."""
@@ -429,6 +442,7 @@ def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
     assert [row.iteration for row in again[made].history()] == [0, 1, 2, 3]
 
 
+@pytest.mark.serial  # ranks have no part in it
 def test_foreign_checkpoint_is_not_used(plan, done, tmp_path):
     """A checkpoint of another scene in the folder: the case begins anew."""
     _, outcomes = done

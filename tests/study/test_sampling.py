@@ -48,6 +48,7 @@ def respond(cases, folder, comm=WORLD):
     return arrays, outcomes.computed, {k: v for o in found for k, v in o.messages.items()}
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter
 @pytest.mark.parametrize(
     ("changes", "scaling"),
     [

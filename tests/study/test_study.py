@@ -225,6 +225,7 @@ def test_grid_of_two(folder):
     np.testing.assert_array_equal([line.y for line in left.lines], compliance.T)
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter
 def test_three_keys_one_at_a_time(folder):
     vary = ["payload.mass=5,7", "motion.flattening=0.9,1", "material.density=2600,2800"]
     done = study.study(scene(), None, vary, [], folder, WORLD, shown=False)
@@ -240,6 +241,7 @@ def test_three_keys_one_at_a_time(folder):
     assert largest == sorted(largest, reverse=True)
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter
 def test_design_table_needs_reoptimising(folder):
     """Less material is less stiff when designs are made for it."""
     done = study.study(
@@ -250,6 +252,7 @@ def test_design_table_needs_reoptimising(folder):
     assert made[0] > made[1]
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter
 def test_arms_of_several_sizes(folder):
     """Longer arms are made for themselves: no design goes into another's scenario."""
     done = study.study(
@@ -389,6 +392,7 @@ def test_solid_ends_allow_nothing_attached():
 SIX = ("mass", "esl", "deviation", "stress", "effort", "settling")
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter
 def test_one_scene_posed_six_ways(folder):
     """What falls with the mass keeps the scene's limits, the others have half the material."""
     folder = folder / "six"

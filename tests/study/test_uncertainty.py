@@ -169,6 +169,7 @@ def study(given, folder, *random, base=None, **options):
     return study_random(base, random, [given], folder, WORLD, Sampling(**options), shown=False)
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter of test_sampling
 def test_small_scatter_is_linear(folder, given):
     """The standard deviation is that of the linearised model, by central differences."""
     fine = scene("simulation.tolerance=1e-4", "motion.horizon=2.2")
@@ -202,6 +203,7 @@ def test_small_scatter_is_linear(folder, given):
         np.testing.assert_allclose([row[3] for row in rows], shares[:, j], atol=0.01)
 
 
+@pytest.mark.serial  # ranks: test_ranks_do_not_matter of test_sampling
 def test_both_ways_to_the_indices(folder, given):
     """Saltelli's scheme takes more simulations and comes to the polynomial's indices."""
     fitted = study(given, folder / "i", MASS, YOUNG, samples=32)
