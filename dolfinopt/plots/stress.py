@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.disk import write_atomically
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.design import (
+from dolfinopt.plots.page import (
     HEAD,
     MARGIN,
     TEXT,
@@ -18,10 +17,12 @@ from dolfinopt.plots.design import (
     Page,
     draw_colour_scale,
     draw_ruler,
+    figure_of_page,
     stack_arms,
+    write_page,
 )
 from dolfinopt.plots.shapes import outline
-from dolfinopt.plots.style import BLUE, GREY, PathLike, new_figure, round_number
+from dolfinopt.plots.style import BLUE, GREY, PathLike, round_number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,28 +41,12 @@ def draw_stress(path: PathLike, views: Sequence[ArmView], title: str) -> Path:
         views: of the arms whose stress is known, from the cart outwards.
         title: above the picture.
     """
-    from PIL import Image
-
-    image = Image.fromarray(_image(views, title))
-    target = Path(path)
-    write_atomically(target, lambda stream: image.save(stream, format="PNG", compress_level=3))
-    return target
+    return write_page(path, stress_page(views, title))
 
 
 def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     """Return the picture of `draw_stress` as a figure of Matplotlib, pixel for pixel."""
-    image = _image(views, title)
-    figure = new_figure(image.shape[1] / 100.0, image.shape[0] / 100.0, 100, laid_out=False)
-    figure.figimage(image)
-    return figure
-
-
-def _image(views: Sequence[ArmView], title: str) -> np.ndarray:
-    page = stress_page(views, title)
-    try:
-        return page.render()
-    finally:
-        page.close()
+    return figure_of_page(stress_page(views, title))
 
 
 def stress_page(views: Sequence[ArmView], title: str) -> Page:

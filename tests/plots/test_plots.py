@@ -19,7 +19,7 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots import animation, curves, design, loops, machine, shapes, stress, style
+from dolfinopt.plots import animation, curves, design, loops, machine, page, shapes, stress, style
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -154,19 +154,19 @@ SLENDER, FAT = (1.0, 0.06), (1.0, 1.2)
 @pytest.mark.parametrize("size", [SLENDER, FAT])
 def test_arms_stand_below_each_other_on_the_page(arms, size):
     views = [beam("a", size[0] / (k + 1), size[1] / (k + 1), 4, 2) for k in range(arms)]
-    layout = design.stack_arms([view.corners for view in views])
+    layout = page.stack_arms([view.corners for view in views])
     placed = [layout.place(k, view.corners) for k, view in enumerate(views)]
     lows, highs = (np.array([f(p, axis=(0, 1)) for p in placed]) for f in (np.min, np.max))
-    assert np.allclose(lows[:, 0], design.MARGIN)
-    assert (highs[:, 0] <= layout.width - design.MARGIN + 1.0).all()
-    assert (lows[:-1, 1] - highs[1:, 1] >= design.LABEL - 1.0).all()  # room for each name
-    assert lows[-1, 1] >= design.FOOT - 1.0
-    assert highs[0, 1] <= layout.height - design.HEAD - design.LABEL + 1.0
+    assert np.allclose(lows[:, 0], page.MARGIN)
+    assert (highs[:, 0] <= layout.width - page.MARGIN + 1.0).all()
+    assert (lows[:-1, 1] - highs[1:, 1] >= page.LABEL - 1.0).all()  # room for each name
+    assert lows[-1, 1] >= page.FOOT - 1.0
+    assert highs[0, 1] <= layout.height - page.HEAD - page.LABEL + 1.0
     assert np.allclose(
         highs - lows, layout.scale * np.array(size) / np.arange(1, arms + 1)[:, None]
     )
     if size == SLENDER:
-        assert highs[0, 0] == pytest.approx(layout.width - design.MARGIN, abs=1.0)
+        assert highs[0, 0] == pytest.approx(layout.width - page.MARGIN, abs=1.0)
 
 
 @pytest.mark.serial
@@ -178,7 +178,7 @@ def test_design_shows_each_density_in_its_place(tmp_path):
     path = design.draw_design(tmp_path / "design.png", views, "half and half")
     assert [p.name for p in tmp_path.iterdir()] == ["design.png"]
     image = imread(path)[..., :3]
-    layout = design.stack_arms([view.corners for view in views])
+    layout = page.stack_arms([view.corners for view in views])
     assert image.shape == (layout.height, layout.width, 3)
     for index, view in enumerate(views):
         for density in (0.0, 1.0):
@@ -188,7 +188,7 @@ def test_design_shows_each_density_in_its_place(tmp_path):
             np.testing.assert_allclose(shown, np.tile(expected, (len(shown), 1)), atol=0.02)
     dark = image.max(axis=2) < 0.3
     ruler, scale = layout.height - int(layout.bottom), layout.height - 90
-    assert dark[: int(design.HEAD)].sum() > 500  # title
+    assert dark[: int(page.HEAD)].sum() > 500  # title
     assert dark[ruler + 30 : ruler + 60].sum() > 500  # lengths in m
     assert dark[scale:, : layout.width // 2 + 200].sum() > 300  # what the colours mean
     frame = np.concatenate([image[:8].ravel(), image[:, :8].ravel(), image[:, -8:].ravel()])
@@ -199,8 +199,8 @@ def test_design_shows_each_density_in_its_place(tmp_path):
 def test_joint_axes_are_marked_where_they_are():
     """By black rings with white inside: the axis of the outboard joint is not the mesh's end."""
     view = replace(beam("with bores", 1.1, 0.2, 20, 4), length=1.0)
-    image = design.design_image([view], "title")
-    layout = design.stack_arms([view.corners])
+    image = page.image_of(design.design_page([view], "title"))
+    layout = page.stack_arms([view.corners])
     for x, y in layout.place(0, np.array([[0.0, 0.0], [1.0, 0.0]])):
         row, column = int(layout.height - y), int(x)
         assert (image[row, column] > 240).all()
@@ -211,7 +211,10 @@ def test_joint_axes_are_marked_where_they_are():
 @pytest.mark.serial
 def test_figure_of_the_designs_is_the_picture():
     views = [beam("upper", 1.0, 0.2, 20, 4)]
-    figure, image = design.design_figure(views, "title"), design.design_image(views, "title")
+    figure, image = (
+        design.design_figure(views, "title"),
+        page.image_of(design.design_page(views, "title")),
+    )
     figure.canvas.draw()
     shown = np.asarray(figure.canvas.buffer_rgba())[..., :3]
     assert shown.shape == image.shape
@@ -222,9 +225,9 @@ def test_figure_of_the_designs_is_the_picture():
 def test_captions_give_the_axis_distance():
     """Which is not the extent of an arm with bosses beyond its bores."""
     view = replace(beam("with bores", 1.1, 0.2, 20, 4), length=1.0)
-    page = design.design_page([view], "title")
-    page.close()
-    (caption,) = [words for words in page.texts if words.startswith("with")]
+    drawn = design.design_page([view], "title")
+    drawn.close()
+    (caption,) = [words for words in drawn.texts if words.startswith("with")]
     assert "axis distance 1 m, 0.2 m high" in caption
 
 
@@ -235,14 +238,14 @@ def test_stress_says_where_when_and_in_what_unit(tmp_path):
         view = beam(name, 1.0, 0.1, 20, 4)
         s = largest * (1.0 - view.centroid[:, 0]) / (1.0 - view.centroid[0, 0])
         views.append(replace(view, stress=s, stress_instant=np.full(len(s), 0.75)))
-    page = stress.stress_page(views, "two arms")
-    page.close()
-    assert any("arm1   largest 61 MPa at x = 0.025 m" in words for words in page.texts)
-    assert any("arm2   largest 40 MPa" in words and "t = 0.75 s" in words for words in page.texts)
-    assert stress.STRESS in page.texts and "[MPa]" in stress.STRESS
+    drawn = stress.stress_page(views, "two arms")
+    drawn.close()
+    assert any("arm1   largest 61 MPa at x = 0.025 m" in words for words in drawn.texts)
+    assert any("arm2   largest 40 MPa" in words and "t = 0.75 s" in words for words in drawn.texts)
+    assert stress.STRESS in drawn.texts and "[MPa]" in stress.STRESS
     marks = stress.scale_marks(61.0)
     assert marks.tolist() == [0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0]
-    assert {f"{mark:g}" for mark in marks} <= set(page.texts)
+    assert {f"{mark:g}" for mark in marks} <= set(drawn.texts)
     path = stress.draw_stress(tmp_path / "stress.png", views, "two arms")
     with Image.open(path) as image:
         shown = np.asarray(image.convert("RGB")).astype(int)
