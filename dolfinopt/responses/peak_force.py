@@ -11,7 +11,7 @@ from dolfinopt.multibody.motion import CART
 from dolfinopt.responses.drives import DriveResponse
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.p_norm import p_norm
-from dolfinopt.responses.response import register
+from dolfinopt.responses.response import Response, register
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import Objective
 
@@ -25,14 +25,26 @@ class PeakForce(DriveResponse):
 
     name, label, unit = "peak_force", "weighted sum of the drives' peak forces", "-"
 
-    def __init__(self, options: Objective, limited: bool = False, drive: int = 0):
-        """Take the options, and which of the scene's drives this is."""
+    def __init__(
+        self,
+        options: Objective,
+        limited: bool = False,
+        drive: int = 0,
+        drives: tuple[int, ...] | None = None,
+    ):
+        """Take the options, which of the scene's drives this is, and of which it has parts."""
         super().__init__(options, limited)
-        self.drive = drive
+        self.drive, self.drives = drive, drives
+
+    def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
+        """Return the response of those drives that have a limit, and these limits."""
+        drives = tuple(k for k, one in enumerate(limits) if one is not None)
+        kept = tuple(one for one in limits if one is not None)
+        return PeakForce(self.options, self.limited, drives=drives), kept
 
     def parts(self, scene: Scene) -> Sequence[tuple[str, MotionResponse]]:
-        """Return one response for every drive, by the name of its coordinate."""
-        every = range(len(scene.driven))
+        """Return one response for every drive that counts, by the name of its coordinate."""
+        every = range(len(scene.driven)) if self.drives is None else self.drives
         return [(scene.driven[k], PeakForce(self.options, self.limited, k)) for k in every]
 
     @classmethod

@@ -142,6 +142,7 @@ def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
     if not scene.scenarios:
         return ()
     plain = scene.to_tree() | {"scenarios": []}
+    del plain["objective"]["scenarios"]  # there is nothing to combine
     return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
 
 

@@ -33,11 +33,11 @@ from dolfinopt.study.variants import (
     METHODS,
     OBJECTIVES,
     RESPONSES,
-    changed,
     posed,
     reduction_name,
     reductions,
     reference_scene,
+    with_objective,
 )
 
 SWEPT = (4, 6, 8, 12, 16, 24, 48)  # coordinates of "coordinates"
@@ -61,21 +61,21 @@ def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
         InputError: the scene cannot have one of these kinds.
     """
     rows: Rows = [({}, Case(scene, label="initial design"))]
+    report = partial(_objectives, weights=scene.objective.effort_weights)
     if kinds:
         cases = [Case(posed(scene, kind), "optimize", label=kind) for kind in kinds]
-        return Plan("objective", [*rows, *(({}, case) for case in cases)], _objectives)
+        return Plan("objective", [*rows, *(({}, case) for case in cases)], report)
     for label, settings in (*OBJECTIVES, *RESPONSES):
-        free = ["objective.worst=compliance"] if "worst=deviation" not in settings else []
         try:
-            other = changed(scene, *free, *(f"objective.{setting}" for setting in settings))
+            other = with_objective(scene, *settings)
         except InputError:  # the scene excludes it, as passive ends do "nothing attached"
             continue
         rows.append(({}, Case(other, "optimize", label=label)))
-    return Plan("objective", rows, _objectives)
+    return Plan("objective", rows, report)
 
 
-def _objectives(frame: pd.DataFrame) -> Report:
-    measures = pd.DataFrame([_measures(outcome) for outcome in frame["outcome"]])
+def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
+    measures = pd.DataFrame([_measures(outcome, weights) for outcome in frame["outcome"]])
     columns = ["label", *QUANTITIES, "at [s]"]
     rest = ["grayness [-]", "iterations", "seconds", "ended by"]
     whole = pd.concat([frame[columns], measures, frame[rest]], axis=1)
@@ -94,18 +94,20 @@ def _objectives(frame: pd.DataFrame) -> Report:
     ]
 
 
-def _measures(outcome: Outcome) -> dict[str, float]:
-    """Return what else a design does in its motion: true values, in the scene's weights."""
+def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, float]:
+    """Return what else a design does in its motion: true values, efforts by one set of weights."""
     found = {"settling [mm]": math.nan, "stress [MPa]": math.nan, "effort [-]": math.nan,
              "mass [kg]": math.nan}  # fmt: skip
     if outcome.failure:
         return found
-    summary, weights = outcome.summary(), outcome.case.scene.objective.effort_weights
+    summary = outcome.summary()
     forces = np.array([*summary["drive_rms"].values()])
     found["settling [mm]"] = 1e3 * summary["settling"]
     if summary.get("stress") is not None:
         found["stress [MPa]"] = 1e-6 * summary["stress"]["value"]
-    found["effort [-]"] = float(np.linalg.norm(forces if weights is None else forces * weights))
+    found["effort [-]"] = float(
+        np.linalg.norm(forces if weights is None else forces * np.array(weights))
+    )
     found["mass [kg]"] = float(sum(summary["mass"].values()))
     return found
 

@@ -6,33 +6,34 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
-from dolfinopt.scene.tables.responses import LIGHTER
+from dolfinopt.scene.tables.responses import LIGHTER, unused_options
 
-# Label, and the settings that make it.
+# Label, kind, and the settings that make it.
 OBJECTIVES = (
-    ("dynamic loads (esl)", ("kind=esl", "gradient=esl")),
-    ("dynamic loads (esl), exact gradient", ("kind=esl", "gradient=exact")),
-    ("dynamic loads (esl) chosen by deviation", ("kind=esl", "gradient=esl", "worst=deviation")),
-    ("compliance over the horizon", ("kind=compliance", "gradient=esl")),
-    ("compliance over the horizon, exact gradient", ("kind=compliance", "gradient=exact")),
-    ("deviation", ("kind=deviation", "gradient=esl")),
-    ("deviation, exact gradient", ("kind=deviation", "gradient=exact")),
-    ("static compliance", ("kind=static",)),
-    ("eigenfrequency, rigid bodies attached", ("kind=eigenfrequency", "attached=rigid-body")),
-    ("eigenfrequency, point masses attached", ("kind=eigenfrequency", "attached=point-mass")),
-    ("eigenfrequency, nothing attached", ("kind=eigenfrequency", "attached=none")),
+    ("dynamic loads (esl)", ("esl", "gradient=esl", "worst=compliance")),
+    ("dynamic loads (esl), exact gradient", ("esl", "gradient=exact", "worst=compliance")),
+    ("dynamic loads (esl) chosen by deviation", ("esl", "gradient=esl", "worst=deviation")),
+    ("compliance over the horizon", ("compliance", "gradient=esl")),
+    ("compliance over the horizon, exact gradient", ("compliance", "gradient=exact")),
+    ("deviation", ("deviation", "gradient=esl")),
+    ("deviation, exact gradient", ("deviation", "gradient=exact")),
+    ("static compliance", ("static",)),
+    ("eigenfrequency, rigid bodies attached", ("eigenfrequency", "attached=rigid-body")),
+    ("eigenfrequency, point masses attached", ("eigenfrequency", "attached=point-mass")),
+    ("eigenfrequency, nothing attached", ("eigenfrequency", "attached=none")),
 )
 # Those that a comparison adds to the paper's.
 RESPONSES = (
-    ("settling", ("kind=settling",)),
-    ("stress", ("kind=stress",)),
-    ("effort of the drives", ("kind=effort",)),
-    ("mass", ("kind=mass",)),
+    ("settling", ("settling",)),
+    ("stress", ("stress",)),
+    ("effort of the drives", ("effort",)),
+    ("mass", ("mass",)),
 )
 # Craig-Bampton with this many coordinates stands for the unreduced arm.
 REFERENCE_METHOD, REFERENCE = "craig-bampton", 48
@@ -141,6 +142,27 @@ def changed(scene: Scene, *overrides: str) -> Scene:
     return other
 
 
+def with_objective(scene: Scene, kind: str, *settings: str) -> Scene:
+    """Return the scene with another objective and options of it, each "key=value".
+
+    Options that nothing uses any more are left out.
+
+    Raises:
+        InputError: the scene cannot have it.
+    """
+    tree = scene.to_tree()
+    tree["objective"] |= {"kind": kind}
+    _drop_unused(tree)
+    return scene_from_dict(tree, scene.source, [f"objective.{one}" for one in settings])
+
+
+def _drop_unused(tree: dict[str, Any]) -> None:
+    """Take out of a scene's data what its objective and its limits do not use."""
+    limited = [key for key, limit in tree["constraints"].items() if limit is not None]
+    for key in unused_options(tree["objective"]["kind"], limited):
+        tree["objective"].pop(key, None)
+
+
 def posed(scene: Scene, kind: str) -> Scene:
     """Return the scene with another objective, for designs that can be compared with each other.
 
@@ -156,6 +178,9 @@ def posed(scene: Scene, kind: str) -> Scene:
         tree["constraints"] = {}
     elif scene.objective.kind not in LIGHTER or "volume_fraction" not in tree["design"]:
         tree["design"]["volume_fraction"] = None if kind == "mass" else 1.0
+        if kind == "mass":
+            tree["design"]["shared_volume"] = False
+    _drop_unused(tree)
     return scene_from_dict(tree, scene.source)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from runs import ROOT, TWO_ARM, scene
 import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.errors import InputError
-from dolfinopt.responses.constraints import constraint_label, limits_of
+from dolfinopt.responses.constraints import constraint_label, limits_by_column, limits_of
 
 WORLD = MPI.COMM_WORLD
 EFFORT = "objective.kind=effort"
@@ -139,7 +140,8 @@ def test_without_a_limit_no_arm_would_be_left(kind: str) -> None:
 def test_peak_forces_are_limited_drive_by_drive() -> None:
     """The true values are the largest samples; smooth ones and weights only lead there."""
     limits = "constraints.peak_force=[20.0,30.0,10.0]"
-    made = scene("arms.cells=[20,3]", limits, "objective.effort_weights=[0.0,2.0,1.0]")
+    weighted = ["objective.effort_weights=[0.0,2.0,1.0]", "constraints.effort=100.0"]
+    made = scene("arms.cells=[20,3]", limits, *weighted)
     result = Model(made).simulate()
     found = limits_of(made, result.evaluation)[-3:]
     assert [one.name for one in found] == [f"peak_force_{k}" for k in ("cart", "arm1", "arm2")]
@@ -156,6 +158,22 @@ def test_peak_forces_are_limited_drive_by_drive() -> None:
         assert [one.value for one in found] == pytest.approx(list(peaks), rel=1e-12)
         smooth = np.array(result.evaluation.responses[-1].smooth)
         assert (smooth < peaks).all() and (smooth > 0.7 * peaks).all()
+
+
+def test_a_drive_may_have_no_limit(shared_tmp_path: Path) -> None:
+    """As inf in a scene, and null in a summary's, which is read back."""
+    made = scene("arms.cells=[20,3]", "constraints.peak_force=[inf,30.0,inf]")
+    result = Model(made).simulate()
+    (found,) = limits_of(made, result.evaluation)[-1:]
+    assert (found.name, found.limit) == ("peak_force_arm1", 30.0)
+    assert len(result.evaluation.constraints) == 3  # with the volumes of both arms
+    assert limits_by_column(made, ["peak_force_arm1"]) == {"peak_force_arm1": 30.0}
+    text = json.dumps(made.to_dict(), allow_nan=False)
+    assert do.scene_from_dict(json.loads(text)) == made
+    with pytest.raises(InputError, match="expected a limit for one drive at least"):
+        scene("constraints.peak_force=[inf,inf,inf]")
+    with pytest.raises(InputError, match="expected 3 numbers"):
+        scene("constraints.peak_force=[inf,1.0]")
 
 
 def test_weighted_sum_of_peak_forces_as_objective() -> None:

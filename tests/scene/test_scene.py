@@ -10,6 +10,7 @@ import string
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import example, given
@@ -30,6 +31,8 @@ from dolfinopt.scene.load import (
     scene_from_dict,
 )
 from dolfinopt.scene.tables.constraints import Constraints
+from dolfinopt.scene.tables.objective import Objective, ObjectiveKind
+from dolfinopt.scene.tables.responses import OPTIONS
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
@@ -1368,3 +1371,63 @@ def test_length_of_a_body_from_a_file(tmp_path):
     data["arms"][1] = dict(ARM, name="arm2")
     first = scene_from_dict(data, str(tmp_path / "scene.toml")).arms[0]
     assert first.height == first.thickness == pytest.approx(0.04)
+
+
+# -- options that nothing uses -----------------------------------------------------------------
+
+# Key, a value that is not its default, and settings with which something uses it.
+UNUSED = {
+    "objective.worst": ("deviation", ["objective.kind=static", "constraints.esl=9.0"]),
+    "objective.stress_exponent": ("8.0", ["constraints.stress=1e8"]),
+    "objective.loads": ("[[0.0,1.0,0.0]]", ["constraints.tip_deflection=0.1"]),
+    "objective.effort_weights": ("[1.0,2.0,3.0]", ["constraints.effort=50.0"]),
+    "objective.attached": ("point-mass", ["constraints.first_frequency=1.0"]),
+    "objective.elbow_angle": ("1.0", ["objective.kind=first_frequency"]),
+    "objective.modes": ("2", ["objective.kind=eigenfrequency"]),
+    "objective.follow": ("true", ["objective.kind=eigenfrequency"]),
+    "objective.scenarios": ("worst", ["scenarios=[{changes=['payload.mass=1']}]"]),
+    "design.sharpness": ("64.0", ["design.projection=heaviside"]),
+    "design.continuation": ("10", ["design.projection=heaviside"]),
+    "design.erosion": ("0.2", ["design.projection=robust"]),
+}
+# What does not: the wrong response, or none.
+OTHERS = {
+    "objective.worst": ["objective.kind=compliance"],
+    "objective.effort_weights": ["constraints.peak_force=[9.0,9.0,9.0]"],
+    "objective.follow": ["objective.kind=first_frequency"],
+    "design.erosion": ["design.projection=heaviside"],
+}
+
+
+@pytest.mark.parametrize("key", UNUSED)
+def test_options_that_nothing_uses_are_refused(key):
+    value, used = UNUSED[key]
+    setting = f"{key}={value}"
+    assert load_scene(TWO_ARM, [*used, setting])
+    with pytest.raises(InputError) as caught:
+        load_scene(TWO_ARM, [*OTHERS.get(key, []), setting])
+    text = str(caught.value)
+    assert (f"{key} = " in text and "default" in text) or "expected none" in text
+    assert "\n" not in text
+
+
+def test_every_option_of_a_response_is_used_by_one():
+    """The table of their users names options, objectives and limits that there are."""
+    for key, (objectives, limits) in OPTIONS.items():
+        assert key in Objective.model_fields
+        assert set(objectives) <= set(get_args(ObjectiveKind)) and set(limits) <= set(
+            Constraints.model_fields
+        )
+
+
+def test_no_volume_is_shared_where_none_is_limited():
+    lightest, shared = TWO_ARM.with_name("lightest_two_arm.toml"), "design.shared_volume=true"
+    assert load_scene(lightest, ["design.volume_fraction=0.4", shared]).design.shared_volume
+    with pytest.raises(InputError, match=r"design\.shared_volume = true: expected false"):
+        load_scene(lightest, [shared])
+
+
+def test_scenarios_are_posed_without_what_combines_them():
+    scene = load_scene(TWO_ARM, [UNUSED["objective.scenarios"][1][0], "objective.scenarios=worst"])
+    (posed,) = pose_scenarios(scene)
+    assert posed.objective.scenarios == "sum" and posed.payload.mass == 1.0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+import math
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from dolfinopt.scene.tables.base import Loc, Refusal, Table
 
@@ -18,7 +19,7 @@ Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
-Limit = float | tuple[float, ...]
+Limit = float | tuple[float | None, ...]
 
 
 class Constraints(Table):
@@ -53,10 +54,10 @@ class Constraints(Table):
         description="upper limit of the weighted root mean square of the drives' forces, see "
         "objective.effort_weights [-]",
     )
-    peak_force: tuple[Force, ...] | None = Field(
+    peak_force: tuple[Force | None, ...] | None = Field(
         default=None,
         description="upper limits of the largest force of every drive, the cart's first, then the "
-        "joints' from the base outwards [N, N m]",
+        "joints' from the base outwards; inf leaves one without limit [N, N m]",
     )
     first_frequency: Frequency | tuple[Frequency, ...] | None = Field(
         default=None,
@@ -68,6 +69,17 @@ class Constraints(Table):
         description="upper limit of the static deflection of the outboard interface of every "
         "designed arm under objective.loads, one for all or one for each [m]",
     )
+
+    @field_validator("peak_force", mode="before")
+    @classmethod
+    def _leave_free(cls, value: Any) -> Any:
+        """Take None for inf, which JSON does not know."""
+        if not isinstance(value, list | tuple):
+            return value
+        free = tuple(None if one == math.inf else one for one in value)
+        if free and all(one is None for one in free):
+            raise Refusal("expected a limit for one drive at least")
+        return free
 
     @property
     def limits(self) -> dict[str, Limit]:

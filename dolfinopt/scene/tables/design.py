@@ -161,6 +161,14 @@ class Design(Table):
         return self
 
     @model_validator(mode="after")
+    def _check_unused(self) -> Design:
+        projected = self.projection is not False
+        self.refuse_unused(projected, "projection", "sharpness", "continuation")
+        self.refuse_unused(self.projection == "robust", "projection", "erosion")
+        self.refuse_unused(self.volume_fraction is not None, "volume_fraction", "shared_volume")
+        return self
+
+    @model_validator(mode="after")
     def _check_minimum(self) -> Design:
         if self.minimum >= self.initial:
             raise Refusal(

@@ -8,7 +8,15 @@ from pydantic import Field, field_validator
 
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import Loc, Refusal, Table
-from dolfinopt.scene.tables.responses import EXACT_ONLY, LIGHTER, NEEDS, Need, need_of
+from dolfinopt.scene.tables.responses import (
+    EXACT_ONLY,
+    LIGHTER,
+    NEEDS,
+    OPTIONS,
+    Need,
+    need_of,
+    unused_options,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -149,9 +157,10 @@ class Objective(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
+        self._check_weights(scene)
+        self._check_unused(scene)
         self._check_attached(scene)
         self._check_load_cases(scene)
-        self._check_weights(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):
             if scene.scenarios:
@@ -193,6 +202,29 @@ class Objective(Table):
                 return f"constraints.{key}", ("constraints", key)
         exact = 'objective.gradient = "exact"' if self.gradient == "exact" else ""
         return exact, ("objective", "gradient")
+
+    def _check_unused(self, scene: Scene) -> None:
+        """Refuse options that neither the objective nor a limit uses."""
+        fields = type(self).model_fields
+        for key in unused_options(self.kind, scene.constraints.limits):
+            default = fields[key].default
+            if getattr(self, key) == default:
+                continue
+            objectives, limits = OPTIONS[key]
+            users = f"objective.kind = {' or '.join(map(shown, objectives))}"
+            users += "".join(f", or constraints.{name}" for name in limits)
+            expected = "none" if default is None else f"{shown(default)}, the default,"
+            raise Refusal(
+                f"expected {expected} without {users}: nothing else uses it",
+                ("objective", key),
+                ("objective", "kind"),
+            )
+        if not scene.scenarios and self.scenarios != fields["scenarios"].default:
+            raise Refusal(
+                f"expected {shown(fields['scenarios'].default)}, the default, without "
+                "[[scenarios]]: there are none to combine",
+                ("objective", "scenarios"),
+            )
 
     def _check_weights(self, scene: Scene) -> None:
         if self.effort_weights is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -29,6 +29,17 @@ NEEDS: Mapping[str, frozenset[Need]] = {
 }
 # Those that no equivalent static load tells anything of: their gradient is always the exact one.
 EXACT_ONLY = frozenset({"effort", "peak_force"})
+# What uses an option of [objective]: as objective, and under [constraints].
+OPTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "worst": (("esl",), ("esl",)),
+    "stress_exponent": (("stress",), ("stress",)),
+    "loads": (("static", "tip_deflection"), ("tip_deflection",)),
+    "effort_weights": (("effort", "peak_force"), ("effort",)),
+    "attached": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
+    "elbow_angle": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
+    "modes": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
+    "follow": (("eigenfrequency",), ()),
+}
 # Those that fall with the mass, down to that of no arm at all.
 LIGHTER = frozenset({"mass", "effort", "peak_force"})
 
@@ -36,6 +47,20 @@ LIGHTER = frozenset({"mass", "effort", "peak_force"})
 def asked(scene: Scene) -> list[str]:
     """Return the words of the objective and of everything under [constraints]."""
     return [scene.objective.kind, *scene.constraints.limits]
+
+
+def unused_options(kind: str, limited: Collection[str]) -> list[str]:
+    """Return the options of [objective] that nothing uses.
+
+    Args:
+        kind: the objective.
+        limited: keys under [constraints].
+    """
+    return [
+        key
+        for key, (objectives, limits) in OPTIONS.items()
+        if kind not in objectives and not set(limits) & set(limited)
+    ]
 
 
 def freezes(scene: Scene) -> bool:
