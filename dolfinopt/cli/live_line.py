@@ -7,19 +7,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.history import FurtherRow, HistoryRow
 
 WIDE = 110  # characters a line
 EVERY = 5.0  # s between two lines where there is no terminal
 
 
 def _words(row: HistoryRow, iterations: int) -> str:
-    """Return a row of the history in words."""
+    """Return a row of the history, or of the further iterations after it, in words."""
+    count, kind = iterations, ""
+    if isinstance(row, FurtherRow):
+        count, kind = row.of, "exact gradient, further "
     return (
-        f"{row.iteration}/{iterations} objective {row.objective:.4g} "
+        f"{kind}{row.iteration}/{count} objective {row.objective:.4g} "
         f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
         f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
         + (f", {row.tightest}" if row.tightest else "")
@@ -78,6 +79,8 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
         task = progress.add_task("setting up", total=iterations)
 
         def show(row: HistoryRow) -> None:
-            progress.update(task, completed=row.iteration, description=_words(row, iterations))
+            total = row.of if isinstance(row, FurtherRow) else iterations
+            words = _words(row, iterations)
+            progress.update(task, total=total, completed=row.iteration, description=words)
 
         yield show

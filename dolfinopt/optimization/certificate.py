@@ -17,6 +17,7 @@ import numpy as np
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.further import Attempt, Further, attempt, best_of
 from dolfinopt.optimization.optimality import Sum, kkt_residual
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.parallel import sum_over_arms
@@ -28,45 +29,6 @@ from dolfinopt.scene.tables.responses import freezes
 
 # Variables nearer to a bound than this part of their range count as held by it.
 AT_BOUND = 1e-3
-
-
-@dataclass(frozen=True)
-class Further:
-    """What iterations with the exact gradient made of a design, and what they started from.
-
-    Attributes:
-        iterations: how many there were; fewer than asked for where a motion could not be simulated.
-        begun: objective of the design.
-        objective: the best of those designs, this one included, that keep all constraints; if
-            none does, that of the last one.
-        feasible: whether it keeps them.
-        maximised: whether the greatest objective is the best.
-    """
-
-    iterations: int
-    begun: float
-    objective: float
-    feasible: bool
-    maximised: bool = False
-
-    @property
-    def excess(self) -> float:
-        """By how much the design is worse than the best one found, relative to that."""
-        worse = self.begun - self.objective
-        return (-worse if self.maximised else worse) / abs(self.objective) if worse else 0.0
-
-    @property
-    def sentence(self) -> str:
-        """E.g. "5.1 % above the best of 20 further iterations with the exact gradient"."""
-        how = f"{self.iterations} further iterations with the exact gradient"
-        if not self.feasible:
-            return f"{how} found no design that keeps all constraints"
-        if self.excess == 0.0:
-            return f"{how} found nothing better"
-        percent = 100.0 * abs(self.excess)
-        size = f"{percent:.2g}" if percent < 99.5 else f"{percent:.0f}"
-        where = "above" if (self.excess > 0.0) != self.maximised else "below"
-        return f"{size} % {where} the best of {how}"
 
 
 @dataclass(frozen=True)
@@ -188,7 +150,7 @@ def certify(
     x: np.ndarray,
     nominal: EvaluatedDesign,
     problem: Problem,
-    further: Callable[[Problem, int], Iterable[Problem]],
+    further: Callable[[Problem, int], Iterable[Attempt]],
 ) -> Certificate:
     """Return the certificate of the design that was evaluated last (collective).
 
@@ -199,8 +161,8 @@ def certify(
         evaluator: of the iterations.
         x: (n,) this rank's design variables.
         nominal, problem: at x.
-        further: iterates from x with the exact problem given first, and yields those that follow;
-            the arms may end with another design.
+        further: iterates from x with the exact problem given first, and yields what follows; the
+            arms are to end with x.
     """
     scene, comm = evaluator.scene, evaluator.partition.world
     if missing := without_exact_gradient(scene):
@@ -223,29 +185,7 @@ def certify(
     if not (count := scene.optimizer.exact_iterations):
         return found
     turned = objective_of(scene).turned
-    return replace(found, further=best_of(exact, further(exact, count), maximised=turned))
-
-
-def best_of(first: Problem, others: Iterable[Problem], *, maximised: bool = False) -> Further:
-    """Return the best of the problems at a row of designs that keeps all constraints.
-
-    A simulation that fails ends the row.
-    """
-
-    def rank(problem: Problem) -> tuple[bool, float]:
-        """Return what is smaller for a better design: feasible ones come first."""
-        return bool(violated(problem.limits)), -problem.f0 if maximised else problem.f0
-
-    best, count, last = first, 0, first
-    try:
-        for last in others:
-            count += 1
-            best = min(best, last, key=rank)
-    except ConvergenceError:  # of a design on the way; on all ranks
-        pass
-    if violated(best.limits):
-        best = last
-    return Further(count, first.f0, best.f0, not violated(best.limits), maximised)
+    return replace(found, further=best_of(attempt(exact), further(exact, count), maximised=turned))
 
 
 def _problem_by(

@@ -55,3 +55,14 @@ class HistoryRow:
         # Columns by name: one by one they would hide what mypy can check.
         named = dict(zip(columns[1:own], map(float, figures), strict=True))
         return cls(iteration=int(iteration), constraints=dict(pairs), **named)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class FurtherRow(HistoryRow):
+    """The same of a further iteration with the exact gradient; shown, and not kept.
+
+    Attributes:
+        of: how many of them there are at most.
+    """
+
+    of: int = 0

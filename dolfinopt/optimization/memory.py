@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -13,35 +14,70 @@ from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.responses.order_selection import OrderSelection
 
 
-@dataclass(frozen=True, eq=False)
-class Memory:
-    """Everything the next iteration depends on; cell and node arrays are this rank's.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IterateMemory:
+    """Everything the next step depends on; cell and node arrays are this rank's.
 
     Attributes:
         iteration: design updates made.
+        change, kkt: largest change in the last one, and the residual of the design.
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
-        multipliers: MMA's, on all ranks.
+        multipliers, convexity: MMA's, on all ranks.
         solutions: from which this design's simulations set out; the root's count.
-        history: rows so far.
-        initial_deviation: (n, 2) m of the initial design.
-        finished: reason, or "" while running.
         beta: steepness of the projection.
         thresholds: per arm its eta.
-        choice: of the coordinates, where the scene leaves it to "auto".
-        stiffening: decided for the initial design; None where nothing was simulated.
     """
 
     iteration: int
+    change: float
+    kkt: float
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
     multipliers: np.ndarray
+    convexity: np.ndarray
     solutions: tuple[Solution, ...]
+    beta: float
+    thresholds: Mapping[int, float]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FurtherMemory(IterateMemory):
+    """The further iterations with the exact gradient.
+
+    Attributes:
+        begun: updates of the design from which they set out.
+        objectives: of every design, in the order of the iterations.
+        feasible: whether it keeps all constraints.
+    """
+
+    begun: int
+    objectives: tuple[float, ...]
+    feasible: tuple[bool, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Memory(IterateMemory):
+    """A whole optimisation.
+
+    Attributes:
+        history: rows so far.
+        initial_deviation: (n, 2) m of the initial design.
+        finished: reason, or "" while running.
+        choice: of the coordinates, where the scene leaves it to "auto".
+        stiffening: decided for the initial design; None where nothing was simulated.
+        further: what has been done of the further iterations with the exact gradient.
+    """
+
     history: list[HistoryRow]
     initial_deviation: np.ndarray
     finished: str
-    beta: float
-    thresholds: Mapping[int, float]
     choice: OrderSelection | None = None
     stiffening: Stiffening | None = None
+    further: FurtherMemory | None = None
+
+
+def fields_of(one: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as they are, by their names."""
+    return {field.name: getattr(one, field.name) for field in fields(one)}

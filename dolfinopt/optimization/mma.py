@@ -40,7 +40,7 @@ _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
 # asymptotes of variables at rest would depend on the order of summation over the ranks.
 _AT_REST = 1e-9
 
-_CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
+CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
 _RAA0 = 1e-5  # his raa0: convex even where all gradients are zero
 _PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y + y^2 / 2
 
@@ -104,6 +104,7 @@ def mma_step(
     *,
     move: float = 0.2,
     widest: float = LARGEST_DISTANCE,
+    convexity: npt.ArrayLike | None = None,
     comm: MPI.Comm | None = None,
     pieces: Mapping[int, int] | None = None,
 ) -> tuple[Array, MMAState]:
@@ -125,6 +126,8 @@ def mma_step(
         move: largest step of a variable, in units of its range.
         widest: largest distance of the asymptotes, in these units. Wide ones make the approximation
             nearly linear, which lets curved constraints be left again and again.
+        convexity: (1 + m,) least rho_i of objective and constraints, in their units, for Svanberg's
+            (2002) 2 rho_i / range_j in H_ij; by default his raa0.
         comm: communicator over which the variables are distributed; None: all are here.
         pieces: number and length of the consecutive pieces of this rank's variables. Sums are
             taken piece by piece and added in the order of their numbers: as long as no piece is
@@ -152,6 +155,7 @@ def mma_step(
         state,
         move,
         widest,
+        np.zeros(1 + np.size(f)) if convexity is None else np.asarray(convexity, dtype=np.float64),
         {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
     )
     f_agreed, largest = _agree(given, comm)
@@ -177,6 +181,7 @@ class _Given:
     state: MMAState
     move: float
     widest: float
+    convexity: Array
     pieces: Mapping[int, int]
 
     def gradients(self, columns: slice) -> Array:
@@ -207,6 +212,7 @@ def _fault(given: _Given) -> str:
     """Say what is wrong with the inputs on this rank; empty if nothing is."""
     n, m = given.x.size, given.f.size
     shapes = {"x": (n,), "df0dx": (n,), "f": (m,), "dfdx": (m, n), "xmin": (n,), "xmax": (n,)}
+    shapes["convexity"] = (1 + m,)
     for name, shape in shapes.items():
         value = getattr(given, name)
         if value.shape != shape:
@@ -292,7 +298,8 @@ def _block(given: _Given, columns: slice, active: npt.NDArray[np.bool_], scale: 
     distance = relative * width
     step = np.minimum(_LARGEST_STEP, given.move / relative)
     G = given.gradients(columns)[active] / scale[:, None]
-    H = relative * (_CURVATURE * np.abs(G) + 2.0 * _RAA0)
+    rho = given.convexity[active] / scale
+    H = relative * (CURVATURE * np.abs(G) + 2.0 * np.maximum(rho, _RAA0)[:, None])
     G *= relative
     s_min, s_max = -np.minimum(step, room_down / distance), np.minimum(step, room_up / distance)
     return _Block(G, H, s_min, s_max, distance)

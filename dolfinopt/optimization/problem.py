@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import objective_of
+from dolfinopt.responses.response import constraints_of, objective_of
 from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
 
@@ -52,6 +52,8 @@ class Problem:
         f, dfdx: (m,) relative constraints and (m, n) their gradients.
         limits: the constraints by name, as reports show them.
         rows: (m,) index in `limits` of every constraint: robust designs share a limit.
+        turned: whether the objective is maximised.
+        guarded: (1 + m,) which of objective and constraints are guarded, see `Response.guarded`.
     """
 
     f0: float
@@ -60,6 +62,13 @@ class Problem:
     dfdx: np.ndarray
     limits: tuple[Limit, ...]
     rows: np.ndarray
+    turned: bool = False
+    guarded: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    @property
+    def values(self) -> np.ndarray:
+        """What is minimised, and the relative constraints (1 + m,)."""
+        return np.append(-self.f0 if self.turned else self.f0, self.f)
 
 
 def problem_of(scene: Scene, designs: Sequence[EvaluatedDesign]) -> Problem:
@@ -81,13 +90,19 @@ def problem_of(scene: Scene, designs: Sequence[EvaluatedDesign]) -> Problem:
         dfdx = ratio[:, None] * dilated.constraints[own]
     everywhere = [np.array(one.evaluation.constraints)[~own] for one in designs]
     f0, df0dx = _objective(scene, designs)
+    limits = worst_limits([limits_of(scene, one.evaluation) for one in designs])
+    rows = np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(designs)])
+    objective = objective_of(scene)
+    guards = {one.name: one.response.guarded for one in constraints_of(scene)}
     return Problem(
         f0,
         df0dx,
         np.concatenate([f, *everywhere]),
         np.vstack([dfdx, *(one.constraints[~own] for one in designs)]),
-        worst_limits([limits_of(scene, one.evaluation) for one in designs]),
-        np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(designs)]),
+        limits,
+        rows,
+        objective.turned,
+        np.array([objective.guarded, *(guards[limits[row].quantity] for row in rows)]),
     )
 
 

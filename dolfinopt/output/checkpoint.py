@@ -14,7 +14,7 @@ from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.memory import Memory
+from dolfinopt.optimization.memory import FurtherMemory, IterateMemory, Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 NAME = CHECKPOINT
+FURTHER = "further/"  # before the names of what further iterations left
 # A solution's arrays: name in the file, field.
 SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
 # Keys a resumed run may change: they say when to stop, not what design is computed.
@@ -57,6 +58,23 @@ def save(
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
     number = len(scene.arms) + 1
+    arrays = _gathered(partition, arms, memory, number)
+    if memory.further is not None:
+        more = _gathered(partition, arms, memory.further, number)
+        arrays |= {FURTHER + key: value for key, value in more.items()}
+    with together(partition.world):
+        if partition.world.rank == 0:
+            _write(folder, scene, memory, arrays)
+
+
+def _gathered(
+    partition: Partition, arms: Mapping[int, Arm], memory: IterateMemory, number: int
+) -> dict[str, Any]:
+    """Return the arrays of one design, of whole arms (collective; complete on the root).
+
+    Args:
+        number: of sets of modes.
+    """
     with together(partition.world):
         points = {k: _interior_points(arm) for k, arm in arms.items()}
         known = [
@@ -73,36 +91,41 @@ def save(
         columns[f"outboard{j}"] = gather_cells(
             partition, {k: last for k, (_, last) in by_arm.items()}
         )
-    with together(partition.world):
-        if partition.world.rank == 0:
-            _write(folder, scene, memory, columns)
-
-
-def _write(
-    folder: Path, scene: Scene, memory: Memory, columns: Mapping[str, Mapping[int, Any]]
-) -> None:
-    """Write the file; `columns` holds whole arms (root only)."""
+    if partition.world.rank != 0:
+        return {}
     arrays: dict[str, Any] = {
-        **_stamp(scene),
         "iteration": memory.iteration,
+        "last": [memory.change, memory.kkt],
         "multipliers": memory.multipliers,
+        "convexity": memory.convexity,
+        "sharpness": memory.beta,
+    }
+    for k, solution in enumerate(memory.solutions):
+        for name, field in (*SOLUTION.items(), ("error", "error")):
+            arrays[f"solution{k}/{name}"] = getattr(solution, field)
+    for key, by_arm in columns.items():
+        arrays |= {f"arm{k}/{key}": value for k, value in by_arm.items()}
+    return arrays
+
+
+def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -> None:
+    """Write the file, with the designs' `arrays` (root only)."""
+    arrays = {
+        **_stamp(scene),
+        **arrays,
         "history": np.array([row.values for row in memory.history]),
         "history_columns": np.array(memory.history[0].columns),
         "initial_deviation": memory.initial_deviation,
         "finished": np.array(memory.finished),
-        "sharpness": memory.beta,
     }
     if memory.choice is not None:
         arrays["coordinates"] = memory.choice.coordinates
         arrays["tried"] = np.array(memory.choice.tried)
     if memory.stiffening is not None:
         arrays["stiffening"] = [memory.stiffening.estimate, float(memory.stiffening.on)]
-    for k, solution in enumerate(memory.solutions):
-        for name, field in (*SOLUTION.items(), ("error", "error")):
-            arrays[f"solution{k}/{name}"] = getattr(solution, field)
-    for key, by_arm in columns.items():
-        for k, value in by_arm.items():
-            arrays[f"arm{k}/{key}"] = value
+    if (further := memory.further) is not None:
+        arrays[f"{FURTHER}begun"] = further.begun
+        arrays[f"{FURTHER}designs"] = np.column_stack([further.objectives, further.feasible])
     write_arrays(folder / NAME, arrays)
 
 
@@ -130,6 +153,40 @@ def load(
 
 def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
     """Return the checkpoint's memory, cells and modes of this rank's arms."""
+    columns = arrays["history_columns"].tolist()
+    history = [HistoryRow.from_values(columns, row.tolist()) for row in arrays["history"]]
+    choice = None
+    if "coordinates" in arrays:
+        tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
+        count = int(arrays["coordinates"])
+        choice = OrderSelection(count, dict(tried)[count], tried)
+    stiffening = None
+    if "stiffening" in arrays:
+        estimate, on = arrays["stiffening"].tolist()
+        stiffening = Stiffening(estimate, bool(on))
+    further = None
+    if f"{FURTHER}begun" in arrays:
+        own = {k.removeprefix(FURTHER): v for k, v in arrays.items() if k.startswith(FURTHER)}
+        objectives, feasible = own["designs"].T.tolist()
+        further = FurtherMemory(
+            **_of_design(own, arms),
+            begun=int(own["begun"]),
+            objectives=tuple(objectives),
+            feasible=tuple(map(bool, feasible)),
+        )
+    return Memory(
+        **_of_design(arrays, arms),
+        history=history,
+        initial_deviation=arrays["initial_deviation"],
+        finished=str(arrays["finished"]),
+        choice=choice,
+        stiffening=stiffening,
+        further=further,
+    )
+
+
+def _of_design(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
+    """Return the fields of `IterateMemory`."""
     cells: dict[int, np.ndarray] = {}
     modes: dict[int, list[np.ndarray]] = {}
     for k, arm in arms.items():
@@ -148,31 +205,19 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         of = f"solution{len(solutions)}"
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
-    columns = arrays["history_columns"].tolist()
-    history = [HistoryRow.from_values(columns, row.tolist()) for row in arrays["history"]]
-    choice = None
-    if "coordinates" in arrays:
-        tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
-        count = int(arrays["coordinates"])
-        choice = OrderSelection(count, dict(tried)[count], tried)
-    stiffening = None
-    if "stiffening" in arrays:
-        estimate, on = arrays["stiffening"].tolist()
-        stiffening = Stiffening(estimate, bool(on))
-    return Memory(
-        iteration=int(arrays["iteration"]),
-        cells=cells,
-        modes=modes,
-        multipliers=arrays["multipliers"],
-        solutions=tuple(solutions),
-        history=history,
-        initial_deviation=arrays["initial_deviation"],
-        finished=str(arrays["finished"]),
-        beta=float(arrays["sharpness"]),
-        thresholds={k: float(arrays[f"arm{k}/threshold"]) for k in cells},
-        choice=choice,
-        stiffening=stiffening,
-    )
+    change, kkt = arrays["last"].tolist()
+    return {
+        "iteration": int(arrays["iteration"]),
+        "change": change,
+        "kkt": kkt,
+        "cells": cells,
+        "modes": modes,
+        "multipliers": arrays["multipliers"],
+        "convexity": arrays["convexity"],
+        "solutions": tuple(solutions),
+        "beta": float(arrays["sharpness"]),
+        "thresholds": {k: float(arrays[f"arm{k}/threshold"]) for k in cells},
+    }
 
 
 def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
@@ -209,7 +254,7 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
             arrays = {key: data[key] for key in data.files}
         theirs = json.loads(str(arrays["scene"]))
         if int(arrays["iteration"]) >= 0:
-            arrays["history_columns"]  # those of earlier versions have none
+            arrays["history_columns"], arrays["last"]  # those of earlier versions have none
     except Exception as error:  # whatever a foreign or damaged file may raise
         raise InputError(
             f"{path}: --resume cannot read this checkpoint ({type(error).__name__}); start "

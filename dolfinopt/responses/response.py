@@ -119,10 +119,26 @@ class Response(ABC):
         asked = self.options.direction
         return not self.limited and asked is not None and asked != self.natural
 
+    @property
+    def guarded(self) -> bool:
+        """Whether steps are taken back that spoil it against their forecast.
+
+        Of what is left of vibrations: the gradient tells little of it beyond the next iterate.
+        """
+        return False
+
     @classmethod
     def unit_of(cls, value: str) -> str:
         """Return the unit of the true value of that name, and of its limit."""
         return cls.limit_unit or cls.unit
+
+    def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
+        """Return the response of those values that have a limit, and these limits.
+
+        Args:
+            limits: of every value, None where it has none.
+        """
+        return self, tuple(one for one in limits if one is not None)
 
     @abstractmethod
     def measure(self, analysis: Analysis) -> Measured:
@@ -206,10 +222,14 @@ def constraints_of(scene: Scene) -> list[Constraint]:
     """Return what the scene limits: the volume, then [constraints] in the order of its keys."""
     volume = scene.design.volume_fraction
     limits = ({} if volume is None else {"volume_fraction": volume}) | scene.constraints.limits
-    return [
-        Constraint(key, find_limited(key)(scene.objective, limited=True), limit)
-        for key, limit in limits.items()
-    ]
+    found = []
+    for key, limit in limits.items():
+        response = find_limited(key)(scene.objective, limited=True)
+        if isinstance(limit, tuple):
+            found.append(Constraint(key, *response.restricted(limit)))
+        else:
+            found.append(Constraint(key, response, limit))
+    return found
 
 
 def asked_of(scene: Scene) -> list[Response]:

@@ -286,7 +286,7 @@ def test_every_file_of_a_run_is_known(optimised):
 @pytest.mark.parametrize("how", ["--overwrite", "--resume"])
 def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, how):
     """No summary of an earlier run stands beside a new history, which `plot` would mix."""
-    from dolfinopt.optimization import loop as optimization
+    from dolfinopt.optimization import iterate
 
     folder = shared_tmp_path / "o"
     line = ["optimize", TWO_ARM, *TINY, "--no-plots", "--out", folder, "--set"]
@@ -299,7 +299,7 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
     def killed(*_):
         raise RuntimeError("killed")
 
-    monkeypatch.setattr(optimization._Run, "_update", killed)
+    monkeypatch.setattr(iterate.Iterate, "_update", killed)
     with pytest.raises(RuntimeError, match="killed"):
         run(*line, "optimizer.max_iterations=3", how)
     WORLD.barrier()

@@ -8,7 +8,7 @@ import pytest
 
 from dolfinopt.cli.live_line import plain_lines
 from dolfinopt.cli.shared import elapsed
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.history import FurtherRow, HistoryRow
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -29,6 +29,16 @@ def test_lines_without_a_terminal(capsys):
     assert text.count("7/400 objective 2.5 dev 7.5 mm") >= 2
     time.sleep(0.1)
     assert capsys.readouterr().err.count("\n") <= 1  # it ends with the run
+
+
+def test_further_iterations_are_told_apart(capsys):
+    with plain_lines(400, every=0.02) as show:
+        show(FurtherRow(3, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0, of=20))
+        deadline, text = time.monotonic() + 10.0, ""
+        while "objective" not in text and time.monotonic() < deadline:
+            time.sleep(0.01)
+            text += capsys.readouterr().err
+    assert "exact gradient, further 3/20 objective 2.5" in text and "/400" not in text
 
 
 def test_a_short_run_says_nothing(capsys):

@@ -17,8 +17,10 @@ from mpi4py import MPI
 from runs import TWO_ARM, overrides, run, shell
 
 import dolfinopt as do
-from dolfinopt.optimization import certificate
-from dolfinopt.optimization.certificate import Certificate, best_of, judge
+from dolfinopt.optimization import certificate, iterate, loop
+from dolfinopt.optimization.certificate import Certificate, judge
+from dolfinopt.optimization.further import attempt, best_of
+from dolfinopt.optimization.history import FurtherRow
 from dolfinopt.optimization.mma import initial_state, mma_step
 from dolfinopt.optimization.problem import Problem
 from dolfinopt.parallel import Partition, sum_over_arms
@@ -136,7 +138,7 @@ def test_two_bars_rest_where_no_optimum_is(w2):
     # Going on with the exact gradient ends in an optimum, which the certificate confirms.
     steps = bars.improved(k, 60)
     assert bars.judged(steps[-1][0]).kkt < 1e-6
-    further = best_of(bars.problem(k, bars.exact(k)), (one for _, one in steps))
+    further = best_of(attempt(bars.problem(k, bars.exact(k))), (attempt(one) for _, one in steps))
     assert further.iterations == 60 and further.feasible
     grid = np.linspace(w2 + 0.01, 2.0 - w2 - 0.01, 20001)
     least = min(bars.compliance(np.array([one, 2.0 - one])) for one in grid)
@@ -168,7 +170,7 @@ def test_two_bars_above_resonance():
     assert bars.judged(k, bars.frozen(k)).kkt < 1e-9
     steps = bars.improved(k, 60)
     np.testing.assert_allclose(steps[-1][0], 0.1, atol=1e-6)
-    further = best_of(bars.problem(k, bars.exact(k)), (one for _, one in steps))
+    further = best_of(attempt(bars.problem(k, bars.exact(k))), (attempt(one) for _, one in steps))
     assert further.excess > 1.0  # the optimum is less than half as compliant
 
 
@@ -206,7 +208,9 @@ def test_variables_at_bounds_have_no_part_in_the_angle():
 def test_best_of_what_keeps_the_constraints():
     def at(f0, met=True):
         limit = Limit("mass", "", 1.0 if met else 2.0, 1.0, "kg")
-        return Problem(f0, np.zeros(1), np.zeros(1), np.zeros((1, 1)), (limit,), np.zeros(1))
+        return attempt(
+            Problem(f0, np.zeros(1), np.zeros(1), np.zeros((1, 1)), (limit,), np.zeros(1))
+        )
 
     found = best_of(at(3.0), [at(1.0, met=False), at(2.0), at(2.5)])
     assert (found.objective, found.iterations, found.feasible) == (2.0, 3, True)
@@ -387,6 +391,59 @@ def test_finished_run_is_judged_later(shared_tmp_path):
     assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
     for k, x in whole.x_phys.items():
         np.testing.assert_array_equal(later.x_phys[k], x)
+
+
+class Killed(Exception):
+    """Stands for a kill."""
+
+
+@pytest.mark.parametrize("kept", [0, 2])
+def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept):
+    """Those of the checkpoint are not repeated, and the end has the same bits."""
+    asked = scene(LIGHT, "optimizer.exact_iterations=4", iterations=2)
+    shown: list[FurtherRow] = []
+
+    def keep(row):
+        if isinstance(row, FurtherRow):
+            shown.append(row)
+
+    whole = do.optimize(asked, report=keep)
+    if WORLD.rank == 0:
+        assert [(row.iteration, row.of) for row in shown] == [(k, 4) for k in (1, 2, 3, 4)]
+        best = whole.certificate.further.objective
+        assert min(row.objective for row in shown) == best < whole.evaluation.objective
+    assert len(WORLD.bcast(whole.history, root=0)) == 3  # the finished design's own
+    monkeypatch.setattr(loop, "CHECKPOINT_INTERVAL", 0.0)
+    made, update = [], iterate.Iterate._update
+
+    def counted(one, *arguments):
+        if one.evaluator.scene.objective.gradient == "exact":
+            if len(made) == kept:
+                raise Killed
+            made.append(one.iteration)
+        update(one, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(iterate.Iterate, "_update", counted)
+        with pytest.raises(Killed):
+            do.optimize(asked, shared_tmp_path)
+        made.clear()
+        kept = 4 - kept
+        with pytest.raises(Killed):  # asked for one more than are left
+            more = scene(LIGHT, "optimizer.exact_iterations=5", iterations=2)
+            do.optimize(more, shared_tmp_path, resume=True)
+    again = do.optimize(asked, shared_tmp_path, resume=True)
+    assert replace(again.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
+    for k, x in whole.x_phys.items():
+        np.testing.assert_array_equal(again.x_phys[k], x)
+
+
+def test_further_iterations_of_another_design_do_not_count(shared_tmp_path):
+    asked = "optimizer.exact_iterations=2"
+    whole = do.optimize(scene(LIGHT, asked, iterations=2))
+    do.optimize(scene(LIGHT, asked, iterations=1), shared_tmp_path)
+    later = do.optimize(scene(LIGHT, asked, iterations=2), shared_tmp_path, resume=True)
+    assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
 
 
 def test_summary_and_screen(shared_tmp_path):

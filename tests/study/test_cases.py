@@ -11,6 +11,7 @@ from mpi4py import MPI
 from runs import TWO_ARM
 
 import dolfinopt as do
+from dolfinopt.optimization import iterate
 from dolfinopt.optimization import loop as optimization
 from dolfinopt.output import checkpoint, run
 from dolfinopt.responses import evaluation
@@ -429,9 +430,9 @@ def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
     assert reached == {0: -1, 2: 1, None: 3}[stop]
 
     iterations = []
-    step = optimization._Run._update
+    step = iterate.Iterate._update
     monkeypatch.setattr(
-        optimization._Run, "_update", lambda run, *a: (iterations.append(1), step(run, *a))
+        iterate.Iterate, "_update", lambda run, *a: (iterations.append(1), step(run, *a))
     )
     # Under another name: a checkpoint does not depend on it.
     renamed = Case(scene('name="another"'), "optimize")
