@@ -17,7 +17,10 @@ class AffineMatrix:
 
     Attributes:
         pattern: (size, size) matrix of ones.
+        block: 1, the dofs to a row of the pattern.
     """
+
+    block = 1
 
     def __init__(self, dofs: np.ndarray, elements: np.ndarray, size: int):
         """Set up the pattern from element dofs (n_cells, n) and matrices (n_cells, n, n)."""
@@ -43,13 +46,71 @@ class AffineMatrix:
         return sp.csr_matrix((values, pattern.indices, pattern.indptr), pattern.shape)
 
 
+class NodePairs:
+    """Which nodes share a cell, and by which pairs of its corners: the pattern of like cells.
+
+    Attributes:
+        pattern: (n_nodes, n_nodes) matrix of ones.
+    """
+
+    def __init__(self, cells: np.ndarray, num_nodes: int):
+        """Sort the pairs of nodes of all cells (n_cells, n)."""
+        width = cells.shape[1]
+        keys = (cells[:, :, None].astype(np.int64) * num_nodes + cells[:, None, :]).ravel()
+        order = np.argsort(keys, kind="stable")
+        keys = keys[order]
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        # The entries of one pair of nodes by their cells, and by their places in a cell's matrix.
+        self.starts = np.append(first, len(keys))
+        self.cell = (order // width**2).astype(np.int32)
+        self.place = (order % width**2).astype(np.int32)
+        self.width = width
+        rows, columns = np.divmod(keys[first], num_nodes)
+        indptr = np.searchsorted(rows, np.arange(num_nodes + 1)).astype(np.int32)
+        data = (np.ones(len(first)), columns.astype(np.int32), indptr)
+        self.pattern = sp.csr_matrix(data, shape=(num_nodes, num_nodes))
+
+
+class UniformMatrix:
+    """sum_e s_e A of cells that are all alike, as a matrix of blocks that couple two nodes.
+
+    A sparse matrix of s_e, by pairs of nodes and places in A, times the blocks of A: it holds
+    b x b times fewer numbers than those of `AffineMatrix`.
+
+    Attributes:
+        pattern: of the pairs of nodes.
+        block: b, components of A to a node.
+    """
+
+    def __init__(self, pairs: NodePairs, element: np.ndarray):
+        """Set up for A (b n, b n) of cells with n nodes."""
+        self._pairs, self.pattern = pairs, pairs.pattern
+        n = pairs.width
+        self.block = b = len(element) // n
+        self._blocks = element.reshape(n, b, n, b).swapaxes(1, 2).reshape(n * n, b * b).copy()
+
+    def assemble(self, scale: np.ndarray) -> sp.csr_matrix | sp.bsr_matrix:
+        """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""
+        pairs, b, pattern = self._pairs, self.block, self.pattern
+        by_place = sp.csr_matrix(
+            (scale[pairs.cell], pairs.place, pairs.starts),
+            shape=(pattern.nnz, len(self._blocks)),
+        )
+        values = by_place @ self._blocks
+        if b == 1:
+            return sp.csr_matrix((values.ravel(), pattern.indices, pattern.indptr), pattern.shape)
+        size = b * pattern.shape[0]
+        values = values.reshape(-1, b, b)
+        return sp.bsr_matrix((values, pattern.indices, pattern.indptr), (size, size))
+
+
 @dataclass(frozen=True, eq=False)
 class InteriorEntries:
-    """The entries of a local CSR matrix in interior rows and columns, sorted by these.
+    """The entries of a local matrix in interior rows and columns, sorted by these.
 
     Attributes:
         rows, columns: (nnz,) global interior numbers.
-        source: (nnz,) places in the data array of the local matrix.
+        source: (nnz,) places in the flat data array of the local matrix.
     """
 
     rows: np.ndarray
@@ -78,8 +139,33 @@ def interior_entries(
     return InteriorEntries(rows[keep], cols[keep].astype(PETSc.IntType), source[keep])
 
 
+def interior_blocks(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) -> InteriorEntries:
+    """Select the interior entries of a matrix of blocks.
+
+    Args:
+        pattern: of the local nodes.
+        block: b, dofs of a node, which are interior together.
+        numbers: (b n_local_nodes,) global interior number of each local dof, -1 for others.
+    """
+    nodes = np.where(numbers[::block] < 0, -1, numbers[::block] // block)
+    found = interior_entries(pattern, 1, nodes)
+    first = np.flatnonzero(np.diff(found.rows, prepend=-1))
+    lengths = np.diff(np.append(first, len(found.rows)))
+    start, length = np.repeat(first, lengths), np.repeat(lengths, lengths)
+    base = block * block * start + block * (np.arange(len(found.rows)) - start)
+    size, kind = block * block * len(found.rows), PETSc.IntType
+    rows, columns, source = (np.empty(size, dtype=kind) for _ in range(3))
+    for r in range(block):
+        for c in range(block):
+            at = base + r * block * length + c
+            rows[at] = block * found.rows + r
+            columns[at] = block * found.columns + c
+            source[at] = block * block * found.source + r * block + c
+    return InteriorEntries(rows, columns, source)
+
+
 class InteriorMatrix:
-    """The interior rows and columns of a local CSR matrix as a PETSc matrix."""
+    """The interior rows and columns of a local matrix as a PETSc matrix."""
 
     def __init__(self, comm: MPI.Comm, entries: InteriorEntries, owned: int):
         """Lay down the pattern.
@@ -120,7 +206,11 @@ class InteriorMatrix:
             indptr, cols, row_ids = self._kept
             self.mat.zeroEntries()
             self.mat.setValuesIJV(
-                indptr, cols, data[self._source], addv=PETSc.InsertMode.ADD_VALUES, rowmap=row_ids
+                indptr,
+                cols,
+                data.ravel()[self._source],
+                addv=PETSc.InsertMode.ADD_VALUES,
+                rowmap=row_ids,
             )
         self.mat.assemble()
         # Forgotten whenever values change; without them MUMPS pivots.

@@ -52,7 +52,7 @@ def static_modes(arm: ElasticArm) -> ConstraintModes:
         ConvergenceError: the contrast between solid and void is too large for this design.
     """
     coupling, corner = arm.restrict(arm.substructure.rigid_forces(arm.young))
-    modes = _with_energies(arm, arm.solve(-coupling), coupling, corner)
+    modes = _with_energies(arm, arm.solve(-coupling, "constraint modes"), coupling, corner)
     if floats(arm):
         modes = _refined(arm, modes)
     if not _is_stiffness(modes.stiffness):

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem import cells
-from dolfinopt.fem.assembly import AffineMatrix
+from dolfinopt.fem.assembly import AffineMatrix, NodePairs, UniformMatrix
 from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity
@@ -58,14 +58,20 @@ class Substructure:
         self.profile = profile
         size = len(operators.points)
         dim = mesh.dim
-        dofs = np.repeat(dim * operators.cells, dim, axis=1)
-        for component in range(1, dim):
-            dofs[:, component::dim] += component
+        self._stiffness: AffineMatrix | UniformMatrix
+        self._mass: AffineMatrix | UniformMatrix
         with together(mesh.comm):
-            self._stiffness = AffineMatrix(dofs, operators.stiffness, dim * size)
-            self._mass = AffineMatrix(operators.cells, operators.mass, size)
+            if dim == 3 and self.uniform is not None:  # where memory counts
+                pairs = NodePairs(operators.cells, size)
+                self._stiffness = UniformMatrix(pairs, self.uniform.stiffness)
+                self._mass = UniformMatrix(pairs, self.uniform.mass)
+            else:
+                self._stiffness = AffineMatrix(
+                    _dofs(operators.cells, dim), operators.stiffness, dim * size
+                )
+                self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        self.interior = InteriorSystem(self.T, self._stiffness.pattern, self._mass.pattern, profile)
+        self.interior = InteriorSystem(self.T, self._stiffness, self._mass, profile)
         self._last: ElasticArm | None = None
 
     @cached_property
@@ -157,6 +163,14 @@ class Substructure:
         return bool(same[0]), bool(same[1])
 
 
+def _dofs(cells: np.ndarray, dim: int) -> np.ndarray:
+    """Return the local dofs (n_cells, d n) of cells, given their nodes."""
+    dofs = np.repeat(dim * cells, dim, axis=1)
+    for component in range(1, dim):
+        dofs[:, component::dim] += component
+    return dofs
+
+
 class AssembledMatrix:
     """sum_e s_e A_e of one design, assembled when it is first asked for.
 
@@ -164,7 +178,7 @@ class AssembledMatrix:
         scale: (n_cells,) s, not to be changed.
     """
 
-    def __init__(self, affine: AffineMatrix, scale: np.ndarray, profile: Profile):
+    def __init__(self, affine: AffineMatrix | UniformMatrix, scale: np.ndarray, profile: Profile):
         self.scale = scale.copy()
         self._affine, self._profile = affine, profile
 
@@ -284,17 +298,22 @@ class ElasticArm:
         """Return M_II, valid until another design of the arm asks for its own."""
         return self.substructure.interior.mass(self.M.matrix)
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
+    def solve(self, right: np.ndarray, purpose: str = "") -> np.ndarray:
         """Solve K_II U = right for (num_interior, k) owned rows.
+
+        Args:
+            right: right sides.
+            purpose: what for, where the design before had similar ones, see `InteriorSystem.solve`.
 
         Raises:
             ConvergenceError: K_II is singular but for rounding.
         """
-        factor = self.factorise()
+        interior = self.substructure.interior
+        interior.factorise(self.K.matrix)
         with self.profile.phase("solves"):
-            out = factor.solve(right)
+            out, failed = interior.solve(self.K.matrix, right, purpose)
         self.profile.counts.solves += right.shape[1]
-        if factor.failed:  # the same on all ranks
+        if failed:  # the same on all ranks
             raise ConvergenceError(
                 f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is too "
                 "soft for double precision beside solid; raise "
@@ -305,7 +324,7 @@ class ElasticArm:
     def interior_inverse(self, right: np.ndarray) -> np.ndarray:
         """Return K_II^-1 right for one right side (num_interior,) of owned rows."""
         self.profile.counts.solves += 1
-        return self.factorise().solve(right)
+        return self.substructure.interior.inverse(self.K.matrix, right)
 
     def interior_mass_times(self, vector: np.ndarray) -> np.ndarray:
         """Return M_II times a vector (num_interior,) of owned rows."""

@@ -191,7 +191,7 @@ class UnitLoads:
             by_V[:, :, :b] += combine(outboard, compliance)
             work = arm.comm.allreduce(np.tensordot(modes.field, outboard, ((0, 1), (0, 1))))
             by_stiffness = 0.0 - compliance @ work @ compliance
-        adjoint = static_response(arm, *arm.restrict(forces[:, :, solved]))
+        adjoint = static_response(arm, *arm.restrict(forces[:, :, solved]), "adjoint of unit loads")
         by_young -= self._energies(adjoint)
         by_inertia = _by_inertia(adjoint[:, :, :inertial])
         return GeometricGradient(arm, by_V, by_young, by_inertia, by_stiffness)
@@ -279,7 +279,7 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
     """
     modes = arm.constraint_modes()
     ones, places = np.moveaxis(arm.rigid_inertia, 2, 0)
-    inertial = static_response(arm, *arm.restrict(_accelerations(ones, places)))
+    inertial = static_response(arm, *arm.restrict(_accelerations(ones, places)), "accelerations")
     interface = combine(modes.field, np.linalg.inv(modes.stiffness))
     return UnitLoads(arm, np.concatenate([inertial, interface], axis=2))
 
@@ -304,21 +304,24 @@ def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
     return fields
 
 
-def static_response(arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+def static_response(
+    arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray, purpose: str = ""
+) -> np.ndarray:
     """Return the displacements (n_nodes, d, k) of static loads, outboard interface free.
 
     Args:
         arm: clamped inboard.
         interior: (num_interior, k) loads on the interior dofs, N; zero columns cost nothing.
         outboard: (b, k) force and moment at the outboard interface, N, N m.
+        purpose: see `ElasticArm.solve`.
     """
     modes = arm.constraint_modes()
     loaded = arm.comm.allreduce(np.array([column.any() for column in interior.T]))
     if loaded.all():
-        particular = arm.solve(interior)
+        particular = arm.solve(interior, purpose)
     else:
         particular = np.zeros_like(interior)
-        particular[:, loaded] = arm.solve(interior[:, loaded])
+        particular[:, loaded] = arm.solve(interior[:, loaded], purpose)
     load = outboard + arm.comm.allreduce(modes.interior.T @ interior)
     tip = np.linalg.solve(modes.stiffness, load)
     return arm.expand(particular + modes.interior @ tip, tip)

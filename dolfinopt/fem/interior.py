@@ -1,15 +1,25 @@
-"""The interior block of one arm: its matrices and its one factorisation."""
+"""The interior block of one arm: its matrices, and its one factorisation or hierarchy."""
 
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_entries
+from dolfinopt.fem.assembly import (
+    AffineMatrix,
+    InteriorEntries,
+    InteriorMatrix,
+    UniformMatrix,
+    interior_blocks,
+    interior_entries,
+)
 from dolfinopt.fem.interface import InterfaceTransformation
+from dolfinopt.mesh.budget import free_memory
 from dolfinopt.profiling import Profile
 from dolfinopt.solver import (
     BandCholesky,
@@ -20,10 +30,23 @@ from dolfinopt.solver import (
     obeying_options,
 )
 
+if TYPE_CHECKING:
+    from dolfinopt.fem.multigrid import BlockConjugateGradients
+
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
 # has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
 MOST_WORK = 1e9
+# Of a solid arm beside MUMPS: 120 x 12 x 8 cells, 42 000 rows, have 8e9 and take half of its time.
+MOST_SOLID_WORK = 5e10
+# Rows of a solid arm from which on conjugate gradients are used, or where factors would take more
+# than a part of the free memory: bytes of MUMPS' factor a row at so many rows, growing as a power.
+ITERATIVE_ROWS = 120_000
+FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
+FREE_SHARE = 0.5
+# Of conjugate gradients in energy, relative: stiffness, mass and gradients are then right to it.
+TOLERANCE = 1e-8
+TIGHT = 1e-12  # where a Krylov space is made of solutions
 
 
 class InteriorSystem:
@@ -36,28 +59,31 @@ class InteriorSystem:
     def __init__(
         self,
         T: InterfaceTransformation,
-        stiffness: sp.csr_matrix,
-        mass: sp.csr_matrix,
+        stiffness: AffineMatrix | UniformMatrix,
+        mass: AffineMatrix | UniformMatrix,
         profile: Profile,
     ):
-        """Set up for matrices of these patterns; nothing is selected before it is asked for.
+        """Set up for such matrices; nothing is selected before it is asked for.
 
         Args:
             T: numbers the interior dofs.
-            stiffness: over local dofs.
+            stiffness: over local dofs, or in blocks over local nodes.
             mass: over local nodes.
             profile: of this rank.
         """
         self._T, self._profile = T, profile
-        self._patterns = stiffness, mass
+        self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
         self._factor: Factor | None = None
         self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
         self._stiffness_of: sp.csr_matrix | None = None
         self._mass_of: sp.csr_matrix | None = None
+        self._solutions: dict[str, np.ndarray] = {}
         self._node_mass_of: sp.csr_matrix | None = None
 
     @cached_property
     def _entries(self) -> InteriorEntries:
+        if self._block > 1:
+            return interior_blocks(self._patterns[0], self._block, self._T.numbers)
         return interior_entries(self._patterns[0], 1, self._T.numbers)
 
     @cached_property
@@ -77,7 +103,8 @@ class InteriorSystem:
         if self._T.comm.size > 1 or has_options(OPTIONS):
             return None
         rows, columns, size = self._entries.rows, self._entries.columns, self._T.num_interior
-        if size * float((rows - columns).max(initial=0)) ** 2 > MOST_WORK:
+        most = MOST_WORK if self._T.dim == 2 else MOST_SOLID_WORK
+        if size * float((rows - columns).max(initial=0)) ** 2 > most:
             return None
         return BandCholesky(rows, columns, size)
 
@@ -90,24 +117,79 @@ class InteriorSystem:
     @cached_property
     def _ksp(self) -> PETSc.KSP:
         # Natural: the interior dofs are numbered for it.
-        return direct_solver(self._stiffness.mat, "natural", OPTIONS)
+        return direct_solver(self._stiffness.mat, "natural", OPTIONS, own=self._T.dim == 2)
+
+    @cached_property
+    def is_iterative(self) -> bool:
+        """Whether systems are solved by conjugate gradients: those of large solid arms."""
+        T = self._T
+        if T.dim == 2 or has_options(OPTIONS):
+            return False
+        rows = T.num_dofs
+        factor = FACTOR_BYTES * rows * (rows / FACTOR_AT) ** FACTOR_GROWTH / T.comm.size
+        short = rows > FACTOR_AT and factor > FREE_SHARE * free_memory()
+        return rows >= ITERATIVE_ROWS or T.comm.allreduce(short, op=MPI.LOR)
+
+    @cached_property
+    def _iterative(self) -> BlockConjugateGradients:
+        from dolfinopt.fem.multigrid import BlockConjugateGradients, with_rigid_motions
+
+        T = self._T
+        with_rigid_motions(self._stiffness.mat, T.points[T.interior_nodes])
+        return BlockConjugateGradients(self._stiffness.mat, TOLERANCE)
 
     def factorise(self, K: sp.csr_matrix) -> Factor:
         """Return the factor of K_II; nothing is done if K was the last one (collective)."""
         if self._factor is not None and self._factorised is K:
             return self._factor
         self._factorised = None
+        if self.is_iterative:
+            return self._refreshed(K)
         band = self._band
         with self._profile.phase("factorisation"):
             # What rounding has made indefinite PETSc factorises all the same; whether the result
             # is worth anything is judged by it.
-            if band is not None and band.factorise(K.data[self._band_source]):
+            if band is not None and band.factorise(K.data.ravel()[self._band_source]):
                 self._factor = band
             else:
                 self._factor = self._petsc(K)
         self._profile.counts.factorisations += 1
         self._factorised = K
         return self._factor
+
+    def _refreshed(self, K: sp.csr_matrix) -> BlockConjugateGradients:
+        """Return the iterative solver of K_II (collective)."""
+        with self._profile.phase("factorisation"):
+            self.stiffness(K)
+            if "_iterative" in self.__dict__:
+                self._iterative.update()
+            self._factor = self._iterative
+        self._profile.counts.factorisations += 1
+        self._factorised = K
+        return self._iterative
+
+    def solve(self, K: sp.csr_matrix, right: np.ndarray, purpose: str) -> tuple[np.ndarray, bool]:
+        """Return K_II^-1 right (num_interior, k) and whether that failed (collective).
+
+        Conjugate gradients set out from the best in the space of the last solutions for the same
+        purpose, which the design before has left.
+        """
+        factor = self.factorise(K)
+        if not self.is_iterative:
+            return factor.solve(right), factor.failed
+        if right.shape[1] == 0:
+            return right.copy(), False
+        out = self._iterative.solve(right, self._solutions.get(purpose))
+        if purpose:
+            self._solutions[purpose] = out
+        return out, self._iterative.failed
+
+    def inverse(self, K: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
+        """Return K_II^-1 times a vector (num_interior,), to nearly all digits."""
+        factor = self.factorise(K)
+        if self.is_iterative:
+            return self._iterative.solve(right, tolerance=TIGHT)
+        return factor.solve(right)
 
     @cached_property
     def _nodes(self) -> InteriorEntries:
@@ -134,7 +216,8 @@ class InteriorSystem:
     def stiffness(self, K: sp.csr_matrix) -> PETSc.Mat:
         """Return K_II, owned by this object (collective)."""
         if self._stiffness_of is not K:
-            if isinstance(self._factor, PetscFactor):  # it would follow the matrix
+            # Those of PETSc would follow the matrix.
+            if isinstance(self._factor, PetscFactor) or self.is_iterative:
                 self._factorised = None
             self._stiffness.update(K.data)
             self._stiffness_of = K

@@ -203,4 +203,4 @@ def load_fields(loads: UnitLoads, V: np.ndarray, MV: np.ndarray) -> LoadFields:
         MV: mass matrix times V, contributions of this rank's cells.
     """
     arm = loads.arm
-    return LoadFields(loads, V, static_response(arm, *arm.restrict(moved(MV))))
+    return LoadFields(loads, V, static_response(arm, *arm.restrict(moved(MV)), "elastic motion"))

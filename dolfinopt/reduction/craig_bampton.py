@@ -61,7 +61,7 @@ def craig_bampton_adjoint(
         outboard: (b, q) cotangents of its outboard rows; without effect here.
     """
     b = len(basis.outboard)
-    mu = arm.solve(interior[:, :b])
+    mu = arm.solve(interior[:, :b], "adjoint of constraint modes")
     values = np.concatenate([np.zeros(b), np.diag(basis.stiffness)[b:]])
     if interior.shape[1] > b:
         pencil = interior_pencil(arm)

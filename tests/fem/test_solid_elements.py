@@ -95,7 +95,7 @@ def frequencies(name: str, shape: str, cells: tuple[int, int, int]) -> np.ndarra
     """Return the first six of the link clamped at x = 0, the other end free, Hz."""
     arm = solid(name, mesh_of(shape, cells))
     free = np.flatnonzero(~np.repeat(arm.inboard, 3))
-    K = arm.K.matrix[free][:, free].tocsc()
+    K = arm.K.matrix.tocsr()[free][:, free].tocsc()
     M = sp.kron(arm.M.matrix, sp.eye(3), format="csr")[free][:, free].tocsc()
     values = eigsh(K, 6, M, sigma=0.0, v0=np.ones(len(free)))[0]
     return np.sqrt(np.sort(values)) / (2.0 * np.pi)

@@ -1,0 +1,86 @@
+"""Conjugate gradients with multigrid for solid arms, beside the direct solution."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from solids import solid_arm
+
+from dolfinopt.arms.arm import Arm
+from dolfinopt.fem import interior
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.responses.sensitivity import exact_gradient
+
+COMM = MPI.COMM_WORLD
+CELLS = (20, 4, 3)
+
+
+@pytest.fixture(scope="module")
+def direct() -> Arm:
+    return solid_arm(cells=CELLS, stiffening=True)
+
+
+@pytest.fixture
+def iterative(monkeypatch: pytest.MonkeyPatch) -> Arm:
+    monkeypatch.setattr(interior, "ITERATIVE_ROWS", 0)
+    arm = solid_arm(cells=CELLS, stiffening=True)
+    assert arm.substructure.interior.is_iterative
+    return arm
+
+
+def hollow(arm: Arm, void: float) -> np.ndarray:
+    """Return a box beam with a soft core in which an island floats."""
+    x, y, z = arm.mesh.centroid.T
+    core = (np.abs(y) < 0.015) & (np.abs(z) < 0.005)
+    island = core & (np.abs(x - 0.25) < 0.03)
+    return np.where(arm.mesh.passive | island, 1.0, np.where(core, void, 1.0))
+
+
+def difference(one: ShapeIntegrals, other: ShapeIntegrals) -> float:
+    """Return the largest difference of an integral's entries, in its largest."""
+    pairs = [(np.asarray(getattr(x, each.name)) for x in (one, other)) for each in TABLE]
+    return max(
+        float(np.abs(a - b).max(initial=0.0) / np.abs(a).max(initial=1e-300)) for a, b in pairs
+    )
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("void", [0.1, 0.01, 1e-3])  # contrasts of 1e3, 1e6, 1e9 but for the floor
+def test_as_the_direct_solution(direct, iterative, void):
+    """Body and gradient to 2e-6 of their largest entries; 47 steps without contrast, 58 with it."""
+    states = [arm.state(hollow(arm, void)) for arm in (direct, iterative)]
+    assert difference(*(state.body for state in states)) < 2e-6
+    by = states[0].body
+    gradients = [exact_gradient(state, by) for state in states]
+    largest = COMM.allreduce(np.abs(gradients[0]).max(initial=0.0), MPI.MAX)
+    assert np.abs(gradients[0] - gradients[1]).max(initial=0.0) < 2e-6 * largest
+    assert iterative.substructure.interior._iterative.steps < 70
+
+
+@pytest.mark.serial
+def test_warm_start(iterative):
+    """A design nearby takes fewer steps, and the hierarchy is not made anew."""
+    solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
+    iterative.state(x).elastic.constraint_modes()
+    cold = solver._iterative.steps
+    place = iterative.mesh.centroid
+    change = 0.005 * np.sin(200.0 * place[:, 0]) * (1.0 - iterative.mesh.passive)
+    nearby = iterative.state(np.clip(x - np.abs(change), 0.0, 1.0))
+    warm_modes = nearby.elastic.constraint_modes()
+    warm = solver._iterative.steps
+    assert warm < 0.8 * cold
+    assert solver._iterative._grid.setups == 1
+    solver._solutions.clear()
+    nearby.elastic.__dict__.pop("_constraint_modes")
+    cold_modes = nearby.elastic.constraint_modes()
+    assert solver._iterative.steps > warm
+    assert np.allclose(warm_modes.stiffness, cold_modes.stiffness, rtol=1e-9, atol=1e-3)
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
+def test_ranks_agree(monkeypatch):
+    """The same body on any number of ranks, as the tolerance allows."""
+    monkeypatch.setattr(interior, "ITERATIVE_ROWS", 0)
+    arms = [solid_arm(comm, cells=(10, 3, 2)) for comm in (MPI.COMM_SELF, COMM)]
+    assert difference(*(arm.state(hollow(arm, 0.01)).body for arm in arms)) < 2e-6
