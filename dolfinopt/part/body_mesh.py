@@ -118,8 +118,9 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes (n,) of the outline and where they belong (n, 2), m.
 
     That is on the curve, and from there along the normal by the area A between curve and straight
-    sides over their length l, (A_before + A_after) / (l_before + l_after): all sides together then
-    enclose what the curves do. Ends of straight pieces, and corners, stay on the curves.
+    sides over their length l, (A_before + A_after) / (l_before + l_after), and by a small distance
+    that is the same all around, so that the sides enclose what the curves do. Ends of straight pieces, and
+    corners, stay on the curves.
     """
     pieces = mesh.shape.pieces
     count = len(mesh.sides)
@@ -143,8 +144,15 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
     place = np.searchsorted(mesh.sides[order, 0], mesh.sides[:, 1])
     before[order[place]] = np.arange(count)  # the side that ends where this one begins
     smooth = (normal * back[before]).sum(axis=1) > np.cos(CORNER)
-    shift = (lost + lost[before]) / (chord + chord[before])
-    shift[~(smooth & curved & curved[before])] = 0.0
+    moves = smooth & curved & curved[before]
+    length = chord + chord[before]
+    shift = np.where(moves, (lost + lost[before]) / length, 0.0)
+    after = np.empty(count, dtype=int)
+    after[before] = np.arange(count)
+    for _ in range(2 if moves.any() else 0):  # what is missing at corners and straight pieces
+        places = begin + shift[:, None] * normal
+        missing = mesh.shape.area - 0.5 * _cross(places, places[after]).sum()
+        shift[moves] += missing / (0.5 * length[moves].sum())
     return mesh.sides[:, 0], begin + shift[:, None] * normal
 
 

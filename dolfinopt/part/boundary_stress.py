@@ -27,6 +27,8 @@ from dolfinopt.responses.stress_loads import arm_loads, motions_of
 from dolfinopt.responses.stress_report import ArmStress, Peak
 
 if TYPE_CHECKING:
+    from shapely import Geometry
+
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
 
@@ -65,10 +67,20 @@ def singular_points(shape: Shape) -> np.ndarray:
     return np.array(found).reshape(-1, 2)
 
 
+def interface_lines(shape: Shape) -> Geometry:
+    """Return the curves of both interfaces as polylines (shapely)."""
+    import shapely
+
+    t = np.linspace(0.0, 1.0, 65)
+    return shapely.union_all(
+        [shapely.LineString(piece.curve.at(t)) for piece in shape.pieces if piece.label]
+    )
+
+
 def part_stress(
     arms: Mapping[int, Arm],
     trajectory: Trajectory,
-    singular: Mapping[int, np.ndarray],
+    shapes: Mapping[int, Shape],
     apart: Mapping[int, float],
 ) -> dict[int, PartStress]:
     """Return the stress of every part by its place in the chain, on this rank alone.
@@ -76,18 +88,24 @@ def part_stress(
     Args:
         arms: meshed in quadratic triangles, of solid material, reduced.
         trajectory: of these arms; of scenarios the worst counts.
-        singular: points (n, 2) of every arm, m.
-        apart: distance from them that is looked at, m.
+        shapes: of every arm.
+        apart: distance from singular points that is looked at, m; so is
+            `objective.stress_margin` from the interfaces.
     """
+    import shapely
+
     scene = next(iter(arms.values())).scene
     motions = motions_of(trajectory)
     found: dict[int, PartStress] = {}
     for k, loads in arm_loads(scene, motions).items():
         points = _Points(*_at_corners(arms[k]))
         away = np.ones(len(points.places), dtype=bool)
-        if len(singular[k]):
-            gaps = np.linalg.norm(points.places[:, None] - singular[k], axis=2)
+        if len(singular := singular_points(shapes[k])):
+            gaps = np.linalg.norm(points.places[:, None] - singular, axis=2)
             away = gaps.min(axis=1) >= apart[k]
+        if (margin := scene.objective.stress_margin) > 0.0:
+            at = shapely.points(points.places)
+            away &= shapely.distance(at, interface_lines(shapes[k])) >= margin
         for one in loads:
             a, t = one.coefficients, motions[one.motion].t
             best = points.peak(a, t, np.flatnonzero(away))

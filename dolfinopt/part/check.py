@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.output.views import ArmView, gather_views
-from dolfinopt.part.boundary_stress import singular_points
 from dolfinopt.part.forms import (
     STRESS,
     Column,
@@ -251,11 +250,10 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
         ConvergenceError: the motion of the densities or of the parts cannot be simulated.
     """
     density, crisp = design_columns(scene, folder)
-    singular = {k: singular_points(one.shape) for k, one in parts.items()}
     coarse = simulate_bodies(scene, parts, meshes.coarse)
-    coarse_column, _ = part_column(scene, coarse, parts, singular)
+    coarse_column, _ = part_column(scene, coarse, parts)
     fine = simulate_bodies(scene, parts, meshes.fine)
-    column, stress = part_column(scene, fine, parts, singular)
+    column, stress = part_column(scene, fine, parts)
     cells = {place: one.cells for place, one in stress.items()}
     worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value

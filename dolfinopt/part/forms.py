@@ -166,10 +166,10 @@ def part_column(
     scene: Scene,
     one: Simulated,
     parts: Mapping[int, Part],
-    singular: Mapping[int, np.ndarray],
 ) -> tuple[Column, dict[int, PartStress]]:
     apart = {k: APART * part.domain.cell for k, part in parts.items()}
-    found = part_stress(one.arms, one.trajectory, singular, apart)
+    shapes = {k: part.shape for k, part in parts.items()}
+    found = part_stress(one.arms, one.trajectory, shapes, apart)
     peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
     return _column(one, peak, arm), found
 

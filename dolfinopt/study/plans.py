@@ -78,12 +78,17 @@ def by_design(
 
 
 def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
-    """Return the files' designs by label, or else the initial and the optimised one."""
+    """Return the files' designs by label, or else the initial and the optimised one.
+
+    Where the scene leaves nothing to optimise, as that of parts does, the solid arms alone.
+    """
     _check_designs(scene, designs)
     if designs:
         names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
         plain = len(set(names)) == len(names)
         return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
+    if scene.design.is_solid:
+        return {"solid arms": None}
     optimised = Case(scene, "optimize", label="optimised design")
     return {"initial design": None, optimised.label: optimised}
 

@@ -22,6 +22,7 @@ import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.study import presets, variants
 from dolfinopt.study import studies as study
+from dolfinopt.study.plans import given_designs
 from dolfinopt.study.variants import parse_vary
 
 ROOT = Path(__file__).parents[2]
@@ -545,3 +546,10 @@ def test_killed_study_goes_on(whole, tmp_path, capsys, ranks):
     assert [path.name for path in a] == [path.name for path in b] and len(a) == 6
     for one, other in zip(a, b, strict=True):
         assert one.read_bytes() == other.read_bytes()
+
+
+def test_solid_arms_are_not_optimised():
+    """As those of parts: the scene leaves nothing to optimise."""
+    words = ["design.initial=1.0", "design.volume_fraction=1.0"]
+    assert given_designs(do.load_scene(TWO_ARM, words), ()) == {"solid arms": None}
+    assert len(given_designs(do.load_scene(TWO_ARM), ())) == 2

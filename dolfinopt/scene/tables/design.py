@@ -100,6 +100,11 @@ class Design(Table):
         return (self.erosion, wider) if member < gap else (wider, self.erosion)
 
     @property
+    def is_solid(self) -> bool:
+        """Whether arms are solid from the start, and may stay so: as those of parts."""
+        return self.initial == 1.0 and self.volume_fraction == 1.0
+
+    @property
     def radius(self) -> float:
         """Radius of the cone filter: `filter_radius`, or what the least widths ask for, m.
 
