@@ -119,8 +119,8 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
 
     That is on the curve, and from there along the normal by the area A between curve and straight
     sides over their length l, (A_before + A_after) / (l_before + l_after), and by a small distance
-    that is the same all around, so that the sides enclose what the curves do. Ends of straight pieces, and
-    corners, stay on the curves.
+    that is the same all around, so that the sides enclose what the curves do. Ends of straight
+    pieces, and corners, stay on the curves.
     """
     pieces = mesh.shape.pieces
     count = len(mesh.sides)
