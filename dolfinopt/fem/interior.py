@@ -41,7 +41,7 @@ MOST_WORK = 1e9
 MOST_SOLID_WORK = 5e10
 # Rows of a solid arm from which on conjugate gradients are used, or where factors would take more
 # than a part of the free memory: bytes of MUMPS' factor a row at so many rows, growing as a power.
-ITERATIVE_ROWS = 120_000
+ITERATIVE_ROWS = 100_000
 FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
 FREE_SHARE = 0.5
 # Of conjugate gradients in energy, relative: stiffness, mass and gradients are then right to it.

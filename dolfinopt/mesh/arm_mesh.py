@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
+from scipy.spatial import cKDTree
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -155,6 +156,8 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     Raises:
         InputError: the file cannot be the arm; on all ranks of `comm`.
     """
+    if arm.is_solid:
+        return _solid_arm(comm, arm)
     with gmsh_on_root(comm) as gmsh:
         lines, notes = on_root(comm, build_model, gmsh, arm)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
@@ -162,6 +165,20 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
         mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
     return replace(mesh, notes=notes)
+
+
+def _solid_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    """Mesh a solid arm from its file, see `file_arm`."""
+    from dolfinopt.mesh.solid_model import build_solid
+
+    with gmsh_on_root(comm) as gmsh:
+        points = on_root(comm, build_solid, gmsh, arm)
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
+    with together(comm):
+        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+        if arm.solid_ends > 0.0:
+            mesh.passive[:] |= cKDTree(points).query(mesh.centroid)[0] < arm.solid_ends
+    return mesh
 
 
 def _arm_mesh(

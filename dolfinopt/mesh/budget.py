@@ -28,6 +28,7 @@ QUADRATIC = 1.3  # bytes a node of a quadratic element over those of others
 # gradients, which replace the factor where memory is short.
 SOLID = 3.0
 CELLS_ACROSS = 12  # of a STEP file without mesh_size, see `geometry.py`
+SOLID_CELLS_ACROSS = 4  # of a solid's, see `solid_model.py`
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -68,7 +69,10 @@ def estimated_cells(arm: Arm) -> int:
     """Return how many cells an arm has or may get, 0 where nothing tells."""
     if arm.n_cells or arm.mesh is None or Path(arm.mesh).suffix.lower() not in (".step", ".stp"):
         return arm.n_cells
-    return arm.model_copy(update={"mesh_size": arm.height / CELLS_ACROSS}).n_cells
+    size = arm.height / CELLS_ACROSS
+    if arm.is_solid:
+        size = min(arm.height, arm.thickness) / SOLID_CELLS_ACROSS
+    return arm.model_copy(update={"mesh_size": size}).n_cells
 
 
 def _cells_for_one(arm: Arm) -> float:

@@ -1,0 +1,148 @@
+"""Solid arms from STEP, .geo and .msh files: groups, interfaces by place, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from solids import HEIGHT, LENGTH, THICKNESS
+
+from dolfinopt.arms.arm import Arm as Flexible
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import Arm
+
+COMM = MPI.COMM_WORLD
+KEYS = {"name": "a", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": None}
+BOX = f"""
+SetFactory("OpenCASCADE");
+Box(1) = {{0, {-HEIGHT / 2}, {-THICKNESS / 2}, 0.1, {HEIGHT}, {THICKNESS}}};
+Box(2) = {{0.1, {-HEIGHT / 2}, {-THICKNESS / 2}, 0.4, {HEIGHT}, {THICKNESS}}};
+BooleanFragments {{ Volume{{1}}; Delete; }}{{ Volume{{2}}; Delete; }}
+Physical Volume("passive root") = {{1}};
+Physical Surface("Inboard") = {{Surface In BoundingBox {{-1e-6, -1, -1, 1e-6, 1, 1}}}};
+Physical Surface("Outboard") = {{Surface In BoundingBox {{0.499999, -1, -1, 0.500001, 1, 1}}}};
+"""
+
+
+def mesh_of(path: Path, **keys: object) -> ArmMesh:
+    told = {"cell_shape": "tetrahedron"} | keys
+    return arm_mesh(COMM, Arm(**KEYS, mesh=str(path), **told))
+
+
+def sums(mesh: ArmMesh) -> np.ndarray:
+    """Return volume, solid volume and the areas of both interfaces as the mass they carry."""
+    return COMM.allreduce(np.array([mesh.area.sum(), mesh.area[mesh.passive].sum()]))
+
+
+def written(folder: Path, name: str, bored: bool) -> Path:
+    """Write the box, or a bar with bores about both joint axes, as a file of Gmsh's."""
+    path = folder / name
+    with gmsh_on_root(COMM) as gmsh:
+        if COMM.rank == 0:
+            occ = gmsh.model.occ
+            gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
+            reach = 0.5 * HEIGHT if bored else 0.0
+            low = -reach, -0.5 * HEIGHT, -0.5 * THICKNESS
+            bar = [(3, occ.addBox(*low, LENGTH + 2.0 * reach, HEIGHT, THICKNESS))]
+            if bored:
+                holes = [
+                    (3, occ.addCylinder(x, 0.0, -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, 0.01))
+                    for x in (0.0, LENGTH)
+                ]
+                occ.cut(bar, holes)
+            occ.dilate(occ.getEntities(3), 0.0, 0.0, 0.0, 1e3, 1e3, 1e3)  # files are in mm
+            occ.synchronize()
+            gmsh.write(str(path))
+    COMM.barrier()
+    return path
+
+
+def test_geo_with_groups(shared_tmp_path):
+    path = shared_tmp_path / "box.geo"
+    if COMM.rank == 0:
+        path.write_text(BOX)
+    COMM.barrier()
+    mesh = mesh_of(path, mesh_size=0.02)
+    volume = LENGTH * HEIGHT * THICKNESS
+    assert np.allclose(sums(mesh), [volume, 0.2 * volume], rtol=1e-9)
+    hexahedra = mesh_of(path, mesh_size=0.02, cell_shape="hexahedron")
+    assert np.allclose(sums(hexahedra), [volume, 0.2 * volume], rtol=1e-9)
+    assert mesh.dim == 3 and np.array_equal(mesh.outboard_point, [LENGTH, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("bored", [False, True])
+def test_step_without_names(shared_tmp_path, bored):
+    """Flat ends, or bores about the joint axes; solid cells about them; a body of right mass."""
+    path = written(shared_tmp_path, "bar.step", bored)
+    mesh = mesh_of(path, mesh_size=0.01, passive=0.03)
+    total, solid = sums(mesh)
+    bar, holes = (LENGTH + HEIGHT) * HEIGHT * THICKNESS, 2.0 * np.pi * 0.01**2 * THICKNESS
+    expected = bar - holes if bored else LENGTH * HEIGHT * THICKNESS
+    assert total == pytest.approx(expected, rel=0.01)
+    assert 0.05 * total < solid < 0.3 * total
+    facets = mesh.mesh.topology.index_map(2).size_local
+    ends = [(side < facets).sum() for side in (mesh.inboard_facets, mesh.outboard_facets)]
+    assert COMM.allreduce(np.array(ends)).min() >= 8
+
+
+def test_body_of_a_step_file(shared_tmp_path, monkeypatch):
+    """Quadratic tetrahedra, from file to floating body: six coordinates, the solid's inertia."""
+    from solids import solid_scene
+
+    path = written(shared_tmp_path, "bar.step", bored=False)
+    keys = {"cells": None, "mesh": str(path), "mesh_size": 0.015, "cell_shape": "tetrahedron"}
+    scene = solid_scene(**keys, filter_radius=0.02)
+    arm = Flexible(scene, 0, COMM, Profile())
+    body = arm.reduce(arm.physical(np.ones(arm.mesh.num_cells)))
+    mass = 2700.0 * LENGTH * HEIGHT * THICKNESS
+    assert body.mass == pytest.approx(mass, rel=1e-9)
+    assert body.W[0, 0, 0] == pytest.approx(mass * LENGTH**2 / 3.0, rel=1e-9)
+    bending = 3.0 * 70e9 * THICKNESS * HEIGHT**3 / 12.0 / LENGTH**3
+    assert np.linalg.inv(body.K)[1, 1] * bending == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.serial
+def test_refusals(shared_tmp_path):
+    plain = written(shared_tmp_path, "bar.step", bored=False)
+    cases = [
+        ({"length": 0.6}, "no interface at x = 0.6 m"),
+        ({"height": 0.05}, "expected height = 0.05 m"),
+        ({"thickness": 0.03}, "expected thickness = 0.03 m"),
+    ]
+    for keys, text in cases:
+        with pytest.raises(InputError, match=text.replace(".", r"\.")):
+            arm = Arm(**KEYS | keys, mesh=str(plain), cell_shape="tetrahedron", mesh_size=0.02)
+            arm_mesh(COMM, arm)
+    nameless = shared_tmp_path / "nameless.geo"
+    nameless.write_text(BOX.replace("Inboard", "left"))
+    with pytest.raises(InputError, match='no faces in a group "inboard"'):
+        mesh_of(nameless, mesh_size=0.02)
+    flat = shared_tmp_path / "flat.msh"
+    flat.write_text("$MeshFormat\n4.1 0 8\n$EndMeshFormat\n")
+    with pytest.raises(InputError, match=r"flat\.msh: mesh of arm 'a'"):
+        mesh_of(flat)
+
+
+@pytest.mark.serial
+def test_names_of_faces(shared_tmp_path):
+    """Named outboard one by one, the six faces of a box: one of them lies at the joint."""
+    text = written(shared_tmp_path, "bar.step", bored=False).read_text(encoding="latin-1")
+    pieces = text.split("ADVANCED_FACE('',")
+    assert len(pieces) == 7
+    found = []
+    for k in range(1, 7):
+        path = shared_tmp_path / f"named{k}.step"
+        named = "ADVANCED_FACE('Outboard',".join(
+            ["ADVANCED_FACE('',".join(pieces[:k]), "ADVANCED_FACE('',".join(pieces[k:])]
+        )
+        path.write_text(named, encoding="latin-1")
+        try:
+            found.append(mesh_of(path, mesh_size=0.04))
+        except InputError as error:
+            assert 'group "outboard" has its middle at' in str(error)
+    assert len(found) == 1
