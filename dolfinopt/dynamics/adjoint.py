@@ -86,7 +86,8 @@ class Adjoint:
         q, qd, a = self._rates
         gradient = self.system.body_gradient(self._times, q, qd, a, turned)
         by_start = self._modes.gradient_from_modes(first)
-        return add_gradients(gradient, self.system.start_gradient(self.solution.q[0], by_start))
+        through_start = self.system.start_gradient(self.solution.q[0], by_start)
+        return add_gradients(gradient, through_start) if through_start else gradient
 
     def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,).

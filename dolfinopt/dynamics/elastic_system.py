@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from dolfinopt.dynamics import modal_coordinates
 from dolfinopt.dynamics.system import State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_gradient import body_gradient
-from dolfinopt.multibody.inverse_dynamics import elastic_residual
+from dolfinopt.multibody.inverse_dynamics import body_loads, elastic_residual
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -120,7 +121,11 @@ class ElasticSystem:
         return f"the arms' ends turn by {angle:.2g} rad"
 
     def preconditioner(self) -> modal_coordinates.Modes:
-        """Return the arms' vibrations."""
+        """Return the arms' vibrations; simulation and adjoint ask for the same."""
+        return self._modes
+
+    @cached_property
+    def _modes(self) -> modal_coordinates.Modes:
         return modal_coordinates.modes_of(self)
 
     def body_gradient(
@@ -135,8 +140,15 @@ class ElasticSystem:
         return body_gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
 
     def start_gradient(self, q: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
-        """Return the derivative by every body of J through the equilibrium q (N,) at t = 0."""
+        """Return the derivative by every body of J through the equilibrium q (N,) at t = 0.
+
+        Nothing where nothing loads the bodies there: they are at rest whatever they are.
+        """
         rest = np.zeros((1, len(q)))
+        if not q.any():
+            loads = body_loads(self.mechanism, self.motion(np.zeros(1)), (rest, rest, rest))
+            if not any(p.any() for p, _ in loads):
+                return []
         tangent = self.at(np.zeros(1)).linearise(q[None], rest, rest).dense()
         multipliers = np.linalg.solve(tangent[0, :, : len(q)].T, -by_q)
         return self.body_gradient(np.zeros(1), q[None], rest, rest, multipliers[None])

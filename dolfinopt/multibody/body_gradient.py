@@ -153,7 +153,7 @@ def _outboard_gradient(
         _Weights(phi, outer.w, outer.wd, outer.moment),
     )
     modes = np.stack([one.linear(rates, multipliers) for one in weights])
-    K0 = _by_K0(frame, weights, rates, multipliers)
+    K0 = _by_K0(frame, weights, multipliers)
     inner = _Outer(
         force=force,
         moment=outer.moment + (np.conj(frame.d) * force).imag,
@@ -184,25 +184,22 @@ class _Weights:
         q, qd, qdd = rates
         return self.value @ q + self.rate @ qd + self.second @ qdd + self.virtual @ multipliers
 
-    def quadratic(self, rates: Rates, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative (q, q) by K0, of which the symmetric part counts."""
-        q, qd, qdd = rates
-        other = (
-            0.5 * self.value[:, None] * q
-            + self.rate[:, None] * qd
-            + self.second[:, None] * qdd
-            + self.virtual[:, None] * multipliers
-        )
-        return -(q.T @ other + (self.second[:, None] * qd).T @ qd)
 
+def _by_K0(frame: Frame, weights: tuple[_Weights, ...], multipliers: np.ndarray) -> np.ndarray:
+    """Return the derivatives by K0 (k, q, q); (0, q, q) of a linear body.
 
-def _by_K0(
-    frame: Frame, weights: tuple[_Weights, ...], rates: Rates, multipliers: np.ndarray
-) -> np.ndarray:
-    """Return the derivatives by K0 (k, q, q); (0, q, q) of a linear body."""
+    Of -1/2 q'K0 q, its rates and its variation; their symmetric part counts.
+    """
+    size = multipliers.shape[1]
     if frame.bent is None:
-        return np.zeros((0, multipliers.shape[1], multipliers.shape[1]))
-    return np.stack([one.quadratic(rates, multipliers) for one in weights])
+        return np.zeros((0, size, size))
+    x = np.concatenate([frame.bent.rates, multipliers.T[None]])
+    y = np.array([[one.value, one.rate, one.second, one.virtual] for one in weights])
+    y[:, 0] *= 0.5
+    other = np.einsum("pdn,dkn->pkn", y, x)
+    squares = y[:, 2, None] * x[1]
+    by_K0 = x[0] @ other.swapaxes(1, 2) + x[1] @ squares.swapaxes(1, 2)
+    return np.negative(by_K0, out=by_K0)
 
 
 def _integral_gradient(
@@ -235,12 +232,12 @@ def _integral_gradient(
         D=multipliers.T @ qd,
         outboard=outboard,
         outboard_point=np.zeros(2),
-        K0=_by_geometric_stiffness(frame, rates, virtual),
+        K0=_by_geometric_stiffness(frame, virtual),
         K0_outboard=K0_outboard,
     )
 
 
-def _by_geometric_stiffness(frame: Frame, rates: Rates, virtual: Rates) -> np.ndarray:
+def _by_geometric_stiffness(frame: Frame, virtual: Rates) -> np.ndarray:
     """Return the gradient (4, q, q) by the geometric stiffness of a_x, a_y, wd and -w^2."""
     p, rotation, multipliers = virtual
     w, wd, a = frame.w, frame.wd, frame.a
@@ -253,7 +250,7 @@ def _by_geometric_stiffness(frame: Frame, rates: Rates, virtual: Rates) -> np.nd
         _Weights(zero, zero, rotation, wd),  # the angular momentum of the relative motion
         _Weights(2.0 * rotation * wd, 2.0 * rotation * w, zero, -w * w),  # half the inertia
     )
-    return _by_K0(frame, weights, rates, multipliers)
+    return _by_K0(frame, weights, multipliers)
 
 
 def _with_body(frame: Frame, rates: Rates, virtual: Rates, outer: _Outer) -> _Outer:

@@ -24,11 +24,10 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.multibody.instants import FEW, Scale, as_column, several
-from dolfinopt.multibody.mechanism import Mechanism, ModalConstants, product
+from dolfinopt.multibody.mechanism import INTERFACE, Mechanism, ModalConstants, product
 from dolfinopt.multibody.motion import RigidMotion
 
 Rates = tuple[np.ndarray, np.ndarray, np.ndarray]  # q, qd, qdd
-NUM_LOADS = 7  # that stiffen
 # Up to so many modes their products two by two are cheaper than a sum for each load.
 FEW_MODES = 8
 
@@ -39,44 +38,66 @@ class SecondOrder:
 
     Attributes:
         K0: (7, q, q).
-        q, qd, qdd: (n, 7, q) K0_p times the coordinates and their rates.
-        value, rate, second: (n, 6) -1/2 q'K0_p q and its time derivatives in the columns of
+        rates: (3, q, n) the coordinates, qd, qdd.
+        changes: (3, n, 6) -1/2 q'K0_p q and its time derivatives in the columns of
             `ModalConstants.kinematics`: p = a_x, a_y, F_x, F_y, T; 0.
     """
 
     K0: np.ndarray
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    value: np.ndarray
-    rate: np.ndarray
-    second: np.ndarray
+    rates: np.ndarray
+    changes: np.ndarray
+
+    @cached_property
+    def q(self) -> np.ndarray:
+        """K0_p times the coordinates (n, 7, q), in memory with the instants last."""
+        loads, q, _ = self.K0.shape
+        found = self.K0.reshape(loads * q, q) @ self.rates[0]
+        return found.reshape(loads, q, -1).transpose(2, 0, 1)
+
+    @cached_property
+    def qd(self) -> np.ndarray:
+        """K0_p qd (n, 7, q)."""
+        return self._by_instant(self.rates[1])
+
+    @cached_property
+    def qdd(self) -> np.ndarray:
+        """K0_p qdd (n, 7, q)."""
+        return self._by_instant(self.rates[2])
+
+    def _by_instant(self, x: np.ndarray) -> np.ndarray:
+        loads, q, _ = self.K0.shape
+        return (x.T @ self.K0.transpose(1, 0, 2).reshape(q, -1)).reshape(-1, loads, q)
+
+    @property
+    def spin(self) -> np.ndarray:
+        """qd'K0_p qd of the angular acceleration wd (n,)."""
+        qd = self.rates[1]
+        return np.einsum("kn,kn->n", self.K0[2] @ qd, qd)
+
+    def of_loads(self, loads: np.ndarray) -> np.ndarray:
+        """Return sum_p loads_p K0_p q (n, q) for loads (n, 7)."""
+        by_load = np.ascontiguousarray(loads.T)
+        return np.einsum("pn,pkn->kn", by_load, self.q.transpose(1, 2, 0)).T
 
 
 def _second_order(constants: ModalConstants, rates: Rates) -> SecondOrder:
-    K0, (count, q) = constants.K0, rates[0].shape
+    """Return it, with the instants last: NumPy then runs along them, not along few coordinates."""
+    K0 = constants.K0
     assert K0 is not None
-    flat = K0.transpose(1, 0, 2).reshape(q, -1)  # K0_p is symmetric
-    e, ed, edd = ((x @ flat).reshape(count, NUM_LOADS, q) for x in rates)
-    if q <= FEW_MODES:
-        i, j, weights = constants.second_order
-        together = np.stack(rates)
-        (x, xd, xdd), (y, yd, ydd) = (together.take(pair, axis=2) for pair in (i, j))
-        products = np.stack([x * y, xd * y + x * yd, xdd * y + 2.0 * xd * yd + x * ydd])
-        value, rate, second = (products.reshape(-1, len(i)) @ weights).reshape(3, count, -1)
-    else:
-        value, rate, second = (_work(e, x) for x in rates)
-        value *= 0.5
-        second += _work(ed, rates[1])
-    return SecondOrder(K0, e, ed, edd, value, rate, second)
-
-
-def _work(forces: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return -forces_p . x (n, 6) of a_x, a_y, F_x, F_y, T; 0, for (n, 7, q) and (n, q)."""
-    out = np.zeros((len(x), 6))
-    np.einsum("npk,nk->np", forces[:, :2], x, out=out[:, :2])
-    np.einsum("npk,nk->np", forces[:, 4:], x, out=out[:, 2:5])
-    return np.negative(out, out=out)
+    x = np.stack([np.ascontiguousarray(one.T) for one in rates])
+    _, q, count = x.shape
+    if q > FEW_MODES:
+        forces = (K0[INTERFACE].reshape(-1, q) @ x[:2]).reshape(2, -1, q, count)
+        changes = np.zeros((3, count, 6))
+        changes[:, :, :5] = -np.einsum("pkn,dkn->dnp", forces[0], x)
+        changes[2, :, :5] -= np.einsum("pkn,kn->np", forces[1], x[1])
+        changes[0] *= 0.5
+        return SecondOrder(K0, x, changes)
+    products = np.empty((3, q, q, count))
+    np.multiply(x[0][:, None], x[:, None], out=products)
+    products[2] += x[1][:, None] * x[1]
+    changes = products.reshape(3, q * q, count).swapaxes(1, 2) @ constants.second_order
+    return SecondOrder(K0, x, changes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,19 +149,26 @@ class Frame:
     def C(self) -> np.ndarray:
         """Return the derivative of s by the coordinates, (q,), or (n, q) if bent; complex."""
         C, bent = self.constants.C, self.bent
-        return C if bent is None else C - bent.q[:, 0] - 1j * bent.q[:, 1]
+        return C if bent is None else C - as_complex(bent.q[:, 0], bent.q[:, 1])
 
     @cached_property
     def B(self) -> np.ndarray:
         """Return that of the outboard point."""
         B, bent = self.constants.B, self.bent
-        return B if bent is None else B - bent.q[:, 4] - 1j * bent.q[:, 5]
+        return B if bent is None else B - as_complex(bent.q[:, 4], bent.q[:, 5])
 
     @cached_property
     def rotation(self) -> np.ndarray:
         """Return that of the outboard rotation."""
         rotation, bent = self.constants.rotation, self.bent
         return rotation if bent is None else rotation - bent.q[:, 6]
+
+
+def as_complex(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return x + i y of real arrays of one shape."""
+    out = np.empty(x.shape, dtype=complex)
+    out.real, out.imag = x, y
+    return out
 
 
 def along(x: np.ndarray, modes: np.ndarray) -> np.ndarray:
@@ -167,7 +195,7 @@ def outward_pass(
         bent = None
         if constants.K0 is not None:
             bent = _second_order(constants, (e, qd[:, part], qdd[:, part]))
-            for linear, more in zip(moved, (bent.value, bent.rate, bent.second), strict=True):
+            for linear, more in zip(moved, bent.changes, strict=True):
                 linear += more
         (s, d, rotation), (sd, dd, rotation_d), (sdd, ddd, rotation_dd) = (
             one.view(complex).T for one in moved
@@ -274,7 +302,7 @@ def inward_pass(
             moment = moment + carried[1] * frame.next_wd
         force = frame.joint_rotation * force  # of everything outboard, in this frame
         if loads is not None:
-            loads.insert(0, (_load_columns(frame, (force, moment)), frame.w))
+            loads.insert(0, (load_columns(frame, (force, moment)), frame.w))
         rows[:, part] = _body_residual(frame, own, (force, moment), scale)
         if k > 0 or driven:
             moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame, own)
@@ -290,7 +318,7 @@ def _body_residual(
     e, ed, edd = rates
     body, constants = frame.constants.body, frame.constants
     w, wd = frame.w, frame.wd
-    load_coefficients = _load_columns(frame, load)
+    load_coefficients = load_columns(frame, load)
     load_coefficients[:, :4] *= as_column(scale.mass)
     w, wd = w[:, None], wd[:, None]
     inertial = (edd - (w * w) * e) @ body.M
@@ -299,14 +327,14 @@ def _body_residual(
         inertial *= as_column(scale.mass)
     inertial += load_coefficients @ constants.loads
     if frame.bent is not None:
-        inertial -= (load_coefficients[:, None] @ frame.bent.q)[:, 0]
+        inertial -= frame.bent.of_loads(load_coefficients)
     inertial += as_column(scale.stiffness) * product(e, constants.K)
     if constants.D is not None:
         inertial += as_column(scale.damping) * product(ed, constants.D)
     return inertial
 
 
-def _load_columns(frame: Frame, load: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def load_columns(frame: Frame, load: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return (a_x, a_y, wd, -w^2, F_x, F_y, T) (n, 7)."""
     columns = np.empty((len(frame.w), 7))
     parts = (frame.a.real, frame.a.imag, frame.wd, -frame.w * frame.w)
@@ -325,7 +353,7 @@ def body_moment(frame: Frame, rates: Rates) -> np.ndarray:
         + np.einsum("nk,nk->n", frame.rG, edd)
     )
     if frame.bent is not None:
-        moment -= np.einsum("nk,nk->n", frame.bent.qd[:, 2], ed)
+        moment -= frame.bent.spin
     return moment
 
 

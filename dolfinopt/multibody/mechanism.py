@@ -17,6 +17,9 @@ import numpy as np
 from dolfinopt.multibody.instants import UNSCALED, PerInstant, Scale, at
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
+# Of the loads (a_x, a_y, wd, -w^2, F_x, F_y, T) those whose work is in `ModalConstants.kinematics`.
+INTERFACE = [0, 1, 4, 5, 6]
+
 
 @dataclass(frozen=True, eq=False)
 class ModalConstants:
@@ -47,18 +50,17 @@ class ModalConstants:
     K0: np.ndarray | None
 
     @cached_property
-    def second_order(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What -1/2 q'K0_p q is by the products q_i q_j, in the columns of `kinematics`.
+    def second_order(self) -> np.ndarray:
+        """What -1/2 q'K0_p q and its time derivatives are by products of rates (3, q q, 6).
 
-        Returns:
-            i <= j (pairs,) each, and the weights (pairs, 6).
+        In the columns of `kinematics`, of the value, the rate and the second rate.
         """
         assert self.K0 is not None
-        i, j = np.triu_indices(len(self.rotation))
-        weights = np.zeros((len(i), 6))
-        interface = self.K0[[0, 1, 4, 5, 6]][:, i, j]  # a_x, a_y, F_x, F_y, T
-        weights[:, :5] = -(np.where(i == j, 0.5, 1.0) * interface).T
-        return i, j, weights
+        interface = self.K0[INTERFACE]
+        weights = np.zeros((3, interface[0].size, 6))
+        weights[:, :, :5] = -interface.reshape(5, -1).T
+        weights[0] *= 0.5
+        return weights
 
 
 def _modal_constants(body: ShapeIntegrals) -> ModalConstants:

@@ -18,9 +18,11 @@ from dolfinopt.multibody.instants import FEW, PerInstant, Scale, as_column, seve
 from dolfinopt.multibody.inverse_dynamics import (
     Frame,
     Rates,
+    as_complex,
     body_force,
     body_moment,
     inertia,
+    load_columns,
     outward_pass,
 )
 from dolfinopt.multibody.mechanism import Mechanism, ModalConstants
@@ -407,8 +409,9 @@ def _next_motion(
     w_v, wd_v = w_v.copy(), wd_v.copy()
     if (bent := frame.bent) is not None:
         ed, edd = bent.qd[..., places.kept[k]], bent.qdd[..., places.kept[k]]
-        inner[:, cq] -= 2j * w * (ed[:, 4] + 1j * ed[:, 5]) + edd[:, 4] + 1j * edd[:, 5]
-        inner[:, cv] -= 2.0 * (ed[:, 4] + 1j * ed[:, 5])
+        B_d = as_complex(ed[:, 4], ed[:, 5])
+        inner[:, cq] -= 2j * w * B_d + as_complex(edd[:, 4], edd[:, 5])
+        inner[:, cv] -= 2.0 * B_d
         w_v[:, cq] -= ed[:, 6]
         wd_v[:, cq] -= edd[:, 6]
         wd_v[:, cv] -= 2.0 * ed[:, 6]
@@ -473,9 +476,9 @@ def _body_load(
     moment[:, ca] += frame.rG[:, chosen]
     if (bent := frame.bent) is not None:
         K0_ed, K0_edd = bent.qd[..., chosen], bent.qdd[..., chosen]
-        force[:, cq] -= 2j * w * (K0_ed[:, 0] + 1j * K0_ed[:, 1])
-        force[:, cq] -= K0_edd[:, 0] + 1j * K0_edd[:, 1]
-        force[:, cv] -= 2.0 * (K0_ed[:, 0] + 1j * K0_ed[:, 1])
+        C_d = as_complex(K0_ed[:, 0], K0_ed[:, 1])
+        force[:, cq] -= 2j * w * C_d + as_complex(K0_edd[:, 0], K0_edd[:, 1])
+        force[:, cv] -= 2.0 * C_d
         moment[:, cq] -= 2.0 * w * K0_ed[:, 3] + K0_edd[:, 2]
         moment[:, cv] -= 2.0 * K0_ed[:, 2]
     return force, moment
@@ -487,7 +490,6 @@ def _geometric(
     """Return sum_p p K0_p (n, q, q) under the load on the outboard end, None of a linear body."""
     if frame.bent is None:
         return None
-    force, moment = load
-    inertial = [frame.a.real, frame.a.imag, frame.wd, -frame.w * frame.w]
-    p = [*(mass * x for x in inertial), force.real, force.imag, moment]
-    return np.tensordot(np.stack(p, axis=1), frame.bent.K0, 1)
+    p, K0 = load_columns(frame, load), frame.bent.K0
+    p[:, :4] *= as_column(mass)
+    return (p @ K0.reshape(len(K0), -1)).reshape(-1, *K0.shape[1:])
