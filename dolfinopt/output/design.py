@@ -128,7 +128,7 @@ def _load_design(path: Path) -> dict[str, np.ndarray]:
                 return {key: data[key] for key in data.files}
         except (ValueError, OSError, EOFError, KeyError, _zip_error()):
             raise InputError(
-                f"{path}: --design is no readable .npz file; give a design.npz that dolfinopt wrote"
+                f"{path}: no readable .npz file; give a design.npz that dolfinopt wrote"
             ) from None
 
 

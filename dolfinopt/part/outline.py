@@ -38,7 +38,7 @@ UNIFORM = 1e-3  # range of a density without outline
 PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
 NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
 # Corners are rounded by the tool's radius and so many tolerances: curves may turn a little sharper.
-ROUNDING = 5.0
+ROUNDING = 8.0
 
 
 @dataclass(frozen=True, eq=False)

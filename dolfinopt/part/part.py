@@ -60,9 +60,10 @@ class Part:
             )
         if outline.islands:
             share = 100.0 * outline.islands_area / one.volume
+            number = _count(outline.islands, "piece")
             found.append(
-                f"arm {one.name!r}: {outline.islands} pieces without a joint to both interfaces "
-                f"({share:.2g} % of the volume) are left out"
+                f"arm {one.name!r}: {number} without a joint to both interfaces "
+                f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
             )
         if self.thinnest is not None and self.thinnest < 0.9 * one.minimum_member:
             found.append(
@@ -169,13 +170,18 @@ def make_part(
             f"{domain.cell:.3g} m"
         )
     tool = default_tool(domain) if tool_radius is None else tool_radius
+    # Where nobody has asked for a tool, curves within the tolerance of its path will do.
+    least = max(tool - tolerance, 0.0) if tool_radius is None else ENOUGH * tool
     rounding = None
     for _ in range(TRIES):
         outline = draw_outline(domain, tool, tolerance, rounding)
         shape = make_shape(outline, tolerance, arcs)
         radius = shape.concave_radius
-        # Where nobody has asked for a tool, curves within the tolerance of its path will do.
-        if tool_radius is None or radius >= ENOUGH * tool:
+        if radius >= least:
             break
         rounding = outline.rounding * min(1.1 * tool / radius, 2.0)
     return Part(domain, outline, shape, tolerance, thinnest_member(outline))
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}" if number == 1 else f"{number} {name}s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import subprocess
@@ -10,13 +11,15 @@ import xml.etree.ElementTree as ElementTree
 import click
 import numpy as np
 import pytest
+from browser import browser, open_browser
 from conftest import folder_with, frame
 from mpi4py import MPI
+from PIL import Image
 from runs import run, shell
 
 import dolfinopt as do
 from dolfinopt.data import mesh_folder
-from dolfinopt.errors import InputError
+from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 
@@ -168,24 +171,35 @@ def test_svg_is_to_scale(part):
     assert path.count("M ") == path.count("Z") == figures["loops"]
 
 
-def test_freecad_opens_the_solid(part):
+def test_browser_draws_the_svg(part, tmp_path):
+    if browser() is None:
+        pytest.skip("no browser on this machine")
+    folder, figures = part
+    with open_browser(tmp_path / "profile") as page:
+        page.open(folder / "arm1.svg", 4000, 320)  # 96 px are 25.4 mm
+        page.value("document.querySelector('path').setAttribute('stroke', 'none')")
+        page.photograph(tmp_path / "arm.png")
+        assert page.complaints() == []
+    shown = np.asarray(Image.open(tmp_path / "arm.png").convert("L"), dtype=float)
+    covered = (255.0 - shown).sum() / (255.0 - shown.min())
+    assert covered * (25.4 / 96.0) ** 2 == pytest.approx(1e6 * figures["area"], rel=5e-3)
+
+
+def test_freecad_opens_the_solid(part, tmp_path):
     program = shutil.which("freecadcmd") or shutil.which("FreeCADCmd")
     if program is None:
         pytest.skip("no FreeCAD on this machine")
     folder, figures = part
-    script = folder / "check.py"
+    script = tmp_path / "volume.py"
     script.write_text(
         "import Part\n"
         f"shape = Part.read({str(folder / 'arm1.step')!r})\n"
-        "print('FOUND', len(shape.Solids), shape.isValid(), shape.Solids[0].isClosed(), "
-        "shape.Volume)\n"
+        "body, = shape.Solids\n"
+        "print('FOUND', shape.isValid(), body.isClosed(), repr(shape.Volume), 'END')\n"
     )
-    try:
-        done = subprocess.run([program, str(script)], capture_output=True, text=True, timeout=120)
-    finally:
-        script.unlink()
-    _, solids, valid, closed, volume = done.stdout.split("FOUND")[1].join(["x ", ""]).split()[:5]
-    assert (solids, valid, closed) == ("1", "True", "True")
+    done = subprocess.run([program, str(script)], capture_output=True, text=True, timeout=120)
+    valid, closed, volume = done.stdout.split("FOUND")[1].split("END")[0].split()
+    assert (valid, closed) == ("True", "True")
     assert float(volume) == pytest.approx(1e9 * figures["volume"], rel=1e-6)
 
 
@@ -235,6 +249,70 @@ def test_used_folder_is_refused(made):
         run("part", made["plain"].parent, "--no-plots")
 
 
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("checkpoint.npz", r"not come to its end: go on with .*optimize SCENE --out .* --resume"),
+        ("cases/key", "this is a study: name the folder of one of its cases"),
+        ("note.txt", "name the folder of a finished optimize or simulate run"),
+    ],
+)
+def test_folder_without_a_run_says_what_to_name(tmp_path, name, reason):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match=reason):
+        run("part", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (lambda arrays: None, r"no readable \.npz file"),
+        (lambda arrays: {"arm1/centroid": arrays["arm1/centroid"]}, "missing key 'arm1/density'"),
+        (lambda arrays: arrays | {"arm1/density": np.full(2400, np.nan)}, "nan at cell 0"),
+        (lambda arrays: arrays | {"arm1/filtered": np.full(2400, np.nan)}, "2400 finite numbers"),
+    ],
+)
+def test_damaged_design_is_refused(tmp_path, content, reason):
+    folder = folder_with(tmp_path / "run", frame)
+    with np.load(folder / "design.npz") as data:
+        arrays = content(dict(data))
+    if arrays is None:
+        (folder / "design.npz").write_bytes(b"PK\3\4 and no more")
+    else:
+        np.savez(folder / "design.npz", **arrays)
+    with pytest.raises(InputError, match=reason):
+        run("part", folder)
+    assert not (folder / "part").exists()
+
+
+def test_files_are_there_all_or_none(tmp_path, monkeypatch):
+    """What a killed command has left goes; a disk that is full leaves no part.json."""
+    from dolfinopt.part import files
+
+    made, folder = tmp_path / "made", tmp_path / "part"
+    names = ["part.json", "part.toml", "arm1.svg"]
+    for place in (made, folder / ".part-left"):
+        place.mkdir(parents=True)
+        for name in names:
+            (place / name).write_text(str(place))
+    files._publish(made, folder, names)
+    assert {path.name: path.read_text() for path in folder.iterdir()} == dict.fromkeys(
+        names, str(made)
+    )
+
+    def full(source, target):
+        if target.name == "part.toml":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    replace = files.os.replace
+    monkeypatch.setattr(files.os, "replace", full)
+    with pytest.raises(OutputError, match="No space left"):
+        files._publish(made, folder, names)
+    assert [path.name for path in folder.iterdir()] == ["arm1.svg"]
+
+
 def test_interrupted_command_leaves_what_was_there(tmp_path, monkeypatch):
     from dolfinopt.part import files
 
@@ -247,5 +325,5 @@ def test_interrupted_command_leaves_what_was_there(tmp_path, monkeypatch):
 
     monkeypatch.setattr(files, "solid_text", interrupted)
     with pytest.raises(click.Abort):
-        run("part", folder, "--no-plots")
+        run("part", folder, "--no-plots", "--no-check")
     assert [path.name for path in (folder / "part").iterdir()] == ["note.txt"]
