@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dolfinopt.cli.export_robot import export_robot
 from dolfinopt.cli.options import (
     design_option,
     out_option,
@@ -15,6 +16,7 @@ from dolfinopt.cli.options import (
     set_option,
 )
 from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
+from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -29,18 +31,32 @@ KINDS = (".sid", ".sid.npz", ".fem")
 @out_option("the bodies; default: results/SCENE-bodies")
 @overwrite_option
 @set_option
+@click.option(
+    "--urdf",
+    is_flag=True,
+    help="instead, with the folder of a finished run as SCENE: the robot that its scene was "
+    "imported from, with the run's links; default folder: SCENE/urdf",
+)
 def export(
     scene: Path,
     design: Path | None,
     out: Path | None,
     overwrite: bool,
     overrides: tuple[str, ...],
+    urdf: bool,
 ) -> None:
     """Write the reduced arms of SCENE for other multibody codes.
 
     Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
     geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
     """
+    if urdf:
+        if design is not None or overrides:
+            raise InputError("--urdf: expected no --design and no --set, they are the run's")
+        export_robot(scene, out, overwrite)
+        return
+    if scene.is_dir():
+        raise InputError(f"{scene}: a folder; name a scene file, or add --urdf for a robot's run")
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.disk import write_arrays, write_text

@@ -156,13 +156,13 @@ def _fit(
             f"{', '.join(map(repr, found)) or 'nothing'}; give a design made for these arms"
         )
     centroid, density = (np.asarray(arrays[key]) for key in keys)
-    if centroid.ndim != 2 or centroid.shape[1] < 2 or density.shape != centroid.shape[:1]:
+    if centroid.ndim != 2 or centroid.shape[1] < mesh.dim or density.shape != centroid.shape[:1]:
         raise InputError(
             f"{path}: {keys[1]} has shape {density.shape} beside centroids of shape "
-            f"{centroid.shape}; expected (n,) and (n, 2)"
+            f"{centroid.shape}; expected (n,) and (n, {mesh.dim})"
         )
     try:
-        centroid, density = centroid.astype(float)[:, :2], density.astype(float)
+        centroid, density = centroid.astype(float)[:, : mesh.dim], density.astype(float)
     except (TypeError, ValueError):
         raise InputError(f"{path}: {keys[1]} holds {density.dtype}, not numbers") from None
     if len(density) == 0 or not np.isfinite(centroid).all():
@@ -194,7 +194,7 @@ def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.n
     cells, comm = mesh.centroid, mesh.comm
     low = np.min(comm.allgather(cells.min(axis=0)), axis=0)
     high = np.max(comm.allgather(cells.max(axis=0)), axis=0)
-    size = np.sqrt(comm.allreduce(mesh.area.max(), op=max))
+    size = comm.allreduce(mesh.area.max(), op=max) ** (1.0 / mesh.dim)
     points = tree(centroid)
     spacing = points.query(centroid, k=2)[0][:, 1].max() if len(centroid) > 1 else np.inf
     reach = 2.0 * (size + min(spacing, np.ptp(centroid, axis=0).max()))
@@ -203,8 +203,11 @@ def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.n
     if np.abs(edge).max() > reach or distance.max() > reach:
         a, b = centroid.min(axis=0), centroid.max(axis=0)
         raise InputError(
-            f"{path}: the design of arm {mesh.name!r} covers x {a[0]:.4g}..{b[0]:.4g} m, "
-            f"y {a[1]:.4g}..{b[1]:.4g} m, its mesh x {low[0]:.4g}..{high[0]:.4g} m, "
-            f"y {low[1]:.4g}..{high[1]:.4g} m; give a design made for these arms"
+            f"{path}: the design of arm {mesh.name!r} covers {_box(a, b)}, "
+            f"its mesh {_box(low, high)}; give a design made for these arms"
         )
     return place
+
+
+def _box(low: np.ndarray, high: np.ndarray) -> str:
+    return ", ".join(f"{axis} {a:.4g}..{b:.4g} m" for axis, a, b in zip("xyz", low, high))

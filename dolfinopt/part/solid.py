@@ -19,12 +19,22 @@ def stl_bytes(shape: Shape, thickness: float, tolerance: float, title: str) -> b
         title: for the header.
     """
     corners = _facets(shape.polygons(tolerance), thickness) * MM
+    return triangle_bytes(corners, f"{title}, mm")
+
+
+def triangle_bytes(corners: np.ndarray, title: str) -> bytes:
+    """Return a binary STL of triangles, in single precision.
+
+    Args:
+        corners: (n, 3, 3) of every triangle, counterclockwise from outside.
+        title: for the header, which is the place to name the unit.
+    """
     data = np.zeros(len(corners), dtype=[("n", "<f4", 3), ("p", "<f4", (3, 3)), ("a", "<u2")])
     data["p"] = corners
     a, b, c = (data["p"][:, k].astype(float) for k in range(3))
     normal = np.cross(b - a, c - a)
     data["n"] = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-    head = f"{title}, mm".encode("ascii", "replace")[:80].ljust(80)
+    head = title.encode("ascii", "replace")[:80].ljust(80)
     return head + np.uint32(len(corners)).tobytes() + data.tobytes()
 
 

@@ -7,10 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from mpi4py import MPI
-from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_arm
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_arm, solid_scene
 
 from dolfinopt.arms.arm import Arm
+from dolfinopt.errors import InputError
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.output.design import read_design
+from dolfinopt.parallel import partition_arms
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.sensitivity import exact_gradient
 
 COMM = MPI.COMM_WORLD
@@ -48,6 +52,23 @@ def test_inertia_of_a_box():
     for at, value in beam.items():
         assert modes[at] == pytest.approx(value, rel=0.025), at
     assert body.C[:, :3] == pytest.approx(0.5 * MASS * np.eye(3), rel=0.01, abs=1e-10)
+
+
+@pytest.mark.serial
+def test_a_design_file_of_a_solid_is_read_by_place(tmp_path):
+    """By all three coordinates, in any order; another box's is refused."""
+    scene = solid_scene(cells=(10, 3, 2))
+    arm = Arm(scene, 0, MPI.COMM_SELF, Profile())
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    expected, order = rough(arm), np.random.default_rng(0).permutation(60)
+    path, name = tmp_path / "design.npz", scene.arms[0].name
+    arrays = {"centroid": arm.mesh.centroid[order], "density": expected[order]}
+    np.savez(path, **{f"{name}/{key}": value for key, value in arrays.items()})
+    assert np.array_equal(read_design(path, partition, {0: arm})[0], expected)
+    arrays["centroid"] = arrays["centroid"] + [0.0, 0.0, 0.1]
+    np.savez(path, **{f"{name}/{key}": value for key, value in arrays.items()})
+    with pytest.raises(InputError, match=r"z 0.095..0.105 m, its mesh .*z -0.005..0.005 m"):
+        read_design(path, partition, {0: arm})
 
 
 def response(weights: ShapeIntegrals) -> Callable[[ShapeIntegrals], float]:

@@ -6,21 +6,28 @@ import sys
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from robots import GRAVITY, frames_of, mechanism_of, tree_of, write_uneven
 from runs import ROOT, run
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
+from dolfinopt.arms.arm import Arm
+from dolfinopt.cli.export_robot import link_inertia
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
 from dolfinopt.exchange.urdf.checks import implausible_inertias
 from dolfinopt.exchange.urdf.read import read_robot
-from dolfinopt.exchange.urdf.robot import MASSLESS, Robot, roll_pitch_yaw_of
-from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
+from dolfinopt.exchange.urdf.robot import MASSLESS, Inertia, Robot, roll_pitch_yaw_of
+from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, read_origin, scene_names
+from dolfinopt.exchange.urdf.write import NewLink, robot_text
 from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.spatial.rotations import exponential, roll_pitch_yaw
+from dolfinopt.profiling import Profile
 
 yourdfpy = pytest.importorskip("yourdfpy")
+trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 DEMO = ROOT / "demos" / "robot.urdf"
 DEMO_MOTION = ROOT / "demos" / "robot_motion.csv"
@@ -396,3 +403,101 @@ def test_inertias_that_cannot_be_are_told(tmp_path, old, new, message):
     found = implausible_inertias(read_robot(file))
     assert any(message in one for one in found), found
     assert all("link 'forearm': " in one and "\n" not in one for one in found)
+
+
+# -- back ------------------------------------------------------------------------------------
+
+
+def same_kinematics(one: Robot, other: Robot) -> bool:
+    """Return whether all joints are alike, to the last bit."""
+    return all(
+        (a.name, a.kind, a.parent, a.child, a.lower, a.upper, a.velocity)
+        == (b.name, b.kind, b.parent, b.child, b.lower, b.upper, b.velocity)
+        and np.array_equal(a.pose, b.pose)
+        and np.array_equal(a.axis, b.axis)
+        for a, b in zip(one.joints, other.joints, strict=True)
+    )
+
+
+def test_there_and_back(imported, tmp_path):
+    """Frames of solids are undone: mass, centre and inertia come back to rounding."""
+    file, _, links = imported
+    robot = read_robot(file)
+    bodies = scene_bodies(robot, links, default_tool(robot, links))
+    new = [NewLink(b.link, b.inertia.posed(b.frame)) for b in bodies if b.is_solid]
+    back = tmp_path / "back" / "robot.urdf"
+    back.parent.mkdir()
+    back.write_bytes(robot_text(file, new, back.parent))
+    again = read_robot(back)
+    assert list(again.links) == list(robot.links) and same_kinematics(robot, again)
+    for name, link in robot.links.items():
+        own = again.links[name].own
+        assert own.mass == pytest.approx(link.own.mass, rel=1e-15)
+        assert np.abs(own.centre - link.own.centre).max() < 1e-15
+        assert np.abs(own.tensor - link.own.tensor).max() < 1e-14
+    text = back.read_text()
+    if file == DEMO:
+        assert "Denavit-Hartenberg" in text and "the rod between shoulder and elbow" in text
+    else:
+        assert "<!-- kept -->" in text and '<gazebo reference="hand"><selfCollide>' in text
+    changed = sum(a != b for a, b in zip(file.read_text().splitlines(), text.splitlines()))
+    assert changed > 0 and text.count("<inertial>") == file.read_text().count("<inertial>")
+
+
+def test_new_meshes_take_the_place_of_all_shapes(tmp_path):
+    """The material stays; meshes of other links are found from the new folder."""
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box(extents=(0.1, 0.2, 0.3)).export(tmp_path / "meshes" / "hand.stl")
+    file = write_uneven(tmp_path)
+    hand = '<link name="hand">'
+    shape = '<visual><geometry><mesh filename="meshes/hand.stl" scale="2 1 1"/></geometry></visual>'
+    file.write_text(file.read_text().replace(hand, hand + shape))
+    folder = tmp_path / "new"
+    folder.mkdir()
+    trimesh.creation.icosphere(radius=0.1).export(folder / "upper.stl")
+    body = Inertia(2.5, np.array([0.1, 0.2, 0.3]), np.diag([0.01, 0.02, 0.025]))
+    back = folder / "uneven.urdf"
+    back.write_bytes(robot_text(file, [NewLink("upper", body, "upper.stl")], folder))
+    robot = read_robot(back)
+    upper, hand_link = robot.links["upper"], robot.links["hand"]
+    assert not upper.missing and not hand_link.missing
+    assert (upper.own.mass, *upper.own.centre) == (2.5, 0.1, 0.2, 0.3)
+    assert np.array_equal(upper.own.tensor, body.tensor)
+    assert len(upper.shapes) == 1 and upper.volume == pytest.approx(4 / 3 * np.pi * 1e-3, rel=0.02)
+    assert hand_link.volume == pytest.approx(2 * 0.1 * 0.2 * 0.3)
+    inside = back.read_text().split('<link name="upper">')[1].split("</link>")[0]
+    assert inside.count("<visual>") == inside.count("<collision>") == 1
+    assert '<material name="grey"/>' in inside and "box" not in inside
+    with pytest.raises(InputError, match="no link 'arm'; is it the robot of the scene"):
+        robot_text(file, [NewLink("arm", body)], folder)
+
+
+def test_a_links_inertia_is_its_bodys_and_its_motors():
+    """Against parallel axes by hand: a box, and a motor at its outboard end."""
+    scene = solid_scene(cells=(10, 3, 2), joint_mass=0.7, joint_inertia=0.01)
+    arm = Arm(scene, 0, MPI.COMM_SELF, Profile())
+    found = link_inertia(scene, 0, arm.reduce(np.ones(60)))
+    box = DENSITY * LENGTH * HEIGHT * THICKNESS
+    mass = box + 0.7
+    centre = (0.5 * box * LENGTH + 0.7 * LENGTH) / mass
+    squares = np.array([HEIGHT**2 + THICKNESS**2, LENGTH**2 + THICKNESS**2, LENGTH**2 + HEIGHT**2])
+    apart = box * (centre - 0.5 * LENGTH) ** 2 + 0.7 * (LENGTH - centre) ** 2
+    expected = np.diag(box * squares / 12.0 + 0.01 + [0.0, apart, apart])
+    assert found.mass == pytest.approx(mass, rel=1e-13)
+    assert found.centre == pytest.approx([centre, 0.0, 0.0], abs=1e-14)
+    assert np.abs(found.tensor - expected).max() < 1e-13
+
+
+def test_export_says_what_it_cannot_write(tmp_path):
+    with pytest.raises(InputError, match="add --urdf for a robot's run"):
+        run("export", tmp_path)
+    with pytest.raises(InputError, match="expected no --design and no --set"):
+        run("export", tmp_path, "--urdf", "--set", "payload.mass=1")
+    with pytest.raises(InputError, match=r"summary.json: cannot be read .* finished"):
+        run("export", tmp_path, "--urdf")
+    record = tmp_path / "robot.json"
+    for text in (None, "{", '{"urdf": "a", "solids": {"b": {"link": "c", "frame": [1]}}}'):
+        if text is not None:
+            record.write_text(text)
+        with pytest.raises(InputError, match=r"robot\.json: cannot be read .* `dolfinopt import`"):
+            read_origin(record)

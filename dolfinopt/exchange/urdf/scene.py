@@ -21,6 +21,7 @@ TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
 CELLS = 6000  # of a solid, about
 FEWEST = 4  # over its height and over its thickness
+RADIUS = 1.5  # of the filter, in cells
 MATERIAL, DENSITY = "aluminium 6082-T6", 2700.0  # kg/m3
 SETTLING = 0.3  # of the motion's duration, simulated after it
 ROUNDING = 1e-15  # m, rad: less is written as zero
@@ -138,6 +139,9 @@ class RobotScene:
         return [*lines, f"axis = {_list(_tidy(body.axis))}"] if joint.moves else lines
 
     def _rest(self) -> list[str]:
+        """Return motion, payload and what of the defaults is not for a solid of this size."""
+        boxes = [(body.length, *body.size) for body in self.bodies if body.size is not None]
+        side = max(size / n for box in boxes for size, n in zip(box, cells_of(*box), strict=True))
         return [
             "[motion]",
             'path = "joints"',
@@ -148,8 +152,15 @@ class RobotScene:
             "[payload]",
             "mass = 0.0  # kg, what the tool carries",
             "",
+            "[damping]",
+            "stiffness_proportional = 1e-4  # s",
+            "",
+            "[reduction]",
+            "coordinates = 6  # of a solid link: those of its outboard interface alone",
+            "",
             "[design]",
             "volume_fraction = 0.4  # of each solid link may stay",
+            f"filter_radius = {_number(_up(RADIUS * side))}  # m",
         ]
 
     def record(self, folder: Path) -> dict[str, Any]:

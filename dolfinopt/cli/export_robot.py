@@ -1,0 +1,132 @@
+"""`dolfinopt export RUN --urdf`: a robot with the links of a finished run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import numpy as np
+
+from dolfinopt.cli.shared import claim, design_of, prepare, scene_of, warn
+from dolfinopt.cli.start import start
+from dolfinopt.errors import InputError
+
+if TYPE_CHECKING:
+    from dolfinopt.exchange.urdf.robot import Inertia
+    from dolfinopt.exchange.urdf.scene import Origin
+    from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+    from dolfinopt.scene.load import Scene
+
+
+def export_robot(run: Path, out: Path | None, overwrite: bool) -> None:
+    """Write the robot that a run's scene was imported from, its solid links as they are now.
+
+    Args:
+        run: folder of the run, which `dolfinopt optimize` or `simulate` has written.
+        out: folder for the URDF file and the links' surfaces; None: urdf in the run's.
+        overwrite: whether to replace them.
+    """
+    world = start()
+    from dolfinopt.parallel import gather_arms, gather_cells, on_root, together
+    from dolfinopt.profiling import Profile
+
+    scene: Scene = on_root(world, scene_of, run)
+    origin = on_root(world, _origin_of, scene, run)
+    folder = out or run / "urdf"
+    names = [origin.file.name, *(f"{arm}.stl" for arm in origin.links)]
+    claim(world, folder, overwrite, names)
+    partition, arms, x_phys = design_of(world, scene, run / "design.npz", Profile())
+    with together(world):
+        mine = {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}
+    bodies = gather_arms(partition, mine)
+    centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
+    densities = gather_cells(partition, {k: x_phys[k] for k in arms})
+    prepare(world, folder)
+    with together(world):
+        if world.rank == 0:
+            cells = {k: (centroids[k], densities[k]) for k in bodies}
+            _write(scene, origin, folder, bodies, cells)
+
+
+def _origin_of(scene: Scene, run: Path) -> Origin:
+    """Return where the scene's solids come from: the record is beside the trajectory."""
+    from dolfinopt.exchange.urdf.scene import RECORD, read_origin
+
+    if scene.motion.file is None:
+        raise InputError(f"{run}: no scene of a robot, it has no table of joint coordinates")
+    return read_origin(Path(scene.motion.file).with_name(RECORD))
+
+
+def _write(
+    scene: Scene,
+    origin: Origin,
+    folder: Path,
+    bodies: Mapping[int, ShapeIntegrals],
+    cells: Mapping[int, tuple[np.ndarray, np.ndarray]],
+) -> None:
+    """Write the files and say what has become of the links (root only)."""
+    from dolfinopt.disk import write_atomically
+    from dolfinopt.exchange.urdf.read import read_robot
+    from dolfinopt.exchange.urdf.write import NewLink, robot_text
+
+    before = read_robot(origin.file).links
+    links, index = [], {arm.name: k for k, arm in enumerate(scene.arms)}
+    for name, link in origin.links.items():
+        owner = scene.owners[index[name]] if name in index else None
+        if owner is None or link not in before:
+            warn([f"{name}: no solid arm of this scene, or no link {link!r}: it stays as it is"])
+            continue
+        frame, mesh = origin.frames[name], None
+        inertia = link_inertia(scene, index[name], bodies[owner]).posed(frame)
+        surface = _surface(scene, owner, frame, *cells[owner])
+        if surface is None:
+            warn([f"{name}: its shapes stay in the robot: it has no box of cells"])
+        else:
+            mesh = f"{name}.stl"
+            write_atomically(folder / mesh, partial(_put, surface))
+        links.append(NewLink(link, inertia, mesh))
+        click.echo(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")
+    path = folder / origin.file.name
+    write_atomically(path, partial(_put, robot_text(origin.file, links, folder)))
+    click.echo(f"the robot with these links: {path}")
+
+
+def _put(data: bytes, stream: object) -> None:
+    stream.write(data)  # type: ignore[attr-defined]
+
+
+def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
+    """Return the inertia of a solid arm in its frame, with what sits at its outboard interface.
+
+    Args:
+        scene: of the run.
+        index: of the arm.
+        body: its integrals in space; w and W hold int x and int x x' of the undeformed body.
+    """
+    from dolfinopt.exchange.urdf.robot import Inertia
+
+    arm = scene.arms[index]
+    second = body.W[:, 0, 0].reshape(3, 3)
+    centre = body.w[:, 0] / body.mass
+    second = second - body.mass * np.outer(centre, centre)
+    own = Inertia(float(body.mass), centre, np.trace(second) * np.eye(3) - second)
+    motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
+    return own + motor
+
+
+def _surface(
+    scene: Scene, owner: int, frame: np.ndarray, centroid: np.ndarray, density: np.ndarray
+) -> bytes | None:
+    """Return an arm's design as STL in its link's frame, in metres; None without a box."""
+    from dolfinopt.part.isosurface import Surface, box_surface
+    from dolfinopt.part.solid import triangle_bytes
+
+    arm = scene.arms[owner]
+    if arm.cells is None or len(arm.cells) != 3:
+        return None
+    found = box_surface((arm.length, arm.height, arm.thickness), arm.cells, centroid, density)
+    points = found.points @ frame[:3, :3].T + frame[:3, 3]
+    return triangle_bytes(Surface(points, found.triangles).corners, f"{arm.name}, m")
