@@ -138,7 +138,8 @@ def _write(
 
     prepare_folder(target)
     drawn = pictures if plots else None
-    figures = write_parts(target, scene, parts, meshes.fine, check, polished, drawn)
+    bodies = meshes.fine if check is None else check.meshes
+    figures = write_parts(target, scene, parts, bodies, check, polished, drawn)
     for name, row in figures["arms"].items():
         points = f" with {row['control_points']} control points" if row["control_points"] else ""
         click.echo(

@@ -36,6 +36,7 @@ VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference tr
 # Of a singular point, in cells of the design: the centre of the design's cell in such a corner,
 # where its stress is known, is as far away.
 APART = np.sqrt(0.5)
+HOT = 0.8  # of the largest stress, from which on a place is worth a finer mesh
 SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
 
 
@@ -46,12 +47,14 @@ class PartStress:
     Attributes:
         peak: the largest further than `APART` cells from every singular point.
         everywhere: the largest of all, singular points included.
+        hot: (n, 2) where stress exceeds `HOT` times the peak, but at singular points, m.
         cells: for pictures: the largest at any corner of every triangle, and when; at singular
             points at most `SHOWN` times `peak`.
     """
 
     peak: Peak
     everywhere: Peak
+    hot: np.ndarray
     cells: ArmStress
 
 
@@ -113,7 +116,14 @@ def part_stress(
             if known is not None and known.peak.value >= best.value:
                 continue
             whole = points.peak(a, t, np.arange(len(away)))
-            found[one.place] = PartStress(best, whole, points.by_cell(a, t, away, best, whole))
+            at, when = maxima(MPI.COMM_SELF, points.A, a)
+            hot = points.places[away & (at > HOT * best.value)]
+            # What has no limit would be all that the colours show.
+            at[~away] = np.minimum(at[~away], SHOWN * best.value)
+            worst = at[points.corners].argmax(axis=1)
+            node = points.corners[np.arange(len(worst)), worst]
+            cells = ArmStress(best, whole, at[node], t[when[node]])
+            found[one.place] = PartStress(best, whole, hot, cells)
     return found
 
 
@@ -136,17 +146,6 @@ class _Points:
         largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
         x, y = self.places[chosen][largest.point]
         return Peak(largest.largest, (float(x), float(y)), float(t[largest.instant]))
-
-    def by_cell(
-        self, a: np.ndarray, t: np.ndarray, away: np.ndarray, best: Peak, whole: Peak
-    ) -> ArmStress:
-        """Return the largest stress of every triangle, see `PartStress.cells`."""
-        at, when = maxima(MPI.COMM_SELF, self.A, a)
-        # What has no limit would be all that the colours show.
-        at[~away] = np.minimum(at[~away], SHOWN * best.value)
-        worst = at[self.corners].argmax(axis=1)
-        node = self.corners[np.arange(len(worst)), worst]
-        return ArmStress(best, whole, at[node], t[when[node]])
 
 
 def _at_corners(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.output.views import ArmView, gather_views
+from dolfinopt.part.body_mesh import BodyMesh
+from dolfinopt.part.boundary_stress import HOT
 from dolfinopt.part.forms import (
     STRESS,
     Column,
@@ -25,7 +27,7 @@ from dolfinopt.part.forms import (
     simulate_bodies,
     units_of,
 )
-from dolfinopt.part.mesh import Meshes
+from dolfinopt.part.mesh import Meshes, finer_meshes
 from dolfinopt.part.part import Part
 from dolfinopt.responses.stress_report import Peak
 from dolfinopt.scene.load import Scene
@@ -35,7 +37,8 @@ if TYPE_CHECKING:
 
 # Change by the last refinement up to which a figure counts as converged, also that of stress: a
 # method of second order leaves a third of it.
-SETTLED, SETTLED_STRESS = 5e-3, 0.1
+SETTLED, SETTLED_STRESS = 1e-2, 0.1
+ROUNDS = 2  # refinements of the mesh where stress is largest, at most
 LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART = "density", "crisp", "part"
 
@@ -48,6 +51,8 @@ class Check:
         units: of the table's rows.
         density, crisp, part: the forms; None of a crisp design that falls apart.
         coarse: the part on a mesh with sides twice as long.
+        stress_change: relative, of the largest stress by the last refinement where it is largest.
+        meshes: of the parts by their place in the chain, as fine as their stress needs.
         views: the parts' arms with their stress, for pictures.
         cells: triangles of the parts by the name of the arm.
         singular: where stress has no limit on the parts and is larger than the one reported.
@@ -58,6 +63,8 @@ class Check:
     crisp: Column | None
     part: Column
     coarse: Column
+    stress_change: float
+    meshes: Mapping[int, BodyMesh]
     views: list[ArmView]
     cells: Mapping[str, int]
     singular: Peak | None
@@ -90,11 +97,15 @@ class Check:
 
     @cached_property
     def refinement(self) -> dict[str, float]:
-        """Relative change of every figure of the part by the last refinement of its mesh."""
-        return {
+        """Relative change of every figure of the part by a refinement of its mesh.
+
+        That of the whole mesh; of stress by the last one where it is largest.
+        """
+        found = {
             name: _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
             for name in self.units
         }
+        return found | {STRESS: self.stress_change}
 
     @property
     def converged(self) -> bool:
@@ -251,9 +262,20 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
     """
     density, crisp = design_columns(scene, folder)
     coarse = simulate_bodies(scene, parts, meshes.coarse)
-    coarse_column, _ = part_column(scene, coarse, parts)
-    fine = simulate_bodies(scene, parts, meshes.fine)
-    column, stress = part_column(scene, fine, parts)
+    before, _ = part_column(scene, coarse, parts)
+    coarse_column, bodies = before, meshes.fine
+    places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
+    for round_ in range(ROUNDS + 1):
+        fine = simulate_bodies(scene, parts, bodies)
+        column, stress = part_column(scene, fine, parts)
+        change = _ratio(column.values[STRESS], before.values[STRESS]) - 1.0
+        if round_ == ROUNDS or not abs(change) > SETTLED_STRESS:
+            break
+        for place, one in stress.items():
+            owner = scene.owners[place]
+            if owner is not None and one.peak.value > HOT * column.values[STRESS]:
+                places[owner].append(one.hot)
+        before, bodies = column, finer_meshes(parts, places)
     cells = {place: one.cells for place, one in stress.items()}
     worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value
@@ -263,6 +285,8 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
         crisp=crisp,
         part=column,
         coarse=coarse_column,
+        stress_change=change,
+        meshes=bodies,
         views=gather_views(fine.scene, fine.partition, fine.arms, fine.x_phys, cells),
         cells={scene.arms[k].name: fine.arms[k].mesh.num_cells for k in parts},
         singular=worst if grows else None,

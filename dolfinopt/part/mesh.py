@@ -36,6 +36,17 @@ NEAREST = 48  # places around each that may be the other side of a member
 OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
+def finer_meshes(
+    parts: Mapping[int, Part], places: Mapping[int, Sequence[np.ndarray]]
+) -> dict[int, BodyMesh]:
+    """Return fine meshes of parts with shorter sides near places, see `body_mesh`."""
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        return {
+            k: body_mesh(gmsh, one.shape, one.domain.cell, finer=places[k])
+            for k, one in parts.items()
+        }
+
+
 @dataclass(frozen=True, eq=False)
 class Meshes:
     """Meshes of parts by their place in the chain.
@@ -59,7 +70,13 @@ def mesh_parts(parts: Mapping[int, Part]) -> Meshes:
     return Meshes(coarse, fine)
 
 
-def body_mesh(gmsh: Any, shape: Shape, cell: float, coarser: float = 1.0) -> BodyMesh:
+def body_mesh(
+    gmsh: Any,
+    shape: Shape,
+    cell: float,
+    coarser: float = 1.0,
+    finer: Sequence[np.ndarray] = (),
+) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
     Args:
@@ -67,12 +84,13 @@ def body_mesh(gmsh: Any, shape: Shape, cell: float, coarser: float = 1.0) -> Bod
         shape: m.
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
+        finer: places (n, 2), m, near each of which sides are halved, once for every array.
 
     Raises:
         ConvergenceError: straight sides along its curves cross each other, however short.
     """
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = [coarser * size for size in _sizes(shape, samples, cell)]
+    sizes = [coarser * size for size in _sizes(shape, samples, cell, finer)]
     for _ in range(FINER):
         outline = _outline(shape, samples, sizes, coarser * TURN)
         if outline.is_simple:  # Gmsh would end the process
@@ -146,7 +164,9 @@ def _sampled(curve: Curve, spacing: float) -> np.ndarray:
     return np.union1d(even, np.concatenate([np.linspace(a, b, 4) for a, b in pairwise(breaks)]))
 
 
-def _sizes(shape: Shape, samples: Sequence[np.ndarray], cell: float) -> list[np.ndarray]:
+def _sizes(
+    shape: Shape, samples: Sequence[np.ndarray], cell: float, finer: Sequence[np.ndarray]
+) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
     points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
@@ -156,6 +176,9 @@ def _sizes(shape: Shape, samples: Sequence[np.ndarray], cell: float) -> list[np.
     wall = facing(points, inward, near, 1.0)
     size = np.minimum(WALL * wall, TURN / np.maximum(bend, 1e-9 / cell))
     size = np.clip(size, SMALLEST * cell, LARGEST * cell)
+    for places in finer:
+        away = cKDTree(places).query(points)[0]
+        size = np.where(away < np.maximum(2.0 * size, SAMPLES * cell), 0.5 * size, size)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])

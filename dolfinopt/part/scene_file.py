@@ -42,15 +42,8 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
         if owner is not None:
             name = scene.arms[owner].name if arm.design else arm.name
             row.update(_arm(parts[owner], meshes.absolute() / f"{name}.msh"))
-    data["design"].update(
-        volume_fraction=1.0,
-        shared_volume=False,
-        initial=1.0,
-        filter_radius=0.0,
-        projection=False,
-        minimum_member=0.0,
-        minimum_gap=0.0,
-    )
+    # All of it stays solid; what else there is to say of a design has no use.
+    data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
     return data
 
 

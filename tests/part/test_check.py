@@ -20,7 +20,8 @@ from dolfinopt.part.part import make_parts
 
 pytestmark = pytest.mark.serial
 
-SMALL = ("arms.cells=[100,6]", "simulation.sample=0.005", "constraints.stress=13e6")
+SMALL = ("arms.cells=[100,6]", "simulation.sample=0.005", "constraints.stress=13e6",
+         "design.erosion=0.25")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
