@@ -122,8 +122,8 @@ class SimulationResult:
         from pandas import DataFrame, Index
 
         motion = self.trajectory
-        x, y = motion.deviation.T
-        columns = {"deviation_x": x, "deviation_y": y, "deviation": np.hypot(x, y)}
+        columns = {f"deviation_{axis}": d for axis, d in zip("xyz", motion.deviation.T)}
+        columns["deviation"] = motion.distance
         arms = zip(self.scene.arms, motion.compliance.T, strict=True)
         columns |= {f"compliance_{arm.name}": values for arm, values in arms}
         return DataFrame(columns, index=Index(motion.t, name="t"))

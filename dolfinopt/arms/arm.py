@@ -463,7 +463,12 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
         body = _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
         unwanted = body.is_stiffened and scene.simulation.stiffening is False
         return linear_part(body) if unwanted else body
+    if scene.is_spatial:
+        from dolfinopt.multibody.spatial.links import rigid_link
+
+        return rigid_link(arm, scene.material_of(index).density)
     mass = arm.mass
     if mass is None:
         mass = scene.material_of(index).density * arm.length * arm.height * arm.thickness
+    assert not isinstance(arm.inertia, tuple)  # the scene would have refused it
     return rigid_bar(arm.length, arm.height, mass, arm.inertia)

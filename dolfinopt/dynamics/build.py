@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -13,15 +14,17 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.drives import Closure, Drives, Springs, pin, slider
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
-from dolfinopt.multibody.motion import RigidMotion, breakpoints, rigid_motion
+from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.load import Arm, Scene
 
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.spatial_system import SpatialSystem
+
 MAX_ROWS = 50  # of a table of forces whose rows begin steps; more are fine as a curve
 SAME_TIME = 1e-6  # share of the horizon within which two instants are one
-Motion = Callable[[np.ndarray], RigidMotion]
 
 
 def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
@@ -33,8 +36,8 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     return Mechanism(
         bodies=tuple(bodies),
         payload_mass=scene.payload.mass,
-        payload_inertia=scene.payload.inertia,
-        gravity=scene.motion.gravity,
+        payload_inertia=scene.payload.moment,
+        gravity=(scene.motion.gravity[0], scene.motion.gravity[1]),
         joint_height=scene.motion.joint_height,
         joints=joints if any(joint != JointHardware() for joint in joints) else (),
         cart_mass=scene.motion.cart_mass,
@@ -63,9 +66,18 @@ def is_machine(scene: Scene) -> bool:
     return scene.control is not None or scene.closure is not None or soft
 
 
+def desired_motion(scene: Scene) -> Callable[[np.ndarray], Any]:
+    """Return the scene's motion as a function of instants (n,), s."""
+    if scene.is_spatial:
+        from dolfinopt.multibody.spatial.motion import joint_motion
+
+        return partial(joint_motion, scene=scene)
+    return partial(rigid_motion, scene=scene)
+
+
 def build_system(
-    scene: Scene, bodies: list[ShapeIntegrals], motion: Motion | None = None
-) -> ElasticSystem | MachineSystem:
+    scene: Scene, bodies: list[ShapeIntegrals], motion: Callable[[np.ndarray], Any] | None = None
+) -> ElasticSystem | MachineSystem | SpatialSystem:
     """Return the equations of a scene.
 
     Args:
@@ -73,9 +85,15 @@ def build_system(
         bodies: from the base outwards.
         motion: the desired rigid motion, shared with other scenes; None: the scene's.
     """
-    mechanism = build_mechanism(scene, bodies)
     if motion is None:
-        motion = partial(rigid_motion, scene=scene)
+        motion = desired_motion(scene)
+    if scene.is_spatial:
+        from dolfinopt.dynamics.spatial_system import SpatialSystem
+        from dolfinopt.multibody.spatial.links import build_spatial_mechanism
+
+        tree = build_spatial_mechanism(scene, bodies)
+        return SpatialSystem(tree, motion, breakpoints(scene))
+    mechanism = build_mechanism(scene, bodies)
     elastic = ElasticSystem(mechanism, motion, breakpoints(scene))
     if not is_machine(scene):
         return elastic

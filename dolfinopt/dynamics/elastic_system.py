@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from dolfinopt.dynamics import modal_coordinates
-from dolfinopt.dynamics.system import State, System, relative_errors
+from dolfinopt.dynamics.modal_coordinates import Own
+from dolfinopt.dynamics.system import Instants, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import body_loads, elastic_residual
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import ElasticBodies, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import Tangent, linearise
@@ -51,8 +53,10 @@ class ElasticInstants:
 
 
 @dataclass(frozen=True)
-class ElasticSystem:
+class PrescribedSystem:
     """Elastic residual of a mechanism = 0 over a horizon, rigid coordinates prescribed.
+
+    What plane and space have in common; of them know `at`, `describe` and `body_gradient`.
 
     Attributes:
         mechanism: N elastic coordinates.
@@ -61,8 +65,8 @@ class ElasticSystem:
             prescribed motion is smooth; steps end there. s.
     """
 
-    mechanism: Mechanism
-    motion: Callable[[np.ndarray], RigidMotion]
+    mechanism: ElasticBodies
+    motion: Callable[[np.ndarray], Any]
     breakpoints: tuple[float, ...]
 
     @property
@@ -79,10 +83,6 @@ class ElasticSystem:
     def runs(self) -> int:
         """One."""
         return 1
-
-    def at(self, t: np.ndarray) -> ElasticInstants:
-        """Return mechanism and motion at instants t (n,), s."""
-        return ElasticInstants(self.mechanism, self.motion(t))
 
     def initial_state(self) -> State:
         """Return the static equilibrium (1, N) at t = 0: zero unless loads act there.
@@ -113,20 +113,67 @@ class ElasticSystem:
         squares = np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass)))
         return float(np.sqrt(1.0 / squares.max()))
 
+    def preconditioner(self: Own) -> modal_coordinates.Modes[Own]:
+        """Return the arms' vibrations; simulation and adjoint ask for the same."""
+        return self._modes
+
+    @cached_property
+    def _modes(self) -> modal_coordinates.Modes[Any]:
+        return modal_coordinates.modes_of(self)
+
+    def start_gradient(self, q: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
+        """Return the derivative by every body of J through the equilibrium q (N,) at t = 0.
+
+        Nothing where nothing loads the bodies there: they are at rest whatever they are.
+        """
+        if not q.any() and not self.is_loaded_at_rest():
+            return []
+        rest = np.zeros((1, len(q)))
+        tangent = self.at(np.zeros(1)).linearise(q[None], rest, rest).dense()
+        multipliers = np.linalg.solve(tangent[0, :, : len(q)].T, -by_q)
+        return self.body_gradient(np.zeros(1), q[None], rest, rest, multipliers[None])
+
+    def is_loaded_at_rest(self) -> bool:
+        """Return whether anything may load the bodies at t = 0, while they are not deformed."""
+        return True
+
+    def at(self, t: np.ndarray) -> Instants:
+        """Return mechanism and motion at instants t (n,), s."""
+        raise NotImplementedError
+
+    def describe(self, q: np.ndarray) -> str:
+        """Say how far the bodies' ends turn in a motion q (n, N)."""
+        raise NotImplementedError
+
+    def body_gradient(
+        self,
+        t: np.ndarray,
+        q: np.ndarray,
+        qd: np.ndarray,
+        qdd: np.ndarray,
+        multipliers: np.ndarray,
+    ) -> list[ShapeIntegrals]:
+        """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class ElasticSystem(PrescribedSystem):
+    """That of a chain in the plane."""
+
+    mechanism: Mechanism
+    motion: Callable[[np.ndarray], RigidMotion]
+
+    def at(self, t: np.ndarray) -> ElasticInstants:
+        """Return mechanism and motion at instants t (n,), s."""
+        return ElasticInstants(self.mechanism, self.motion(t))
+
     def describe(self, q: np.ndarray) -> str:
         """Say how far the arms' ends turn in a motion q (n, N)."""
         angle = 0.0
         for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
             angle = max(angle, float(np.abs(q[:, part] @ body.outboard[2]).max(initial=0.0)))
         return f"the arms' ends turn by {angle:.2g} rad"
-
-    def preconditioner(self) -> modal_coordinates.Modes:
-        """Return the arms' vibrations; simulation and adjoint ask for the same."""
-        return self._modes
-
-    @cached_property
-    def _modes(self) -> modal_coordinates.Modes:
-        return modal_coordinates.modes_of(self)
 
     def body_gradient(
         self,
@@ -139,19 +186,11 @@ class ElasticSystem:
         """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
         return body_gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
 
-    def start_gradient(self, q: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
-        """Return the derivative by every body of J through the equilibrium q (N,) at t = 0.
-
-        Nothing where nothing loads the bodies there: they are at rest whatever they are.
-        """
-        rest = np.zeros((1, len(q)))
-        if not q.any():
-            loads = body_loads(self.mechanism, self.motion(np.zeros(1)), (rest, rest, rest))
-            if not any(p.any() for p, _ in loads):
-                return []
-        tangent = self.at(np.zeros(1)).linearise(q[None], rest, rest).dense()
-        multipliers = np.linalg.solve(tangent[0, :, : len(q)].T, -by_q)
-        return self.body_gradient(np.zeros(1), q[None], rest, rest, multipliers[None])
+    def is_loaded_at_rest(self) -> bool:
+        """Return whether anything loads the arms at t = 0, while they are not deformed."""
+        rest = np.zeros((1, self.num_coordinates))
+        loads = body_loads(self.mechanism, self.motion(np.zeros(1)), (rest, rest, rest))
+        return any(p.any() for p, _ in loads)
 
 
 def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:

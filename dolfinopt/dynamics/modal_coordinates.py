@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
@@ -17,7 +17,9 @@ from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.elastic_system import ElasticSystem
+    from dolfinopt.dynamics.elastic_system import PrescribedSystem
+
+Own = TypeVar("Own", bound="PrescribedSystem")
 
 # What T'KT may be away from the identity, and is still taken for it.
 ROUNDING = 1e-9
@@ -27,7 +29,7 @@ REFERENCES = 3  # instants of the horizon whose mass is averaged: 1 to 9 cost th
 
 
 @dataclass(frozen=True, eq=False)
-class Modes:
+class Modes(Generic[Own]):
     """A system in the coordinates z of its arms' vibrations, q = T z arm by arm.
 
     Attributes:
@@ -37,7 +39,7 @@ class Modes:
         frequencies: (1, N) of every coordinate, rad/s, those of an arm descending.
     """
 
-    system: ElasticSystem
+    system: Own
     transforms: tuple[np.ndarray, ...]
     inverses: tuple[np.ndarray, ...]
     frequencies: np.ndarray
@@ -67,7 +69,7 @@ class Modes:
         """Return dJ/dq = T^-T dJ/dz (..., N)."""
         return self._each(by_z, [inverse.T for inverse in self.inverses])
 
-    def chosen(self, runs: np.ndarray) -> Modes:
+    def chosen(self, runs: np.ndarray) -> Modes[Own]:
         """Return itself: there is one run."""
         return self
 
@@ -77,7 +79,7 @@ class Modes:
         return np.concatenate(pieces, axis=-1)
 
 
-def modes_of(system: ElasticSystem) -> Modes:
+def modes_of(system: Own) -> Modes[Own]:
     """Return the system in every arm's vibrations with all that it carries, T'KT = I.
 
     K v = w^2 M v with the arm's block of the chain's mass matrix at rest, the mean over some

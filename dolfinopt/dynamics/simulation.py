@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.build import build_system
+from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.dynamics.drive_forces import DriveForces
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.load_coefficients import load_coefficients
@@ -18,14 +19,24 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.drives import Closure
-from dolfinopt.multibody.end_effector import deviation, end_effector, end_effector_gradient
+from dolfinopt.multibody.end_effector import (
+    deviation,
+    end_effector,
+    end_effector_gradient,
+    lengths,
+)
 from dolfinopt.multibody.interface_jacobian import interface_place
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism, compliance
-from dolfinopt.multibody.motion import RigidMotion, rigid_motion
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.spatial_system import SpatialSystem
+
+    Problem = ElasticSystem | MachineSystem | SpatialSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +104,11 @@ class Trajectory:
             return deviation(self.mechanism, self.motion, self.q_e)
         wanted = end_effector(self.mechanism, self.desired, np.zeros_like(self.q_e))
         return self.end - wanted
+
+    @property
+    def distance(self) -> np.ndarray:
+        """Length of the deviation (n,), m."""
+        return lengths(self.deviation)
 
     @cached_property
     def compliance(self) -> np.ndarray:
@@ -228,8 +244,7 @@ class Trajectory:
 
         With a horizon that ends with the motion, the deviation at its end.
         """
-        distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
-        return float(distance[self.after_motion].max())
+        return float(self.distance[self.after_motion].max())
 
     @property
     def after_motion(self) -> np.ndarray:
@@ -252,9 +267,8 @@ class Trajectory:
     @property
     def max_deviation(self) -> tuple[float, float]:
         """Largest distance between flexible and rigid end-effector, m, and its instant, s."""
-        distance = np.hypot(self.deviation[:, 0], self.deviation[:, 1])
-        worst = int(np.argmax(distance))
-        return float(distance[worst]), float(self.t[worst])
+        worst = int(np.argmax(self.distance))
+        return float(self.distance[worst]), float(self.t[worst])
 
 
 def simulate(
@@ -330,14 +344,14 @@ def simulate_batch(
 
 
 def _by_radau(
-    problems: Sequence[ElasticSystem | MachineSystem],
+    problems: Sequence[Problem],
     tolerance: float,
     stages: int,
     profile: Profile,
     starts: Sequence[Solution | None],
     goal: float,
 ) -> list[Solution | ConvergenceError]:
-    """Return the solutions in their order: together of prescribed motions, machines one by one."""
+    """Return the solutions in their order: chains on prescribed motions together, others alone."""
     together = [i for i, one in enumerate(problems) if isinstance(one, ElasticSystem)]
     own = [one for one in problems if isinstance(one, ElasticSystem)]
     begun = [starts[i] for i in together]
@@ -350,24 +364,25 @@ def _by_radau(
     return [found[i] for i in range(len(problems))]
 
 
-def _problems(
-    scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]
-) -> list[ElasticSystem | MachineSystem]:
+def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -> list[Problem]:
     """Return what moves in every scene; scenes of one motion share it."""
-    motions: dict[object, Callable[[np.ndarray], RigidMotion]] = {}
-    problems: list[ElasticSystem | MachineSystem] = []
+    motions: dict[object, Callable[[np.ndarray], Any]] = {}
+    problems: list[Problem] = []
     for scene, own in zip(scenes, bodies, strict=True):
         lengths = tuple((arm.name, arm.length) for arm in scene.arms)
         key = (scene.motion, scene.closure, lengths)
-        motion = motions.setdefault(key, partial(rigid_motion, scene=scene))
+        motion = motions.setdefault(key, desired_motion(scene))
         problems.append(build_system(scene, own, motion))
     return problems
 
 
-def _trajectory(
-    problem: ElasticSystem | MachineSystem, scene: Scene, solution: Solution
-) -> Trajectory:
+def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajectory:
     """Return a solution with its sample instants."""
     horizon, sample = scene.motion.horizon, scene.simulation.sample
     t = np.arange(round(horizon / sample) + 1) * sample
-    return Trajectory(problem, scene, solution, t[t <= horizon * (1 + 1e-12)])
+    t = t[t <= horizon * (1 + 1e-12)]
+    if isinstance(problem, (ElasticSystem, MachineSystem)):
+        return Trajectory(problem, scene, solution, t)
+    from dolfinopt.dynamics.spatial_trajectory import SpatialTrajectory
+
+    return SpatialTrajectory(problem, scene, solution, t)

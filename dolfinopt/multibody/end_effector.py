@@ -9,6 +9,14 @@ from dolfinopt.multibody.mechanism import Mechanism, ModalConstants
 from dolfinopt.multibody.motion import RigidMotion
 
 
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths (n,) of vectors (n, 2), or (n, 3) in space."""
+    if vectors.shape[1] == 2:
+        return np.hypot(vectors[:, 0], vectors[:, 1])
+    out: np.ndarray = np.linalg.norm(vectors, axis=1)
+    return out
+
+
 def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
     if 0 < len(q) < FEW:

@@ -115,6 +115,9 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 def check_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
     motion = scene.motion
+    if scene.is_spatial:
+        along_table(np.zeros(1), motion, columns_of(scene))
+        return
     end = motion.horizon if motion.path == "rotation" else motion.duration
     rigid_motion(np.linspace(0.0, end, DENSE), scene)
 
@@ -128,7 +131,7 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     motion = scene.motion
     corners, timed = np.zeros(0), False
     if motion.path in ("points", "joints"):
-        curve, timed = _curve(motion, _columns(scene), file_stamp(motion))
+        curve, timed = _curve(motion, columns_of(scene), file_stamp(motion))
         corners = np.array(curve.kinks)
     if not timed:
         rows = _when(corners, motion) if 0 < len(corners) <= MAX_CORNERS else []
@@ -159,7 +162,7 @@ def desired_path(t: np.ndarray, motion: Motion) -> Path:
         return arc(t, motion)
     if motion.path == "line":
         return line(t, motion)
-    return Path(*_along(t, motion, POINT))
+    return Path(*along_table(t, motion, POINT))
 
 
 def arc(t: np.ndarray, motion: Motion) -> Path:
@@ -185,7 +188,7 @@ def line(t: np.ndarray, motion: Motion) -> Path:
     return Path(start + s * (end - start), sd * (end - start), sdd * (end - start))
 
 
-def _along(
+def along_table(
     t: np.ndarray, motion: Motion, columns: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a table's curve (n, k) and two time derivatives, in its own time or by the law."""
@@ -396,7 +399,7 @@ def _prescribed_joints(t: np.ndarray, scene: Scene) -> Derivatives:
     """Return the coordinates that a table or a rotation prescribes (n, k) and two derivatives."""
     motion = scene.motion
     if motion.path == "joints":
-        return _along(t, motion, _columns(scene))
+        return along_table(t, motion, columns_of(scene))
     turned = rotation(t, time_law(motion), motion.speed, motion.start_angle, motion.duration)
     angle, rate, growth = (x[:, None] for x in turned)
     return angle, rate, growth
@@ -451,10 +454,12 @@ def _loop(scene: Scene) -> Loop:
     )
 
 
-def _columns(scene: Scene) -> tuple[str, ...]:
+def columns_of(scene: Scene) -> tuple[str, ...]:
     """Return the columns of the scene's table."""
     if scene.motion.path == "points":
         return POINT
+    if scene.is_spatial:
+        return scene.driven
     names = tuple(arm.name for arm in scene.arms)
     names = names[: len(names) - scene.dependent_joints]
     for reserved in (TIME, CART):

@@ -139,8 +139,11 @@ class ShapeIntegrals:
 
     @cached_property
     def M(self) -> np.ndarray:
-        """Int Phi_k . Phi_l (q, q); plane bodies."""
-        return np.ascontiguousarray(self.W[0, 1:, 1:])
+        """Int Phi_k . Phi_l (q, q)."""
+        modes = self.W[:, 1:, 1:]
+        if len(modes) == len(SPACE):  # W_xx + W_yy + W_zz
+            return np.asarray(modes[0] + modes[4] + modes[8])
+        return np.ascontiguousarray(modes[0])
 
     @cached_property
     def G(self) -> np.ndarray:

@@ -79,7 +79,7 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
     return [
         trajectory.t,
         trajectory.deviation,
-        np.hypot(*trajectory.deviation.T),
+        trajectory.distance,
         trajectory.compliance.sum(axis=1),
         trajectory.q_r,
         trajectory.q_e,

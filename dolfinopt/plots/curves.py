@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.plots.style import (
     BLUE,
@@ -212,7 +213,7 @@ def deviation_figure(
     curves = [("", deviation)]
     if initial_deviation is not None:
         curves = [(INITIAL, initial_deviation), (OPTIMISED, deviation)]
-    distances = [1e3 * np.hypot(*vectors.T) for _, vectors in curves]
+    distances = [1e3 * lengths(vectors) for _, vectors in curves]
     largest = [float(d.max()) for d in distances] + [1e3 * limit for limit, _ in limits]
     top = 1.1 * max(largest) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)

@@ -136,7 +136,7 @@ def _chain(analysis: Analysis) -> Chain:
             angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
         else:
             angles = [angle] * len(bodies)
-        load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.inertia)
+        load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.moment)
         return Chain(bodies, outboard_points, angles, load, scene.objective.attached)
 
     return on_root(partition.world, freeze)

@@ -49,7 +49,7 @@ def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "complia
     if worst == "compliance":
         badness = trajectory.compliance.sum(axis=1)
     else:
-        badness = np.hypot(trajectory.deviation[:, 0], trajectory.deviation[:, 1])
+        badness = trajectory.distance
     horizon = trajectory.scene.motion.horizon
     # The tolerance keeps a sample on an interval's end in that interval, whatever the rounding.
     interval = np.ceil(trajectory.t / horizon * count - 1e-9).astype(int) - 1

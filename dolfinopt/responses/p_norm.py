@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dolfinopt.multibody.end_effector import lengths
+
 
 def p_norm(
     values: np.ndarray, exponent: float, weights: np.ndarray | None = None
@@ -35,21 +37,21 @@ def p_norm(
 def p_norm_of_lengths(
     vectors: np.ndarray, exponent: float, weights: np.ndarray | None = None
 ) -> tuple[float, np.ndarray]:
-    """Return the p-norm of the lengths |e_k| and its derivative by the vectors (n, 2).
+    """Return the p-norm of the lengths |e_k| and its derivative by the vectors (n, d).
 
     |e|^(p - 2) e: no division by a length of zero.
 
     Args:
-        vectors: (n, 2) e.
+        vectors: (n, d) e, d = 2 or 3.
         exponent: p >= 2.
         weights: as for `p_norm`.
     """
-    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
-    largest = lengths.max()
+    distances = lengths(vectors)
+    largest = distances.max()
     if largest == 0.0:
         return 0.0, np.zeros_like(vectors)
-    relative = lengths / largest
-    weights = np.ones_like(lengths) if weights is None else weights
+    relative = distances / largest
+    weights = np.ones_like(distances) if weights is None else weights
     total = float(weights @ relative**exponent)
     factor = total ** (1.0 / exponent - 1.0) * weights * relative ** (exponent - 2.0) / largest
     return float(largest * total ** (1.0 / exponent)), factor[:, None] * vectors

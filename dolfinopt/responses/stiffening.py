@@ -53,14 +53,27 @@ def _static_body(arm: Arm) -> ShapeIntegrals:
     elastic, static = state.elastic, state.elastic.constraint_modes()
     none = np.empty((len(static.interior), 0))
     weighted = elastic.mass_times(static.field)
-    basis = Basis(static.field, weighted, static.stiffness, np.eye(3), none)
+    basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)
     return shape_integrals(elastic, basis, 0.0, state.unit_loads)
 
 
 def _estimate(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> float:
     largest = 0.0
     for scene in scenes:
+        if scene.is_spatial:
+            largest = max(largest, _spatial_change(scene, chain_of(scene, owned)))
+            continue
         mechanism = build_mechanism(scene, chain_of(scene, owned))
         motion = rigid_motion(np.linspace(0.0, scene.motion.horizon, INSTANTS), scene)
         largest = max(largest, largest_change(mechanism, motion, closure_of(scene)))
     return largest
+
+
+def _spatial_change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
+    """Return the largest change of a link's stiffness in space."""
+    from dolfinopt.multibody.spatial.links import build_spatial_mechanism
+    from dolfinopt.multibody.spatial.motion import joint_motion
+    from dolfinopt.multibody.spatial.stiffening import largest_change as change
+
+    motion = joint_motion(np.linspace(0.0, scene.motion.horizon, INSTANTS), scene)
+    return change(build_spatial_mechanism(scene, bodies), motion)

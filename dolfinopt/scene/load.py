@@ -48,6 +48,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
+
 __all__ = [
     "FILE_KEYS",
     "MAX_CELLS",
@@ -117,6 +119,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
+    _size_rigid(tree)
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
     _measure_bodies(tree, inherited)
@@ -207,6 +210,25 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
         for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
             if loc[2] in ("passive", *MESH_KEYS):
                 arm.pop(loc[2], None)
+
+
+def _size_rigid(tree: dict[str, Any]) -> None:
+    """Give rigid arms in space that state their inertia a size to be drawn with.
+
+    A point has no inertia to state; of other arms mass and inertia would follow from the size.
+    """
+    arms = tree.get("arms")
+    if not tree.get("joints") or not isinstance(arms, list):
+        return
+    for arm in arms:
+        if not isinstance(arm, dict) or arm.get("rigid") is not True:
+            continue
+        length = arm.get("length")
+        point = length in (0, 0.0) and not arm.get("mass")
+        if point or ("mass" in arm and "inertia" in arm):
+            size = length / 20.0 if isinstance(length, (int, float)) and length > 0 else DRAWN
+            arm.setdefault("height", size)
+            arm.setdefault("thickness", size)
 
 
 def _time_motion(

@@ -17,7 +17,7 @@ from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.material import Material, check_material
 
-_COUNTS = {2: "two", 3: "three", 4: "four"}
+_COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
 
 
 @dataclass(frozen=True)
@@ -228,14 +228,15 @@ def _found(loc: Loc, tree: dict[str, Any]) -> str:
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:
     """Return the TOML spelling of a path, with the name of the arm it belongs to."""
     text = ".".join(map(key_text, loc))
-    name = arm_name(tree, loc[1]) if loc[0] == "arms" and len(loc) > 1 else None
+    named = loc[0] in ("arms", "joints") and len(loc) > 1
+    name = arm_name(tree, loc[1], loc[0]) if named else None
     return f"{text} ({name})" if name and loc[2:] != ("name",) else text
 
 
-def arm_name(tree: dict[str, Any], index: Any) -> str | None:
-    """Return the name of an arm if it has one that can stand in a message."""
+def arm_name(tree: dict[str, Any], index: Any, table: str = "arms") -> str | None:
+    """Return the name of an arm, or a joint, if it has one that can stand in a message."""
     try:
-        return check_arm_name(tree["arms"][index]["name"])
+        return check_arm_name(tree[table][index]["name"])
     except (KeyError, IndexError, TypeError, ValueError):
         return None
 

@@ -19,6 +19,7 @@ from dolfinopt.scene.tables.control import Control
 from dolfinopt.scene.tables.damping import Damping
 from dolfinopt.scene.tables.design import Design
 from dolfinopt.scene.tables.interpolation import Interpolation
+from dolfinopt.scene.tables.joints import Joint
 from dolfinopt.scene.tables.material import MATERIAL_VALUES, Material
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import Objective
@@ -45,6 +46,11 @@ class Scene(Table):
     material: Material = Field(description="the solid material")
     interpolation: Interpolation = Field(default=Interpolation(), description="material law")
     arms: tuple[Arm, ...] = Field(description="arms from the cart outwards")
+    joints: tuple[Joint, ...] = Field(
+        default=(),
+        description="joints of a machine in space, a tree on the ground; without this table the "
+        "arms are a chain in the plane",
+    )
     motion: Motion = Field(default=Motion(), description="prescribed motion")
     control: Control | None = Field(
         default=None,
@@ -120,13 +126,28 @@ class Scene(Table):
         return min([1.0, *scales])
 
     @property
+    def is_spatial(self) -> bool:
+        """Whether the machine moves in space, by [[joints]]."""
+        return bool(self.joints)
+
+    @property
+    def movable(self) -> tuple[Joint, ...]:
+        """Joints in space that have a coordinate, in their order."""
+        return tuple(joint for joint in self.joints if joint.moves)
+
+    @property
     def dependent_joints(self) -> int:
         """Number of joints, the last ones, that follow from the others in a closed loop."""
         return 0 if self.closure is None else self.closure.dependent
 
     @property
     def driven(self) -> tuple[str, ...]:
-        """Names of the rigid coordinates that are driven: the cart, and arms for their joints."""
+        """Names of the rigid coordinates that are driven: the cart, and arms for their joints.
+
+        In space the joints' own.
+        """
+        if self.is_spatial:
+            return tuple(joint.name for joint in self.movable)
         names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
         return names if self.motion.base == "fixed" else ("cart", *names)
 
@@ -136,7 +157,7 @@ class Scene(Table):
 
         A fixed base is no drive, and neither are joints that follow from the others in a loop.
         """
-        first = 1 if self.motion.base == "fixed" else 0
+        first = 1 if self.motion.base == "fixed" and not self.is_spatial else 0
         return slice(first, first + len(self.driven))
 
     def material_of(self, index: int) -> Material:

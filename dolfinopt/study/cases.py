@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.scene.contents import file_digest, program, with_digests
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import variants
@@ -178,7 +179,7 @@ class Outcome:
     def deviation(self) -> tuple[np.ndarray, np.ndarray]:
         """Return sample instants (n,), s, and the end-effector's distance from its path (n,), m."""
         with np.load(self.folder / "trajectory.npz", allow_pickle=False) as data:
-            return data["t"], np.hypot(*data["deviation"].T)
+            return data["t"], lengths(data["deviation"])
 
     def summary(self) -> dict[str, Any]:
         """Return the content of summary.json."""

@@ -125,6 +125,8 @@ def test_demo_states_every_other_key():
         "sample",
         "shared_volume",
         *("minimum_member", "minimum_gap"),
+        # in space
+        *("type", "parent", "child", "axis", "origin", "rpy", "centre", "offset"),
         *("pattern", "box", "circle", "material", "yield_strength"),
         "kkt_tolerance",
         "exact_iterations",

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dolfinopt.multibody.motion import along_table, columns_of
+from dolfinopt.scene.load import Scene
+
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
@@ -22,3 +25,12 @@ class JointMotion:
     def __getitem__(self, part: slice | np.ndarray) -> JointMotion:
         """Return it at some of the instants."""
         return JointMotion(self.q[part], self.qd[part], self.qdd[part])
+
+
+def joint_motion(t: np.ndarray, scene: Scene) -> JointMotion:
+    """Return the joints at instants t (n,), s, by the scene's table.
+
+    Raises:
+        InputError: the table cannot be used.
+    """
+    return JointMotion(*along_table(t, scene.motion, columns_of(scene)))

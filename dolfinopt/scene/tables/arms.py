@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from dolfinopt.scene.spelling import shown
-from dolfinopt.scene.tables.base import FileName, Length, Loc, Refusal, Table
+from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table
+from dolfinopt.scene.tables.inertia import Moment, Tensor, tensor_problem
 from dolfinopt.scene.tables.material import (
     CatalogueName,
     MassDensity,
@@ -33,7 +34,9 @@ DEFAULT_ELEMENT: dict[CellShape, ElementName] = {
 }
 SIMPLICES = ("triangle", "tetrahedron")
 SOLID_SHAPES = ("hexahedron", "tetrahedron")
+SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
+ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MESH_FILES = (".geo", ".msh", ".step", ".stp")
 
@@ -46,7 +49,7 @@ JOINT_KEYS = (
 )  # fmt: skip
 MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
 # never taken from the arm before
-OWN_KEYS = ("name", "design", "pattern", "rigid", "mass", "inertia", "sid")
+OWN_KEYS = ("name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid")
 # What an arm with a pattern has from there.
 PATTERN_KEYS = ("passive", "symmetric", "symmetric_z", "extruded", "regions")
 
@@ -69,9 +72,9 @@ class Arm(Table):
     name: Annotated[str, AfterValidator(check_arm_name)] = Field(
         description="unique name, used in files and messages [-]"
     )
-    length: Length = Field(
+    length: ArmLength = Field(
         description="distance from the inboard joint axis to the outboard one, or to the "
-        "end-effector [m]"
+        "end-effector; 0 only of a rigid arm in space [m]"
     )
     height: Length = Field(description="height in the plane of motion [m]")
     thickness: Length = Field(description="thickness normal to the plane of motion [m]")
@@ -130,12 +133,15 @@ class Arm(Table):
         le=1e9,
         description="mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
     )
-    inertia: float | None = Field(
+    inertia: Moment | Tensor | None = Field(
         default=None,
-        ge=0,
-        le=1e9,
-        description="moment of inertia of a rigid arm about its centre; default: that of a bar of "
-        "its mass [kg m2]",
+        description="moment of inertia of a rigid arm about its centre, in space the tensor xx, "
+        "yy, zz, xy, xz, yz; default: that of a bar of its mass [kg m2]",
+    )
+    centre: tuple[Position, Position, Position] | None = Field(
+        default=None,
+        description="centre of mass of a rigid arm in space, in the arm's frame; default: halfway "
+        "[m]",
     )
     joint_mass: float = Field(
         default=0.0,
@@ -227,7 +233,7 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_joint(self) -> Arm:
-        for key in ("mass", "inertia"):
+        for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
                 raise Refusal("expected only with rigid = true", (key,), ("rigid",))
         if self.joint_damping > 0.0 and self.joint_stiffness == 0.0:
@@ -255,6 +261,10 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_ends(self) -> Arm:
+        if self.length < SHORTEST and not (self.rigid and self.length == 0.0):
+            raise Refusal(f"expected a number >= {SHORTEST:g}", ("length",))
+        if self.rigid and self.length == 0.0:
+            return self
         if 2.0 * self.solid_ends >= self.length:
             raise Refusal(
                 f"expected less than half of length = {self.length} [m]", ("passive",), ("length",)
@@ -416,17 +426,32 @@ class Arm(Table):
         # Some file systems do not tell capitals apart.
         if self.name.casefold() in (arm.name.casefold() for arm in before):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
-        if self.is_solid and self.flexible and not getattr(scene, "joints", ()):
+        if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "
                 "moves in space, and needs [[joints]]",
                 (*at, "cells" if self.cells is not None else "cell_shape"),
             )
+        self._check_inertia(scene, at)
         self._check_regions(at)
         if self.pattern is not None:
             self._check_pattern(before, at)
         if self.design is not None:
             self._check_shared(before, at)
+
+    def _check_inertia(self, scene: Scene, at: Loc) -> None:
+        """Refuse what a rigid arm in the plane cannot have, and inertia that no body has."""
+        plane = "without [[joints]]: the machine moves in the plane"
+        if scene.is_spatial:
+            if problem := tensor_problem(self.inertia):
+                raise Refusal(problem, (*at, "inertia"))
+            return
+        if self.length == 0.0:
+            raise Refusal(f"expected more than 0 {plane}", (*at, "length"))
+        if isinstance(self.inertia, tuple):
+            raise Refusal(f"expected a number {plane}", (*at, "inertia"))
+        if self.centre is not None:
+            raise Refusal(f"expected none {plane}", (*at, "centre"))
 
     def _check_shared(self, before: tuple[Arm, ...], at: Loc) -> None:
         owners = {arm.name: arm for arm in before if arm.own}

@@ -56,6 +56,12 @@ class Closure(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse a loop of too few arms, and what a closed loop cannot be combined with."""
+        if scene.is_spatial:
+            raise Refusal(
+                "expected no [closure] with [[joints]]: closed loops are simulated in the plane",
+                (*at, "kind"),
+                ("joints",),
+            )
         if len(scene.arms) <= self.dependent:
             raise Refusal(
                 f'expected kind = "{self.kind}" with at least {self.dependent + 1} arms, found '

@@ -16,6 +16,7 @@ Path2D = Literal["arc", "line", "points", "joints", "rotation"]
 TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
 Base = Literal["cart", "fixed"]
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
+Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 
 
@@ -106,8 +107,10 @@ class Motion(Table):
         default=-1,
         description="sign of the elbow angle beta; with one arm, of the cosine of its angle [-]",
     )
-    gravity: tuple[Acceleration, Acceleration] = Field(
-        default=(0.0, 0.0), description="gravitational acceleration in x and y [m/s2]"
+    gravity: Gravity = Field(
+        default=(0.0, 0.0),
+        description="gravitational acceleration in x and y; in space, with [[joints]], in x, y and "
+        "z [m/s2]",
     )
 
     @model_validator(mode="after")
@@ -159,6 +162,14 @@ class Motion(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
+        if scene.is_spatial:
+            return  # `tables.joints` knows
+        if len(self.gravity) == 3:
+            raise Refusal(
+                "expected an array of two numbers without [[joints]]: the machine moves in the "
+                "plane",
+                ("motion", "gravity"),
+            )
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(

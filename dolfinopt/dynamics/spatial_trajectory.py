@@ -1,0 +1,88 @@
+"""The simulated motion of a machine in space, see `simulation.Trajectory`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.spatial_system import SpatialSystem, interface_rotations
+from dolfinopt.multibody.spatial.end_effector import (
+    deviation,
+    end_effector,
+    end_effector_gradient,
+)
+from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
+from dolfinopt.multibody.spatial.motion import JointMotion
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialTrajectory(Trajectory):
+    """A simulated motion in space; joints stand in the order of [[joints]]."""
+
+    problem: SpatialSystem  # type: ignore[assignment]
+
+    @property
+    def mechanism(self) -> SpatialMechanism:  # type: ignore[override]
+        """What moved."""
+        return self.problem.mechanism
+
+    @cached_property
+    def motion(self) -> JointMotion:  # type: ignore[override]
+        """Joints at the samples, as they move."""
+        return self.desired
+
+    @cached_property
+    def desired(self) -> JointMotion:  # type: ignore[override]
+        """Joints at the samples as the scene asks for them."""
+        return self.problem.motion(self.t)
+
+    @cached_property
+    def deviation(self) -> np.ndarray:
+        """Flexible minus rigid end-effector (n, 3), m."""
+        return deviation(self.mechanism, self.motion, self.q_e)
+
+    @cached_property
+    def end(self) -> np.ndarray:
+        """Place of the end-effector (n, 3), m, as it moves."""
+        return end_effector(self.mechanism, self.motion, self.q_e)
+
+    @cached_property
+    def deflections(self) -> np.ndarray:
+        """Largest outboard deflection of every body in its own frame, over its length (bodies,)."""
+        found = []
+        for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
+            u = np.linalg.norm(self.q_e[:, part] @ body.outboard[:3].T, axis=1)
+            length = float(np.linalg.norm(body.outboard_point))
+            found.append(u.max() / length if body.num_modes and length else 0.0)
+        return np.array(found)
+
+    @cached_property
+    def interface_rotations(self) -> np.ndarray:
+        """Largest rotation of every body's outboard interface (bodies,), rad."""
+        return interface_rotations(self.mechanism, self.q_e)
+
+    @cached_property
+    def joint_forces(self) -> np.ndarray:
+        """What drives the joints (n, joints), N m of revolute and N of prismatic ones."""
+        qd, qdd = self.unknowns[1:]
+        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+
+    def by_end_effector(
+        self, indices: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return the gradient of sum_n weights_n . end_effector_n at some samples.
+
+        Args:
+            indices: (n,) of the samples.
+            weights: (n, 3).
+
+        Returns:
+            By the system's coordinates (n, S), and by every body.
+        """
+        motion, q = self.motion[indices], self.q_e[indices]
+        by_q, _, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
+        return by_q, by_bodies
