@@ -175,8 +175,9 @@ def draw(
 
     minimised = objective_of(scene)
     label = f"{minimised.label} [{minimised.unit}]"
-    draw_design(folder / "design.png", designed(views), scene.name)
-    if stressed := [view for view in views if view.stress is not None]:
+    if not scene.is_spatial:  # designs in the plane
+        draw_design(folder / "design.png", designed(views), scene.name)
+    if not scene.is_spatial and (stressed := [view for view in views if view.stress is not None]):
         draw_stress(folder / "stress.png", stressed, scene.name)
     if history:
         limits = limits_by_column(scene, history[0].constraints)
@@ -189,6 +190,8 @@ def draw(
         draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title, of_end)
     if trajectory.is_machine:
         draw_drives(folder / "drives.png", trajectory)
+    if scene.is_spatial:
+        return
     save(figure_of(views, trajectory, scene.name), folder / "machine.png")
     if animation:
         from dolfinopt.plots.animation import draw_motion
@@ -249,9 +252,9 @@ def _stress(summary: Mapping[str, Any]) -> str:
     found = summary["stress"]
     if found is None:
         return ""
-    x, y = found["place"]
+    place = ", ".join(f"{x:.3g}" for x in found["place"])
     return (
-        f"largest stress {1e-6 * found['value']:.4g} MPa in {found['arm']} at ({x:.3g}, {y:.3g}) m "
+        f"largest stress {1e-6 * found['value']:.4g} MPa in {found['arm']} at ({place}) m "
         f"and {found['instant']:.3f} s, "
     )
 

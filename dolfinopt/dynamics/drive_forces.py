@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -24,12 +25,25 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import Tangent, linearise
 
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.spatial_system import SpatialSystem
+
+    Problem = ElasticSystem | MachineSystem | SpatialSystem
+
+
+class Forces(Protocol):
+    """Drive forces at some instants."""
+
+    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return `DriveForces.gradient`."""
+
+
 CHUNK = 512  # instants whose matrices are made at once
 KEPT_BYTES = 64e6  # of matrices that are kept for further functions of the same forces
 
 
 def drive_force_gradient(
-    system: ElasticSystem | MachineSystem, t: np.ndarray, rates: Rates, weights: np.ndarray
+    system: Problem, t: np.ndarray, rates: Rates, weights: np.ndarray
 ) -> tuple[np.ndarray, list[ShapeIntegrals]]:
     """Return what `DriveForces.gradient` does, of a single function."""
     return DriveForces(system, t, rates).gradient(weights)
@@ -44,10 +58,10 @@ class DriveForces:
         rates: its S coordinates, their rates and accelerations there, each (n, S).
     """
 
-    def __init__(self, system: ElasticSystem | MachineSystem, t: np.ndarray, rates: Rates) -> None:
+    def __init__(self, system: Problem, t: np.ndarray, rates: Rates) -> None:
         """Take the motion."""
         self.system, self.t, self.rates = system, t, rates
-        self._kept: list[_Prescribed | _Machine] = []
+        self._kept: list[Forces] = []
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return the derivative of sum_n weights_n . forces_n, instants and coordinates held apart.
@@ -68,7 +82,7 @@ class DriveForces:
         assert total is not None, "no instants"
         return np.concatenate(by_rates, axis=1), total
 
-    def _chunks(self, parts: list[slice]) -> Iterable[_Prescribed | _Machine]:
+    def _chunks(self, parts: list[slice]) -> Iterable[Forces]:
         """Return the parts' own; the same ones every time unless they take too much memory."""
         bodies, columns = len(self.system.mechanism.bodies), 3 * self.rates[0].shape[1]
         if 8 * len(self.t) * (1 + 8 * bodies) * columns > KEPT_BYTES:
@@ -76,12 +90,16 @@ class DriveForces:
         self._kept = self._kept or [self._chunk(part) for part in parts]
         return self._kept
 
-    def _chunk(self, part: slice) -> _Prescribed | _Machine:
+    def _chunk(self, part: slice) -> Forces:
         y, yd, ydd = (x[part] for x in self.rates)
         system, t = self.system, self.t[part]
         if isinstance(system, ElasticSystem):
             return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
-        return _Machine(system.at(t), (y, yd, ydd))
+        if isinstance(system, MachineSystem):
+            return _Machine(system.at(t), (y, yd, ydd))
+        from dolfinopt.dynamics.spatial_forces import SpatialForces
+
+        return SpatialForces(system.mechanism, system.motion(t), (y, yd, ydd))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,30 +16,58 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.multibody.inverse_dynamics import Rates, body_loads
+from dolfinopt.multibody.mechanism import ElasticBodies
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
+from dolfinopt.multibody.shape_integrals import SPACE, ShapeIntegrals, in_basis
 
-UNIT_LOADS = 7  # of frame and outboard interface, in the plane
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.spatial_system import SpatialSystem
+
+    Problem = ElasticSystem | MachineSystem | SpatialSystem
 
 
-def num_loads(num_modes: int) -> int:
-    """Return the number of entries of c of a body with so many modes."""
-    return UNIT_LOADS + 2 * num_modes
+@dataclass(frozen=True)
+class LoadCounts:
+    """How many entries of c a body has, in their order.
+
+    Attributes:
+        frame: of the frame's acceleration and rotation: 4, in space 12.
+        outboard: force and moment at the outboard interface: 3, in space 6.
+        elastic: of the inertia of the elastic motion: 2 q, in space 9 q.
+    """
+
+    frame: int
+    outboard: int
+    elastic: int
+
+    @property
+    def total(self) -> int:
+        """All of them: 7 + 2 q, in space 18 + 9 q."""
+        return self.frame + self.outboard + self.elastic
+
+
+def load_counts(body: ShapeIntegrals) -> LoadCounts:
+    """Return the numbers of entries of c of a body."""
+    (d, _), g = body.w.shape, len(body.W)
+    return LoadCounts(d + g, len(body.outboard), g * body.num_modes)
 
 
 def load_coefficients(
-    system: ElasticSystem | MachineSystem,
+    system: Problem,
     t: np.ndarray,
     rates: Rates,
     motion: RigidMotion | None = None,
 ) -> list[np.ndarray]:
     """Return c (n, 7 + 2 q) of every body, see above; m/s2, 1/s2, N, N m and modes per s2.
+
+    In space they are 18 + 9 q: a, A_ab, force, moment, and A_ab q + 2 Omega_ab qd + delta_ab qdd.
 
     Args:
         system: what moves.
@@ -73,7 +101,7 @@ class LoadGradient:
 
 
 def load_gradient(
-    system: ElasticSystem | MachineSystem,
+    system: Problem,
     t: np.ndarray,
     rates: Rates,
     by_coefficients: Sequence[np.ndarray],
@@ -82,7 +110,7 @@ def load_gradient(
 
     Args:
         system, t, rates: as there.
-        by_coefficients: (n, 7 + 2 q) of every body.
+        by_coefficients: (n, 7 + 2 q or 18 + 9 q) of every body.
     """
     probe = _Probe(system)
     at = tuple(probe.spread(x) for x in rates)
@@ -109,22 +137,23 @@ class _Probe:
         places: of the added coordinates of every body.
     """
 
-    def __init__(self, system: ElasticSystem | MachineSystem):
-        mechanism = system.mechanism
+    def __init__(self, system: Problem):
+        mechanism: ElasticBodies = system.mechanism
         first = system.elastic_columns.start or 0
         own = list(range(first))
         self.places: list[slice] = []
         end = first
         for body in mechanism.bodies:
-            q, more = body.num_modes, num_loads(body.num_modes)
+            q, more = body.num_modes, load_counts(body).total
             own += range(end, end + q)
             self.places.append(slice(end + q, end + q + more))
             end += q + more
         rest = system.num_coordinates - first - mechanism.num_coordinates
         self.own = np.array([*own, *range(end, end + rest)], dtype=int)
         self._size = end + rest
-        wide = replace(mechanism, bodies=tuple(map(_with_probes, mechanism.bodies)))
-        self.system = replace(system, mechanism=wide)
+        bodies = tuple(map(_with_probes, mechanism.bodies))
+        change: dict[str, Any] = {"mechanism": replace(mechanism, bodies=bodies)}
+        self.system: Any = replace(system, **change)
 
     def spread(self, x: np.ndarray) -> np.ndarray:
         """Return the larger system's unknowns (n, S + ...) of the system's (n, S)."""
@@ -135,10 +164,14 @@ class _Probe:
 
 def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body with one coordinate more for every entry of c, which alone loads it."""
-    q, more = body.num_modes, num_loads(body.num_modes)
+    q, more = body.num_modes, load_counts(body).total
     wide = in_basis(body, np.eye(q, q + more))
     w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
     k = 1 + q + np.arange(more)  # beside the reference position and the modes
+    if len(body.W) == len(SPACE):
+        _probe_space(w, W, outboard, k)
+        K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
+        return replace(wide, w=w, W=W, outboard=outboard, K=K)
     w[0, k[0]] = w[1, k[1]] = 1.0  # C
     W[1, k[2], 0], W[1, 0, k[2]] = 1.0, -1.0  # r
     W[0, k[3], 0] = W[0, 0, k[3]] = 1.0  # j
@@ -148,3 +181,16 @@ def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     W[1, around, modes], W[1, modes, around] = 1.0, -1.0  # G
     K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
     return replace(wide, w=w, W=W, outboard=outboard, K=K)
+
+
+def _probe_space(w: np.ndarray, W: np.ndarray, outboard: np.ndarray, k: np.ndarray) -> None:
+    """Give the coordinates k of a spatial body one load each, in the order of c."""
+    q = (len(k) - 18) // 9
+    partners = np.arange(9).reshape(3, 3).T.ravel()  # W_ba = W_ab'
+    w[np.arange(3), k[:3]] = 1.0
+    for ab in range(9):
+        at = k[3 + ab]
+        W[ab, at, 0] = W[partners[ab], 0, at] = 1.0
+        own, modes = k[18 + ab * q : 18 + (ab + 1) * q], 1 + np.arange(q)
+        W[ab, own, modes] = W[partners[ab], modes, own] = 1.0
+    outboard[np.arange(6), k[12:18] - 1] = 1.0

@@ -9,6 +9,7 @@ import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.spatial_system import SpatialSystem, interface_rotations
+from dolfinopt.multibody.spatial.body_loads import load_coefficients
 from dolfinopt.multibody.spatial.end_effector import (
     deviation,
     end_effector,
@@ -70,6 +71,11 @@ class SpatialTrajectory(Trajectory):
         """What drives the joints (n, joints), N m of revolute and N of prismatic ones."""
         qd, qdd = self.unknowns[1:]
         return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+
+    @cached_property
+    def load_coefficients(self) -> list[np.ndarray]:
+        """What loads every body (n, 18 + 9 q), see `dynamics.load_coefficients`."""
+        return load_coefficients(self.mechanism, self.motion, self.unknowns)
 
     def by_end_effector(
         self, indices: np.ndarray, weights: np.ndarray

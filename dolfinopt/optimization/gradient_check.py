@@ -221,8 +221,9 @@ def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np
         return arms[k].mesh.centroid[:, 0] / arms[k].mesh.outboard_point[0]
 
     def noise(k: int) -> np.ndarray:
-        x, y = arms[k].mesh.centroid.T * 1e3
-        return 2.0 * np.modf(np.abs(np.sin(12.9898 * x + 78.233 * y + k) * 43758.5453))[0] - 1.0
+        x, y, *z = arms[k].mesh.centroid.T * 1e3
+        angle = 12.9898 * x + 78.233 * y + sum(37.719 * one for one in z)
+        return 2.0 * np.modf(np.abs(np.sin(angle + k) * 43758.5453))[0] - 1.0
 
     chosen: dict[str, Callable[[int], np.ndarray]] = {
         "random": noise,

@@ -12,8 +12,15 @@ import numpy as np
 from dolfinopt.disk import write_atomically
 from dolfinopt.output.views import ArmView, designed
 
-VTK_TRIANGLE, VTK_QUAD = 5, 9
-XDMF_CELLS = {3: 4, 4: 5}  # its numbers of triangles and quadrilaterals, by corners
+# Cells by dimension and corners: triangle, quadrilateral, tetrahedron, hexahedron.
+VTK_CELLS = {(2, 3): 5, (2, 4): 9, (3, 4): 10, (3, 8): 12}
+XDMF_CELLS = {(2, 3): 4, (2, 4): 5, (3, 4): 6, (3, 8): 9}
+XDMF_NAMES = {
+    (2, 3): "Triangle",
+    (2, 4): "Quadrilateral",
+    (3, 4): "Tetrahedron",
+    (3, 8): "Hexahedron",
+}
 
 
 def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
@@ -33,7 +40,8 @@ class _Sheet:
 
     Attributes:
         points: (n_points, 3).
-        cells: (n_cells, 3 or 4) points around each cell, an array an arm.
+        cells: (n_cells, corners) points around each cell, an array an arm.
+        dimension: of the cells, 2 or 3.
         density: (all cells,).
         arm: (all cells,) number of the arm, from 0 in the scene's order.
         stress: (all cells,) largest von Mises stress along the motion, Pa, or None.
@@ -44,6 +52,7 @@ class _Sheet:
     density: np.ndarray
     arm: np.ndarray
     stress: np.ndarray | None = None
+    dimension: int = 2
 
     @property
     def fields(self) -> dict[str, np.ndarray]:
@@ -58,7 +67,8 @@ def _sheet(views: Sequence[ArmView]) -> _Sheet:
     for index, view in enumerate(views):
         if view.designed:
             own, corners = _merge_corners(view.corners)
-            points.append(np.column_stack([own[:, 0], own[:, 1] + offset, np.zeros(len(own))]))
+            depth = own[:, 2] if own.shape[1] == 3 else np.zeros(len(own))
+            points.append(np.column_stack([own[:, 0], own[:, 1] + offset, depth]))
             cells.append(corners + count)
             arm.append(np.full(len(corners), index))
             offset -= 2.0 * np.ptp(own[:, 1])
@@ -66,7 +76,8 @@ def _sheet(views: Sequence[ArmView]) -> _Sheet:
     density = np.concatenate([view.density for view in designed(views)])
     stresses = [view.stress for view in designed(views) if view.stress is not None]
     whole = np.concatenate(stresses) if len(stresses) == len(cells) else None
-    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm), whole)
+    dimension = designed(views)[0].corners.shape[2]
+    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm), whole, dimension)
 
 
 def _write_vtu(path: Path, sheet: _Sheet) -> None:
@@ -90,7 +101,8 @@ def _write_vtu(path: Path, sheet: _Sheet) -> None:
     cells = Xml.SubElement(piece, "Cells")
     add(cells, "connectivity", np.concatenate([part.ravel() for part in sheet.cells]))
     add(cells, "offsets", np.cumsum(corners))
-    add(cells, "types", np.where(corners == 4, VTK_QUAD, VTK_TRIANGLE))
+    types = [np.full(len(part), VTK_CELLS[sheet.dimension, part.shape[1]]) for part in sheet.cells]
+    add(cells, "types", np.concatenate(types))
     data = Xml.SubElement(piece, "CellData", Scalars="density")
     for name, values in sheet.fields.items():
         add(data, name, values)
@@ -105,13 +117,14 @@ def _write_xdmf(path: Path, sheet: _Sheet) -> None:
     Xml.SubElement(grid, "Time", Value="0")
     topology = Xml.SubElement(grid, "Topology")
     topology.set("NumberOfElements", str(len(sheet.density)))
-    shapes = {part.shape[1] for part in sheet.cells}
+    shapes = {(sheet.dimension, part.shape[1]) for part in sheet.cells}
     if len(shapes) == 1:
-        topology.set("TopologyType", "Quadrilateral" if shapes == {4} else "Triangle")
+        topology.set("TopologyType", XDMF_NAMES[next(iter(shapes))])
         _data_item(topology, np.vstack(sheet.cells), "Int")
     else:
         topology.set("TopologyType", "Mixed")
-        parts = [np.insert(part, 0, XDMF_CELLS[part.shape[1]], axis=1) for part in sheet.cells]
+        numbers = [XDMF_CELLS[sheet.dimension, part.shape[1]] for part in sheet.cells]
+        parts = [np.insert(c, 0, k, axis=1) for c, k in zip(sheet.cells, numbers, strict=True)]
         _data_item(topology, np.concatenate([part.ravel() for part in parts]), "Int")
     geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
     _data_item(geometry, sheet.points, "Float")
@@ -141,8 +154,8 @@ def _text_of(values: np.ndarray, form: str) -> str:
 
 
 def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 2) and cells (n_cells, corners) of cells that share their corners."""
-    flat = corners.reshape(-1, 2)
+    """Return points (n, d) and cells (n_cells, corners) of cells that share their corners."""
+    flat = corners.reshape(-1, corners.shape[2])
     rounded = np.round(flat / (1e-9 * np.ptp(flat, axis=0).max()))
     _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     return flat[kept], place.reshape(corners.shape[:2])

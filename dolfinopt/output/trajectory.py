@@ -11,6 +11,8 @@ from dolfinopt.disk import write_arrays, write_text
 from dolfinopt.multibody.motion import CART
 from dolfinopt.scene.load import Scene
 
+FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
+
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
 
@@ -23,7 +25,7 @@ def write_trajectory(
     Args:
         folder: where.
         trajectory: what.
-        initial: (n, 2) deviation of the initial design, m, kept for the picture.
+        initial: (n, d) deviation of the initial design, m, kept for the picture.
     """
     arrays = {
         "t": trajectory.t,
@@ -45,7 +47,7 @@ def write_trajectory(
         "q_e": "m or rad: times V is a displacement in m",
         "deviation": "m",
         "compliance": "N m",
-        "joint_forces": ", ".join(("N", *["N m"] * len(scene.arms))),
+        "joint_forces": ", ".join(FORCE_OF[unit] for unit in rigid_units(scene).values()),
         "closure_force": "N, " + _directions(scene),
         "slider_position": "m, from closure.point along closure.direction",
         "initial_deviation": "m",
@@ -90,13 +92,16 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
 
 
 def rigid_units(scene: Scene) -> dict[str, str]:
-    """Return the unit of every rigid coordinate by its name: cart, then the arms."""
+    """Return the unit of every rigid coordinate by its name: cart, then the arms; or the joints."""
+    if scene.is_spatial:
+        return {one.name: "m" if one.type == "prismatic" else "rad" for one in scene.movable}
     return {CART: "m", **{arm.name: "rad" for arm in scene.arms}}
 
 
 def drive_units(scene: Scene) -> dict[str, str]:
     """Return the unit of every drive by the name of its coordinate, see `Scene.driven`."""
-    return {name: "N" if name == CART else "N m" for name in scene.driven}
+    units = rigid_units(scene)
+    return {name: FORCE_OF[units[name]] for name in scene.driven}
 
 
 def free_drives(scene: Scene) -> tuple[str, ...]:
@@ -110,7 +115,8 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
 def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     """Return the unit of every column of trajectory.csv, in their order."""
     scene, slices = trajectory.scene, trajectory.mechanism.slices
-    units = {"t": "s", "deviation_x": "m", "deviation_y": "m", "deviation": "m"}
+    axes = "xyz" if scene.is_spatial else "xy"
+    units = {"t": "s", **{f"deviation_{axis}": "m" for axis in axes}, "deviation": "m"}
     units |= {"compliance": "N m"}
     units |= {f"q_r_{name}": unit for name, unit in rigid_units(scene).items()}
     for arm, part in zip(scene.arms, slices, strict=True):

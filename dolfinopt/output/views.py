@@ -22,16 +22,26 @@ if TYPE_CHECKING:
 CIRCLE = 48  # corners that stand for a circle in pictures
 
 
+# DOLFINx numbers corners of quadrilaterals and hexahedra as a tensor product; here they go around.
+AROUND: dict[tuple[int, ...], list[int]] = {
+    (3, 2): [0, 1, 2],
+    (4, 2): [0, 1, 3, 2],
+    (4, 3): [0, 1, 2, 3],
+    (8, 3): [0, 1, 3, 2, 4, 5, 7, 6],
+}
+
+
 @dataclass(frozen=True, eq=False)
 class ArmView:
     """One whole arm on the root, cells in the order of their centroids.
 
     Attributes:
         name: the arm's.
-        corners: (n_cells, 3 or 4, 2) m, around each cell.
-        centroid: (n_cells, 2) m.
+        corners: (n_cells, 3 or 4, 2) m, around each cell; of solids (n_cells, 4 or 8, 3), as VTK
+            orders them.
+        centroid: (n_cells, d) m.
         density: (n_cells,) physical densities.
-        modes: (n_cells, 3 or 4, 2, q) the reduced basis at the corners; q = 0 if not reduced.
+        modes: (n_cells, corners, d, q) the reduced basis at the corners; q = 0 if not reduced.
         designed: False for arms without a design: rigid ones and those from a file.
         length: from joint axis to joint axis, m; None if not known.
         regions: what the scene keeps solid or void: kind and outline (n, 2), m, of every region.
@@ -81,7 +91,7 @@ def gather_views(
     def modes(index: int, arm: Arm) -> np.ndarray:
         cells = corner_nodes(arm)
         if arm.basis is None:
-            return np.zeros((*cells.shape, 2, 0))
+            return np.zeros((*cells.shape, arm.mesh.dim, 0))
         return arm.basis.V[cells]
 
     def points(index: int, arm: Arm) -> np.ndarray:
@@ -112,11 +122,10 @@ def _views(
     for index, owner in enumerate(scene.owners):
         name = scene.arms[index].name
         if owner is None:
-            views.append(_bar_view(name, scene.arms[index].height, fixed_body(scene, index)))
+            views.append(_fixed_view(scene, index))
             continue
         order = canonical_order(centroids[owner])
-        # DOLFINx numbers a quadrilateral's corners as a tensor product; here they go around.
-        around = [0, 1, 3, 2] if corners[owner].shape[1] == 4 else [0, 1, 2]
+        around = AROUND[corners[owner].shape[1:]]
         known = stress.get(index)
         views.append(
             ArmView(
@@ -155,6 +164,21 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
     return tuple(found)
 
 
+def _fixed_view(scene: Scene, index: int) -> ArmView:
+    """Return an arm without a design: a bar, in space a box from inboard to outboard."""
+    arm, body = scene.arms[index], fixed_body(scene, index)
+    if not scene.is_spatial:
+        return _bar_view(arm.name, arm.height, body)
+    side = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # of y and z
+    faces = [
+        np.column_stack([np.full(4, x), side * [arm.height, arm.thickness]])
+        for x in (0.0, arm.length)
+    ]
+    corners = np.concatenate(faces)[None]
+    modes = np.zeros((*corners.shape, 0))
+    return ArmView(arm.name, corners, corners.mean(axis=1), np.ones(1), modes, False, arm.length)
+
+
 def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
     """Return a body whose shape is not known as a bar from joint to joint.
 
@@ -180,10 +204,10 @@ def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
 
 
 def canonical_order(points: np.ndarray) -> np.ndarray:
-    """Sort points by x, then y, as equal to 1e-9 of their extent: the same on any partition."""
+    """Sort points by x, then y (then z), equal to 1e-9 of their extent: alike on any partition."""
     size = np.ptp(points, axis=0).max() or 1.0
     rounded = np.round(points / (1e-9 * size))
-    return np.lexsort((rounded[:, 1], rounded[:, 0]))
+    return np.lexsort(rounded.T[::-1])
 
 
 def designed(views: Sequence[ArmView]) -> list[ArmView]:

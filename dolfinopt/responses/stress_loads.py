@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dolfinopt.dynamics.adjoint import add_gradients
-from dolfinopt.dynamics.load_coefficients import load_gradient, num_loads
+from dolfinopt.dynamics.load_coefficients import load_counts, load_gradient
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import SPACE, ShapeIntegrals
 from dolfinopt.responses.response import by_owner
 from dolfinopt.responses.scenarios import cotangents_of_scene, factors
 from dolfinopt.scene.load import Scene
@@ -52,7 +52,11 @@ def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[Arm
 
 
 def load_matrix(body: ShapeIntegrals) -> np.ndarray:
-    """Return P = V' L (q, 7 + 2 q): every load's part in the modes."""
+    """Return P = V' L (q, 7 + 2 q), in space (q, 18 + 9 q): every load's part in the modes."""
+    if len(body.W) == len(SPACE):
+        q, (of_X, of_modes) = body.num_modes, (body.W[:, 1:, 0], body.W[:, 1:, 1:])
+        elastic = of_modes.swapaxes(0, 1).reshape(q, -1)
+        return np.hstack([body.C.T, of_X.T, body.outboard.T, elastic])
     columns = [body.C.T, body.r[:, None], body.j[:, None], body.outboard.T, body.M, body.G]
     return np.hstack(columns)
 
@@ -75,12 +79,12 @@ def loads_gradient(
     by_q = np.zeros((len(instants), mechanism.num_coordinates))
     by_c, own = [], []
     for place, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        by_loads = np.zeros((len(instants), num_loads(body.num_modes)))
+        by_loads = np.zeros((len(instants), load_counts(body).total))
         by_P, by_K = np.zeros((body.num_modes, by_loads.shape[1])), np.zeros_like(body.K)
         if place in by_arm:
             where, by = by_arm[place]
             rows, q = np.searchsorted(instants, where), body.num_modes
-            by = by * _scale(scene, motion.scene, place, q)
+            by = by * _scale(scene, motion.scene, place, body)
             c, P = motion.load_coefficients[place][where], load_matrix(body)
             z = -np.linalg.solve(body.K, by[:, :q].T)
             by_q[rows, part] = by[:, :q]
@@ -107,19 +111,21 @@ def _coefficients(scene: Scene, motion: Trajectory, place: int) -> np.ndarray:
     body, c = mechanism.bodies[place], motion.load_coefficients[place]
     modal = motion.q_e[:, mechanism.slices[place]]
     modal = modal - np.linalg.solve(body.K, load_matrix(body) @ c.T).T
-    return np.hstack([modal, c]) * _scale(scene, motion.scene, place, body.num_modes)
+    return np.hstack([modal, c]) * _scale(scene, motion.scene, place, body)
 
 
-def _scale(scene: Scene, other: Scene, place: int, q: int) -> np.ndarray:
+def _scale(scene: Scene, other: Scene, place: int, body: ShapeIntegrals) -> np.ndarray:
     """Return what an arm's columns are multiplied by in another scene (q + 7 + 2 q,)."""
-    scale = np.ones(q + num_loads(q))
+    counts, q = load_counts(body), body.num_modes
+    scale = np.ones(q + counts.total)
     if other is scene:
         return scale
     owner = scene.owners[place]
     assert owner is not None
     f = factors(scene, other, owner)
     scale[q:] = f.mass / f.stiffness
-    scale[q + 4 : q + 7] = 1.0 / f.stiffness
+    outboard = q + counts.frame
+    scale[outboard : outboard + counts.outboard] = 1.0 / f.stiffness
     young = other.material_of(owner).young_modulus / scene.material_of(owner).young_modulus
     return young * scale
 
@@ -127,10 +133,16 @@ def _scale(scene: Scene, other: Scene, place: int, q: int) -> np.ndarray:
 def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> ShapeIntegrals:
     """Return the derivatives by a body from those by P and K."""
     q = body.num_modes
-    w, W, outboard = np.zeros_like(body.w), np.zeros_like(body.W), by_P[:, 4:7].T
-    w[:, 1:] = by_P[:, :2].T
-    W[1, 1:, 0], W[0, 0, 1:] = by_P[:, 2], by_P[:, 3]
-    W[0, 1:, 1:], W[1, 1:, 1:] = by_P[:, 7 : 7 + q], by_P[:, 7 + q :]
+    w, W = np.zeros_like(body.w), np.zeros_like(body.W)
+    if len(W) == len(SPACE):
+        outboard = by_P[:, 12:18].T
+        w[:, 1:], W[:, 1:, 0] = by_P[:, :3].T, by_P[:, 3:12].T
+        W[:, 1:, 1:] = by_P[:, 18:].reshape(q, 9, q).swapaxes(0, 1)
+    else:
+        outboard = by_P[:, 4:7].T
+        w[:, 1:] = by_P[:, :2].T
+        W[1, 1:, 0], W[0, 0, 1:] = by_P[:, 2], by_P[:, 3]
+        W[0, 1:, 1:], W[1, 1:, 1:] = by_P[:, 7 : 7 + q], by_P[:, 7 + q :]
     zero = {
         key: np.zeros_like(getattr(body, key))
         for key in ("D", "outboard_point", "K0", "K0_outboard")

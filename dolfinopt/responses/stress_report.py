@@ -32,7 +32,7 @@ class Peak:
     """
 
     value: float
-    place: tuple[float, float]
+    place: tuple[float, ...]
     instant: float
 
     def to_dict(self, arm: str) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def stress_report(
 
 @dataclass(frozen=True, eq=False)
 class _Peaks:
-    """Of one arm: place in the chain; value, place (2,) and sample of both peaks."""
+    """Of one arm: place in the chain; value, place (d,) and sample of both peaks."""
 
     place: int
     centre: tuple[float, np.ndarray, int]
@@ -124,7 +124,7 @@ class _Peaks:
 
 def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
     def peak(value: float, place: np.ndarray, sample: int) -> Peak:
-        return Peak(value, (float(place[0]), float(place[1])), float(t[sample]))
+        return Peak(value, tuple(map(float, place)), float(t[sample]))
 
     when = t[cells[:, 1].astype(int)]
     return ArmStress(peak(*peaks.centre), peak(*peaks.points), cells[:, 0], when)
@@ -143,12 +143,12 @@ def _arm_stress(
     where = cells.state.mesh.centroid
     centre = largest.largest, _shared(partition, where, largest.point), largest.instant
     state, mesh = cells.state, cells.state.mesh
-    points = stress_points(compat.cell_geometry_nodes(mesh.mesh, 0).shape[1])
+    points = stress_points(compat.cell_geometry_nodes(mesh.mesh, 0).shape[1], mesh.dim)
     operator = stress_operator(mesh, state.elastic.operators, points)
     A = state.load_fields.stress(state.solid.young_modulus * operator)
     A *= np.repeat(cells.root * (cells.weights > 0.0), len(points))[:, None]
     largest = screen(comm, A, a, coarse)
-    place = _shared(partition, places_of(mesh, points).reshape(-1, 2), largest.point)
+    place = _shared(partition, places_of(mesh, points).reshape(-1, mesh.dim), largest.point)
     peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant))
     return peaks, np.column_stack([by_cell, when])
 

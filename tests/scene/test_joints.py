@@ -51,6 +51,7 @@ def with_tool():
     data = copy.deepcopy(ROBOT)
     data["arms"].append(TOOL)
     data["joints"].append(WRIST)
+    data["reduction"] = {"coordinates": 6}
     return data
 
 

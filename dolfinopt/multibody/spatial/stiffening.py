@@ -7,22 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from dolfinopt.multibody.shape_integrals import rigid_part
-from dolfinopt.multibody.spatial.inverse_dynamics import Link, inward_pass, outward_pass
-from dolfinopt.multibody.spatial.kinematics import Load
+from dolfinopt.multibody.spatial.body_loads import body_loads
+from dolfinopt.multibody.spatial.inverse_dynamics import inward_pass, outward_pass
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.stiffening import stiffness_change
-
-
-def body_loads(links: list[Link], outboard: list[Load | None]) -> list[np.ndarray]:
-    """Return p = (a, A_ab, force, moment) (n, 18) of every body; see `shape_integrals`."""
-    found = []
-    for link, load in zip(links, outboard, strict=True):
-        count = len(link.body.a)
-        none = np.zeros((count, 3))
-        force, moment = (none, none) if load is None else load
-        found.append(np.hstack([link.body.a, link.body.A.reshape(count, 9), force, moment]))
-    return found
 
 
 def largest_change(mechanism: SpatialMechanism, motion: JointMotion) -> float:
