@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.arms import check_arm_name
 from dolfinopt.scene.tables.base import Loc, Position, Refusal, Table
+from dolfinopt.scene.tables.responses import asked
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -20,6 +21,7 @@ Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 GROUND = "ground"
 TIME = "t"  # column of a table of joint coordinates
 # What a machine in the plane has instead of joints.
+PLANE_RESPONSES = ("static", "tip_deflection", "eigenfrequency", "first_frequency")
 PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
@@ -155,6 +157,15 @@ def _check_machine(scene: Scene) -> None:
             ("control", "stiffness"),
             ("joints",),
         )
+    for key in asked(scene):
+        if key in PLANE_RESPONSES:
+            objective = scene.objective.kind == key
+            raise Refusal(
+                "expected a response of the motion, or mass, with [[joints]]: this one is computed "
+                "of arms in the plane",
+                ("objective", "kind") if objective else ("constraints", key),
+                ("joints",),
+            )
     for k, arm in enumerate(scene.arms):
         if arm.sid is not None:
             raise Refusal(

@@ -1,0 +1,74 @@
+"""The yaw-pitch-pitch chain of solid links: its deviation, gradients of responses, its files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import ROOT, overrides, run
+
+import dolfinopt as do
+from dolfinopt.arms.patterns import uniform_design
+from dolfinopt.optimization.gradient_check import taylor_test
+
+pytestmark = pytest.mark.serial
+DEMO = ROOT / "demos" / "spatial_arm.toml"
+COARSE = ("arms.link1.cells=[8,2,2]", "arms.link2.cells=[8,2,2]", "arms.passive=0.06",
+          "simulation.sample=0.01", "objective.load_cases=6")  # fmt: skip
+SOLID = ("design.initial=1.0", "design.volume_fraction=1.0")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The folder of a simulation of solid links."""
+    out = tmp_path_factory.mktemp("space") / "run"
+    cells = ("arms.link1.cells=[24,4,2]", "arms.link2.cells=[24,4,2]")
+    changes = overrides(*SOLID, *cells, "simulation.sample=0.002")
+    run("simulate", DEMO, "--out", out, *changes)
+    return out
+
+
+def test_deviation_of_the_demo(folder):
+    """Nonlinear beams with rigid end faces give 18.62 mm; the demo's own cells 18.620 mm."""
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["max_deviation"] == pytest.approx(18.62e-3, rel=0.03)  # coarse cells: 18.15 mm
+    assert summary["max_deviation_time"] == pytest.approx(0.416, abs=0.003)
+    assert summary["mass"] == pytest.approx({"column": 0.0, "link1": 1.08, "link2": 0.972})
+    assert set(summary["drive_peak"]) == {"yaw", "shoulder", "elbow"}
+    assert len(summary["stress"]["place"]) == 3
+    assert summary["units"]["drive_peak"] == dict.fromkeys(("yaw", "shoulder", "elbow"), "N m")
+
+
+def test_files_in_space(folder):
+    with np.load(folder / "trajectory.npz") as found:
+        assert found["q_r"].shape == found["joint_forces"].shape == (301, 3)
+        assert found["deviation"].shape == (301, 3)
+        assert found["q_r"][-1] == pytest.approx([1.6, 1.1, -0.5])
+        deviation = found["deviation"]
+    table = np.genfromtxt(folder / "trajectory.csv", delimiter=",", names=True)
+    assert np.abs(table["deviation_z"] - deviation[:, 2]).max() < 1e-9
+    assert table["q_r_elbow"][0] == -1.9
+    with np.load(folder / "design.npz") as found:
+        assert found["link1/centroid"].shape == (24 * 4 * 2, 3)
+    pyvista = pytest.importorskip("pyvista")
+    grid = pyvista.read(folder / "design.vtu")
+    assert grid.n_cells == 2 * 192 and set(grid.celltypes) == {12}
+    assert grid.volume == pytest.approx(0.95 * 0.04 * 0.02, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["deviation", "effort", "stress"])
+def test_exact_gradient_in_space(kind, monkeypatch):
+    """Taylor's remainders fall by the order 2.00 along directions without any symmetry."""
+    monkeypatch.setattr("dolfinopt.optimization.gradient_check.STEPS", (2.5e-3, 6.25e-4))
+    limited = ("constraints.deviation=0.1",) if kind == "effort" else ()
+    scene = do.load_scene(DEMO, (*COARSE, f"objective.kind={kind}", *limited))
+    profile = do.Profile()
+    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = do.build_arms(scene, partition, profile)
+    x = uniform_design(scene, partition, arms, 0.5)
+    found = taylor_test(scene, partition, arms, x, profile)
+    rates = {row.direction: row.rate for row in found.rows}
+    assert rates["random"] == pytest.approx(2.0, abs=0.02), rates
+    assert rates["smooth"] == pytest.approx(2.0, abs=0.02), rates
