@@ -88,11 +88,7 @@ def build_system(
     if motion is None:
         motion = desired_motion(scene)
     if scene.is_spatial:
-        from dolfinopt.dynamics.spatial_system import SpatialSystem
-        from dolfinopt.multibody.spatial.links import build_spatial_mechanism
-
-        tree = build_spatial_mechanism(scene, bodies)
-        return SpatialSystem(tree, motion, breakpoints(scene))
+        return _spatial_system(scene, bodies, motion)
     mechanism = build_mechanism(scene, bodies)
     elastic = ElasticSystem(mechanism, motion, breakpoints(scene))
     if not is_machine(scene):
@@ -100,6 +96,20 @@ def build_system(
     closure = closure_of(scene)
     instants = _with_rows(elastic.breakpoints, scene)
     return MachineSystem(mechanism, motion, instants, _drives(scene), closure)
+
+
+def _spatial_system(
+    scene: Scene, bodies: list[ShapeIntegrals], motion: Callable[[np.ndarray], Any]
+) -> MachineSystem | SpatialSystem:
+    """Return the equations of a scene in space: joints prescribed, or controlled."""
+    from dolfinopt.dynamics.spatial_machine import SpatialMachineSystem
+    from dolfinopt.dynamics.spatial_system import SpatialSystem
+    from dolfinopt.multibody.spatial.links import build_spatial_mechanism
+
+    tree, instants = build_spatial_mechanism(scene, bodies), breakpoints(scene)
+    if scene.control is None:
+        return SpatialSystem(tree, motion, instants)
+    return SpatialMachineSystem(tree, motion, _with_rows(instants, scene), _drives(scene))
 
 
 def closure_of(scene: Scene) -> Closure | None:
@@ -119,14 +129,15 @@ def _drives(scene: Scene) -> Drives:
     With control all of them are free; without it those of a loop that follow from the others, which
     have no drive, and joints with a spring between drive and arm.
     """
-    first = 0 if scene.motion.base == "cart" else 1  # a fixed base has no coordinate
-    last = 1 + len(scene.arms) - scene.dependent_joints
-    stiffness, damping = np.zeros((2, 1 + len(scene.arms)))
-    limits = np.full(1 + len(scene.arms), np.inf)
-    free = np.zeros(1 + len(scene.arms), dtype=bool)
+    first = scene.driven_columns.start  # a fixed base has no coordinate
+    count = _num_rigid(scene)
+    last = count - scene.dependent_joints
+    stiffness, damping = np.zeros((2, count))
+    limits = np.full(count, np.inf)
+    free = np.zeros(count, dtype=bool)
     free[last:] = True
-    for k, arm in enumerate(scene.arms[: last - 1]):
-        if arm.joint_stiffness > 0.0:
+    for k, arm in enumerate(scene.arms[: max(last - 1, 0)]):
+        if arm.joint_stiffness > 0.0:  # in the plane
             free[1 + k], stiffness[1 + k], damping[1 + k] = True, arm.joint_stiffness, 0.0
             damping[1 + k] = arm.joint_damping
     control, driven = scene.control, slice(first, last)
@@ -158,15 +169,20 @@ def _drives(scene: Scene) -> Drives:
     )
 
 
+def _num_rigid(scene: Scene) -> int:
+    """Return the number of rigid coordinates: cart and arms, or the joints in space that move."""
+    return len(scene.movable) if scene.is_spatial else 1 + len(scene.arms)
+
+
 def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return the scene's table of forces as a function of time (n, 1 + arms), or None."""
     if scene.control is None or scene.control.forces is None:
         return None
     times, curve = _forces(scene.control.forces, scene.driven)
-    first = 1 if scene.motion.base == "fixed" else 0
+    first = scene.driven_columns.start
 
     def forces(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), 1 + len(scene.arms)))
+        out = np.zeros((len(t), _num_rigid(scene)))
         inside = t <= times[-1]
         out[inside, first : first + len(scene.driven)] = curve(t[inside])
         return out

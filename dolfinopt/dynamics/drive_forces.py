@@ -11,31 +11,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
-from dolfinopt.multibody.body_gradient import body_gradient
+from dolfinopt.dynamics.machine_system import PLANE, Equations, MachineInstants, MachineSystem
+from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.interface_jacobian import interface_place, place_gradient
 from dolfinopt.multibody.inverse_dynamics import Rates
-from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.mechanism import ElasticBodies
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
-from dolfinopt.multibody.tangent import Tangent, linearise
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.spatial_system import SpatialSystem
 
     Problem = ElasticSystem | MachineSystem | SpatialSystem
-
-
-class Forces(Protocol):
-    """Drive forces at some instants."""
-
-    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
-        """Return `DriveForces.gradient`."""
 
 
 CHUNK = 512  # instants whose matrices are made at once
@@ -61,7 +52,7 @@ class DriveForces:
     def __init__(self, system: Problem, t: np.ndarray, rates: Rates) -> None:
         """Take the motion."""
         self.system, self.t, self.rates = system, t, rates
-        self._kept: list[Forces] = []
+        self._kept: list[_Prescribed | _Machine] = []
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return the derivative of sum_n weights_n . forces_n, instants and coordinates held apart.
@@ -82,7 +73,7 @@ class DriveForces:
         assert total is not None, "no instants"
         return np.concatenate(by_rates, axis=1), total
 
-    def _chunks(self, parts: list[slice]) -> Iterable[Forces]:
+    def _chunks(self, parts: list[slice]) -> Iterable[_Prescribed | _Machine]:
         """Return the parts' own; the same ones every time unless they take too much memory."""
         bodies, columns = len(self.system.mechanism.bodies), 3 * self.rates[0].shape[1]
         if 8 * len(self.t) * (1 + 8 * bodies) * columns > KEPT_BYTES:
@@ -90,31 +81,32 @@ class DriveForces:
         self._kept = self._kept or [self._chunk(part) for part in parts]
         return self._kept
 
-    def _chunk(self, part: slice) -> Forces:
+    def _chunk(self, part: slice) -> _Prescribed | _Machine:
         y, yd, ydd = (x[part] for x in self.rates)
         system, t = self.system, self.t[part]
         if isinstance(system, ElasticSystem):
             return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
         if isinstance(system, MachineSystem):
             return _Machine(system.at(t), (y, yd, ydd))
-        from dolfinopt.dynamics.spatial_forces import SpatialForces
+        from dolfinopt.dynamics.spatial_machine import SPACE
 
-        return SpatialForces(system.mechanism, system.motion(t), (y, yd, ydd))
+        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), SPACE)
 
 
 @dataclass(frozen=True, eq=False)
 class _Prescribed:
     """Forces of inverse dynamics along a given motion; q, qd, qdd (n, N) are elastic."""
 
-    mechanism: Mechanism
-    motion: RigidMotion
+    mechanism: ElasticBodies
+    motion: Any  # RigidMotion, in space JointMotion
     rates: Rates
+    equations: Equations = PLANE
 
     @cached_property
-    def tangent(self) -> Tangent:
+    def tangent(self) -> Linearisation:
         """By rigid and elastic coordinates."""
-        every = np.arange(1 + len(self.mechanism.bodies))
-        return linearise(self.mechanism, self.motion, *self.rates, None, every)
+        every = np.arange(self.motion.q.shape[1])
+        return self.equations.linearise(self.mechanism, self.motion, *self.rates, None, every)
 
     def by_all(self, weights: np.ndarray) -> np.ndarray:
         """Return the derivatives (3, n, 1 + arms + N) by rigid and elastic coordinates."""
@@ -124,7 +116,8 @@ class _Prescribed:
     def by_bodies(self, weights: np.ndarray) -> list[ShapeIntegrals]:
         """Return those by every body, all coordinates held."""
         none = np.zeros_like(self.rates[0])
-        return body_gradient(self.mechanism, self.motion, *self.rates, none, weights)
+        motion = self.motion
+        return self.equations.body_gradient(self.mechanism, motion, *self.rates, none, weights)
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`; rigid coordinates do not change."""
@@ -143,7 +136,8 @@ class _Machine:
         """What a given motion along which the machine moves would ask for."""
         instants, (y, yd, ydd) = self.instants, self.rates
         q, qd, qdd = (instants.split(x)[1] for x in self.rates)
-        return _Prescribed(instants.machine.mechanism, instants.motion(y, yd, ydd), (q, qd, qdd))
+        motion, machine = instants.motion(y, yd, ydd), instants.machine
+        return _Prescribed(machine.mechanism, motion, (q, qd, qdd), machine.equations)
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.modal_coordinates import Modes
-from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.dynamics.system import Linearisation, State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_gradient import body_gradient
 from dolfinopt.multibody.drives import Closure, Drives
@@ -33,6 +33,18 @@ from dolfinopt.multibody.tangent import linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
 ROUNDING = 1e-13  # of a step of that iteration, beside the coordinates
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Inverse dynamics of a kind of mechanism, its tangent and its gradient by the bodies."""
+
+    forces: Callable[..., tuple[np.ndarray, np.ndarray]]
+    linearise: Callable[..., Linearisation]
+    body_gradient: Callable[..., list[ShapeIntegrals]]
+
+
+PLANE = Equations(inverse_dynamics, linearise, body_gradient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +143,7 @@ class MachineInstants:
             actual = desired.copy()
             actual[:, free] += change[:, :R]
             parts.append(actual)
-        return RigidMotion(*parts)
+        return type(self.desired)(*parts)
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
@@ -148,7 +160,7 @@ class MachineInstants:
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
+        forces = machine.equations.forces(machine.mechanism, motion, q, qd, qdd)[1]
         if machine.closure is not None:
             jacobian = interface_place(machine.mechanism, motion, q).jacobian
             pull = machine.ground_force(multipliers)
@@ -167,7 +179,7 @@ class MachineInstants:
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        rows, forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)
+        rows, forces = machine.equations.forces(machine.mechanism, motion, q, qd, qdd)
         drives, springs = self.drive_forces(y, yd), machine.drives.springs
         rigid = forces[:, machine.drives.free] - drives
         pulled = self.spring_forces(y, yd)
@@ -198,7 +210,8 @@ class MachineInstants:
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         matrix = np.zeros((count, S, 3, S))
-        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, machine.drives.free)
+        free = machine.drives.free
+        tangent = machine.equations.linearise(machine.mechanism, motion, q, qd, qdd, None, free)
         matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
         passing = machine.drives.passing(self.ahead, self.at_drives(y), self.at_drives(yd))
         springs, every = machine.drives.springs, machine.drive_columns
@@ -250,8 +263,18 @@ class MachineSystem:
     @cached_property
     def columns(self) -> np.ndarray:
         """Places of the free and the elastic coordinates among all of the mechanism's."""
-        rigid = 1 + len(self.mechanism.bodies)
+        rigid = self.num_rigid
         return np.concatenate([self.drives.free, rigid + np.arange(self.mechanism.num_coordinates)])
+
+    @property
+    def equations(self) -> Equations:
+        """The mechanism's: those of a chain in the plane."""
+        return PLANE
+
+    @property
+    def num_rigid(self) -> int:
+        """Number of rigid coordinates, free or not."""
+        return 1 + len(self.mechanism.bodies)
 
     @cached_property
     def drive_columns(self) -> np.ndarray:
@@ -321,13 +344,17 @@ class MachineSystem:
         desired = self.motion(t)
         ahead = np.zeros((len(t), self.ends[0]))
         if self.drives.rigid_feed_forward:
-            ahead += feed_forward(self.rigid, desired, self.drives, self.closure)
+            ahead += self.feed_forward(desired)
             springs = self.drives.springs
             wanted = desired.qdd[:, self.drives.free[springs.joints]]
             ahead[:, springs.joints] += springs.rotor * wanted
         if self.drives.table is not None:
             ahead += self.drives.table(t)
         return MachineInstants(self, desired, ahead)
+
+    def feed_forward(self, desired: RigidMotion) -> np.ndarray:
+        """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
+        return feed_forward(self.rigid, desired, self.drives, self.closure)
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -399,7 +426,8 @@ class MachineSystem:
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
         of_forces = np.zeros_like(motion.q)
         of_forces[:, self.drives.free] = of_rigid
-        total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
+        bodies = self.equations.body_gradient
+        total = bodies(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
         at_drives = instants.at_drives
         passing = self.drives.passing(instants.ahead, at_drives(y), at_drives(yd))
         pushed = -passing * at_drives(multipliers)
@@ -428,7 +456,7 @@ class MachineSystem:
             return total
         of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
         none = np.zeros((len(weights), 0))
-        rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
+        rigid = self.equations.body_gradient(self.rigid, desired, none, none, none, none, of_forces)
         return [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
 
     def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:

@@ -381,8 +381,9 @@ def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajector
     horizon, sample = scene.motion.horizon, scene.simulation.sample
     t = np.arange(round(horizon / sample) + 1) * sample
     t = t[t <= horizon * (1 + 1e-12)]
-    if isinstance(problem, (ElasticSystem, MachineSystem)):
+    if not scene.is_spatial:
+        assert isinstance(problem, (ElasticSystem, MachineSystem))
         return Trajectory(problem, scene, solution, t)
     from dolfinopt.dynamics.spatial_trajectory import SpatialTrajectory
 
-    return SpatialTrajectory(problem, scene, solution, t)
+    return SpatialTrajectory(problem, scene, solution, t)  # type: ignore[arg-type]

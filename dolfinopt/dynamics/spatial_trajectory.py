@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.spatial_machine import SpatialMachineSystem
 from dolfinopt.dynamics.spatial_system import SpatialSystem, interface_rotations
 from dolfinopt.multibody.spatial.body_loads import load_coefficients
 from dolfinopt.multibody.spatial.end_effector import (
@@ -24,7 +25,7 @@ from dolfinopt.multibody.spatial.motion import JointMotion
 class SpatialTrajectory(Trajectory):
     """A simulated motion in space; joints stand in the order of [[joints]]."""
 
-    problem: SpatialSystem  # type: ignore[assignment]
+    problem: SpatialSystem | SpatialMachineSystem  # type: ignore[assignment]
 
     @property
     def mechanism(self) -> SpatialMechanism:  # type: ignore[override]
@@ -34,7 +35,10 @@ class SpatialTrajectory(Trajectory):
     @cached_property
     def motion(self) -> JointMotion:  # type: ignore[override]
         """Joints at the samples, as they move."""
-        return self.desired
+        if isinstance(self.problem, SpatialSystem):
+            return self.desired
+        found: JointMotion = self.problem.at(self.t).motion(*self.unknowns)  # type: ignore
+        return found
 
     @cached_property
     def desired(self) -> JointMotion:  # type: ignore[override]
@@ -43,8 +47,10 @@ class SpatialTrajectory(Trajectory):
 
     @cached_property
     def deviation(self) -> np.ndarray:
-        """Flexible minus rigid end-effector (n, 3), m."""
-        return deviation(self.mechanism, self.motion, self.q_e)
+        """Flexible minus rigid end-effector (n, 3), m; the latter on the desired motion."""
+        if isinstance(self.problem, SpatialSystem):
+            return deviation(self.mechanism, self.motion, self.q_e)
+        return self.end - end_effector(self.mechanism, self.desired, np.zeros_like(self.q_e))
 
     @cached_property
     def end(self) -> np.ndarray:
@@ -69,13 +75,16 @@ class SpatialTrajectory(Trajectory):
     @cached_property
     def joint_forces(self) -> np.ndarray:
         """What drives the joints (n, joints), N m of revolute and N of prismatic ones."""
+        if not isinstance(self.problem, SpatialSystem):
+            return self.problem.at(self.t).forces(*self.unknowns)
         qd, qdd = self.unknowns[1:]
         return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
         """What loads every body (n, 18 + 9 q), see `dynamics.load_coefficients`."""
-        return load_coefficients(self.mechanism, self.motion, self.unknowns)
+        q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
+        return load_coefficients(self.mechanism, self.motion, (q, qd, qdd))
 
     def by_end_effector(
         self, indices: np.ndarray, weights: np.ndarray
@@ -90,5 +99,9 @@ class SpatialTrajectory(Trajectory):
             By the system's coordinates (n, S), and by every body.
         """
         motion, q = self.motion[indices], self.q_e[indices]
-        by_q, _, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
-        return by_q, by_bodies
+        by_q, by_joints, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
+        by = self.by_unknowns(by_q)
+        if isinstance(self.problem, SpatialMachineSystem):
+            free = self.problem.drives.free
+            by[:, : len(free)] = by_joints[:, free]
+        return by, by_bodies

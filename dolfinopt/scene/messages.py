@@ -46,8 +46,9 @@ def first_problem(
 ) -> str:
     """Return the one-line message of the first problem and the number of others."""
     problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
-    # Two wrong elements of one array are one problem.
-    problems = [problem for i, problem in enumerate(problems) if problem not in problems[:i]]
+    # Wrong elements of one array are one problem, and so are the kinds of value that a key takes.
+    places = [(problem.kind, problem.locs) for problem in problems]
+    problems = [one for i, one in enumerate(problems) if places[i] not in places[:i]]
     known = {(problem.kind, problem.locs) for problem in problems}
     problems = [problem for problem in problems if not _is_echo(problem, inherited, known)]
     # A misspelt key is also a missing one: the spelling is the message that helps.

@@ -13,7 +13,10 @@ from spatial_bodies import changes, posed_machine, posed_motion
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.spatial_machine import SpatialMachineSystem
 from dolfinopt.dynamics.spatial_system import SpatialSystem
+from dolfinopt.multibody.drives import Drives
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.end_effector import deviation, end_effector_gradient
@@ -23,26 +26,46 @@ pytestmark = pytest.mark.serial
 TOLERANCE = 1e-5
 
 
-def test_plane_machine_in_space():
-    """The two-arm machine of beams, posed in space, has the plane's trajectory."""
+def plane_motion(t):
+    """Cart and two joints by quintics in 0.5 s."""
+    u = t[:, None] / 0.5
+    s, sd = u**3 * (10.0 - 15.0 * u + 6.0 * u * u), 30.0 * u**2 * (1.0 - u) ** 2 / 0.5
+    sdd = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / 0.25
+    step = np.array([0.3, 1.2, -0.9])
+    return RigidMotion(step * s + [0.0, 0.4, 0.6], step * sd, step * sdd)
+
+
+@pytest.mark.parametrize("controlled", [False, True])
+def test_plane_machine_in_space(controlled):
+    """The two-arm machine of beams, posed in space, has the plane's trajectory; under control, too.
+
+    There positions alone are compared to 1e-9 and the feed-forward is that of the rigid machine.
+    """
     bodies = tuple(beam(damping=1e-3).body() for _ in range(2))
     plane = Mechanism(bodies, 0.5, 0.01, (0.0, -9.81), -0.3)
+    tree, ends = posed_machine(plane), (0.0, 0.5)
 
-    def motion(t):
-        u = t[:, None] / 0.5
-        s, sd = u**3 * (10.0 - 15.0 * u + 6.0 * u * u), 30.0 * u**2 * (1.0 - u) ** 2 / 0.5
-        sdd = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / 0.25
-        step = np.array([0.3, 1.2, -0.9])
-        return RigidMotion(step * s + [0.0, 0.4, 0.6], step * sd, step * sdd)
+    def joints(t):
+        return posed_motion(plane_motion(t))
 
-    ends = (0.0, 0.5)
-    expected = radau.integrate(ElasticSystem(plane, motion, ends), TOLERANCE, 4, Profile())
-    space = SpatialSystem(posed_machine(plane), lambda t: posed_motion(motion(t)), ends)
-    found = radau.integrate(space, TOLERANCE, 4, Profile())
-    assert len(found.a) == len(expected.a)
+    systems = [ElasticSystem(plane, plane_motion, ends), SpatialSystem(tree, joints, ends)]
+    if controlled:
+        gains = np.array([2e3, 400.0, 200.0])
+        limits, driven = np.full(3, np.inf), np.ones(3, dtype=bool)
+        drives = Drives(np.arange(3), gains, 0.05 * gains, limits, driven, True)
+        systems = [
+            MachineSystem(plane, plane_motion, ends, drives),
+            SpatialMachineSystem(tree, joints, ends, drives),
+        ]
+    grid = radau.integrate(systems[0], TOLERANCE, 4, Profile()).time_grid
+    expected, found = (radau.on_grid(one, grid, TOLERANCE, 4) for one in systems)
     t = np.linspace(*ends, 101)
-    q = expected.sample(t)
-    assert np.abs(found.sample(t) - q).max() < 1e-9 * np.abs(q).max()
+    y = expected.sample(t)
+    assert np.abs(found.sample(t) - y).max() < 1e-9 * np.abs(y).max()
+    if controlled:
+        rates = [y, expected.sample(t, 1), expected.sample(t, 2)]
+        forces = [one.at(t).forces(*rates) for one in systems]
+        assert np.abs(forces[1] - forces[0]).max() < 1e-11 * np.abs(forces[0]).max()
 
 
 @pytest.fixture(scope="module")

@@ -58,12 +58,17 @@ def test_files_in_space(folder):
     assert grid.volume == pytest.approx(0.95 * 0.04 * 0.02, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["deviation", "effort", "stress"])
-def test_exact_gradient_in_space(kind, monkeypatch):
+CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.0]")
+
+
+@pytest.mark.parametrize(
+    ("kind", "control"), [("deviation", ()), ("effort", CONTROL), ("stress", ())]
+)
+def test_exact_gradient_in_space(kind, control, monkeypatch):
     """Taylor's remainders fall by the order 2.00 along directions without any symmetry."""
     monkeypatch.setattr("dolfinopt.optimization.gradient_check.STEPS", (2.5e-3, 6.25e-4))
     limited = ("constraints.deviation=0.1",) if kind == "effort" else ()
-    scene = do.load_scene(DEMO, (*COARSE, f"objective.kind={kind}", *limited))
+    scene = do.load_scene(DEMO, (*COARSE, *control, f"objective.kind={kind}", *limited))
     profile = do.Profile()
     partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
     arms = do.build_arms(scene, partition, profile)

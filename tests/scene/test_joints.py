@@ -123,7 +123,7 @@ REFUSED = [
     (("objective", "kind"), "static", "expected a response of the motion, or mass, with"),
     (("constraints", "first_frequency"), 50.0, "expected a response of the motion, or mass, with"),
     (("closure",), {"kind": "pin"}, "expected no [closure] with [[joints]]"),
-    (("control",), {"stiffness": [1, 1], "damping": [1, 1]}, "expected no [control]"),
+    (("control",), {"stiffness": [1], "damping": [1, 1]}, "expected 2 numbers, for yaw, lift"),
 ]  # fmt: skip
 
 

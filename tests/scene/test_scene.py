@@ -496,6 +496,7 @@ BAD_VALUES = [
     ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
     ("arms.0.design", 1, "1", "a string"),
     ("arms.0.rigid", 1, "1", "true or false"),
+    ("arms.0.centre", [0, 0, 0], "[0, 0, 0]", "only with rigid = true"),
     ("arms.0.sid", 1, "1", "a string"),
     ("arms.0.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
     ("arms.0.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
@@ -522,6 +523,9 @@ BAD_VALUES = [
     ("arms.0.passive", -0.01, "-0.01", "a number >= 0"),
     ("arms.0.passive", 0.5, "0.5", "less than half of length = 1.0 [m]"),
     ("arms.0.passive", 0.26, "0.26", "volume_fraction = 0.5 can be met"),
+    ("motion.gravity", [0, 0, -9.81], "[0, 0, -9.81]", "two numbers without [[joints]]"),
+    ("payload.offset", [0, 1], "[0, 1]", "an array of three numbers"),
+    ("payload.inertia", [1, 1], "[1, 1]", "an array of six numbers"),
     ("motion.path", "circle", '"circle"', '"arc" | "line" | "points" | "joints"'),
     ("motion.path", "joints", "None (default)", 'a table (CSV) with motion.path = "joints"'),
     ("motion.radius", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
@@ -733,7 +737,8 @@ def test_every_key_refuses_something():
     refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
     refused |= {f"arms.regions.{key}" for key in ("kind", "box", "circle")}  # see test_regions
     known = {info.key for info in describe_keys()}
-    optional = {key for key in known if key.partition(".")[0] in ("control", "closure")}
+    tables = ("control", "closure", "joints")  # see test_joints
+    optional = {key for key in known if key.partition(".")[0] in tables}
     assert known - optional <= refused
 
 
@@ -1176,6 +1181,7 @@ def test_described_defaults():
         *(f"arms.{key}" for key in ARM),
         *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
+        *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
     }
 
 

@@ -262,7 +262,7 @@ class Arm(Table):
     @model_validator(mode="after")
     def _check_ends(self) -> Arm:
         if self.length < SHORTEST and not (self.rigid and self.length == 0.0):
-            raise Refusal(f"expected a number >= {SHORTEST:g} [m]", ("length",))
+            raise Refusal(f"expected a number >= {SHORTEST:g} and <= 10000 [m]", ("length",))
         if self.rigid and self.length == 0.0:
             return self
         if 2.0 * self.solid_ends >= self.length:

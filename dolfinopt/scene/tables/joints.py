@@ -151,12 +151,6 @@ def _check_machine(scene: Scene) -> None:
         raise Refusal(
             "expected an array of three numbers with [[joints]]", ("motion", "gravity"), ("joints",)
         )
-    if scene.control is not None:
-        raise Refusal(
-            "expected no [control] with [[joints]]: joints in space follow their table exactly",
-            ("control", "stiffness"),
-            ("joints",),
-        )
     for key in asked(scene):
         if key in PLANE_RESPONSES:
             objective = scene.objective.kind == key
