@@ -33,7 +33,12 @@ from dolfinopt.scene.load import scene_from_dict
 # Ranks: limits of the stress in test_every_option_gives_the_same_bits_on_any_number_of_ranks.
 pytestmark = pytest.mark.serial
 
-QUICK = "simulation.sample=0.01", "simulation.tolerance=1e-7", "objective.gradient=exact"
+QUICK = (
+    "simulation.sample=0.01",
+    "motion.horizon=2.2",
+    "simulation.tolerance=1e-7",
+    "objective.gradient=exact",
+)
 
 
 class Analysed:
