@@ -558,7 +558,7 @@ def test_same_gradient_on_any_number_of_ranks(tmp_path: Path, method: str, ranks
     for count in (1, ranks):
         out = tmp_path / f"{count}.npz"
         line = ["gradient", str(TWO_ARM), "--kind", "exact", "--out", str(out)]
-        line += overrides("arms.cells=[40,4]", f"reduction.method={method}")
+        line += overrides("arms.cells=[20,4]", "motion.horizon=2.0", f"reduction.method={method}")
         if count == 1:
             run(*line)
         else:
