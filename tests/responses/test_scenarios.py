@@ -129,6 +129,7 @@ def test_one_reduction_for_all_scenarios():
     ],
     ids=" ".join,
 )
+@pytest.mark.usefixtures("three_steps")
 def test_gradient_of_all_scenarios(combination, options):
     built = build(
         *options,

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.serial
 
 
 @pytest.mark.parametrize("name", list(NEEDS))
+@pytest.mark.usefixtures("three_steps")
 def test_remainders_fall_with_the_square_of_the_step(name: str) -> None:
     """Through filter, reduction, simulation and response; new ones are tested by their word alone.
 
