@@ -1,6 +1,6 @@
 """Seconds and memory of a design iteration of one solid link, beside plain DOLFINx.
 
-`python -m dolfinopt.bench.solid WHO NX NY NZ`, also under mpirun, measures one of both and prints
+`python -m dolfinopt.bench.solid WHO NX NY NZ SCENE.json`, also under mpirun, measures one of both and prints
 one line of JSON; memory is then that of its own process.
 """
 
@@ -11,9 +11,11 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,7 @@ from mpi4py import MPI
 
 from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, curves, fitted_exponent
 from dolfinopt.bench.whole import mpirun
-from dolfinopt.paper.reproduction import load_paper
-from dolfinopt.scene.load import Scene
+from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.tables import Panel
 
 # Links of 0.5 x 0.04 x 0.02 m from 2e4 to 1e6 dofs.
@@ -88,13 +89,15 @@ class _Clock:
         self.seconds[name] += self.comm.allreduce(time.process_time() - begun, op=MPI.MAX)
 
 
-def ours(cells: tuple[int, int, int], comm: MPI.Comm) -> tuple[int, list[list[float]]]:
+def ours(
+    scene: Scene, cells: tuple[int, int, int], comm: MPI.Comm
+) -> tuple[int, list[list[float]]]:
     """Return dofs, and the seconds of the phases of the first design and of one nearby."""
     from dolfinopt.arms.arm import Arm
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.sensitivity import esl_gradient
 
-    arm = Arm(link_scene(load_paper(), cells), 0, comm, Profile())
+    arm = Arm(link_scene(scene, cells), 0, comm, Profile())
     x, found = box_beam(arm.mesh.centroid), []
     for _ in range(2):
         clock = _Clock(comm)
@@ -118,7 +121,9 @@ def ours(cells: tuple[int, int, int], comm: MPI.Comm) -> tuple[int, list[list[fl
     return arm.substructure.T.num_dofs, found
 
 
-def plain(cells: tuple[int, int, int], comm: MPI.Comm) -> tuple[int, list[list[float]]]:
+def plain(
+    scene: Scene, cells: tuple[int, int, int], comm: MPI.Comm
+) -> tuple[int, list[list[float]]]:
     """Return dofs and the seconds of a static iteration as DOLFINx's own demos would do it.
 
     Trilinear hexahedra, one load at the end, conjugate gradients with GAMG to 1e-8 from zero, the
@@ -134,10 +139,11 @@ def plain(cells: tuple[int, int, int], comm: MPI.Comm) -> tuple[int, list[list[f
     from dolfinopt.mesh.box import box_arm
 
     arm = box_arm(comm, "link", (LENGTH, HEIGHT, THICKNESS), cells)
-    V, nu = compat.lagrange_space(arm.mesh, 1, components=3), 0.33
+    V, material = compat.lagrange_space(arm.mesh, 1, components=3), scene.material_of(0)
+    nu, modulus = material.poisson_ratio, material.young_modulus
     W = (fem.FunctionSpace if compat.VERSION < (0, 7) else fem.functionspace)(arm.mesh, ("DG", 0))
     young, u = fem.Function(W), fem.Function(V)
-    young.x.array[: arm.num_cells] = 70e9 * (1e-6 + box_beam(arm.centroid) ** 3)
+    young.x.array[: arm.num_cells] = modulus * (1e-6 + box_beam(arm.centroid) ** 3)
     compat.scatter_forward(young)
 
     def strain(v: Any) -> Any:
@@ -188,7 +194,8 @@ def plain(cells: tuple[int, int, int], comm: MPI.Comm) -> tuple[int, list[list[f
 def _main(words: Sequence[str]) -> None:
     comm = MPI.COMM_WORLD
     cells = int(words[1]), int(words[2]), int(words[3])
-    dofs, phases = (ours if words[0] == "ours" else plain)(cells, comm)
+    scene = scene_from_dict(json.loads(Path(words[4]).read_text(encoding="utf-8")))
+    dofs, phases = (ours if words[0] == "ours" else plain)(scene, cells, comm)
     memory = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
     if comm.rank == 0:
         print(json.dumps({"dofs": dofs, "phases": phases, "memory": memory}), flush=True)
@@ -206,17 +213,21 @@ def _measure(plan: Plan, tell: Tell) -> list[Row]:
             for who in ("ours", "plain"):
                 size = " x ".join(map(str, cells))
                 tell(f"{who}, {size} cells, {ranks} rank{'s' if ranks > 1 else ''}")
-                rows += in_process(who, cells, ranks)
+                rows += in_process(plan.scene, who, cells, ranks)
     return rows
 
 
-def in_process(who: str, cells: tuple[int, int, int], ranks: int) -> list[Row]:
+def in_process(scene: Scene, who: str, cells: tuple[int, int, int], ranks: int) -> list[Row]:
     """Measure in processes of its own; "ours" or "plain"."""
-    command = [sys.executable, "-m", "dolfinopt.bench.solid", who, *map(str, cells)]
-    if ranks > 1:
-        command = [str(mpirun()), "-n", str(ranks), *command]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.json"
+        path.write_text(json.dumps(scene.to_dict()), encoding="utf-8")
+        words = (who, *map(str, cells), str(path))
+        command = [sys.executable, "-m", "dolfinopt.bench.solid", *words]
+        if ranks > 1:
+            command = [str(mpirun()), "-n", str(ranks), *command]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)}: {done.stderr[-2000:]}")
     found = json.loads(done.stdout.strip().splitlines()[-1])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 from mpi4py import MPI
+from runs import TWO_ARM
 
 from dolfinopt.bench import named, solid
 from dolfinopt.errors import InputError
+from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial
 
@@ -14,10 +16,11 @@ pytestmark = pytest.mark.serial
 def test_both_iterations():
     """The same link: dofs of all nodes in DOLFINx, less the clamped and the rigid ones here."""
     cells, comm = (8, 3, 2), MPI.COMM_SELF
-    dofs, phases = solid.ours(cells, comm)
+    scene = load_scene(TWO_ARM)
+    dofs, phases = solid.ours(scene, cells, comm)
     assert dofs == 3 * 7 * 4 * 3 + 6
     assert len(phases) == 2 and all(len(row) == len(solid.PHASES) for row in phases)
-    dofs, phases = solid.plain(cells, comm)
+    dofs, phases = solid.plain(scene, cells, comm)
     assert dofs == 3 * 9 * 4 * 3 and len(phases) == 1
 
 
