@@ -1,7 +1,7 @@
 """Seconds and memory of a design iteration of one solid link, beside plain DOLFINx.
 
-`python -m dolfinopt.bench.solid WHO NX NY NZ SCENE.json`, also under mpirun, measures one of both and prints
-one line of JSON; memory is then that of its own process.
+`python -m dolfinopt.bench.solid WHO NX NY NZ SCENE.json`, also under mpirun, measures one of both
+and prints one line of JSON; memory is then that of its own process.
 """
 
 from __future__ import annotations
