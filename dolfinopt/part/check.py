@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 # Change by the last refinement up to which a figure counts as converged, also that of stress: a
 # method of second order leaves a third of it.
-SETTLED, SETTLED_STRESS = 1e-2, 0.1
+SETTLED, SETTLED_STRESS = 1.5e-2, 0.1
 ROUNDS = 2  # refinements of the mesh where stress is largest, at most
 LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART = "density", "crisp", "part"
