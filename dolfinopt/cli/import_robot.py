@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import click
 import numpy as np
 
 from dolfinopt.cli.options import out_option
 from dolfinopt.cli.shared import warn
-from dolfinopt.cli.start import led_by_another
+from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
+    from dolfinopt.exchange.urdf.bodies import SceneBody
     from dolfinopt.exchange.urdf.robot import Robot
     from dolfinopt.exchange.urdf.scene import RobotScene
 
+CELLS = 6000  # of a solid that is meshed, about
+TETRAHEDRA = 8.5  # that fill the cube of their edge
+FEWEST = 4  # cells over height and thickness
 SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
@@ -37,17 +43,28 @@ SAMPLES = 2000  # at which a trajectory's rates are looked at
 @click.option(
     "--tool", metavar="LINK", help="end-effector; default: end of the chosen links' chain"
 )
+@click.option("--boxes", is_flag=True, help="solid boxes, whatever the links' geometry")
 @out_option("the scene; default: ROBOT without its ending")
 def import_robot(
-    robot: Path, links: str, trajectory: Path, tool: str | None, out: Path | None
+    robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool, out: Path | None
 ) -> None:
     """Make a scene of ROBOT, a URDF file.
 
-    The links named become solid boxes to edit, the others are rigid. Inertias that cannot be are
-    told, and so are joints beyond their limits.
+    The links named become solids: their geometry between the joints where it is closed, else boxes
+    to edit. The others are rigid. Inertias that cannot be are told, and so are joints beyond their
+    limits.
     """
-    if led_by_another():
-        return
+    world = start()
+    from dolfinopt.parallel import together
+
+    with together(world):
+        if world.rank == 0:
+            _import(robot, links, trajectory, tool, boxes, out)
+
+
+def _import(
+    robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool, out: Path | None
+) -> None:
     from dolfinopt.exchange.urdf.bodies import check_links, default_tool, scene_bodies
     from dolfinopt.exchange.urdf.checks import implausible_inertias
     from dolfinopt.exchange.urdf.read import read_robot
@@ -59,11 +76,33 @@ def import_robot(
         raise InputError(f"--links {links!r}: expected names of links of {robot}, A,B")
     check_links(model, chosen, tool)
     bodies = scene_bodies(model, chosen, tool or default_tool(model, chosen))
-    scene_joints = scene_names(body.joint.name for body in bodies)
+    joints = scene_names(body.joint.name for body in bodies)
     t, rows = _trajectory(model, os.fspath(trajectory))
     warn(implausible_inertias(model))
+    if not boxes:
+        bodies = tuple(_meshed(model, one) if one.is_solid else one for one in bodies)
     scene = RobotScene(model, bodies, float(t[-1]))
-    _write(scene, out or Path(robot.stem), [scene_joints[j.name] for j in model.movable], t, rows)
+    _write(scene, out or Path(robot.stem), [joints[j.name] for j in model.movable], t, rows)
+
+
+def _meshed(model: Robot, body: SceneBody) -> SceneBody:
+    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
+    from dolfinopt.exchange.urdf.bodies import SolidMesh
+    from dolfinopt.exchange.urdf.geometry import NoSolid, between_joints
+    from dolfinopt.mesh.surface_solid import mesh_of_surface
+
+    try:
+        surface = between_joints(model.links[body.link], body)
+        _, height, thickness = (float(f"{one:.6g}") for one in surface.extents)
+        volume = float(surface.volume)
+        side = (TETRAHEDRA * volume / CELLS) ** (1.0 / 3.0)
+        size = min(side, min(height, thickness) / FEWEST)
+        data, cells = mesh_of_surface(surface.vertices, surface.faces, body.length, size)
+    except (NoSolid, InputError) as error:
+        warn([f"{model.file}: link {body.link!r} becomes a box: {error}"])
+        return body
+    mesh = SolidMesh(data, cells, size, volume)
+    return replace(body, size=(height, thickness), mesh=mesh)
 
 
 def _trajectory(model: Robot, file: str) -> tuple[np.ndarray, np.ndarray]:
@@ -91,10 +130,12 @@ def _write(
     scene: RobotScene, folder: Path, joints: list[str], t: np.ndarray, rows: np.ndarray
 ) -> None:
     """Write scene, table and record, and say what they are."""
+    from dolfinopt.disk import write_atomically
     from dolfinopt.exchange.urdf.scene import RECORD, TRAJECTORY
     from dolfinopt.exchange.urdf.trajectory import trajectory_text
     from dolfinopt.output.folders import prepare_folder, write_new
     from dolfinopt.scene.json_schema import SCHEMA_FILE, scene_schema
+    from dolfinopt.scene.load import load_scene
 
     path = folder / f"{scene.robot.file.stem}.toml"
     texts = {
@@ -102,14 +143,28 @@ def _write(
         folder / TRAJECTORY: trajectory_text(joints, t, rows),
         folder / RECORD: json.dumps(scene.record(folder), indent=2) + "\n",
     }
+    meshes = {folder / scene.mesh_name(one): one.mesh for one in scene.bodies if one.mesh}
+    for mesh in meshes:
+        if mesh.exists():
+            raise InputError(f"{mesh}: exists already and stays as it is; give another --out")
     prepare_folder(folder)
     write_new(texts, {folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
-    solids = [body for body in scene.bodies if body.is_solid]
+    for file, solid in meshes.items():
+        write_atomically(file, partial(_put, solid.data))
     click.echo(
         f"{path}: {len(scene.bodies)} arms, {len(joints)} joints that move, "
         f"{float(t[-1]):g} s of motion"
     )
-    for body in solids:
-        assert body.size is not None
-        sides = " x ".join(f"{one:.3g}" for one in (body.length, *body.size))
-        click.echo(f"{scene.arms[body.link]}: a solid box of {sides} m; edit it in the scene")
+    for body in scene.bodies:
+        if body.size is not None:
+            sides = " x ".join(f"{one:.3g}" for one in (body.length, *body.size))
+            what = "a box to edit" if body.mesh is None else f"its shape, {body.mesh.cells} cells"
+            click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}")
+    try:
+        load_scene(path)
+    except InputError as error:
+        warn([f"correct the scene before you simulate it: {error}"])
+
+
+def _put(data: bytes, stream: IO[bytes]) -> None:
+    stream.write(data)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import re
 import sys
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from robots import GRAVITY, frames_of, mechanism_of, tree_of, write_uneven
+from robots import frames_of, mechanism_of, tree_of, write_uneven
 from runs import ROOT, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
@@ -20,11 +22,13 @@ from dolfinopt.exchange.urdf.read import read_robot
 from dolfinopt.exchange.urdf.robot import MASSLESS, Inertia, Robot, roll_pitch_yaw_of
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, read_origin, scene_names
 from dolfinopt.exchange.urdf.write import NewLink, robot_text
+from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.spatial.rotations import exponential, roll_pitch_yaw
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import load_scene
 
 yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
@@ -33,6 +37,11 @@ DEMO = ROOT / "demos" / "robot.urdf"
 DEMO_MOTION = ROOT / "demos" / "robot_motion.csv"
 UNEVEN_MOTION = "t,yaw,lift,bend,roll,rail\n0,0,0,0,0,0\n1,0.5,-1,0.7,0.2,0.1\n"
 MOVED = 12  # random joint coordinates
+
+
+def run_import(file, links, motion, folder, *more):
+    """Import a robot with boxes for solids."""
+    run("import", file, "--links", links, "--trajectory", motion, "--out", folder, "--boxes", *more)
 
 
 @pytest.fixture(scope="module", params=["six axes", "uneven"])
@@ -44,7 +53,7 @@ def imported(request, tmp_path_factory):
     else:
         file, motion, links = write_uneven(folder), folder / "motion.csv", "upper,lower"
         motion.write_text(UNEVEN_MOTION)
-    run("import", file, "--links", links, "--trajectory", motion, "--out", folder / "scene")
+    run_import(file, links, motion, folder / "scene")
     return file, folder / "scene" / f"{file.stem}.toml", tuple(links.split(","))
 
 
@@ -52,7 +61,6 @@ def rigid_machine(file, scene, links):
     """Return robot, bodies, and the scene's mechanism with the solids as rigid as in the file."""
     robot = read_robot(file)
     bodies = scene_bodies(robot, links, default_tool(robot, links))
-    tree = tree_of(scene)
     names = scene_names(body.link for body in bodies)
     solids = {
         names[body.link]: (
@@ -63,8 +71,8 @@ def rigid_machine(file, scene, links):
         for body in bodies
         if body.is_solid
     }
-    assert [arm["name"] for arm in tree["arms"]] == list(names.values())
-    return robot, bodies, mechanism_of(tree, solids)
+    assert [arm["name"] for arm in tree_of(scene)["arms"]] == list(names.values())
+    return robot, bodies, mechanism_of(scene, solids)
 
 
 def random_joints(robot: Robot, rng):
@@ -139,7 +147,7 @@ def test_drive_forces_against_pinocchio(imported):
     file, scene, links = imported
     robot, _, mechanism = rigid_machine(file, scene, links)
     model = pin.buildModelFromUrdf(str(file))
-    assert np.array_equal(model.gravity.linear, GRAVITY)
+    assert np.array_equal(model.gravity.linear, mechanism.gravity)
     data = model.createData()
     order = [model.getJointId(joint.name) for joint in robot.movable]
     rng = np.random.default_rng(3)
@@ -220,29 +228,53 @@ def test_what_a_solid_carries_without_a_joint_stays(tmp_path):
     ]
 
 
+def test_a_closed_geometry_becomes_the_solid(tmp_path, capsys):
+    """Cut at the joints and meshed; a box with a reason where that cannot be."""
+    file = tmp_path / "robot.urdf"
+    rod = '<geometry><cylinder radius="0.07" length="1.0"/></geometry>'
+    assert rod in DEMO.read_text()  # the upper arm's, which is to be too short
+    file.write_text(DEMO.read_text().replace(rod, rod.replace("1.0", "0.8")))
+    links = "upper_arm,forearm"
+    run("import", file, "--links", links, "--trajectory", DEMO_MOTION, "--out", tmp_path / "a")
+    said = capsys.readouterr()
+    assert re.search(r"forearm: solid, 0.729 x 0.11 x 0.11 m, its shape, \d{4} cells", said.out)
+    assert "upper_arm: solid, 0.862 x 0.14 x 0.14 m, a box to edit" in said.out
+    assert "'upper_arm' becomes a box: its geometry does not reach the inboard joint" in said.err
+    scene = load_scene(tmp_path / "a" / "robot.toml")
+    index = [arm.name for arm in scene.arms].index("forearm")
+    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[index])
+    ring = 0.5 * 64 * np.sin(2 * np.pi / 64) * 0.055**2  # of the cylinder's flat sides
+    assert mesh.area.sum() == pytest.approx(ring * 0.7287, rel=0.02)
+    assert 2000 < mesh.num_cells < 10000
+    assert 0.05 < mesh.area[mesh.passive].sum() / mesh.area.sum() < 0.1
+
+
 # -- the command -----------------------------------------------------------------------------
 
 
 def test_import_says_what_it_made(tmp_path, capsys):
-    run("import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION, "--out", tmp_path / "a")
+    run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
     said = capsys.readouterr()
-    assert "6 joints that move" in said.out and "forearm: a solid box of 0.729" in said.out
+    assert "6 joints that move" in said.out and "forearm: solid, 0.729 x 0.11 x 0.11 m" in said.out
     assert said.err == ""  # nothing is wrong with this robot
     tree = tree_of(tmp_path / "a" / "robot.toml")
     assert [arm["name"] for arm in tree["arms"] if not arm.get("rigid")] == ["forearm"]
     assert tree["arms"][-1]["name"] == "tool" and tree["motion"]["file"] == "trajectory.csv"
+    scene = load_scene(tmp_path / "a" / "robot.toml")
+    assert scene.is_spatial and scene.driven == tuple(
+        DEMO_MOTION.read_text().splitlines()[1].replace(" ", "").split(",")[1:]
+    )
     assert "7.879 kg" in (tmp_path / "a" / "robot.toml").read_text()
     before = (tmp_path / "a" / "robot.toml").read_bytes()
     with pytest.raises(InputError, match="exists already"):
-        run("import", DEMO, "--links", "upper_arm", "--trajectory", DEMO_MOTION, "--out",
-            tmp_path / "a")  # fmt: skip
+        run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")  # fmt: skip
     assert (tmp_path / "a" / "robot.toml").read_bytes() == before
 
 
 def test_a_joint_that_follows_and_those_not_named_have_columns(tmp_path, capsys):
     file, motion = write_uneven(tmp_path), tmp_path / "motion.csv"
     motion.write_text("t,finger,yaw\n0,0.01,0\n1,0.03,2\n")
-    run("import", file, "--links", "upper", "--trajectory", motion, "--out", tmp_path / "a")
+    run_import(file, "upper", motion, tmp_path / "a")
     rows = np.genfromtxt(tmp_path / "a" / "trajectory.csv", delimiter=",", names=True)
     assert set(rows.dtype.names) == {
         "t", "yaw", "lift", "rail", "bend", "roll", "finger", "other"
@@ -267,7 +299,7 @@ def test_trajectories_that_cannot_be_followed(tmp_path, table, message):
     motion = tmp_path / "motion.csv"
     motion.write_text(table)
     with pytest.raises(InputError, match=message):
-        run("import", DEMO, "--links", "forearm", "--trajectory", motion, "--out", tmp_path / "a")
+        run_import(DEMO, "forearm", motion, tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
@@ -275,7 +307,7 @@ def test_a_motion_that_is_too_fast_is_told(tmp_path, capsys):
     """A quintic from rest to rest peaks at 15/8 of its mean speed."""
     motion = tmp_path / "motion.csv"
     motion.write_text("t,elbow\n0,0\n1,1.5\n")
-    run("import", DEMO, "--links", "forearm", "--trajectory", motion, "--out", tmp_path / "a")
+    run_import(DEMO, "forearm", motion, tmp_path / "a")
     assert "joint elbow moves at up to 2.812 rad/s, beyond its limit of 2.618" in (
         capsys.readouterr().err
     )
@@ -293,7 +325,7 @@ def test_a_motion_that_is_too_fast_is_told(tmp_path, capsys):
 )
 def test_links_that_cannot_be_solids(tmp_path, links, message):
     with pytest.raises(InputError, match=message):
-        run("import", DEMO, "--links", links, "--trajectory", DEMO_MOTION, "--out", tmp_path / "a")
+        run_import(DEMO, links, DEMO_MOTION, tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
@@ -501,3 +533,45 @@ def test_export_says_what_it_cannot_write(tmp_path):
             record.write_text(text)
         with pytest.raises(InputError, match=r"robot\.json: cannot be read .* `dolfinopt import`"):
             read_origin(record)
+
+
+def test_an_inertia_that_no_body_has_is_to_be_corrected(tmp_path, capsys):
+    """The scene is written, and says itself what is wrong with it."""
+    file = tmp_path / "robot.urdf"
+    file.write_text(DEMO.read_text().replace('izz="0.0012"', 'izz="0.012"'))
+    run_import(file, "forearm", DEMO_MOTION, tmp_path / "a")
+    said = capsys.readouterr().err
+    assert "link 'wrist_3': its inertia cannot be" in said
+    assert "correct the scene before you simulate it: " in said
+    with pytest.raises(InputError, match=r"inertia \(wrist_3\)"):
+        load_scene(tmp_path / "a" / "robot.toml")
+
+
+def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
+    """A finished run's link in the robot: its mass, its surface, and the same scene again."""
+    run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
+    coarse = ("--set", "arms.forearm.cells=[12,4,4]", "--set", "design.initial=1.0",
+              "--set", "simulation.tolerance=1e-2", "--no-plots")  # fmt: skip
+    run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
+    run("export", tmp_path / "run", "--urdf")
+    assert "kg, was 7.879 kg" in capsys.readouterr().out
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
+    assert same_kinematics(before, after)
+    fore = after.links["forearm"]
+    assert fore.own.mass == pytest.approx(summary["mass"]["forearm"], rel=1e-12)
+    assert fore.is_closed and fore.volume == pytest.approx(fore.own.mass / 2700.0, rel=0.01)
+    # Its frame is the link's: the rod's middle beside the elbow, from it to the wrist.
+    assert fore.own.centre == pytest.approx([-0.36435, 0.0, 0.06], abs=1e-9)
+    assert fore.points.min(axis=0) == pytest.approx([-0.7287, -0.055, 0.005], abs=1e-3)
+    assert implausible_inertias(after) == []
+    run_import(tmp_path / "run" / "urdf" / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "b")
+    masses = [
+        {arm["name"]: arm.get("mass") for arm in tree_of(tmp_path / name / "robot.toml")["arms"]}
+        for name in "ab"
+    ]
+    assert masses[0] == masses[1]
+    again = read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
+    total = sum(link.own.mass for link in again.links.values())
+    rest = sum(link.own.mass for name, link in before.links.items() if name != "forearm")
+    assert total == pytest.approx(rest + summary["mass"]["forearm"], rel=1e-9)

@@ -9,20 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.multibody.spatial.mechanism import (
-    GROUND,
-    Joint,
-    SpatialMechanism,
-    rigid_spatial_body,
-)
-from dolfinopt.multibody.spatial.rotations import about, roll_pitch_yaw
+from dolfinopt.multibody.spatial.links import build_spatial_mechanism, rigid_link
+from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism, rigid_spatial_body
+from dolfinopt.multibody.spatial.rotations import about
+from dolfinopt.scene.load import load_scene
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
-
-GRAVITY = np.array([0.0, 0.0, -9.81])
 
 # Everything that URDF has and a scene must say otherwise: a sensor on a fixed joint, links that a
 # solid carries without a joint, with mass and without, a branch, a finger that follows the other,
@@ -113,36 +108,21 @@ def tree_of(scene: Path) -> dict[str, Any]:
     return tomllib.loads(scene.read_text(encoding="utf-8"))
 
 
-def mechanism_of(tree: Mapping[str, Any], solids: Mapping[str, Sequence[Any]]) -> SpatialMechanism:
+def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> SpatialMechanism:
     """Return the rigid mechanism of a scene.
 
     Args:
-        tree: its tables.
+        file: of the scene.
         solids: mass, centre and inertia (6,) of the arms that are not rigid.
     """
-    names = [arm["name"] for arm in tree["arms"]]
-    bodies, joints = [], {}
-    for arm in tree["arms"]:
-        own = solids[arm["name"]] if arm["name"] in solids else (
-            arm["mass"], arm["centre"], arm["inertia"]
-        )  # fmt: skip
-        bodies.append(rigid_spatial_body(*own, (arm["length"], 0.0, 0.0)))
-    coordinate = 0
-    for joint in tree["joints"]:
-        parent = GROUND if joint["parent"] == "ground" else names.index(joint["parent"])
-        moves = joint["type"] != "fixed"
-        joints[joint["child"]] = Joint(
-            joint["name"],
-            joint["type"],
-            parent,
-            coordinate if moves else None,
-            np.array(joint.get("axis", [0.0, 0.0, 1.0])),
-            np.array(joint["origin"]),
-            roll_pitch_yaw(joint["rpy"]),
-        )
-        coordinate += moves
-    held = tuple(joints[name] for name in names)
-    return SpatialMechanism(tuple(bodies), held, (), GRAVITY, len(bodies) - 1)
+    scene = load_scene(file)
+    bodies = []
+    for arm in scene.arms:
+        if arm.rigid:
+            bodies.append(rigid_link(arm, 0.0))
+        else:
+            bodies.append(rigid_spatial_body(*solids[arm.name], (arm.length, 0.0, 0.0)))
+    return build_spatial_mechanism(scene, bodies)
 
 
 def frames_of(mechanism: SpatialMechanism, q: np.ndarray) -> list[np.ndarray]:

@@ -33,6 +33,23 @@ PARALLEL = 1e-6  # sine of the angle between axes
 
 
 @dataclass(frozen=True, eq=False)
+class SolidMesh:
+    """A solid in the shape of its link.
+
+    Attributes:
+        data: .msh file of its tetrahedra.
+        cells: their number.
+        size: of a cell, m.
+        volume: m3.
+    """
+
+    data: bytes
+    cells: int
+    size: float
+    volume: float
+
+
+@dataclass(frozen=True, eq=False)
 class SceneBody:
     """One of a scene's arms.
 
@@ -46,8 +63,9 @@ class SceneBody:
         axis: (3,) of the joint in its frame.
         inertia: in its frame; of a solid what the file says, without what is fixed to it.
         length: from its frame to the outboard interface along x, m; 0 of a rigid one.
-        size: height and thickness of a solid's box, m; None of a rigid body.
-        measured: whether the box has the extents of the link's geometry.
+        size: height and thickness of a solid, m; None of a rigid body.
+        measured: whether these are the extents of the link's geometry.
+        mesh: of a solid that has the link's geometry; None of a box.
     """
 
     link: str
@@ -61,6 +79,7 @@ class SceneBody:
     length: float = 0.0
     size: tuple[float, float] | None = None
     measured: bool = False
+    mesh: SolidMesh | None = None
 
     @property
     def is_solid(self) -> bool:

@@ -21,10 +21,11 @@ TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
 CELLS = 6000  # of a solid, about
 FEWEST = 4  # over its height and over its thickness
-RADIUS = 1.5  # of the filter, in cells
+RADIUS = 2.0  # of the filter, in cells
 MATERIAL, DENSITY = "aluminium 6082-T6", 2700.0  # kg/m3
 SETTLING = 0.3  # of the motion's duration, simulated after it
 ROUNDING = 1e-15  # m, rad: less is written as zero
+TIME = "t"  # a column of tables
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, xz, yz
 LONGEST_NAME = 64
 
@@ -35,7 +36,7 @@ def scene_names(names: Iterable[str]) -> dict[str, str]:
     Letters, digits, _, - stay; what else there is becomes _.
     """
     found: dict[str, str] = {}
-    taken = {GROUND}
+    taken = {GROUND, TIME}
     for name in names:
         word = re.sub(r"[^A-Za-z0-9_-]", "_", name)[: LONGEST_NAME - 4].lstrip("-") or "_"
         word = f"_{word}" if word.isdigit() else word
@@ -93,20 +94,35 @@ class RobotScene:
 
     def _solid(self, body: SceneBody) -> list[str]:
         assert body.size is not None
-        (height, thickness), own = body.size, body.inertia
-        sides = [_up(side) for side in (height, thickness)]
-        box = DENSITY * body.length * sides[0] * sides[1]
-        by = "the extents of its geometry" if body.measured else "a guess: it has no geometry"
+        own, file = body.inertia, _one_line(self.robot.file.name)
+        if body.mesh is None:
+            sides = height, thickness = (_up(body.size[0]), _up(body.size[1]))
+            weight = DENSITY * body.length * height * thickness
+            by = "the extents of its geometry" if body.measured else "a guess: it has no geometry"
+            keys = [f"cells = {list(cells_of(body.length, *sides))}"]
+        else:
+            sides, weight, by = body.size, DENSITY * body.mesh.volume, "those of its geometry"
+            keys = [
+                f"mesh = {_string(self.mesh_name(body))}  # {body.mesh.cells} cells, its geometry "
+                "between the joints",
+                'cell_shape = "tetrahedron"',
+                f"passive = {_number(_down(min(sides[0] / 4, body.length / 10)))}  # m, kept solid "
+                "at both ends",
+            ]
         return [
             "[[arms]]",
             f"name = {_string(self.arms[body.link])}",
             f"length = {_number(body.length)}  # m, from joint to joint",
-            f"height = {_number(sides[0])}  # m, {by}: edit them",
+            f"height = {_number(sides[0])}  # m, {by}{'' if body.mesh else ': edit them'}",
             f"thickness = {_number(sides[1])}",
-            f"cells = {list(cells_of(body.length, *sides))}",
-            f"# the solid box weighs {box:.4g} kg; {_one_line(self.robot.file.name)}: "
+            *keys,
+            f"# all solid it weighs {weight:.4g} kg; {file}: "
             f"{own.mass:.4g} kg, centre {_rounded(own.centre)}",
         ]
+
+    def mesh_name(self, body: SceneBody) -> str:
+        """Return the name of a solid's mesh file."""
+        return f"{self.arms[body.link]}.msh"
 
     def _rigid(self, body: SceneBody) -> list[str]:
         own = body.inertia
@@ -140,8 +156,7 @@ class RobotScene:
 
     def _rest(self) -> list[str]:
         """Return motion, payload and what of the defaults is not for a solid of this size."""
-        boxes = [(body.length, *body.size) for body in self.bodies if body.size is not None]
-        side = max(size / n for box in boxes for size, n in zip(box, cells_of(*box), strict=True))
+        side = max(_cell_size(body) for body in self.bodies if body.is_solid)
         return [
             "[motion]",
             'path = "joints"',
@@ -218,6 +233,15 @@ def cells_of(length: float, height: float, thickness: float) -> tuple[int, int, 
     return max(1, along), max(FEWEST, across[0]), max(FEWEST, across[1])
 
 
+def _cell_size(body: SceneBody) -> float:
+    """Return the longest side of a solid's cells, m."""
+    assert body.size is not None
+    if body.mesh is not None:
+        return body.mesh.size
+    box = (body.length, *body.size)
+    return max(size / count for size, count in zip(box, cells_of(*box), strict=True))
+
+
 def _path_from(file: Path, folder: Path) -> str:
     return Path(os.path.relpath(file.absolute(), folder.absolute())).as_posix()
 
@@ -226,6 +250,12 @@ def _up(value: float) -> float:
     """Return a number rounded up to three digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)
     return float(f"{math.ceil(round(value / unit, 6)) * unit:.3g}")
+
+
+def _down(value: float) -> float:
+    """Return a number rounded down to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.floor(round(value / unit, 6)) * unit:.2g}")
 
 
 def _tidy(values: np.ndarray) -> np.ndarray:
