@@ -77,7 +77,18 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
     written = write_result(scene, folder, result, elapsed(), pictures=drawn)
     if written is not None:
         conclude(written.summary, folder)
-        if scene.design.projection:
-            click.echo(f"parts for the workshop: dolfinopt part {folder}")
+        click.echo(_next(scene, folder, written.summary["grayness"]))
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
+
+
+def _next(scene: Scene, folder: Path, grayness: float) -> str:
+    """Return how to go on from a design."""
+    from dolfinopt.part.part import GRAY
+
+    if scene.design.projection or grayness <= GRAY:
+        return f"parts for the workshop: dolfinopt part {folder}"
+    return (
+        f"no design for the workshop: with a grayness of {grayness:.2g} parts would be another "
+        'design; optimise with design.projection = "robust", then dolfinopt part'
+    )

@@ -15,6 +15,9 @@ from dolfinopt.part.trace import REACH, Run, trace
 
 FITTED = 0.8  # share of the tolerance for the splines; the rest is for the area
 POINTS = 8  # of a free run in a cell that the splines are fitted to
+# Shares of the tolerance and of the distance of these points, one attempt after the other: splines
+# may leave the outline between points, or cross each other where it is narrow.
+ATTEMPTS = ((1.0, 1.0), (1.0, 0.3), (0.75, 0.3), (0.5, 0.2), (0.25, 0.2))
 ARCS = 0.25  # share of the tolerance for arcs in place of splines
 
 
@@ -33,9 +36,9 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     def change(shape: Shape) -> Shape:
         return with_arcs(shape, ARCS * tolerance) if arcs else shape
 
-    for share in (1.0, 0.75, 0.5, 0.25):
+    for share, finer in ATTEMPTS:
         finest = share * tolerance * (1.0 - ARCS if arcs else 1.0)
-        shape = with_area(_follow(outline, finest), outline.domain.volume, change)
+        shape = with_area(_follow(outline, finest, finer), outline.domain.volume, change)
         if shape.distance <= tolerance and shape.is_simple(0.1 * share * tolerance):
             return shape
     raise InputError(
@@ -44,9 +47,16 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     )
 
 
-def _follow(outline: Outline, tolerance: float) -> Shape:
-    """Return the curves of an outline before their area is corrected."""
+def _follow(outline: Outline, tolerance: float, finer: float = 1.0) -> Shape:
+    """Return the curves of an outline before their area is corrected.
+
+    Args:
+        outline: whose polygon they follow.
+        tolerance: m.
+        finer: share of the usual distance between the points that splines are fitted to.
+    """
     spacing = min(outline.domain.cell / POINTS, max(0.4 * outline.tool_radius, 2.0 * tolerance))
+    spacing *= finer
     reach = REACH * outline.domain.cell
 
     def pieces(runs: Sequence[Run]) -> list[list[Piece]]:
