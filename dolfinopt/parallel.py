@@ -109,6 +109,11 @@ def gather_arms(partition: Partition, mine: Mapping[int, T]) -> dict[int, T]:
     return {arm: merged[arm] for arm in sorted(merged)}
 
 
+def on_all_ranks(partition: Partition, mine: Mapping[int, T]) -> dict[int, T]:
+    """Return one object an arm on all ranks, in the arms' order (collective)."""
+    return partition.world.bcast(gather_arms(partition, mine), root=0)
+
+
 def gather_cells(partition: Partition, mine: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Collect cell arrays (n_local, ...) of every arm on the root, ranks in order.
 

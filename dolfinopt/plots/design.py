@@ -10,15 +10,13 @@ import numpy as np
 
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots.page import (
-    HEAD,
     MARGIN,
     TEXT,
-    TITLE,
     Page,
     draw_colour_scale,
     draw_ruler,
     figure_of_page,
-    stack_arms,
+    page_of_arms,
     write_page,
 )
 from dolfinopt.plots.shapes import outline, volume_fraction
@@ -51,9 +49,7 @@ def design_figure(views: Sequence[ArmView], title: str) -> Figure:
 
 def design_page(views: Sequence[ArmView], title: str) -> Page:
     """Return the page of `draw_design` before it is rendered; the caller closes it."""
-    layout = stack_arms([view.corners for view in views])
-    page = Page(layout.width, layout.height)
-    page.write(title, MARGIN, layout.height - HEAD + 40.0, TITLE, bold=True)
+    page, layout = page_of_arms([view.corners for view in views], title)
     for index, view in enumerate(views):
         page.write(_caption(view), MARGIN, layout.tops[index] + 12.0, TEXT)
         corners = layout.place(index, view.corners)

@@ -200,6 +200,19 @@ class Page:
         self.plotter.close()
 
 
+def page_of_arms(corners: Sequence[np.ndarray], title: str) -> tuple[Page, Layout]:
+    """Return a page with a title, and where arms go on it; the caller closes it.
+
+    Args:
+        corners: (n_cells, k, 2) m of every arm, from the top down.
+        title: above them.
+    """
+    layout = stack_arms(corners)
+    page = Page(layout.width, layout.height)
+    page.write(title, MARGIN, layout.height - HEAD + 40.0, TITLE, bold=True)
+    return page, layout
+
+
 def image_of(page: Page) -> np.ndarray:
     """Render a page and close it; return its picture (height, width, 3), uint8."""
     try:

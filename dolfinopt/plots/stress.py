@@ -10,15 +10,13 @@ import numpy as np
 
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots.page import (
-    HEAD,
     MARGIN,
     TEXT,
-    TITLE,
     Page,
     draw_colour_scale,
     draw_ruler,
     figure_of_page,
-    stack_arms,
+    page_of_arms,
     write_page,
 )
 from dolfinopt.plots.shapes import outline
@@ -51,9 +49,7 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
 
 def stress_page(views: Sequence[ArmView], title: str) -> Page:
     """Return the page of `draw_stress` before it is rendered; the caller closes it."""
-    layout = stack_arms([view.corners for view in views])
-    page = Page(layout.width, layout.height)
-    page.write(title, MARGIN, layout.height - HEAD + 40.0, TITLE, bold=True)
+    page, layout = page_of_arms([view.corners for view in views], title)
     peaks = [float(MEGA * _stress(view).max()) for view in views]
     marks = scale_marks(max(peaks))
     for index, view in enumerate(views):

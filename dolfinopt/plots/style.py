@@ -33,6 +33,8 @@ INITIAL, OPTIMISED = "initial design", "optimised design"
 KNOWN = {OPTIMISED: 0, INITIAL: 1}  # the same in all pictures of all runs
 LOOKS = len(PALETTE) * len(DASHES)
 LABEL_SIZE = 9.0  # points, at line ends
+LONGEST = 60  # characters of a name beside its curve
+WIDE = 0.55  # of its font size, about, a character
 SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
 PathLike = str | os.PathLike[str]
@@ -129,7 +131,7 @@ def label_ends(axes: Axes, height: float, names: Iterable[str] | None = None) ->
     places = spread([y for _, (_, y) in ends], 1.3 * LABEL_SIZE / 72.0 / height)
     for (line, (x, y)), at in zip(ends, places, strict=True):
         axes.annotate(
-            str(line.get_label()),
+            shortened(str(line.get_label())),
             xy=(x, y),
             xytext=(1.04, at),
             xycoords="axes fraction",
@@ -148,6 +150,16 @@ def label_ends(axes: Axes, height: float, names: Iterable[str] | None = None) ->
                 "shrinkB": 3.0,
             },
         )
+
+
+def shortened(name: str) -> str:
+    """Return a curve's name without its beginning where it is too long: of paths the end tells."""
+    return name if len(name) <= LONGEST else "..." + name[3 - LONGEST :]
+
+
+def width_of_names(names: Iterable[str]) -> float:
+    """Return the width that names beside curves take, about, inches."""
+    return max((len(shortened(name)) for name in names), default=0) * WIDE * LABEL_SIZE / 72.0
 
 
 def _last_point(axes: Axes, line: Any) -> tuple[float, float] | None:

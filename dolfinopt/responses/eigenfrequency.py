@@ -10,7 +10,7 @@ from dolfinopt.arms.arm import fixed_body
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
 from dolfinopt.multibody.motion import rigid_motion
-from dolfinopt.parallel import on_root, together
+from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.p_norm import p_norm
 from dolfinopt.responses.response import (
     Analysis,
@@ -18,7 +18,6 @@ from dolfinopt.responses.response import (
     Measured,
     Response,
     by_owner,
-    on_all_ranks,
     register,
 )
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
-from dolfinopt.parallel import Partition, gather_arms
+from dolfinopt.parallel import Partition
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
@@ -262,8 +262,3 @@ def by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:
 def occurrences(scene: Scene) -> dict[int, int]:
     """Return how many arms have each design."""
     return by_owner(scene, [1] * len(scene.arms))
-
-
-def on_all_ranks(partition: Partition, mine: Mapping[int, T]) -> dict[int, T]:
-    """Return one object an arm on all ranks, in the arms' order (collective)."""
-    return partition.world.bcast(gather_arms(partition, mine), root=0)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.parallel import together
+from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
     Response,
     occurrences,
-    on_all_ranks,
     register,
 )
 from dolfinopt.responses.sensitivity import static_gradient

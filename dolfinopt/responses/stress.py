@@ -12,14 +12,13 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.fem.cells import combine
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
 from dolfinopt.responses.cell_stress import CellStress, cell_stress
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
     Response,
-    on_all_ranks,
     register,
 )
 from dolfinopt.responses.screening import every, screen

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.parallel import together
+from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
     Response,
-    on_all_ranks,
     register,
 )
 from dolfinopt.responses.sensitivity import deflection_gradient

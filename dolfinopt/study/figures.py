@@ -22,7 +22,9 @@ from dolfinopt.plots.style import (
     looks,
     new_figure,
     save,
+    shortened,
     spans_decade,
+    width_of_names,
 )
 from dolfinopt.study import tables as findings
 from dolfinopt.study.tables import (
@@ -46,6 +48,7 @@ NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
 PANEL = 3.2  # inches, height of a panel of curves
+LEAST = 3.4  # inches, of a panel without the names of its curves: less is no picture
 
 Looks = Mapping[str, Mapping[str, Any]]
 
@@ -116,7 +119,9 @@ def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     """
     rows, columns = len(figure.rows), max(map(len, figure.rows))
     styles = styles or common_looks([figure])
+    names = [line.label for row in figure.rows for panel in row for line in panel.lines]
     width = (4.4 if columns > 1 else 6.5) + 2.4 / columns  # with the names beside them
+    width = max(width, LEAST + width_of_names(names))
     drawn, grid = _grid(figure.title, (rows, columns), (width, PANEL + 0.4))
     for row, panels in zip(grid, figure.rows, strict=True):
         for axes in row[len(panels) :]:
@@ -164,7 +169,7 @@ def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
     handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
     row[last].legend(
         [handles[name] for name in left],
-        list(left),
+        list(map(shortened, left)),
         loc="upper left",
         bbox_to_anchor=(1.0, 1.02),
         frameon=False,

@@ -12,7 +12,7 @@ from runs import TWO_ARM
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.parallel import together
+from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses import response as registry
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.p_norm import p_norm, p_norm_of_lengths
@@ -26,7 +26,6 @@ from dolfinopt.responses.response import (
     find_limited,
     needs,
     objective_of,
-    on_all_ranks,
 )
 from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene

@@ -1,5 +1,6 @@
 """Pictures of studies: what is drawn, and that it can be read."""
 
+import warnings
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,7 +10,15 @@ import pytest
 from matplotlib.text import Text
 from pictures import TOLERANCE, difference
 
-from dolfinopt.plots.style import BLUE, ORANGE, look, look_numbers, spread
+from dolfinopt.plots.style import (
+    BLUE,
+    LONGEST,
+    ORANGE,
+    look,
+    look_numbers,
+    shortened,
+    spread,
+)
 from dolfinopt.study.figures import (
     column_figure,
     common_looks,
@@ -40,6 +49,27 @@ def test_line_figure():
     assert [text.get_text() for text in right.texts] == ["b"]
     assert [text.get_text() for text in left.texts] == ["a"]  # each name once
     assert left.texts[0].get_color() == left.lines[0].get_color()
+
+
+@pytest.mark.parametrize("ends", [1.0, 0.5], ids=["names where curves end", "legend"])
+@pytest.mark.parametrize("columns", [1, 3])
+def test_long_names_leave_room_for_the_curves(columns, ends):
+    """Names of designs are paths: the figure grows, and their beginnings are cut."""
+    x = np.linspace(0.0, 3.0, 20)
+    folder = "results/a-folder-with-a-long-name/" * 4
+    names = [f"{folder}{k}.npz" for k in range(3)]
+    lines = tuple(
+        Line(name, x * (ends if k else 1.0), x * (k + 1.0)) for k, name in enumerate(names)
+    )
+    panels = tuple(Panel(f"payload {k} kg", "t [s]", "u [mm]", lines) for k in range(columns))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # Matplotlib's, where nothing is left of the axes
+        figure = line_figure(LineFigure("long", "Long names", (panels,)))
+        figure.canvas.draw()
+    assert all(axes.get_window_extent().width / figure.dpi > 2.5 for axes in figure.axes)
+    written = {text.get_text() for text in figure.findobj(Text)}
+    assert {f"...{name[3 - LONGEST :]}" for name in names} <= written
+    assert shortened("short.npz") == "short.npz"
 
 
 def test_one_thing_has_one_look_in_all_figures():
