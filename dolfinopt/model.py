@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+    from dolfinopt.part.check import Check
     from dolfinopt.part.part import Part
 
 Densities = Mapping[str, np.ndarray]
@@ -373,6 +374,37 @@ class Model:
             found.initial_deviation,
             found.certificate,
         )
+
+    def check_parts(
+        self,
+        x: Densities | SimulationResult,
+        *,
+        tool_radius: float | None = None,
+        tolerance: float | None = None,
+    ) -> Check | None:
+        """Simulate the machine with the parts of a design, beside its densities.
+
+        Args:
+            x, tool_radius, tolerance: as for `make_parts`.
+
+        Returns:
+            With `table()`, a data frame; None but on rank 0.
+
+        Raises:
+            InputError: no part can be made of the design.
+            ConvergenceError: the motion of the densities or of the parts cannot be simulated.
+        """
+        from dolfinopt.part.check import check_parts
+        from dolfinopt.part.mesh import mesh_parts
+        from dolfinopt.part.part import make_parts
+
+        with self._folder(None) as place:
+            self._design_file(x, place / "design.npz")
+            parts = make_parts(self.scene, place, tool_radius, tolerance, False, self._world)
+            with together(self._world):
+                if self._world.rank == 0:
+                    return check_parts(self.scene, place, parts, mesh_parts(parts))
+        return None
 
     def make_parts(
         self,

@@ -117,7 +117,9 @@ def _simulated(
     x_phys: Mapping[int, np.ndarray],
 ) -> Simulated:
     from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.order_selection import choose_coordinates
 
+    choose_coordinates(scene, partition, arms, x_phys, Profile())
     evaluation, trajectory = evaluate(scene, partition, arms, x_phys, Profile())
     assert trajectory is not None  # on a single rank
     return Simulated(scene, partition, arms, x_phys, evaluation, trajectory)

@@ -7,11 +7,13 @@ import json
 import numpy as np
 import pytest
 from conftest import folder_with, frame
+from mpi4py import MPI
 from runs import run
 
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.output.views import canonical_order
 from dolfinopt.part import check as checks
 from dolfinopt.part.check import check_parts
 from dolfinopt.part.forms import crisp
@@ -54,6 +56,17 @@ def test_part_is_converged_and_says_what_it_loses(made):
     change = 100.0 * (check.part.values["compliance"] / check.density.values["compliance"] - 1.0)
     assert f"{abs(change):.2g} % {'stiffer' if change < 0 else 'softer'}" in check.loss
     assert "deviation" in check.loss and len(check.loss.splitlines()) == 1
+
+
+def test_model_checks_parts_of_a_design(made):
+    folder, _, check = made
+    model = do.Model(scene_of(folder), comm=MPI.COMM_SELF)
+    with np.load(folder / "design.npz") as data:
+        order = canonical_order(data["arm1/centroid"])
+        design = {"arm1": data["arm1/density"][order]}
+    found = model.check_parts(design)
+    assert found.part.values == pytest.approx(check.part.values, rel=1e-6)
+    assert found.table().shape == check.table().shape
 
 
 def test_limits_are_those_of_the_outline(made):
