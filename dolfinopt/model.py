@@ -143,23 +143,27 @@ class SimulationResult:
         return deviation_figure(one.t, one.deviation, self._initial(), deviation_title(one))
 
     def plot_design(self) -> Figure | None:
-        """Return the figure of the arms' densities."""
+        """Return the figure of the arms' densities; None of solids, see design.vtu."""
         from dolfinopt.plots.design import design_figure
 
+        if self.scene.is_spatial:
+            return None
         return design_figure(designed(self.views), self.scene.name) if self.views else None
 
     def plot_stress(self) -> Figure | None:
-        """Return the figure of every cell's largest stress; None where it was not asked for."""
+        """Return the figure of every cell's largest stress; None if not asked for, or of solids."""
         from dolfinopt.plots.stress import stress_figure
 
         known = [view for view in self.views if view.stress is not None]
+        if self.scene.is_spatial:
+            return None
         return stress_figure(known, self.scene.name) if known else None
 
     def plot_machine(self) -> Figure | None:
-        """Return the figure of the machine in a few poses along its path."""
+        """Return the figure of the machine in a few poses along its path; None in space."""
         from dolfinopt.plots.machine import figure_of
 
-        if self.trajectory is None:
+        if self.trajectory is None or self.scene.is_spatial:
             return None
         return figure_of(self.views, self.trajectory, self.scene.name)
 
@@ -279,7 +283,7 @@ class Model:
 
     @property
     def centroids(self) -> dict[str, np.ndarray]:
-        """Centroids (n_cells, 2) of every designed arm's cells, m; empty but on rank 0."""
+        """Centroids (n_cells, 2 or 3) of every designed arm's cells, m; empty but on rank 0."""
         self._arms()
         return self._centroids
 

@@ -78,6 +78,11 @@ def part(
     from dolfinopt.part.part import make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
+    if scene.is_spatial:
+        raise InputError(
+            f"{folder}: parts are made of arms in the plane, and those of this run are solids; "
+            "design.vtu holds their densities"
+        )
     target = out or folder / "part"
     claim(world, target, overwrite, file_names(scene))
 
