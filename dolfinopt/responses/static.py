@@ -27,7 +27,7 @@ class StaticCompliance(Response):
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the compliance of every design (collective)."""
-        scene, uses, loads = analysis.scene, occurrences(analysis.scene), self._loads
+        scene, uses, loads = analysis.scene, occurrences(analysis.scene), self._loads(analysis)
         with together(analysis.partition.world):
             mine = {
                 k: uses[k] * static_response(state.elastic, loads).compliance
@@ -45,11 +45,10 @@ class StaticCompliance(Response):
             for owner in analysis.scene.cell_counts:
                 row: CellGradient = {k: np.zeros_like(one.x_phys) for k, one in designs.items()}
                 if owner in designs:
-                    response = static_response(designs[owner].elastic, self._loads)
+                    response = static_response(designs[owner].elastic, self._loads(analysis))
                     row[owner] = static_gradient(designs[owner], response) * uses[owner]
                 rows.append(row)
         return rows
 
-    @property
-    def _loads(self) -> np.ndarray:
-        return np.array(self.options.loads)
+    def _loads(self, analysis: Analysis) -> np.ndarray:
+        return np.array(self.options.static_loads(analysis.scene))

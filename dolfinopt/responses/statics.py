@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.responses.p_norm import p_norm_of_lengths
 
 
@@ -15,8 +16,8 @@ class StaticResponse:
     """What static loads do to one arm whose inboard interface is clamped; k load cases.
 
     Attributes:
-        loads: (3, k) force (N) and moment (N m) at the outboard interface.
-        tip: (3, k) its displacement (m) and rotation (rad).
+        loads: (3, k) force (N) and moment (N m) at the outboard interface; of solids (6, k).
+        tip: (3, k) or (6, k) its displacement (m) and rotation (rad).
     """
 
     loads: np.ndarray
@@ -30,16 +31,23 @@ class StaticResponse:
     @property
     def largest(self) -> float:
         """Largest |u_k| of the outboard point, m."""
-        return float(np.hypot(self.tip[0], self.tip[1]).max())
+        return float(lengths(self.displacement).max())
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Displacement of the outboard point (k, d), m."""
+        return self.tip[: 2 if len(self.tip) == 3 else 3].T
 
     def deflection(self, exponent: float) -> float:
         """Return (sum_k |u_k|^p)^(1/p) of the outboard point, m: at least the largest |u_k|."""
-        return p_norm_of_lengths(self.tip[:2].T, exponent)[0]
+        return p_norm_of_lengths(self.displacement, exponent)[0]
 
     def deflection_gradient(self, exponent: float) -> np.ndarray:
-        """Return the derivative (3, k) of `deflection` by the displacements."""
-        _, by_displacement = p_norm_of_lengths(self.tip[:2].T, exponent)
-        return np.vstack([by_displacement.T, np.zeros(self.tip.shape[1])])
+        """Return the derivative (3, k), or (6, k), of `deflection` by the displacements."""
+        _, by_displacement = p_norm_of_lengths(self.displacement, exponent)
+        out = np.zeros_like(self.tip)
+        out[: by_displacement.shape[1]] = by_displacement.T
+        return out
 
 
 def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
@@ -50,7 +58,7 @@ def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
 
     Args:
         arm: of the design.
-        loads: (k, 3) F_x, F_y (N) and moment (N m) of every case.
+        loads: (k, 3) F_x, F_y (N) and moment (N m) of every case; of a solid arm (k, 6).
     """
     columns = np.array(loads, dtype=float).T
     return StaticResponse(columns, np.linalg.solve(arm.constraint_modes().stiffness, columns))

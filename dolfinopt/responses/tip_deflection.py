@@ -29,7 +29,7 @@ class TipDeflection(Response):
         mine = {}
         with together(analysis.partition.world):
             for k, state in analysis.designs.items():
-                response = static_response(state.elastic, self._loads)
+                response = static_response(state.elastic, self._loads(analysis))
                 mine[k] = response.deflection(self.options.exponent), response.largest
         found = on_all_ranks(analysis.partition, mine)
         smooth, largest = zip(*found.values(), strict=True)
@@ -43,13 +43,12 @@ class TipDeflection(Response):
             row = {k: np.zeros_like(one.x_phys) for k, one in designs.items()}
             with together(analysis.partition.world):
                 if owner in designs:
-                    response = static_response(designs[owner].elastic, self._loads)
+                    response = static_response(designs[owner].elastic, self._loads(analysis))
                     row[owner] = deflection_gradient(
                         designs[owner], response, self.options.exponent
                     )
             rows.append(row)
         return rows
 
-    @property
-    def _loads(self) -> np.ndarray:
-        return np.array(self.options.loads)
+    def _loads(self, analysis: Analysis) -> np.ndarray:
+        return np.array(self.options.static_loads(analysis.scene))

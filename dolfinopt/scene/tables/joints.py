@@ -21,7 +21,7 @@ Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 GROUND = "ground"
 TIME = "t"  # column of a table of joint coordinates
 # What a machine in the plane has instead of joints.
-PLANE_RESPONSES = ("static", "tip_deflection", "eigenfrequency", "first_frequency")
+PLANE_RESPONSES = ("eigenfrequency", "first_frequency")
 PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
@@ -155,7 +155,7 @@ def _check_machine(scene: Scene) -> None:
         if key in PLANE_RESPONSES:
             objective = scene.objective.kind == key
             raise Refusal(
-                "expected a response of the motion, or mass, with [[joints]]: this one is computed "
+                "expected another response with [[joints]]: this one is computed "
                 "of arms in the plane",
                 ("objective", "kind") if objective else ("constraints", key),
                 ("joints",),

@@ -42,6 +42,13 @@ Combination = Literal["sum", "worst"]
 WorstBy = Literal["compliance", "deviation"]
 LARGEST_LOAD = 1e9  # N, N m
 Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
+SpatialLoad = tuple[float, float, float, float, float, float]  # force N, moment N m
+# Of solid arms, if none is stated: forces across, and torsion.
+SPATIAL_LOADS: tuple[SpatialLoad, ...] = (
+    (0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
+)
 Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 
 
@@ -99,10 +106,11 @@ class Objective(Table):
         description="how scenarios are combined in the objective: weighted sum, or smooth maximum "
         "[-]",
     )
-    loads: tuple[Load, ...] = Field(
+    loads: tuple[Load | SpatialLoad, ...] = Field(
         default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
         description="static load cases [F_x N, F_y N, moment N m] at each arm's outboard "
-        "interface [-]",
+        "interface; of solids force and moment of three components each, by default unit forces "
+        "along y and z and a unit moment about x [-]",
     )
     effort_weights: tuple[Weight, ...] | None = Field(
         default=None,
@@ -135,7 +143,7 @@ class Objective(Table):
 
     @field_validator("loads")
     @classmethod
-    def _check_loads(cls, loads: tuple[Load, ...]) -> tuple[Load, ...]:
+    def _check_loads(cls, loads: tuple[Load | SpatialLoad, ...]) -> tuple[Load | SpatialLoad, ...]:
         if not loads or not all(any(load) for load in loads):
             raise Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
         sizes = [max(map(abs, load)) for load in loads]
@@ -160,6 +168,7 @@ class Objective(Table):
         self._check_weights(scene)
         self._check_unused(scene)
         self._check_attached(scene)
+        self._check_static(scene)
         self._check_load_cases(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):
@@ -236,6 +245,18 @@ class Objective(Table):
                 f"expected {number}, for {', '.join(drives)}, not all of them 0",
                 ("objective", "effort_weights"),
             )
+
+    def static_loads(self, scene: Scene) -> tuple[Load | SpatialLoad, ...]:
+        """Return the static load cases of the scene's arms."""
+        default = type(self).model_fields["loads"].default
+        return SPATIAL_LOADS if scene.is_spatial and self.loads == default else self.loads
+
+    def _check_static(self, scene: Scene) -> None:
+        """Refuse loads of arms in the plane on solids, and the other way round."""
+        count = 6 if scene.is_spatial else 3
+        if any(len(load) != count for load in self.static_loads(scene)):
+            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
+            raise Refusal(f"expected arrays of {what} [[joints]]", ("objective", "loads"))
 
     def _check_load_cases(self, scene: Scene) -> None:
         num_samples = scene.simulation.num_samples(scene.motion.horizon)
