@@ -161,7 +161,7 @@ def test_schema_knows_every_key_with_its_meaning():
         (("reduction", "coordinates"), "many", "many"),
         (("loads",), {}, "loads"),
         (("arms", 0, "cells"), [10], "[10]"),
-        (("arms", 0, "cells"), [10, 2, 2], "[10, 2, 2]"),
+        (("arms", 0, "cells"), [10, 2, 2, 2], "[10, 2, 2, 2]"),
     ],
 )
 def test_schema_finds_what_is_wrong(path, value, word):

@@ -31,9 +31,12 @@ def folder(tmp_path_factory):
 
 
 def test_deviation_of_the_demo(folder):
-    """Nonlinear beams with rigid end faces give 18.62 mm; the demo's own cells 18.620 mm."""
+    """Nonlinear beams with rigid end faces give 18.62 mm; the demo's own cells 18.620 mm.
+
+    The coarse cells of this test are 2.7 % too stiff.
+    """
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["max_deviation"] == pytest.approx(18.62e-3, rel=0.03)  # coarse cells: 18.15 mm
+    assert summary["max_deviation"] == pytest.approx(18.1138e-3, rel=1e-4)
     assert summary["max_deviation_time"] == pytest.approx(0.416, abs=0.003)
     assert summary["mass"] == pytest.approx({"column": 0.0, "link1": 1.08, "link2": 0.972})
     assert set(summary["drive_peak"]) == {"yaw", "shoulder", "elbow"}
@@ -62,7 +65,8 @@ CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.
 
 
 @pytest.mark.parametrize(
-    ("kind", "control"), [("deviation", ()), ("effort", CONTROL), ("stress", ())]
+    ("kind", "control"),
+    [("deviation", ()), ("effort", CONTROL), ("stress", ()), ("tip_deflection", ())],
 )
 def test_exact_gradient_in_space(kind, control, monkeypatch):
     """Taylor's remainders fall by the order 2.00 along directions without any symmetry."""
