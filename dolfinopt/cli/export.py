@@ -37,6 +37,12 @@ KINDS = (".sid", ".sid.npz", ".fem")
     help="instead, with the folder of a finished run as SCENE: the robot that its scene was "
     "imported from, with the run's links; default folder: SCENE/urdf",
 )
+@click.option(
+    "--before",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="with --urdf: an earlier run of the robot, for a table of both",
+)
 def export(
     scene: Path,
     design: Path | None,
@@ -44,6 +50,7 @@ def export(
     overwrite: bool,
     overrides: tuple[str, ...],
     urdf: bool,
+    before: Path | None,
 ) -> None:
     """Write the reduced arms of SCENE for other multibody codes.
 
@@ -53,8 +60,10 @@ def export(
     if urdf:
         if design is not None or overrides:
             raise InputError("--urdf: expected no --design and no --set, they are the run's")
-        export_robot(scene, out, overwrite)
+        export_robot(scene, out, overwrite, before)
         return
+    if before is not None:
+        raise InputError("--before: expected --urdf with it")
     if scene.is_dir():
         raise InputError(f"{scene}: a folder; name a scene file, or add --urdf for a robot's run")
     world, loaded = load(scene, overrides)

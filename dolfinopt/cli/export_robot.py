@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -19,15 +20,17 @@ if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.scene import Origin
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.scene.load import Scene
+    from dolfinopt.study.tables import Table
 
 
-def export_robot(run: Path, out: Path | None, overwrite: bool) -> None:
+def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | None = None) -> None:
     """Write the robot that a run's scene was imported from, its solid links as they are now.
 
     Args:
         run: folder of the run, which `dolfinopt optimize` or `simulate` has written.
         out: folder for the URDF file and the links' surfaces; None: urdf in the run's.
         overwrite: whether to replace them.
+        before: folder of an earlier run, for a table of what both do.
     """
     world = start()
     from dolfinopt.parallel import gather_arms, gather_cells, on_root, together
@@ -36,7 +39,9 @@ def export_robot(run: Path, out: Path | None, overwrite: bool) -> None:
     scene: Scene = on_root(world, scene_of, run)
     origin = on_root(world, _origin_of, scene, run)
     folder = out or run / "urdf"
+    table = None if before is None else on_root(world, _table, before, run)
     names = [origin.file.name, *(f"{arm}.stl" for arm in origin.links)]
+    names += [] if table is None else [f"{table.name}{kind}" for kind in (".md", ".csv")]
     claim(world, folder, overwrite, names)
     partition, arms, x_phys = design_of(world, scene, run / "design.npz", Profile())
     with together(world):
@@ -49,6 +54,33 @@ def export_robot(run: Path, out: Path | None, overwrite: bool) -> None:
         if world.rank == 0:
             cells = {k: (centroids[k], densities[k]) for k in bodies}
             _write(scene, origin, folder, bodies, cells)
+            if table is not None:
+                _write_table(table, folder)
+
+
+def _table(before: Path, after: Path) -> Table:
+    """Return what two runs do."""
+    from dolfinopt.study.before_after import before_after
+
+    summaries = []
+    for run in (before, after):
+        path = run / "summary.json"
+        try:
+            summaries.append(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{path}: cannot be read ({type(error).__name__}); name a finished run"
+            ) from None
+    return before_after(*summaries)
+
+
+def _write_table(table: Table, folder: Path) -> None:
+    """Write the table as Markdown and CSV, and print it."""
+    from dolfinopt.disk import write_text
+
+    write_text(folder / f"{table.name}.md", table.markdown())
+    write_text(folder / f"{table.name}.csv", table.csv())
+    click.echo(table.markdown())
 
 
 def _origin_of(scene: Scene, run: Path) -> Origin:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from runs import ROOT, run
 
 from dolfinopt.multibody.spatial.links import build_spatial_mechanism, rigid_link
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism, rigid_spatial_body
@@ -18,6 +19,9 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+DEMO = ROOT / "demos" / "robot.urdf"
+DEMO_MOTION = ROOT / "demos" / "robot_motion.csv"
 
 # Everything that URDF has and a scene must say otherwise: a sensor on a fixed joint, links that a
 # solid carries without a joint, with mass and without, a branch, a finger that follows the other,
@@ -79,6 +83,11 @@ UNEVEN = """<?xml version="1.0"?>
 UNEVEN_LINKS = (
     "foot", "turn", "cover", "upper", "bracket", "slide", "lower", "hand", "left", "right",
 )  # fmt: skip
+
+
+def run_import(file: Path, links: str, motion: Path, folder: Path) -> None:
+    """Import a robot with boxes for solids."""
+    run("import", file, "--links", links, "--trajectory", motion, "--out", folder, "--boxes")
 
 
 def inertial(rng: np.random.Generator) -> str:

@@ -1,0 +1,177 @@
+"""Robots written back as URDF."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from mpi4py import MPI
+from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
+from runs import run
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
+
+from dolfinopt.arms.arm import Arm
+from dolfinopt.cli.export_robot import link_inertia
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
+from dolfinopt.exchange.urdf.checks import implausible_inertias
+from dolfinopt.exchange.urdf.read import read_robot
+from dolfinopt.exchange.urdf.robot import Inertia, Robot
+from dolfinopt.exchange.urdf.scene import read_origin
+from dolfinopt.exchange.urdf.write import NewLink, robot_text
+from dolfinopt.profiling import Profile
+from dolfinopt.study.before_after import before_after
+
+yourdfpy = pytest.importorskip("yourdfpy")
+trimesh = pytest.importorskip("trimesh")
+pytestmark = pytest.mark.serial
+
+
+def same_kinematics(one: Robot, other: Robot) -> bool:
+    """Return whether all joints are alike, to the last bit."""
+    return all(
+        (a.name, a.kind, a.parent, a.child, a.lower, a.upper, a.velocity)
+        == (b.name, b.kind, b.parent, b.child, b.lower, b.upper, b.velocity)
+        and np.array_equal(a.pose, b.pose)
+        and np.array_equal(a.axis, b.axis)
+        for a, b in zip(one.joints, other.joints, strict=True)
+    )
+
+
+def test_there_and_back(imported, tmp_path):
+    """Frames of solids are undone: mass, centre and inertia come back to rounding."""
+    file, _, links = imported
+    robot = read_robot(file)
+    bodies = scene_bodies(robot, links, default_tool(robot, links))
+    new = [NewLink(b.link, b.inertia.posed(b.frame)) for b in bodies if b.is_solid]
+    back = tmp_path / "back" / "robot.urdf"
+    back.parent.mkdir()
+    back.write_bytes(robot_text(file, new, back.parent))
+    again = read_robot(back)
+    assert list(again.links) == list(robot.links) and same_kinematics(robot, again)
+    for name, link in robot.links.items():
+        own = again.links[name].own
+        assert own.mass == pytest.approx(link.own.mass, rel=1e-15)
+        assert np.abs(own.centre - link.own.centre).max() < 1e-15
+        assert np.abs(own.tensor - link.own.tensor).max() < 1e-14
+    text = back.read_text()
+    if file == DEMO:
+        assert "Denavit-Hartenberg" in text and "the rod between shoulder and elbow" in text
+    else:
+        assert "<!-- kept -->" in text and '<gazebo reference="hand"><selfCollide>' in text
+    changed = sum(a != b for a, b in zip(file.read_text().splitlines(), text.splitlines()))
+    assert changed > 0 and text.count("<inertial>") == file.read_text().count("<inertial>")
+
+
+def test_new_meshes_take_the_place_of_all_shapes(tmp_path):
+    """The material stays; meshes of other links are found from the new folder."""
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box(extents=(0.1, 0.2, 0.3)).export(tmp_path / "meshes" / "hand.stl")
+    file = write_uneven(tmp_path)
+    hand = '<link name="hand">'
+    shape = '<visual><geometry><mesh filename="meshes/hand.stl" scale="2 1 1"/></geometry></visual>'
+    file.write_text(file.read_text().replace(hand, hand + shape))
+    folder = tmp_path / "new"
+    folder.mkdir()
+    trimesh.creation.icosphere(radius=0.1).export(folder / "upper.stl")
+    body = Inertia(2.5, np.array([0.1, 0.2, 0.3]), np.diag([0.01, 0.02, 0.025]))
+    back = folder / "uneven.urdf"
+    back.write_bytes(robot_text(file, [NewLink("upper", body, "upper.stl")], folder))
+    robot = read_robot(back)
+    upper, hand_link = robot.links["upper"], robot.links["hand"]
+    assert not upper.missing and not hand_link.missing
+    assert (upper.own.mass, *upper.own.centre) == (2.5, 0.1, 0.2, 0.3)
+    assert np.array_equal(upper.own.tensor, body.tensor)
+    assert len(upper.shapes) == 1 and upper.volume == pytest.approx(4 / 3 * np.pi * 1e-3, rel=0.02)
+    assert hand_link.volume == pytest.approx(2 * 0.1 * 0.2 * 0.3)
+    inside = back.read_text().split('<link name="upper">')[1].split("</link>")[0]
+    assert inside.count("<visual>") == inside.count("<collision>") == 1
+    assert '<material name="grey"/>' in inside and "box" not in inside
+    with pytest.raises(InputError, match="no link 'arm'; is it the robot of the scene"):
+        robot_text(file, [NewLink("arm", body)], folder)
+
+
+def test_a_links_inertia_is_its_bodys_and_its_motors():
+    """Against parallel axes by hand: a box, and a motor at its outboard end."""
+    scene = solid_scene(cells=(10, 3, 2), joint_mass=0.7, joint_inertia=0.01)
+    arm = Arm(scene, 0, MPI.COMM_SELF, Profile())
+    found = link_inertia(scene, 0, arm.reduce(np.ones(60)))
+    box = DENSITY * LENGTH * HEIGHT * THICKNESS
+    mass = box + 0.7
+    centre = (0.5 * box * LENGTH + 0.7 * LENGTH) / mass
+    squares = np.array([HEIGHT**2 + THICKNESS**2, LENGTH**2 + THICKNESS**2, LENGTH**2 + HEIGHT**2])
+    apart = box * (centre - 0.5 * LENGTH) ** 2 + 0.7 * (LENGTH - centre) ** 2
+    expected = np.diag(box * squares / 12.0 + 0.01 + [0.0, apart, apart])
+    assert found.mass == pytest.approx(mass, rel=1e-13)
+    assert found.centre == pytest.approx([centre, 0.0, 0.0], abs=1e-14)
+    assert np.abs(found.tensor - expected).max() < 1e-13
+
+
+def test_export_says_what_it_cannot_write(tmp_path):
+    with pytest.raises(InputError, match="add --urdf for a robot's run"):
+        run("export", tmp_path)
+    with pytest.raises(InputError, match="expected no --design and no --set"):
+        run("export", tmp_path, "--urdf", "--set", "payload.mass=1")
+    with pytest.raises(InputError, match=r"summary.json: cannot be read .* finished"):
+        run("export", tmp_path, "--urdf")
+    record = tmp_path / "robot.json"
+    for text in (None, "{", '{"urdf": "a", "solids": {"b": {"link": "c", "frame": [1]}}}'):
+        if text is not None:
+            record.write_text(text)
+        with pytest.raises(InputError, match=r"robot\.json: cannot be read .* `dolfinopt import`"):
+            read_origin(record)
+
+
+def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
+    """A finished run's link in the robot: its mass, its surface, and the same scene again."""
+    run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
+    coarse = ("--set", "arms.forearm.cells=[12,4,4]", "--set", "design.initial=1.0",
+              "--set", "simulation.tolerance=1e-2", "--no-plots")  # fmt: skip
+    run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
+    run("export", tmp_path / "run", "--urdf", "--before", tmp_path / "run")
+    said = capsys.readouterr().out
+    assert "kg, was 7.879 kg" in said and "largest tool deflection" in said
+    rows = pd.read_csv(tmp_path / "run" / "urdf" / "before_after.csv", index_col="figure")
+    assert not rows["change [%]"].abs().max() > 0 and set(rows["unit"]) == {"kg", "mm", "Hz", "N m"}
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
+    assert same_kinematics(before, after)
+    fore = after.links["forearm"]
+    assert fore.own.mass == pytest.approx(summary["mass"]["forearm"], rel=1e-12)
+    assert fore.is_closed and fore.volume == pytest.approx(fore.own.mass / 2700.0, rel=0.01)
+    # Its frame is the link's: the rod's middle beside the elbow, from it to the wrist.
+    assert fore.own.centre == pytest.approx([-0.36435, 0.0, 0.06], abs=1e-9)
+    assert fore.points.min(axis=0) == pytest.approx([-0.7287, -0.055, 0.005], abs=1e-3)
+    assert implausible_inertias(after) == []
+    run_import(tmp_path / "run" / "urdf" / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "b")
+    masses = [
+        {arm["name"]: arm.get("mass") for arm in tree_of(tmp_path / name / "robot.toml")["arms"]}
+        for name in "ab"
+    ]
+    assert masses[0] == masses[1]
+    again = read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
+    total = sum(link.own.mass for link in again.links.values())
+    rest = sum(link.own.mass for name, link in before.links.items() if name != "forearm")
+    assert total == pytest.approx(rest + summary["mass"]["forearm"], rel=1e-9)
+
+
+def test_before_and_after():
+    """Figures of both runs, slides in N; runs of other machines are refused."""
+    one = {
+        "name": "robot", "mass": {"foot": 2.0, "link": 8.0}, "first_frequency": {"link": 50.0},
+        "max_deviation": 2e-3, "settling": None, "drive_peak": {"yaw": 10.0, "rail": 4.0},
+        "drive_rms": {"yaw": 5.0, "rail": 0.0},
+        "scene": {"joints": [{"name": "yaw", "type": "revolute"},
+                             {"name": "rail", "type": "prismatic"}]},
+    }  # fmt: skip
+    other = one | {"mass": {"foot": 2.0, "link": 3.0}, "max_deviation": 1e-3}
+    frame = before_after(one, other).frame.set_index("figure")
+    assert frame.loc["mass of all arms"].tolist() == [10.0, 5.0, -50.0, "kg"]
+    assert frame.loc["largest tool deflection"].tolist() == [2.0, 1.0, -50.0, "mm"]
+    assert frame.loc["peak of drive rail", "unit"] == "N"
+    assert frame.loc["peak of drive yaw", "unit"] == "N m"
+    assert frame.loc["deflection after the motion", ["before", "after"]].isna().all()
+    with pytest.raises(InputError, match="other arms: foot, link before, link after"):
+        before_after(one, one | {"mass": {"link": 1.0}})

@@ -1,0 +1,217 @@
+"""The import of robots: what it says, refuses and finds doubtful."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
+
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.urdf.checks import implausible_inertias
+from dolfinopt.exchange.urdf.read import read_robot
+from dolfinopt.scene.load import load_scene
+
+yourdfpy = pytest.importorskip("yourdfpy")
+trimesh = pytest.importorskip("trimesh")
+pytestmark = pytest.mark.serial
+
+# -- the command -----------------------------------------------------------------------------
+
+
+def test_import_says_what_it_made(tmp_path, capsys):
+    run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
+    said = capsys.readouterr()
+    assert "6 joints that move" in said.out and "forearm: solid, 0.729 x 0.11 x 0.11 m" in said.out
+    assert said.err == ""  # nothing is wrong with this robot
+    tree = tree_of(tmp_path / "a" / "robot.toml")
+    assert [arm["name"] for arm in tree["arms"] if not arm.get("rigid")] == ["forearm"]
+    assert tree["arms"][-1]["name"] == "tool" and tree["motion"]["file"] == "trajectory.csv"
+    scene = load_scene(tmp_path / "a" / "robot.toml")
+    assert scene.is_spatial and scene.driven == tuple(
+        DEMO_MOTION.read_text().splitlines()[1].replace(" ", "").split(",")[1:]
+    )
+    assert "7.879 kg" in (tmp_path / "a" / "robot.toml").read_text()
+    before = (tmp_path / "a" / "robot.toml").read_bytes()
+    with pytest.raises(InputError, match="exists already"):
+        run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")  # fmt: skip
+    assert (tmp_path / "a" / "robot.toml").read_bytes() == before
+
+
+def test_a_joint_that_follows_and_those_not_named_have_columns(tmp_path, capsys):
+    file, motion = write_uneven(tmp_path), tmp_path / "motion.csv"
+    motion.write_text("t,finger,yaw\n0,0.01,0\n1,0.03,2\n")
+    run_import(file, "upper", motion, tmp_path / "a")
+    rows = np.genfromtxt(tmp_path / "a" / "trajectory.csv", delimiter=",", names=True)
+    assert set(rows.dtype.names) == {
+        "t", "yaw", "lift", "rail", "bend", "roll", "finger", "other"
+    }  # fmt: skip
+    assert rows["other"] == pytest.approx(0.005 - rows["finger"], abs=1e-15)
+    assert not rows["lift"].any()
+    assert "stand still: lift = 0, " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("shoulder_pan,elbow\n0,0\n1,1\n", "no column t"),
+        ("t,shoulder\n0,0\n1,1\n", "column 'shoulder': the robot has no such joint; expected t"),
+        ("t,flange\n0,0\n1,1\n", "this joint is fixed"),
+        ("t,elbow\n0,0\n1,1\n1,2\n", "line 4, column t = 1: expected more than 1"),
+        ("t,elbow\n0,0\n1,45\n", r"line 3, joint elbow = 45: expected -3.1416 .*degrees\?"),
+        ("t,elbow\n0,0\n1,3.2\n", r"line 3, joint elbow = 3.2: .* \[rad\], its limits$"),
+    ],
+)
+def test_trajectories_that_cannot_be_followed(tmp_path, table, message):
+    motion = tmp_path / "motion.csv"
+    motion.write_text(table)
+    with pytest.raises(InputError, match=message):
+        run_import(DEMO, "forearm", motion, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_motion_that_is_too_fast_is_told(tmp_path, capsys):
+    """A quintic from rest to rest peaks at 15/8 of its mean speed."""
+    motion = tmp_path / "motion.csv"
+    motion.write_text("t,elbow\n0,0\n1,1.5\n")
+    run_import(DEMO, "forearm", motion, tmp_path / "a")
+    assert "joint elbow moves at up to 2.812 rad/s, beyond its limit of 2.618" in (
+        capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    ("links", "message"),
+    [
+        ("fore_arm", "no link 'fore_arm'; did you mean forearm?"),
+        ("base", "'base' stands on the ground"),
+        ("tool", "'tool': nothing hangs on it"),
+        ("forearm,forearm", "a link is named twice"),
+        (",", "expected names of links"),
+    ],
+)
+def test_links_that_cannot_be_solids(tmp_path, links, message):
+    with pytest.raises(InputError, match=message):
+        run_import(DEMO, links, DEMO_MOTION, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+LINK = '<link name="{}"/>'
+JOINT = (
+    '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>'
+    '<limit lower="0" upper="1" effort="1" velocity="1"/>{}</joint>'
+)
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        ([], "no links"),
+        ([LINK.format("a"), LINK.format("a")], "link 'a' stands there 2 times"),
+        ([LINK.format("a"), LINK.format("b")], "2 links that no joint holds"),
+        ([LINK.format("a"), JOINT.format("j", "revolute", "a", "b", "")], "no link 'b', its child"),
+        (
+            [LINK.format("a"), LINK.format("b"), JOINT.format("j", "floating", "a", "b", "")],
+            "joint 'j': type 'floating'; a scene has joints of type revolute, continuous",
+        ),
+        (
+            [LINK.format("a"), LINK.format("b"), JOINT.format("j", "planar", "a", "b", "")],
+            "type 'planar'",
+        ),
+        (
+            [LINK.format("a"), LINK.format("b"),
+             JOINT.format("j", "revolute", "a", "b", '<axis xyz="0 0 0"/>')],
+            "expected three numbers, not all zero",
+        ),
+        (
+            [LINK.format("a"), LINK.format("b"),
+             JOINT.format("j", "revolute", "a", "b", '<mimic joint="k"/>')],
+            "follows 'k'; expected a joint that moves",
+        ),
+        (
+            [*map(LINK.format, "abc"), JOINT.format("j", "fixed", "b", "c", ""),
+             JOINT.format("k", "fixed", "c", "b", "")],
+            "part of a loop",
+        ),
+        (["<link/>"], "not a robot that yourdfpy can read"),
+    ],
+)  # fmt: skip
+def test_robots_that_a_scene_cannot_hold(tmp_path, inside, message):
+    file = tmp_path / "r.urdf"
+    file.write_text(f'<robot name="r">{"".join(inside)}</robot>')
+    with pytest.raises(InputError, match=message) as caught:
+        read_robot(file)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(file))
+
+
+def test_files_that_are_no_robots(tmp_path):
+    file = tmp_path / "r.urdf"
+    with pytest.raises(InputError, match=r"r\.urdf: cannot be read"):
+        read_robot(file)
+    for text, message in (
+        ("<robot", "not XML"),
+        ('<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"/>', "xacro"),
+        ("<sdf/>", "expected an element <robot name"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match=message):
+            read_robot(file)
+
+
+def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "yourdfpy", None)
+    with pytest.raises(InputError, match=r"pip install 'dolfinopt\[robots\]'"):
+        read_robot(DEMO)
+
+
+# -- inertias --------------------------------------------------------------------------------
+
+
+def test_this_robots_inertias_may_be():
+    assert implausible_inertias(read_robot(DEMO)) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('iyy="0.7576"', 'iyy="-0.7576"', "not positive definite"),
+        ('iyy="0.7576"', 'iyy="1.7576"', "largest exceeds the sum of the others"),
+        ('<mass value="7.879"/>', '<mass value="0"/>', "no mass, though"),
+        ('<mass value="7.879"/>', '<mass value="7879"/>', "kg/m3; expected 100 to 20000"),
+        ('xyz="-0.4053 0 0.0604"', 'xyz="-405.3 0 60.4"', "m outside its geometry"),
+        (
+            'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"',
+            'ixx="26.1" ixy="-0.1" ixz="-29" iyy="757.6" iyz="0" izz="753.3"',
+            "inertia is too large",
+        ),
+        (
+            'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"',
+            'ixx="1e-6" ixy="0" ixz="0" iyy="1e-6" iyz="0" izz="1e-6"',
+            "inertia is too small",
+        ),
+        ('<geometry><cylinder radius="0.055" length="0.84"/></geometry>',
+         '<geometry><mesh filename="package://robot/forearm.stl"/></geometry>',
+         "mesh package://robot/forearm.stl cannot be read"),
+    ],
+)  # fmt: skip
+def test_inertias_that_cannot_be_are_told(tmp_path, old, new, message):
+    text = DEMO.read_text()
+    assert old in text
+    file = tmp_path / "wrong.urdf"
+    file.write_text(text.replace(old, new, 1))
+    found = implausible_inertias(read_robot(file))
+    assert any(message in one for one in found), found
+    assert all("link 'forearm': " in one and "\n" not in one for one in found)
+
+
+def test_an_inertia_that_no_body_has_is_to_be_corrected(tmp_path, capsys):
+    """The scene is written, and says itself what is wrong with it."""
+    file = tmp_path / "robot.urdf"
+    file.write_text(DEMO.read_text().replace('izz="0.0012"', 'izz="0.012"'))
+    run_import(file, "forearm", DEMO_MOTION, tmp_path / "a")
+    said = capsys.readouterr().err
+    assert "link 'wrist_3': its inertia cannot be" in said
+    assert "correct the scene before you simulate it: " in said
+    with pytest.raises(InputError, match=r"inertia \(wrist_3\)"):
+        load_scene(tmp_path / "a" / "robot.toml")
