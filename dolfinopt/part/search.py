@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
+import numpy as np
+
 T = TypeVar("T")
 
-NARROW = 5e-5  # bracket at which the search ends, of the span
-STEPS = 60
+NARROW = 2e-4  # bracket at which the search ends, of the span
+STEPS = 30
 BEYOND = 1.15  # of the step to where a straight line ends
 
 
@@ -36,7 +38,7 @@ def search(
     tried: list[tuple[float, float]] = []
     place = min(max(first, span[0]), span[1])
     best = at(place)
-    found = best
+    found, width = best, np.inf
     for _ in range(STEPS):
         excess = off(found)
         if abs(excess) < abs(off(best)):
@@ -54,8 +56,9 @@ def search(
         else:
             if abs(above[0] - below[0]) < NARROW * (span[1] - span[0]):
                 break
-            # Every third step halves the bracket, for a size may leap; as it does to nothing.
-            leaps = len(tried) % 3 == 0 or max(above[1], -below[1]) > 0.5
+            # A size may leap, as it does to nothing: then the secant hardly narrows the bracket.
+            leaps = abs(above[0] - below[0]) > 0.5 * width or max(above[1], -below[1]) > 0.5
+            width = abs(above[0] - below[0])
             share = 0.5 if leaps else -below[1] / (above[1] - below[1])
             place = below[0] + min(max(share, 0.03), 0.97) * (above[0] - below[0])
         found = at(place)

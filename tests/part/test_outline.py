@@ -14,6 +14,7 @@ from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.part.curves import Arc, Line, direction
 from dolfinopt.part.outline import draw_outline
 from dolfinopt.part.part import make_part
+from dolfinopt.part.search import search
 
 pytestmark = pytest.mark.serial
 
@@ -31,6 +32,7 @@ def check(part, holes):
     assert shape.area == pytest.approx(domain.volume, rel=1e-5)
     assert part.outline.area == pytest.approx(domain.volume, rel=5e-3)
     assert shape.distance <= part.tolerance
+    assert shape.concave_radius >= part.outline.tool_radius - part.tolerance
     assert shape.is_simple(0.05 * part.tolerance)
     assert len(shape.loops) == 1 + holes
     for loop in shape.loops:
@@ -213,3 +215,19 @@ def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
     slopes = [np.subtract(*c.at(np.array([1.0, 0.0]))) for c in exact if isinstance(c, Line)]
     assert [abs(y / x) for x, y in slopes] == pytest.approx([0.01] * len(slopes), abs=1e-6)
     assert {round(c.radius, 8) for c in exact if isinstance(c, Arc)} == {0.04, 0.02}
+
+
+@pytest.mark.parametrize(
+    ("size", "root", "most"),
+    [
+        (lambda x: x**3 - 0.2, 0.2 ** (1.0 / 3.0), 10),
+        (lambda x: np.exp(5.0 * x) - 2.0, np.log(2.0) / 5.0, 14),
+        (lambda x: -1.0 if x < 0.2 else 0.1 * (x - 0.5), 0.5, 14),  # nothing is left
+        (lambda x: 0.3 * x - (0.2 if x < 0.31 else -0.1), 0.31, 18),  # no root, a leap
+    ],
+)
+def test_search_finds_roots_and_leaps(size, root, most):
+    tried = []
+    found = search(lambda x: tried.append(x) or x, size, 0.0, 1.0, (-1.0, 1.0), 1e-4)
+    assert found == pytest.approx(root, abs=2e-3)
+    assert len(tried) <= most
