@@ -30,12 +30,14 @@ class Ranks:
         comm: the ranks, apart from the messages of the tests.
         stderr: standard error, which pytest captures in tests.
         unread: what went wrong in reading test files.
+        left_out: number of files and tests marked `serial` that several ranks do not run.
     """
 
     def __init__(self, config: pytest.Config) -> None:
         self.comm = MPI.COMM_WORLD.Dup()
         self.stderr = os.fdopen(os.dup(2), "w")
         self.unread: list[str] = []
+        self.left_out = 0
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_sessionstart(self, session: pytest.Session) -> None:
@@ -51,7 +53,10 @@ class Ranks:
         """
         if self.comm.size == 1 or not collection_path.match("test_*.py"):
             return None
-        return True if SERIAL_FILE.search(collection_path.read_text(encoding="utf-8")) else None
+        if not SERIAL_FILE.search(collection_path.read_text(encoding="utf-8")):
+            return None
+        self.left_out += 1
+        return True
 
     def pytest_collection_modifyitems(
         self, config: pytest.Config, items: list[pytest.Item]
@@ -62,6 +67,12 @@ class Ranks:
         serial = [item for item in items if item.get_closest_marker("serial")]
         items[:] = [item for item in items if not item.get_closest_marker("serial")]
         config.hook.pytest_deselected(items=serial)
+        self.left_out += len(serial)
+
+    def pytest_sessionfinish(self, session: pytest.Session, exitstatus: int) -> None:
+        """Where all that was asked for is marked `serial`, nothing has failed."""
+        if exitstatus == pytest.ExitCode.NO_TESTS_COLLECTED and self.left_out:
+            session.exitstatus = pytest.ExitCode.OK
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         """Keep what went wrong in reading a test file."""
