@@ -35,14 +35,10 @@ from dolfinopt.scene.load import Scene
 
 LINEAR = {"law": "simp", "penalty": 1.0}  # of added material: all it weighs, all its stiffness
 MOVE = 0.1  # of the outline in the first step, cells of the design
-SMOOTH = 1.0  # length over which moves are alike, cells
 SPIKE = 2.0  # largest move over that of nine of ten
 HALVINGS = 3  # of a step that does not pay
 GROWTH = 1.5  # of the next step after one that does
 WORTH = 0.01  # relative gain below which the part stays as it was
-TIGHT = 1.3  # radii of the tool, of concave places that stay as they are
-INSIDE = 0.9  # of the distance to where material may not be, or must be
-_GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +69,9 @@ class Polished:
     @property
     def sentence(self) -> str:
         """What it brought, in one line."""
+        words = "1 step makes" if self.steps == 1 else f"{self.steps} steps make"
         found = (
-            f"polishing: {self.steps} steps make the objective {100.0 * self.gain:.2g} % better, "
+            f"polishing: {words} the objective {100.0 * self.gain:.2g} % better, "
             f"the outline moves by {1e3 * self.farthest:.2g} mm at most"
         )
         if self.kept:
