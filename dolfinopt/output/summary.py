@@ -124,7 +124,10 @@ def _gather_traits(run: Simulated) -> dict[int, _Traits]:
     widths = _widths(partition, arms, x_phys)
     errors = _frequency_errors(partition, arms, x_phys, run.profile)
     with together(partition.world):
-        return {k: replace(one, widths=widths[k], error=errors.get(k)) for k, one in every.items()}
+        return {
+            k: replace(one, widths=widths.get(k, (None, None)), error=errors.get(k))
+            for k, one in every.items()
+        }
 
 
 def _of_designs(
@@ -277,10 +280,15 @@ def _frequency_errors(
 def _widths(
     partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, tuple[float | None, float | None]]:
-    """Return the widths of member and gap of the designs cut at one half, m; on the root."""
+    """Return the widths of member and gap of the designs cut at one half, m; on the root.
+
+    Those of arms in the plane: members of solid ones are not measured.
+    """
     corners, solid = {}, {}
     with together(partition.world):
         for k, arm in arms.items():
+            if arm.mesh.dim == 3:
+                continue
             points = compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)[:, :, :2]
             corners[k] = points[:, [0, 1, 3, 2]] if points.shape[1] == 4 else points
             solid[k] = x_phys[k] > 0.5

@@ -110,6 +110,12 @@ def read_domains(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, Domai
     from dolfinopt.output.design import read_smooth_design
     from dolfinopt.parallel import partition_arms, together
 
+    for k in scene.cell_counts:
+        if scene.arms[k].is_solid:
+            raise InputError(
+                f"{folder}: arm {scene.arms[k].name!r} is a solid: parts are outlines of arms in "
+                "plane stress, cells = [along, across]"
+            )
     check_budget(world, scene)
     partition = partition_arms(world, scene.cell_counts, whole=True)
     patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
