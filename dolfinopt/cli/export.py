@@ -67,6 +67,11 @@ def export(
     if scene.is_dir():
         raise InputError(f"{scene}: a folder; name a scene file, or add --urdf for a robot's run")
     world, loaded = load(scene, overrides)
+    if loaded.is_spatial:
+        raise InputError(
+            f"{scene}: a machine in space: expected arms in plane stress, whose bodies these files "
+            "hold"
+        )
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.disk import write_arrays, write_text
     from dolfinopt.exchange.sid import sid_arrays, sid_text

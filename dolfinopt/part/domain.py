@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.errors import InputError
 from dolfinopt.part.regions import Region, cells_of, region_of
 from dolfinopt.scene.load import Scene
 
