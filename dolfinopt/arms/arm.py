@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState, InitialVectors, options, same_basis
-from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
+from dolfinopt.arms.vibration import Carried, LoadedModes
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
@@ -259,7 +259,7 @@ class Arm:
         state = self._state
         return state.basis if state is not None and state.is_reduced else None
 
-    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
+    def loaded_modes(self, place: int, carried: Carried) -> LoadedModes:
         """Return those of the current design, see `DesignState.loaded_modes`."""
         return self.current.loaded_modes(place, carried)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals, loaded_modes
+from dolfinopt.arms.vibration import Carried, LoadedModes, loaded_modes
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm
@@ -72,7 +72,7 @@ class DesignState:
         self._initial = initial
         self._basis: Basis | None = None
         self._body: ShapeIntegrals | None = None
-        self._loaded: dict[int, tuple[RigidIntegrals, LoadedModes]] = {}
+        self._loaded: dict[int, tuple[Carried, LoadedModes]] = {}
 
     @property
     def mesh(self) -> ArmMesh:
@@ -140,7 +140,7 @@ class DesignState:
         with self.elastic.profile.phase("stress"):
             return load_fields(self.unit_loads, self.basis.V, self.basis.MV)
 
-    def loaded_modes(self, place: int, carried: RigidIntegrals) -> LoadedModes:
+    def loaded_modes(self, place: int, carried: Carried) -> LoadedModes:
         """Return the natural modes with what is carried; once for the same load.
 
         Args:

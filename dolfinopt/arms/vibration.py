@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import eigh
@@ -13,6 +14,13 @@ from dolfinopt.reduction.eigenproblem import lowest_eigenpairs
 from dolfinopt.reduction.free_arm import FreeArm, FreeOperators
 
 # -- what an arm carries ---------------------------------------------------------------------
+
+
+class Carried(Protocol):
+    """What an arm carries at its outboard interface; equal ones compare as equal."""
+
+    def matrix(self) -> np.ndarray:
+        """Return the inertia under displacements and rotations of the interface."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +188,7 @@ class LoadedModes:
 
 
 def loaded_modes(
-    arm: ElasticArm, carried: RigidIntegrals, count: int, start: np.ndarray | None
+    arm: ElasticArm, carried: Carried, count: int, start: np.ndarray | None
 ) -> LoadedModes:
     """Return the lowest modes of T'KT phi = lambda (T'MT + carried mass) phi.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from dolfinopt.responses.response import (
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.responses import NEEDS
+
+if TYPE_CHECKING:
+    from dolfinopt.multibody.spatial.frozen import FrozenTree
 
 NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
@@ -88,15 +92,16 @@ class Eigenfrequency(Response):
                 own[place] = period_gradient(by_place[place], one, by_values)
         by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
-        zero = [np.zeros((3, 3))] * len(scene.arms)
+        size = 6 if scene.is_spatial else 3
+        zero = [np.zeros((size, size))] * len(scene.arms)
         with together(partition.world):
             for place, matrix in by_carried.items():
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
-                by_body = by_owner(scene, chain.cotangents(carried))
+                by_body: dict[int, Any] = by_owner(scene, chain.cotangents(carried))
                 row = {
-                    k: np.zeros_like(state.x_phys)  # it is not outboard of this place
-                    if by_body[k] == NOTHING
-                    else rigid_gradient(state, by_body[k])
+                    k: rigid_gradient(state, by_body[k])
+                    if _counts(by_body[k])
+                    else np.zeros_like(state.x_phys)  # it is not outboard of this place
                     for k, state in designs.items()
                 }
                 owner = scene.owners[place]
@@ -112,9 +117,18 @@ class Eigenfrequency(Response):
         return np.array(measured.smooth) * (np.array(measured.values) / limits) ** 2
 
 
-def _chain(analysis: Analysis) -> Chain:
+def _counts(by_body: Any) -> bool:
+    """Return whether derivatives by a rigid body's integrals are more than zero."""
+    if isinstance(by_body, RigidIntegrals):
+        return by_body != NOTHING
+    return bool(by_body.mass or by_body.w.any() or by_body.W.any())
+
+
+def _chain(analysis: Analysis) -> Chain | FrozenTree:
     """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
     scene, partition = analysis.scene, analysis.partition
+    if scene.is_spatial:
+        return _tree(analysis)
     with together(partition.world):
         mine = {k: rigid_integrals(one.elastic) for k, one in analysis.designs.items()}
     owned = on_all_ranks(partition, mine)
@@ -141,6 +155,28 @@ def _chain(analysis: Analysis) -> Chain:
     return on_root(partition.world, freeze)
 
 
+def _tree(analysis: Analysis) -> FrozenTree:
+    """Freeze the machine in space in the pose at the middle of its motion (collective)."""
+    from dolfinopt.multibody.spatial.frozen import FrozenTree, rigid_integrals_in_space
+    from dolfinopt.multibody.spatial.links import build_spatial_mechanism
+    from dolfinopt.multibody.spatial.motion import joint_motion
+
+    scene, partition = analysis.scene, analysis.partition
+    with together(partition.world):
+        mine = {k: rigid_integrals_in_space(one.elastic) for k, one in analysis.designs.items()}
+    owned = on_all_ranks(partition, mine)
+
+    def freeze() -> FrozenTree:
+        bodies = [
+            fixed_body(scene, place) if owner is None else owned[owner]
+            for place, owner in enumerate(scene.owners)
+        ]
+        motion = joint_motion(np.array([0.5 * scene.motion.duration]), scene)
+        return FrozenTree(build_spatial_mechanism(scene, bodies), motion, scene.objective.attached)
+
+    return on_root(partition.world, freeze)
+
+
 def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, DesignState]:
     """Return the design of every arm of the chain that has one of this rank's."""
     return {
@@ -150,7 +186,7 @@ def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, Des
     }
 
 
-def _modes(designs: Mapping[int, DesignState], chain: Chain) -> dict[int, LoadedModes]:
+def _modes(designs: Mapping[int, DesignState], chain: Chain | FrozenTree) -> dict[int, LoadedModes]:
     """Return the loaded modes of arms by their place in the chain; within `together`."""
     carried = chain.carried()
     return {place: one.loaded_modes(place, carried[place]) for place, one in designs.items()}

@@ -154,11 +154,12 @@ def period_gradient(
         return PeriodGradient(cells, carried)
 
 
-def rigid_gradient(state: DesignState, by_rigid: RigidIntegrals) -> np.ndarray:
+def rigid_gradient(state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals) -> np.ndarray:
     """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,)."""
-    moment = np.array([by_rigid.moment.real, by_rigid.moment.imag])
-    points = state.elastic.points
-    by = rigid_body(by_rigid.mass, moment, by_rigid.inertia, np.zeros(2))
+    points, by = state.elastic.points, by_rigid
+    if isinstance(by, RigidIntegrals):
+        moment = np.array([by.moment.real, by.moment.imag])
+        by = rigid_body(by.mass, moment, by.inertia, np.zeros(2))
     partners = mass_partners(points, np.empty((*points.shape, 0)), by)
     masses = state.elastic.cell_mass_products(partners.left, partners.right)
     return state.density_slope * masses

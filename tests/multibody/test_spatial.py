@@ -21,13 +21,16 @@ from dolfinopt.multibody import end_effector as plane_end
 from dolfinopt.multibody import inverse_dynamics as plane
 from dolfinopt.multibody.mechanism import JointHardware
 from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import rigid_part
 from dolfinopt.multibody.spatial.body_gradient import body_gradient
 from dolfinopt.multibody.spatial.end_effector import (
     deviation,
     end_effector,
     end_effector_gradient,
 )
+from dolfinopt.multibody.spatial.frozen import FrozenTree
 from dolfinopt.multibody.spatial.inverse_dynamics import elastic_residual, inverse_dynamics
+from dolfinopt.multibody.spatial.mechanism import TRANSPOSED
 from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.spatial.rotations import (
     Turning,
@@ -215,6 +218,34 @@ def test_mass_matrix_is_symmetric(machine):
     S = mechanism.num_joints + mechanism.num_coordinates
     matrix = linearise(mechanism, motion, *rates, None, np.arange(4)).dense()[:, :, 2 * S :]
     assert np.abs(matrix - matrix.swapaxes(1, 2)).max() < ROUNDING * np.abs(matrix).max()
+
+
+def test_carried_inertia_of_a_frozen_tree(tree):
+    """What body 1 carries is what its rows feel of the others, which are held."""
+    cloud, motion, _ = tree
+    mechanism = cloud.mechanism()
+    pose = motion[:1]
+    rest = np.zeros((1, 8))
+    mass = linearise(mechanism, pose, rest, rest, rest).dense()[0, :3, 16:19]
+    rigid = replace(mechanism, bodies=tuple(map(rigid_part, mechanism.bodies)))
+    frozen = FrozenTree(rigid, pose, "rigid-body")
+    carried, B = frozen.carried()[1].matrix(), mechanism.bodies[1].outboard
+    expected = mechanism.bodies[1].M + B.T @ carried @ B
+    assert np.abs(mass - expected).max() < ROUNDING * np.abs(mass).max()
+    # The derivative by body 4, two joints further out, whose inertia is not stretched linearly.
+    weights = np.random.default_rng(2).normal(size=(6, 6))
+    zero = [np.zeros((6, 6))] * 5
+    by = frozen.cotangents([zero[0], weights, *zero[2:]])[4]
+    one = rigid.bodies[4]
+    for name in ("mass", "w", "W"):
+        change = 0.1 * np.asarray(getattr(one, name)) + 0.01
+        if name == "W":
+            change = 0.5 * (change + change[TRANSPOSED])
+        moved = replace(one, **{name: getattr(one, name) + change})
+        other = replace(rigid, bodies=(*rigid.bodies[:4], moved))
+        after = FrozenTree(other, pose, "rigid-body").carried()[1].matrix()
+        found = np.sum(getattr(by, name) * change)
+        assert found == pytest.approx(np.sum(weights * (after - carried)), rel=1e-10)
 
 
 def test_gradient_by_the_bodies(machine):

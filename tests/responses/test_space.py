@@ -66,7 +66,13 @@ CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.
 
 @pytest.mark.parametrize(
     ("kind", "control"),
-    [("deviation", ()), ("effort", CONTROL), ("stress", ()), ("tip_deflection", ())],
+    [
+        ("deviation", ()),
+        ("effort", CONTROL),
+        ("stress", ()),
+        ("tip_deflection", ()),
+        ("eigenfrequency", ()),
+    ],
 )
 def test_exact_gradient_in_space(kind, control, monkeypatch):
     """Taylor's remainders fall by the order 2.00 along directions without any symmetry."""

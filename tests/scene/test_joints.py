@@ -121,7 +121,7 @@ REFUSED = [
     (("motion", "joint_height"), 0.3, "expected -0.5, the default, with [[joints]]"),
     (("motion", "cart_mass"), 2.0, "expected 0.0, the default, with [[joints]]"),
     (("objective",), {"kind": "static", "loads": [[0, 1, 2]]}, "expected arrays of six numbers"),
-    (("constraints", "first_frequency"), 50.0, "expected another response with [[joints]]"),
+    (("objective",), {"kind": "eigenfrequency", "elbow_angle": 0.1}, "pose at the middle"),
     (("closure",), {"kind": "pin"}, "expected no [closure] with [[joints]]"),
     (("control",), {"stiffness": [1], "damping": [1, 1]}, "expected 2 numbers, for yaw, lift"),
 ]  # fmt: skip

@@ -10,7 +10,6 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.arms import check_arm_name
 from dolfinopt.scene.tables.base import Loc, Position, Refusal, Table
-from dolfinopt.scene.tables.responses import asked
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -21,7 +20,6 @@ Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 GROUND = "ground"
 TIME = "t"  # column of a table of joint coordinates
 # What a machine in the plane has instead of joints.
-PLANE_RESPONSES = ("eigenfrequency", "first_frequency")
 PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
@@ -151,15 +149,12 @@ def _check_machine(scene: Scene) -> None:
         raise Refusal(
             "expected an array of three numbers with [[joints]]", ("motion", "gravity"), ("joints",)
         )
-    for key in asked(scene):
-        if key in PLANE_RESPONSES:
-            objective = scene.objective.kind == key
-            raise Refusal(
-                "expected another response with [[joints]]: this one is computed "
-                "of arms in the plane",
-                ("objective", "kind") if objective else ("constraints", key),
-                ("joints",),
-            )
+    if scene.objective.elbow_angle is not None:
+        raise Refusal(
+            "expected none with [[joints]]: links vibrate in the pose at the middle of the motion",
+            ("objective", "elbow_angle"),
+            ("joints",),
+        )
     for k, arm in enumerate(scene.arms):
         if arm.sid is not None:
             raise Refusal(
