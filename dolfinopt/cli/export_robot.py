@@ -16,6 +16,7 @@ from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
     from dolfinopt.exchange.urdf.robot import Inertia
     from dolfinopt.exchange.urdf.scene import Origin
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -47,12 +48,12 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     with together(world):
         mine = {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(partition, mine)
-    centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
+    corners = gather_cells(partition, {k: _corners(arm) for k, arm in arms.items()})
     densities = gather_cells(partition, {k: x_phys[k] for k in arms})
     prepare(world, folder)
     with together(world):
         if world.rank == 0:
-            cells = {k: (centroids[k], densities[k]) for k in bodies}
+            cells = {k: (corners[k], densities[k]) for k in bodies}
             _write(scene, origin, folder, bodies, cells)
             if table is not None:
                 _write_table(table, folder)
@@ -83,6 +84,13 @@ def _write_table(table: Table, folder: Path) -> None:
     click.echo(table.markdown())
 
 
+def _corners(arm: Arm) -> np.ndarray:
+    """Return the corners (n, 4 or 8, 3) of this rank's cells, m."""
+    from dolfinopt.mesh import compat
+
+    return compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)
+
+
 def _origin_of(scene: Scene, run: Path) -> Origin:
     """Return where the scene's solids come from: the record is beside the trajectory."""
     from dolfinopt.exchange.urdf.scene import RECORD, read_origin
@@ -111,14 +119,10 @@ def _write(
         if owner is None or link not in before:
             warn([f"{name}: no solid arm of this scene, or no link {link!r}: it stays as it is"])
             continue
-        frame, mesh = origin.frames[name], None
+        frame, mesh = origin.frames[name], f"{name}.stl"
         inertia = link_inertia(scene, index[name], bodies[owner]).posed(frame)
-        surface = _surface(scene, owner, frame, *cells[owner])
-        if surface is None:
-            warn([f"{name}: its shapes stay in the robot: it has no box of cells"])
-        else:
-            mesh = f"{name}.stl"
-            write_atomically(folder / mesh, partial(_put, surface))
+        surface = _surface(name, frame, *cells[owner])
+        write_atomically(folder / mesh, partial(_put, surface))
         links.append(NewLink(link, inertia, mesh))
         click.echo(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")
     path = folder / origin.file.name
@@ -149,16 +153,10 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
     return own + motor
 
 
-def _surface(
-    scene: Scene, owner: int, frame: np.ndarray, centroid: np.ndarray, density: np.ndarray
-) -> bytes | None:
-    """Return an arm's design as STL in its link's frame, in metres; None without a box."""
-    from dolfinopt.part.isosurface import Surface, box_surface
+def _surface(title: str, frame: np.ndarray, corners: np.ndarray, density: np.ndarray) -> bytes:
+    """Return an arm's design as STL in its link's frame, in metres."""
+    from dolfinopt.part.isosurface import design_surface
     from dolfinopt.part.solid import triangle_bytes
 
-    arm = scene.arms[owner]
-    if arm.cells is None or len(arm.cells) != 3:
-        return None
-    found = box_surface((arm.length, arm.height, arm.thickness), arm.cells, centroid, density)
-    points = found.points @ frame[:3, :3].T + frame[:3, 3]
-    return triangle_bytes(Surface(points, found.triangles).corners, f"{arm.name}, m")
+    found = design_surface(corners, density).corners
+    return triangle_bytes(found @ frame[:3, :3].T + frame[:3, 3], f"{title}, m")

@@ -1,4 +1,4 @@
-"""Surfaces of solid boxes' designs."""
+"""Surfaces of solid designs."""
 
 from __future__ import annotations
 
@@ -6,20 +6,18 @@ import io
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
-from dolfinopt.part.isosurface import box_surface
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.box import box_arm
+from dolfinopt.part.isosurface import design_surface
 from dolfinopt.part.solid import triangle_bytes
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 SIZE, CELLS = (0.5, 0.04, 0.02), (60, 8, 4)
-
-
-def centroids() -> np.ndarray:
-    lines = [(np.arange(n) + 0.5) / n * s for n, s in zip(CELLS, SIZE)]
-    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-    return points - [0.0, 0.5 * SIZE[1], 0.5 * SIZE[2]]
-
+# Of a cube's corners, which of them make six tetrahedra that fill it and meet its neighbours'.
+SIXTHS = [(0, a, a | b, 7) for a in (1, 2, 4) for b in (1, 2, 4) if a != b]
 
 DESIGNS = {
     "solid": lambda x, y, z: np.ones_like(x),
@@ -29,18 +27,29 @@ DESIGNS = {
 }
 
 
+@pytest.fixture(scope="module")
+def hexahedra():
+    """Corners (n, 8, 3) of a box's cells, in some order."""
+    mesh = box_arm(MPI.COMM_SELF, "arm", SIZE, CELLS).mesh
+    corners = compat.cell_coordinates(mesh, int(np.prod(CELLS)))
+    return corners[np.random.default_rng(0).permutation(len(corners))]
+
+
+@pytest.mark.parametrize("shape", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("name", DESIGNS)
-def test_a_surface_is_closed_and_keeps_the_volume(name):
-    """In the box, whatever the order of the cells; a design of one density has no other surface."""
-    points = centroids()
-    density = DESIGNS[name](*points.T)
-    order = np.random.default_rng(0).permutation(len(points))
-    surface = box_surface(SIZE, CELLS, points[order], density[order])
+def test_a_surface_is_closed_and_keeps_the_volume(hexahedra, name, shape):
+    """And ends at the box's faces; a design of one density has no other surface."""
+    density = DESIGNS[name](*hexahedra.mean(axis=1).T)
+    corners = hexahedra
+    if shape == "tetrahedron":
+        corners = np.concatenate([hexahedra[:, sixth] for sixth in SIXTHS])
+        density = np.tile(density, len(SIXTHS))
+    surface = design_surface(corners, density)
     found = trimesh.load_mesh(io.BytesIO(triangle_bytes(surface.corners, "test, m")), "stl")
     assert found.is_watertight and found.is_winding_consistent
     assert found.volume == pytest.approx(surface.volume, rel=1e-5)
     share = 1.0 if name == "gray" else density.mean()
-    assert surface.volume == pytest.approx(share * np.prod(SIZE), rel=0.01)
-    low, high = np.array([0.0, -0.02, -0.01]), np.array([0.5, 0.02, 0.01])
-    assert (surface.points >= low).all() and (surface.points <= high).all()
-    assert found.bounds[:, 0] == pytest.approx([0.0, 0.5], abs=0.01 * 0.5 / 60)
+    assert surface.volume == pytest.approx(share * np.prod(SIZE), rel=1e-3)
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    assert (surface.points > low - 1e-8).all() and (surface.points < high + 1e-8).all()
+    assert found.bounds[:, 0] == pytest.approx([0.0, 0.5], abs=1e-7)
