@@ -132,18 +132,46 @@ class UnitLoads:
             by_fields: (n_nodes, d, p) derivatives of the same function by `fields`, where it
                 depends on them otherwise, too; contributions of this rank's cells.
         """
-        arm = self.arm
+        arm, inertial, work = self.arm, self.num_inertial, None
+        modes = arm.constraint_modes()
+        compliance = np.linalg.inv(modes.stiffness)
         if len(by_K0) == 0:  # of a linear body
             assert by_fields is not None
             forces = np.zeros_like(by_fields)
-            by_V, by_young = np.zeros_like(V), np.zeros_like(arm.young)
+            by_V, direct = np.zeros_like(V), np.zeros_like(arm.young)
         elif arm.substructure.uniform_stress is not None:
-            by_V, forces, by_young = self._stiffened(V).gradient(by_K0)
+            known, fold = self._stiffened(V), static and by_fields is None
+            by_V, forces, direct, work = known.gradient(by_K0, compliance if fold else None)
         else:
-            by_V, forces, by_young = self._gradient(V, by_K0)
+            by_V, forces, direct = self._gradient(V, by_K0)
         if by_fields is not None:
             forces = forces + by_fields
-        return self._through_fields(forces, by_V, by_young, static)
+        by_stiffness = np.zeros_like(compliance)
+        if static:
+            if work is None:
+                outboard, forces = forces[:, :, inertial:], forces[:, :, :inertial]
+                by_V[:, :, : len(compliance)] += combine(outboard, compliance)
+                work = np.tensordot(modes.field, outboard, ((0, 1), (0, 1)))
+            by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
+        adjoint = static_response(arm, *arm.restrict(forces))
+        return GeometricGradient(self, by_V, direct, adjoint, by_stiffness)
+
+    def stiffness_products(
+        self, left: np.ndarray, V: np.ndarray, adjoint: np.ndarray
+    ) -> np.ndarray:
+        """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,).
+
+        Args:
+            left, V: (n_nodes, d, q).
+            adjoint: (n_nodes, d, k) of the first fields.
+        """
+        known, arm = self._last.get("modes"), self.arm
+        if known is not None and known[0] is V:
+            arm.profile.counts.energy_fields += left.shape[2] + adjoint.shape[2]
+            return known[1].stiffness_products(left, adjoint)
+        fields = self.fields[:, :, : adjoint.shape[2]]
+        products = arm.cell_stiffness_products(left, V)
+        return products - arm.cell_stiffness_products(adjoint, fields)
 
     def _gradient(
         self, V: np.ndarray, by_K0: np.ndarray
@@ -170,39 +198,6 @@ class UnitLoads:
             by_modes[cells] = nodal.reshape(size, n, dim, q)
         by_V = sum_at_nodes(arm.operators, by_modes)
         return by_V, sum_at_nodes(arm.operators, by_nodes), by_young
-
-    def _through_fields(
-        self, forces: np.ndarray, by_V: np.ndarray, by_young: np.ndarray, static: bool
-    ) -> GeometricGradient:
-        """Add the part through the fields u_p, given derivatives `forces` (n_nodes, d, p) by them.
-
-        Args:
-            forces: contributions of this rank's cells.
-            by_V, by_young: the other parts; changed in place.
-            static: see `gradient`.
-        """
-        arm, inertial = self.arm, self.num_inertial
-        b = self.num_loads - inertial
-        by_stiffness, solved = np.zeros((b, b)), slice(0, self.num_loads)
-        if static:
-            solved = slice(0, inertial)
-            modes, outboard = arm.constraint_modes(), forces[:, :, inertial:]
-            compliance = np.linalg.inv(modes.stiffness)
-            by_V[:, :, :b] += combine(outboard, compliance)
-            work = arm.comm.allreduce(np.tensordot(modes.field, outboard, ((0, 1), (0, 1))))
-            by_stiffness = 0.0 - compliance @ work @ compliance
-        adjoint = static_response(arm, *arm.restrict(forces[:, :, solved]), "adjoint of unit loads")
-        by_young -= self._energies(adjoint)
-        by_inertia = _by_inertia(adjoint[:, :, :inertial])
-        return GeometricGradient(arm, by_V, by_young, by_inertia, by_stiffness)
-
-    def _energies(self, left: np.ndarray) -> np.ndarray:
-        """Return sum_p left_p' k_e u_p (n_cells,) of the first loads, left (n_nodes, d, k)."""
-        known = self._last.get("modes")
-        if known is None:
-            return self.arm.cell_stiffness_products(left, self.fields[:, :, : left.shape[2]])
-        self.arm.profile.counts.energy_fields += left.shape[2]
-        return known[1].energies(left)
 
     def _cell_values(self, cells: slice) -> np.ndarray:
         """Return the fields at the nodes of these cells (cells, dn, p)."""
@@ -231,27 +226,46 @@ class GeometricGradient:
     """Derivatives of a function of K0.
 
     Attributes:
-        arm: the design.
+        loads: whose stress it is.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
-        by_young: (n_cells,) by Young's modulus, modes held.
-        by_inertia: (n_nodes, d, 2) fields whose products with dM 1_x and dM X are the part by the
-            mass, modes held.
+        direct: (n_cells,) by Young's modulus, modes and fields held.
+        adjoint: (n_nodes, d, k) of the fields of the first k loads.
         by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
     """
 
-    arm: ElasticArm
+    loads: UnitLoads
     by_modes: np.ndarray
-    by_young: np.ndarray
-    by_inertia: np.ndarray
+    direct: np.ndarray
+    adjoint: np.ndarray
     by_stiffness: np.ndarray
+
+    def by_young_beside(self, left: np.ndarray, V: np.ndarray) -> np.ndarray:
+        """Return `by_young` plus sum_k left_k' k_e V_k (n_cells,), in one product.
+
+        Args:
+            left: (n_nodes, d, q).
+            V: the modes.
+        """
+        return self.direct + self.loads.stiffness_products(left, V, self.adjoint)
+
+    @property
+    def by_young(self) -> np.ndarray:
+        """By Young's modulus (n_cells,), modes held."""
+        fields = self.loads.fields[:, :, : self.adjoint.shape[2]]
+        return self.direct - self.loads.arm.cell_stiffness_products(self.adjoint, fields)
+
+    @property
+    def by_inertia(self) -> np.ndarray:
+        """Fields whose products with dM 1_x and dM X are the part by the mass (n_nodes, d, 2)."""
+        return _by_inertia(self.adjoint[:, :, : self.loads.num_inertial])
 
     @property
     def by_density(self) -> np.ndarray:
         """By mass density (n_cells,), modes held."""
-        unit = np.zeros_like(self.arm.points)
+        arm = self.loads.arm
+        unit = np.zeros_like(arm.points)
         unit[:, 0] = 1.0
-        inertia = np.stack([unit, self.arm.points], axis=2)
-        return self.arm.cell_mass_products(self.by_inertia, inertia)
+        return arm.cell_mass_products(self.by_inertia, np.stack([unit, arm.points], axis=2))
 
 
 def _by_inertia(adjoint: np.ndarray) -> np.ndarray:

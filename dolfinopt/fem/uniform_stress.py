@@ -116,41 +116,62 @@ class StiffenedModes:
         K0 = half.reshape(loads, q, q)
         return 0.5 * (K0 + K0.swapaxes(1, 2))
 
-    def gradient(self, by_K0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def gradient(
+        self, by_K0: np.ndarray, compliance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
         """Differentiate a function of K0, given its derivative by K0 (loads, q, q), any symmetry.
 
+        Args:
+            by_K0: the derivative.
+            compliance: C (b, b), where the last b fields are u_F = Psi C with the first b modes
+                Psi: their derivatives are then among those by the modes.
+
         Returns:
-            Its derivatives by the modes (n_nodes, d, q) and by the fields (n_nodes, d, loads),
-            contributions of this rank's cells, and by Young's modulus (n_cells,), both held.
+            Its derivatives by the modes (n_nodes, d, q) and by the fields, or those but the last
+            b, (n_nodes, d, loads), contributions of this rank's cells; by Young's modulus
+            (n_cells,), both held; and Psi' times the derivatives by u_F (b, b), or None.
         """
         (q, loads), cells, T = self._shape, self._tensor.cells, self._tensor.tensor
         symmetric = (0.5 * (by_K0 + by_K0.swapaxes(1, 2))).reshape(loads, -1)
         # Of b = c both factors are the same.
         twice = np.array([2.0 if b == c else 1.0 for b, c in self._pairs])
         weighted = twice[:, None, None] * symmetric.T
-        dim, by_young = cells.operators.points.shape[1], np.empty(cells.count)
-        rows = cells.cell_rows(dim * (q + loads))
+        b = 0 if compliance is None else len(compliance)
+        dim, columns = cells.operators.points.shape[1], q + loads - b
+        rows, by_young = cells.cell_rows(dim * columns), np.empty(cells.count)
+        work = np.zeros((b, b))
         for run, products in self._products():
             count = len(run.young)
-            by = np.empty((*run.u.shape[:2], q + loads, count))
+            by = np.empty((*run.u.shape[:2], columns, count))
             by_u = T.T @ np.matmul(symmetric, products).reshape(len(T), -1)
-            by[:, :, q:] = by_u.reshape(run.u.shape)
+            by_u = by_u.reshape(run.u.shape)
+            by[:, :, q:] = by_u[:, :, : loads - b]
             by_a = self._by_modes(run.a, np.matmul(weighted, run.force))
             # Of second degree in a: a times the derivative by it is twice the value.
-            work = np.einsum("ie,ie->e", run.a.reshape(-1, count), by_a.reshape(-1, count))
-            by_young[run.cells] = 0.5 * work
+            energy = np.einsum("ie,ie->e", run.a.reshape(-1, count), by_a.reshape(-1, count))
+            by_young[run.cells] = 0.5 * energy
             np.multiply(by_a, run.young, out=by[:, :, :q])
+            if compliance is not None:
+                outboard = by_u[:, :, loads - b :]
+                by[:, :, :b] += np.matmul(compliance.T, outboard)
+                work += np.matmul(run.a[:, :, :b], outboard.swapaxes(2, 3)).sum(axis=(0, 1))
             rows[:, run.cells] = by.reshape(len(by), -1, count).swapaxes(1, 2)
-        nodal = cells.sum_of_differences(rows).reshape(-1, dim, q + loads)
-        return nodal[:, :, :q], nodal[:, :, q:], by_young
+        nodal = cells.sum_of_differences(rows).reshape(-1, dim, columns)
+        return nodal[:, :, :q], nodal[:, :, q:], by_young, work if b else None
 
-    def energies(self, left: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' k_e u_k (n_cells,) of the first fields u, left (n_nodes, d, k)."""
-        cells, k = self._tensor.cells, left.shape[2]
-        rows, out = cells.by_component(left), np.empty(cells.count)
+    def stiffness_products(self, left: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,) of the first fields.
+
+        Args:
+            left: (n_nodes, d, q).
+            adjoint: (n_nodes, d, k).
+        """
+        cells, k = self._tensor.cells, adjoint.shape[2]
+        rows, out = cells.by_component(left, adjoint), np.empty(cells.count)
         for run in self._runs:
-            values, u = cells.differences(rows, run.cells), run.u[:, :, :k]
-            out[run.cells] = cells.difference_products(values, u.reshape(values.shape))
+            values = cells.differences(rows, run.cells)
+            right = np.concatenate([run.a, -run.u[:, :, :k]], axis=2)
+            out[run.cells] = cells.difference_products(values, right.reshape(values.shape))
         return out
 
     def _products(self) -> Iterator[tuple[_Run, np.ndarray]]:
@@ -175,10 +196,14 @@ class StiffenedModes:
             a: of the modes.
             weights: (bc, q q, cells), symmetric in the modes, doubled for b = c.
         """
-        found, term, q = np.zeros_like(a), np.empty_like(a[0]), a.shape[2]
-        for weight, (b, c) in zip(weights.reshape(-1, q, q, a.shape[3]), self._pairs, strict=True):
-            found[b] += np.einsum("ije,xje->xie", weight, a[c], out=term)
+        q, found, term = a.shape[2], np.empty_like(a), np.empty_like(a[0])
+        each = list(zip(weights.reshape(-1, q, q, a.shape[3]), self._pairs, strict=True))
+        for weight, (b, c) in each:
+            if b == c:
+                np.einsum("ije,xje->xie", weight, a[b], out=found[b])
+        for weight, (b, c) in each:
             if b != c:
+                found[b] += np.einsum("ije,xje->xie", weight, a[c], out=term)
                 found[c] += np.einsum("ije,xje->xie", weight, a[b], out=term)
         return found
 

@@ -86,16 +86,17 @@ def exact_gradient(
         fields = method.adjoint(
             elastic, basis, state.reduction_options, interior, outboard + cotangents.outboard
         )
-        energies = elastic.cell_stiffness_products(combine(V, by_K.T) - fields.stiffness, V)
         partners.left[:, :, 1:-1] += fields.mass
-        if geometric is not None:  # the partners of 1_x and X stand at the ends
-            partners.left[:, :, -1] += geometric.by_inertia[:, :, 0]
-            partners.left[:, :, 0] += geometric.by_inertia[:, :, 1]
+        left = combine(V, by_K.T) - fields.stiffness
+        if geometric is None:
+            energies = elastic.cell_stiffness_products(left, V)
+        else:
+            energies = geometric.by_young_beside(left, V)
+            # The partners of X and 1_x stand at the ends.
+            partners.left[:, :, [-1, 0]] += geometric.by_inertia
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        if geometric is not None:
-            energies += geometric.by_young
         if inertial is not None:
             energies += inertial.by_young
             masses += inertial.by_density
