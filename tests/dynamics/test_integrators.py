@@ -893,6 +893,18 @@ def test_adjoint_is_exact_with_fast_coordinates(
             assert_close(getattr(a, name), getattr(b, name), 1e-8)
 
 
+def test_adjoint_through_the_beginning() -> None:
+    """Of a motion that begins unloaded there is none; the vibrations are the simulation's."""
+    heavy = fine_arms(3, 1)
+    problem = replace(heavy, mechanism=replace(heavy.mechanism, gravity=(0.0, 0.0)))
+    by_q = np.ones(problem.num_coordinates)
+    assert problem.start_gradient(np.zeros_like(by_q), by_q) == []
+    q = heavy.initial_state()[0][0]
+    assert q.any()
+    assert heavy.start_gradient(q, by_q)[0].K.any()
+    assert problem.preconditioner() is problem.preconditioner()
+
+
 # -- warm start, counts, sampling ------------------------------------------------------------
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dolfinopt.fem import uniform_stress
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
@@ -66,8 +67,12 @@ def test_one_matrix_for_all_cells(element: str) -> None:
 
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("element", sorted(ELEMENTS))
-def test_one_tensor_for_all_cells(element: str, static: bool) -> None:
-    """Geometric stiffness and its derivatives, without the quadrature points."""
+def test_one_tensor_for_all_cells(
+    monkeypatch: pytest.MonkeyPatch, element: str, static: bool
+) -> None:
+    """Geometric stiffness and its derivatives, without the quadrature points, 7 cells at a time."""
+    monkeypatch.setattr(uniform_stress, "CHUNK", 1)
+    monkeypatch.setattr(uniform_stress, "LEAST", 7)
     arm = make_arm(element)
     other = cell_by_cell(arm)
     assert arm.substructure.uniform_stress is not None
@@ -81,6 +86,8 @@ def test_one_tensor_for_all_cells(element: str, static: bool) -> None:
     for name in ("by_young", "by_density", "by_stiffness"):
         found, right = getattr(one, name), getattr(two, name)
         assert largest(found - right) <= 1e-9 * largest(right)
+    beside, right = (each.by_young_beside(fields(arm, 2.5, V.shape[2]), V) for each in (one, two))
+    assert largest(beside - right) <= 1e-9 * largest(right)
     interior, right = (arm.restrict(each.by_modes)[0] for each in (one, two))
     assert largest(interior - right) < 1e-9 * largest(right)
 
