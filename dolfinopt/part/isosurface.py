@@ -83,13 +83,16 @@ def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 def _cut(points: np.ndarray, nodes: np.ndarray, values: np.ndarray, level: float) -> Surface:
     """Return the surface of what of the cells is above a level."""
     import pyvista
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
     count = nodes.shape[1]
     kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
     grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
     # Through a node or next to it triangles would have no size, and corners fall together.
     grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
-    found = grid.clip_scalar(scalars="density", invert=False, value=level).extract_geometry()
-    found = found.triangulate().clean()
+    outside = vtkDataSetSurfaceFilter()
+    outside.SetInputData(grid.clip_scalar(scalars="density", invert=False, value=level))
+    outside.Update()
+    found = pyvista.PolyData(outside.GetOutput()).triangulate().clean()
     triangles = found.faces.reshape(-1, 4)[:, 1:].astype(int)
     return Surface(np.asarray(found.points, dtype=float), triangles)
