@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from mpi4py import MPI
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
-from runs import run
+from runs import ROOT, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
@@ -27,6 +27,7 @@ from dolfinopt.study.before_after import before_after
 yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
+LINK = ROOT / "demos" / "robot_link.toml"
 
 
 def same_kinematics(one: Robot, other: Robot) -> bool:
@@ -175,3 +176,30 @@ def test_before_and_after():
     assert frame.loc["deflection after the motion", ["before", "after"]].isna().all()
     with pytest.raises(InputError, match="other arms: foot, link before, link after"):
         before_after(one, one | {"mass": {"link": 1.0}})
+
+
+# -- the demo --------------------------------------------------------------------------------
+
+
+def test_the_demo_is_what_the_import_writes(tmp_path):
+    """But for what its head says is edited; its record leads to the robot."""
+    run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")
+    made, kept = tree_of(tmp_path / "a" / "robot.toml"), tree_of(LINK)
+    for arm in (*made["arms"], *kept["arms"]):
+        arm.pop("cells", None)
+    assert made["arms"] == kept["arms"] and made["joints"] == kept["joints"]
+    origins = [read_origin(one / "robot.json") for one in (tmp_path / "a", LINK.parent)]
+    assert origins[0].links == origins[1].links and origins[1].file.samefile(DEMO)
+    assert np.array_equal(*(one.frames["upper_arm"] for one in origins))
+
+
+def test_the_demo_deflects_by_a_millimetre_and_a_half(tmp_path):
+    """Pinned, in few cells: deflection, frequency and drives of the gray initial design."""
+    coarse = ("--set", "arms.upper_arm.cells=[24,4,4]", "--no-plots")
+    run("simulate", LINK, *coarse, "--out", tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["max_deviation"] == pytest.approx(1.4518e-3, rel=1e-3)
+    assert summary["first_frequency"]["upper_arm"] == pytest.approx(77.43, rel=1e-3)
+    assert summary["drive_peak"]["shoulder_lift"] == pytest.approx(608.9, rel=1e-3)
+    assert summary["drive_rms"]["elbow"] == pytest.approx(166.7, rel=1e-3)
+    assert summary["mass"]["upper_arm"] == pytest.approx(24.846, rel=1e-4)
