@@ -106,7 +106,7 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 
 def scene_of(folder: Path) -> Scene:
-    """Return the scene of a run, with the coordinates that "auto" came to."""
+    """Return the scene of a run, with what "auto" came to: coordinates and stiffening."""
     from dolfinopt.scene.contents import found_again
     from dolfinopt.scene.load import scene_from_dict
 
@@ -117,6 +117,9 @@ def scene_of(folder: Path) -> Scene:
         if data["reduction"]["coordinates"] == "auto":
             data["reduction"]["coordinates"] = summary["reduction"]["coordinates"]
             del data["reduction"]["tolerance"]
+        decided = summary.get("stiffening")
+        if decided is not None and data["simulation"]["stiffening"] == "auto":
+            data["simulation"]["stiffening"] = decided["on"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}); {_instead(folder)}"

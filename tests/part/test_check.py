@@ -69,6 +69,16 @@ def test_model_checks_parts_of_a_design(made):
     assert found.table().shape == check.table().shape
 
 
+def test_stiffening_is_that_of_the_run(made, tmp_path):
+    """Decided anew, a softer form of the arms might be simulated as another machine."""
+    summary = json.loads((made[0] / "summary.json").read_text())
+    for on in (True, False):
+        text = json.dumps(summary | {"stiffening": {"on": on, "estimate": 0.01}})
+        (tmp_path / "summary.json").write_text(text)
+        assert scene_of(tmp_path).simulation.stiffening is on
+    assert scene_of(made[0]).simulation.stiffening == "auto"
+
+
 def test_limits_are_those_of_the_outline(made):
     check = made[2]
     (limit,) = check.part.limits
