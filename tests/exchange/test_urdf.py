@@ -198,6 +198,26 @@ def test_what_a_solid_carries_without_a_joint_stays(tmp_path):
     ]
 
 
+def test_the_end_effector_is_the_last_arm(tmp_path):
+    """The tool's body, or one at its interface where others hang on it."""
+    file = write_uneven(tmp_path)
+    motion = tmp_path / "motion.csv"
+    motion.write_text("t,yaw\n0,0\n1,1\n")
+    words = ("import", file, "--links", "upper", "--trajectory", motion, "--boxes", "--tool")
+    for tool, last in (("left", "left"), ("lower", "lower_end")):
+        run(*words, tool, "--out", tmp_path / tool)
+        scene = load_scene(tmp_path / tool / "uneven.toml")
+        assert scene.arms[-1].name == last
+        q = {joint.name: 0.3 for joint in read_robot(file).movable}
+        row = np.array([[0.3] * len(scene.driven)])
+        mechanism = mechanism_of(
+            tmp_path / tool / "uneven.toml", {"upper": (1, (0, 0, 0), [1] * 6)}
+        )
+        motion_now = JointMotion(row, 0 * row, 0 * row)
+        end = end_effector(mechanism, motion_now, np.zeros((1, 0)))[0]
+        assert np.abs(end - read_robot(file).poses(q)[tool][:3, 3]).max() < 1e-12
+
+
 def test_a_closed_geometry_becomes_the_solid(tmp_path, capsys):
     """Cut at the joints and meshed; a box with a reason where that cannot be."""
     file = tmp_path / "robot.urdf"

@@ -85,7 +85,7 @@ class SceneBody:
 
 
 def scene_bodies(robot: Robot, chosen: tuple[str, ...], tool: str) -> tuple[SceneBody, ...]:
-    """Return the bodies of a scene, every one behind its parent, the tool's last where it can be.
+    """Return the bodies of a scene, every one behind its parent, the end-effector's last.
 
     Args:
         robot: of any links.
@@ -125,9 +125,16 @@ def scene_bodies(robot: Robot, chosen: tuple[str, ...], tool: str) -> tuple[Scen
                 solid is not None and solid.measured,
             )
         )
-    if all(one.parent != tool for one in found):
-        found.sort(key=lambda one: one.link == tool)
-    return tuple(found)
+    if any(one.parent == tool for one in found):
+        return (*found, _end(tool))
+    return tuple(sorted(found, key=lambda one: one.link == tool))
+
+
+def _end(tool: str) -> SceneBody:
+    """Return a body without mass at the outboard interface of a tool on which others hang."""
+    name, one = f"{tool}_end", np.eye(4)
+    joint = RobotJoint(name, "fixed", tool, name, one, np.array([1.0, 0.0, 0.0]))
+    return SceneBody(name, (), joint, tool, one, one, joint.axis, MASSLESS)
 
 
 def check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
