@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -293,3 +295,9 @@ def test_end_effector_gradient(machine):
 
         found = sum(np.sum(by_bodies[i][name] * x) for name, x in change.items())
         assert found == pytest.approx(derivative(place), rel=1e-11, abs=1e-14)
+
+
+def test_plane_scenes_import_nothing_of_space():
+    code = "import sys, dolfinopt.model; print('dolfinopt.multibody.spatial' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "False"
