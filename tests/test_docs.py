@@ -84,24 +84,29 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+def with_key(scene: str, table: str, key: str, value: str) -> str:
+    """Return the text of a scene with a key of a table set, whether it was there or not."""
+    if f"[{table}]" not in scene:
+        return f"{scene}\n[{table}]\n{key} = {value}\n"
+    head, mark, rest = scene.partition(f"[{table}]")
+    body, more = re.match(r"(.*?)(^\[.*)?\Z", rest, flags=re.MULTILINE | re.DOTALL).groups("")
+    body = re.sub(rf"^{key} = .*\n?", "", body, flags=re.MULTILINE)
+    return f"{head}{mark}\n{key} = {value}{body}{more}"
+
+
 def made_small(scene: str) -> str:
-    """Return the text of a scene with few cells, iterations and samples."""
+    """Return the text of a scene with few cells, iterations and samples, roughly solved."""
     for key, value in SETTINGS.items():
         scene = re.sub(rf"^{key} = \S.*?(?=\s*#|$)", f"{key} = {value}", scene, flags=re.MULTILINE)
-    for table, line in (
-        ("optimizer", f"max_iterations = {SETTINGS['max_iterations']}"),
-        ("simulation", "sample = 0.01"),
-    ):
-        if f"[{table}]" not in scene:
-            scene += f"\n[{table}]\n{line}\n"
-        elif line.split()[0] not in scene:
-            scene = scene.replace(f"[{table}]", f"[{table}]\n{line}")
+    scene = with_key(scene, "optimizer", "max_iterations", SETTINGS["max_iterations"])
+    scene = with_key(scene, "simulation", "tolerance", "1e-2")
+    if "sample =" not in scene:
+        scene = with_key(scene, "simulation", "sample", "0.01")
     if 'projection = "' in scene:
         # A design cut at one half after two iterations falls apart, which takes long to find out,
         # unless it is dense.
-        scene = re.sub(r"^(volume_fraction|initial) = .*\n", "", scene, flags=re.MULTILINE)
-        dense = "[design]\nvolume_fraction = 0.7\ninitial = 0.7"
-        scene = scene.replace("[design]", dense)
+        scene = with_key(scene, "design", "volume_fraction", "0.7")
+        scene = with_key(scene, "design", "initial", "0.7")
     if "cells =" not in scene and "mesh =" not in scene:
         first = scene.index("\n", scene.index("[[arms]]")) + 1
         scene = f"{scene[:first]}cells = {SETTINGS['cells']}\n{scene[first:]}"

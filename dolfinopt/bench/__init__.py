@@ -5,26 +5,36 @@ One file a diagram; each measures rows, which are kept, and says how they are dr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from time import perf_counter
 
 import pandas as pd
 
-from dolfinopt.bench import mesh, peers, reduction, solvers, time, tolerance, whole
+from dolfinopt.bench import mesh, peers, reduction, solid, solvers, time, tolerance, whole
 from dolfinopt.bench.common import Diagram, Goal, Plan, Tell, measured, write_diagram
 from dolfinopt.disk import write_text
+from dolfinopt.errors import InputError
 from dolfinopt.study.tables import Table
 
 QUICKLY = ("arms.cells=[100,6]",)
 
-__all__ = ["QUICKLY", "Diagram", "Goal", "Plan", "bench", "diagrams"]
+__all__ = ["QUICKLY", "Diagram", "Goal", "Plan", "bench", "diagrams", "named"]
 
 
 def diagrams() -> tuple[Diagram, ...]:
-    """Return all diagrams, the main one first."""
+    """Return the diagrams of plane arms, the main one first."""
     modules = time, peers, whole, mesh, reduction, tolerance, solvers
     return tuple(module.diagram() for module in modules)
+
+
+def named(names: Sequence[str]) -> tuple[Diagram, ...]:
+    """Return the diagrams of these names, "solid" among them; all of plane arms for none."""
+    known = {one.name: one for one in (*diagrams(), solid.diagram())}
+    if wrong := [name for name in names if name not in known]:
+        raise InputError(f"bench: no diagram {wrong[0]!r}: expected {' | '.join(known)}")
+    return tuple(known[name] for name in names) or diagrams()
 
 
 def bench(

@@ -22,6 +22,7 @@ LOWEST, HIGHEST, LANCZOS_STEPS = 0.1, 1.1, 10
 MAX_STEPS = 500
 # The hierarchy of another design is kept while it takes at most so many times the steps.
 WORSE = 1.5
+ZERO = 1e-15  # of the largest diagonal entry
 INDEPENDENT = 1e-12  # least share of a direction's length that is none of the others'
 
 
@@ -43,7 +44,11 @@ class Level:
         """Take over the values of the matrix (collective)."""
         self._blocked = _in_blocks(self.matrix)
         self._products.clear()
-        self.inverse_diagonal = 1.0 / self.matrix.getDiagonal().array[:, None]
+        diagonal = self.matrix.getDiagonal().array
+        largest = self.matrix.comm.tompi4py().allreduce(diagonal.max(initial=0.0), op=MPI.MAX)
+        # Aggregates of a node or two have fewer motions than six: rows of zeros.
+        zero = diagonal <= ZERO * largest
+        self.inverse_diagonal = np.where(zero, 0.0, 1.0 / np.where(zero, 1.0, diagonal))[:, None]
         self.__dict__.pop("bounds", None)
 
     @cached_property

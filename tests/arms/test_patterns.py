@@ -80,6 +80,7 @@ def test_the_same_arm_again_is_the_shared_design():
     ["static", *(pytest.param(k, marks=pytest.mark.serial)  # one shows how ranks add up
                  for k in ("esl", "eigenfrequency", "deviation"))],
 )  # fmt: skip
+@pytest.mark.usefixtures("three_steps")
 def test_gradients_add_up(kind):
     """The Taylor test moves one design, and both arms with it."""
     quick = ("motion.horizon=2.0", "simulation.tolerance=1e-6", "arms.symmetric=true")

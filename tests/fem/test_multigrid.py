@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 from solids import solid_arm
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem import interior
+from dolfinopt.fem.multigrid import Level
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.responses.sensitivity import exact_gradient
 
@@ -84,3 +86,16 @@ def test_ranks_agree(monkeypatch):
     monkeypatch.setattr(interior, "ITERATIVE_ROWS", 0)
     arms = [solid_arm(comm, cells=(10, 3, 2)) for comm in (MPI.COMM_SELF, COMM)]
     assert difference(*(arm.state(hollow(arm, 0.01)).body for arm in arms)) < 2e-6
+
+
+@pytest.mark.serial
+def test_rows_of_zeros():
+    """Aggregates of few nodes leave coarse rows without entries; these stay out of the smoother."""
+    values = np.diag([2.0, 0.0, 1.0])
+    matrix = PETSc.Mat().createAIJ((3, 3), comm=PETSc.COMM_SELF)
+    matrix.setUp()
+    matrix.setValues(range(3), range(3), values)
+    matrix.assemble()
+    level = Level(matrix, None)
+    step, residual = level.smooth(np.array([[1.0], [0.0], [1.0]]), last=False)
+    assert step[1] == 0.0 and np.isfinite(step).all() and np.abs(residual).max() < 0.5

@@ -642,6 +642,7 @@ def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
         (3, "line", "s-curve", "fixed"),
     ],
 )
+@pytest.mark.usefixtures("three_steps")
 def test_exact_gradient_of_one_and_three_arms(
     tmp_path: Path, arms: int, path: str, law: str, base: str
 ) -> None:

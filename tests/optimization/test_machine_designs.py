@@ -119,6 +119,7 @@ def test_goes_with(name):
     ],
     ids=["gains", "force and speed"],
 )  # fmt: skip
+@pytest.mark.usefixtures("three_steps")
 def test_gradient_of_scenarios(path, changes):
     """Second-order remainders where scenarios differ in gains, load and speed."""
     cells = "arms.cells=[12,3]" if path == CONTROLLED else "arms.rod.cells=[12,3]"

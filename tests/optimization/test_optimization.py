@@ -282,7 +282,7 @@ def test_same_design_on_any_number_of_ranks(tmp_path):
     for ranks in (1, 4):
         folder = tmp_path / str(ranks)
         line = ["optimize", TWO_ARM, "--no-plots", "--out", folder]
-        line += overrides("arms.cells=[60,4]", "optimizer.max_iterations=3")
+        line += overrides("arms.cells=[40,4]", "optimizer.max_iterations=3")
         if ranks == 1:
             run(*line)
         else:

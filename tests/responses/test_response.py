@@ -144,6 +144,7 @@ def test_a_new_response_is_a_limit() -> None:
     )
 
 
+@pytest.mark.usefixtures("three_steps")
 def test_a_new_response_of_the_motion_has_an_exact_gradient() -> None:
     """From its derivatives by coordinates and bodies alone, to second order."""
     built = build(*QUICK, "objective.gradient=exact")

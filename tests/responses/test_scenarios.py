@@ -129,9 +129,11 @@ def test_one_reduction_for_all_scenarios():
     ],
     ids=" ".join,
 )
+@pytest.mark.usefixtures("three_steps")
 def test_gradient_of_all_scenarios(combination, options):
     built = build(
         *options,
+        "motion.horizon=2.2",
         f"objective.scenarios={combination}",
         "objective.load_cases=6",
         scenarios((*MATERIAL, DAMPING), PATH, weights=[1.0, 0.3]),

@@ -10,13 +10,19 @@ from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.scene.tables.constraints import Constraints
 from dolfinopt.scene.tables.responses import EXACT_ONLY, NEEDS
 
-QUICK = "simulation.sample=0.01", "design.filter_radius=0.05", "objective.gradient=exact"
+QUICK = (
+    "simulation.sample=0.01",
+    "motion.horizon=2.2",
+    "design.filter_radius=0.05",
+    "objective.gradient=exact",
+)
 # Ranks: test_every_option_gives_the_same_bits_on_any_number_of_ranks.
 pytestmark = pytest.mark.serial
 # Limits whose word means another response as objective are tested by that one.
 
 
 @pytest.mark.parametrize("name", list(NEEDS))
+@pytest.mark.usefixtures("three_steps")
 def test_remainders_fall_with_the_square_of_the_step(name: str) -> None:
     """Through filter, reduction, simulation and response; new ones are tested by their word alone.
 

@@ -356,8 +356,8 @@ def test_bad_comparison_is_one_line(words, word, shared_tmp_path):
 
 @pytest.mark.slow
 def test_objective(folder):
-    run(TWO_ARM, "objectives", *SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder,
-        command="compare")  # fmt: skip
+    quick = overrides("optimizer.max_iterations=1", "simulation.tolerance=1e-2")
+    run(TWO_ARM, "objectives", *SETTINGS, *quick, "--out", folder, command="compare")
     rows = rows_of(folder / "objective.csv")
     names = [row["objective"] for row in rows]
     # "Nothing attached" needs solid ends.
