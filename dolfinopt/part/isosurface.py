@@ -90,9 +90,22 @@ def _cut(points: np.ndarray, nodes: np.ndarray, values: np.ndarray, level: float
     grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
     # Through a node or next to it triangles would have no size, and corners fall together.
     grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
+    solid = grid.clip_scalar(scalars="density", invert=False, value=level)
     outside = vtkDataSetSurfaceFilter()
-    outside.SetInputData(grid.clip_scalar(scalars="density", invert=False, value=level))
+    outside.SetInputData(solid)
+    outside.PassThroughCellIdsOn()
     outside.Update()
     found = pyvista.PolyData(outside.GetOutput()).triangulate().clean()
     triangles = found.faces.reshape(-1, 4)[:, 1:].astype(int)
-    return Surface(np.asarray(found.points, dtype=float), triangles)
+    within = solid.cell_centers().points[found.cell_data["vtkOriginalCellIds"]]
+    return _outwards(np.asarray(found.points, dtype=float), triangles, within)
+
+
+def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> Surface:
+    """Return a surface whose triangles turn their backs on points (m, 3) of the cells they bound.
+
+    VTK's own are not all counterclockwise seen from outside in every version.
+    """
+    a, b, c = points[triangles].swapaxes(0, 1)
+    inwards = np.einsum("na,na->n", np.cross(b - a, c - a), a - within) < 0.0
+    return Surface(points, np.where(inwards[:, None], triangles[:, ::-1], triangles))

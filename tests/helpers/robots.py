@@ -95,12 +95,12 @@ def inertial(rng: np.random.Generator) -> str:
     points, masses = rng.normal(scale=0.1, size=(6, 3)), rng.uniform(0.1, 1.0, size=6)
     r = points - masses @ points / masses.sum()
     second = np.einsum("n,na,nb->ab", masses, r, r)
-    I = np.trace(second) * np.eye(3) - second  # noqa: E741
+    I = (np.trace(second) * np.eye(3) - second).tolist()  # noqa: E741
     x, y, z, *turn = (f"{one:.6f}" for one in rng.normal(scale=0.2, size=6))
     return (
         f'<inertial><origin xyz="{x} {y} {z}" rpy="{" ".join(turn)}"/>'
-        f'<mass value="{masses.sum()!r}"/><inertia ixx="{I[0, 0]!r}" ixy="{I[0, 1]!r}" '
-        f'ixz="{I[0, 2]!r}" iyy="{I[1, 1]!r}" iyz="{I[1, 2]!r}" izz="{I[2, 2]!r}"/></inertial>'
+        f'<mass value="{float(masses.sum())!r}"/><inertia ixx="{I[0][0]!r}" ixy="{I[0][1]!r}" '
+        f'ixz="{I[0][2]!r}" iyy="{I[1][1]!r}" iyz="{I[1][2]!r}" izz="{I[2][2]!r}"/></inertial>'
     )
 
 

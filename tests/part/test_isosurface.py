@@ -23,6 +23,9 @@ DESIGNS = {
     "solid": lambda x, y, z: np.ones_like(x),
     "holes": lambda x, y, z: np.clip(0.5 + 0.9 * np.sin(30 * x) * np.cos(150 * y), 0.0, 1.0),
     "hollow": lambda x, y, z: 1.0 * ((x < 0.05) | (x > 0.45) | (np.abs(y) > 0.0105)),
+    "cavity": lambda x, y, z: (
+        1.0 - ((x > 0.1) & (x < 0.4) & (np.abs(y) < 0.01) & (np.abs(z) < 5e-3))
+    ),
     "gray": lambda x, y, z: np.full_like(x, 0.5),
 }
 
