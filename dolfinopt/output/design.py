@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from dolfinopt.mesh.arm_mesh import ArmMesh
 
 
+# Of the arrays of design.npz.
+UNITS = {"centroid": "m", "density": "-", "filtered": "-"}
+
+
 def write_design(folder: Path, views: Sequence[ArmView]) -> None:
     """Write design.npz: centroids and physical densities of every arm.
 
@@ -32,7 +36,8 @@ def write_design(folder: Path, views: Sequence[ArmView]) -> None:
         arrays[f"{view.name}/density"] = view.density
         if view.filtered is not None:
             arrays[f"{view.name}/filtered"] = view.filtered
-    arrays["units"] = np.array(["centroid: m", "density: -", "filtered: -"])
+    held = {key.rpartition("/")[2] for key in arrays}
+    arrays["units"] = np.array([f"{name}: {unit}" for name, unit in UNITS.items() if name in held])
     write_arrays(folder / "design.npz", arrays)
 
 
