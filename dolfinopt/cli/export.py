@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.export_robot import export_robot
 from dolfinopt.cli.options import (
     design_option,
     out_option,
@@ -60,6 +59,9 @@ def export(
     if urdf:
         if design is not None or overrides:
             raise InputError("--urdf: expected no --design and no --set, they are the run's")
+        # Imports NumPy, which the help of commands does without.
+        from dolfinopt.cli.export_robot import export_robot
+
         export_robot(scene, out, overwrite, before)
         return
     if before is not None:
