@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,7 @@ from dolfinopt.solver import (
 if TYPE_CHECKING:
     from dolfinopt.fem.multigrid import BlockConjugateGradients
 
+Columns = Callable[[np.ndarray], np.ndarray]
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
 # has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
@@ -190,6 +192,12 @@ class InteriorSystem:
         if self.is_iterative:
             return self._iterative.solve(right, tolerance=TIGHT)
         return factor.solve(right)
+
+    def multigrid(self, K: sp.csr_matrix) -> tuple[Columns, Columns]:
+        """Return products with K_II and its approximate inverse, of an iterative solver."""
+        self.factorise(K)
+        grid = self._iterative.grid
+        return grid.levels[0].times, grid.cycle
 
     @cached_property
     def _nodes(self) -> InteriorEntries:

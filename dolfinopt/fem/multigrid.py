@@ -242,6 +242,7 @@ class BlockConjugateGradients:
     Ji & Li, BIT 57 (2017) 379-403, doi:10.1007/s10543-016-0631-z.
 
     Attributes:
+        grid: the hierarchy.
         failed: the last solution did not converge.
         steps: of the last solution.
     """
@@ -255,7 +256,7 @@ class BlockConjugateGradients:
                 side's: about that of the solution in energy.
         """
         self.tolerance = tolerance
-        self._grid = Multigrid(matrix)
+        self.grid = Multigrid(matrix)
         self._comm: MPI.Comm = matrix.comm.tompi4py()
         self.failed, self.steps = False, 0
         self._first_steps = 0  # right after the hierarchy was made
@@ -264,10 +265,10 @@ class BlockConjugateGradients:
     def update(self) -> None:
         """Take over new values of the matrix (collective)."""
         if self._first_steps and self.steps > WORSE * self._first_steps:
-            self._grid.make()
+            self.grid.make()
             self._fresh = True
         else:
-            self._grid.update()
+            self.grid.update()
 
     def solve(
         self, right: np.ndarray, guess: np.ndarray | None = None, tolerance: float | None = None
@@ -300,7 +301,7 @@ class BlockConjugateGradients:
         return part if self._comm.size == 1 else self._comm.allreduce(part)
 
     def _solve(self, B: np.ndarray, guess: np.ndarray | None, tolerance: float) -> np.ndarray:
-        grid, fine = self._grid, self._grid.levels[0]
+        grid, fine = self.grid, self.grid.levels[0]
         R = np.array(B, order="F")
         Z = grid.cycle(R)
         goal = tolerance**2 * self._lengths(R, Z)

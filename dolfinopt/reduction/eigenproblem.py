@@ -11,6 +11,7 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.reduction.lobpcg import Operators, interior_operators, lowest_without_factor
 from dolfinopt.solver import has_options, obeying_options
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
@@ -50,12 +51,14 @@ class Pencil:
         inverse: K^-1 times a vector.
         mass: M times a vector.
         matrices: K and M for SLEPc, made when they are asked for.
+        operators: what a search needs where the inverse is dear; None where a factor is at hand.
     """
 
     arm: ElasticArm
     inverse: Callable[[np.ndarray], np.ndarray]
     mass: Callable[[np.ndarray], np.ndarray]
     matrices: Callable[[], tuple[PETSc.Mat, PETSc.Mat]]
+    operators: Operators | None = None
 
     def total(self, part: np.ndarray) -> np.ndarray:
         """Return the sum over the arm's ranks."""
@@ -69,6 +72,7 @@ def interior_pencil(arm: ElasticArm) -> Pencil:
         arm.interior_inverse,
         arm.interior_mass_times,
         lambda: (arm.interior_stiffness(), arm.interior_mass()),
+        interior_operators(arm) if arm.substructure.interior.is_iterative else None,
     )
 
 
@@ -92,7 +96,9 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
     arm = pencil.arm
     with arm.profile.phase("eigenproblem"):
         pairs = None
-        if start is not None and start.shape[1] > 0 and not has_options(OPTIONS):
+        if pencil.operators is not None and not has_options(OPTIONS):
+            pairs = lowest_without_factor(arm, pencil.operators, count, start)
+        elif start is not None and start.shape[1] > 0 and not has_options(OPTIONS):
             pairs = modes_from(pencil, count, start)
             if pairs is not None and _passes_over(pencil, pairs, start):
                 pairs = None

@@ -12,6 +12,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.fem import interior
 from dolfinopt.fem.multigrid import Level
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.reduction import lobpcg
 from dolfinopt.responses.sensitivity import exact_gradient
 
 COMM = MPI.COMM_WORLD
@@ -72,12 +73,29 @@ def test_warm_start(iterative):
     warm_modes = nearby.elastic.constraint_modes()
     warm = solver._iterative.steps
     assert warm < 0.8 * cold
-    assert solver._iterative._grid.setups == 1
+    assert solver._iterative.grid.setups == 1
     solver._solutions.clear()
     nearby.elastic.__dict__.pop("_constraint_modes")
     cold_modes = nearby.elastic.constraint_modes()
     assert solver._iterative.steps > warm
     assert np.allclose(warm_modes.stiffness, cold_modes.stiffness, rtol=1e-9, atol=1e-3)
+
+
+@pytest.mark.serial
+def test_modes_without_a_factor(monkeypatch):
+    """Body with four modes, from cold and from a design nearby; a search knows when it is done."""
+    steps, bodies = [], []
+    for rows in (10**9, 0):
+        monkeypatch.setattr(interior, "ITERATIVE_ROWS", rows)
+        arm = solid_arm(cells=(12, 4, 3), coordinates=10)
+        for void in (0.1, 0.09):
+            bodies.append(arm.state(hollow(arm, void)).body)
+            if rows == 0:
+                found = lobpcg.interior_operators(arm.elastic)
+                steps.append(lobpcg.lobpcg(found, arm.initial.basis, 3, 1e-6)[2])
+    assert difference(bodies[0], bodies[2]) < 1e-6
+    assert difference(bodies[1], bodies[3]) < 1e-6
+    assert steps == [0, 0]
 
 
 @pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
