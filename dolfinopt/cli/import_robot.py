@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 import click
-import numpy as np
 
 from dolfinopt.cli.options import out_option
 from dolfinopt.cli.shared import warn
@@ -18,6 +17,8 @@ from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dolfinopt.exchange.urdf.bodies import SceneBody
     from dolfinopt.exchange.urdf.robot import Robot
     from dolfinopt.exchange.urdf.scene import RobotScene
@@ -107,6 +108,8 @@ def _meshed(model: Robot, body: SceneBody) -> SceneBody:
 
 def _trajectory(model: Robot, file: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the instants (n,) and all joints (n, joints) of a table that the robot can follow."""
+    import numpy as np
+
     from dolfinopt.exchange.urdf.trajectory import (
         check_positions,
         columns_of,
