@@ -143,12 +143,14 @@ class SimulationResult:
         return deviation_figure(one.t, one.deviation, self._initial(), deviation_title(one))
 
     def plot_design(self) -> Figure | None:
-        """Return the figure of the arms' densities; None of solids, see design.vtu."""
+        """Return the figure of the arms' densities; of solids, of what is denser than 0.5."""
         from dolfinopt.plots.design import design_figure
+        from dolfinopt.plots.solid_design import solid_design_figure
 
-        if self.scene.is_spatial:
+        if not (arms := designed(self.views)):
             return None
-        return design_figure(designed(self.views), self.scene.name) if self.views else None
+        draw = solid_design_figure if self.scene.is_spatial else design_figure
+        return draw(arms, self.scene.name)
 
     def plot_stress(self) -> Figure | None:
         """Return the figure of every cell's largest stress; None if not asked for, or of solids."""
@@ -160,12 +162,13 @@ class SimulationResult:
         return stress_figure(known, self.scene.name) if known else None
 
     def plot_machine(self) -> Figure | None:
-        """Return the figure of the machine in a few poses along its path; None in space."""
-        from dolfinopt.plots.machine import figure_of
+        """Return the figure of the machine in a few poses along its path."""
+        from dolfinopt.plots import machine, solid_machine
 
-        if self.trajectory is None or self.scene.is_spatial:
+        if self.trajectory is None:
             return None
-        return figure_of(self.views, self.trajectory, self.scene.name)
+        draw = (solid_machine if self.scene.is_spatial else machine).figure_of
+        return draw(self.views, self.trajectory, self.scene.name)
 
     def plot_drives(self) -> Figure | None:
         """Return the figure of the drives' errors and forces, and of what holds a closed loop."""

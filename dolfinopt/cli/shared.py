@@ -166,22 +166,14 @@ def draw(
     animation: bool = False,
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
-    from dolfinopt.output.views import designed
     from dolfinopt.plots.curves import deviation_title, draw_deviation, draw_history
-    from dolfinopt.plots.design import draw_design
     from dolfinopt.plots.drives import draw_drives
-    from dolfinopt.plots.machine import figure_of
-    from dolfinopt.plots.stress import draw_stress
-    from dolfinopt.plots.style import save
     from dolfinopt.responses.constraints import deviation_limits, limits_by_column
     from dolfinopt.responses.response import objective_of
 
     minimised = objective_of(scene)
     label = f"{minimised.label} [{minimised.unit}]"
-    if not scene.is_spatial:  # designs in the plane
-        draw_design(folder / "design.png", designed(views), scene.name)
-    if not scene.is_spatial and (stressed := [view for view in views if view.stress is not None]):
-        draw_stress(folder / "stress.png", stressed, scene.name)
+    (_draw_in_space if scene.is_spatial else _draw_in_plane)(folder, scene, views, trajectory)
     if history:
         limits = limits_by_column(scene, history[0].constraints)
         draw_history(folder / "history.png", history, label, limits)
@@ -193,14 +185,43 @@ def draw(
         draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title, of_end)
     if trajectory.is_machine:
         draw_drives(folder / "drives.png", trajectory)
-    if scene.is_spatial:
-        return
-    save(figure_of(views, trajectory, scene.name), folder / "machine.png")
-    if animation:
+    if animation and not scene.is_spatial:
         from dolfinopt.plots.animation import draw_motion
 
         film, q_e = folder / "motion.gif", trajectory.q_e
         draw_motion(film, views, mechanism, t, q_r, q_e, desired=desired, closure=closure)
+
+
+def _draw_in_plane(
+    folder: Path, scene: Scene, views: list[ArmView], trajectory: Trajectory
+) -> None:
+    """Draw designs, stress and the machine of plane arms."""
+    from dolfinopt.output.views import designed
+    from dolfinopt.plots.design import draw_design
+    from dolfinopt.plots.machine import figure_of
+    from dolfinopt.plots.stress import draw_stress
+    from dolfinopt.plots.style import save
+
+    draw_design(folder / "design.png", designed(views), scene.name)
+    if stressed := [view for view in views if view.stress is not None]:
+        draw_stress(folder / "stress.png", stressed, scene.name)
+    save(figure_of(views, trajectory, scene.name), folder / "machine.png")
+
+
+def _draw_in_space(
+    folder: Path, scene: Scene, views: list[ArmView], trajectory: Trajectory
+) -> None:
+    """Draw designs and the machine of solid arms."""
+    from dolfinopt.output.views import designed
+    from dolfinopt.plots.solid_design import solid_design_figure
+    from dolfinopt.plots.solid_machine import figure_of
+    from dolfinopt.plots.style import save
+
+    bodies = trajectory.mechanism.bodies
+    masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
+    if links := designed(views):
+        save(solid_design_figure(links, scene.name, masses), folder / "design.png")
+    save(figure_of(views, trajectory, scene.name), folder / "machine.png")
 
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:

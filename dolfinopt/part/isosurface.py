@@ -6,7 +6,8 @@ level; where the density is above it the solid's own faces stay, interfaces amon
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,10 +30,14 @@ class Surface:
     Attributes:
         points: (n, 3) m.
         triangles: (m, 3) indices of corners, counterclockwise seen from outside.
+        cells: (m,) index of the cell behind every triangle, if it was cut from cells.
+        fields: (n, ...) values at the points, by name.
     """
 
     points: np.ndarray
     triangles: np.ndarray
+    cells: np.ndarray | None = None
+    fields: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def corners(self) -> np.ndarray:
@@ -54,14 +59,8 @@ def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
             the same to the last bit.
         density: (n,) of the same cells.
     """
-    points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    nodes = _right_handed(corners, nodes.reshape(corners.shape[:2]))
-    sizes = cell_volumes(corners)
-    weight, total = np.zeros((2, len(points)))
-    for node in nodes.T:
-        np.add.at(weight, node, sizes)
-        np.add.at(total, node, sizes * density)
-    values, volume = total / weight, float(sizes @ density)
+    points, nodes, values = _nodal(corners, density)
+    volume = float(cell_volumes(corners) @ density)
     above, below = 0.0, BELOW * float(values.max())  # levels that enclose too much and too little
     for _ in range(HALVINGS):
         level = 0.5 * (above + below)
@@ -72,6 +71,48 @@ def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
     return surface
 
 
+def surface_at(
+    corners: np.ndarray,
+    density: np.ndarray,
+    level: float,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> Surface:
+    """Return the surface of what is denser than a level, in the cells' frame; it may be empty.
+
+    Args:
+        corners, density: as for `design_surface`.
+        level: of the density.
+        fields: (n, 4 or 8, ...) values at the same corners, to be carried to the surface's points.
+    """
+    points, nodes, values = _nodal(corners, density)
+    if values.max() <= level - APART:
+        empty = np.zeros((0, 3))
+        return Surface(empty, empty.astype(int), np.zeros(0, dtype=int))
+    at_nodes = {}
+    for name, at_corners in (fields or {}).items():
+        at_nodes[name] = np.empty((len(points), *at_corners.shape[2:]))
+        at_nodes[name][_numbers(corners)[1]] = at_corners
+    return _cut(points, nodes, values, level, at_nodes)
+
+
+def _numbers(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (n, 3) of cells, and the cells' nodes in the order of their corners."""
+    points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return points, nodes.reshape(corners.shape[:2])
+
+
+def _nodal(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points (n, 3), nodes of right-handed cells, and the densities (n,) at the points."""
+    points, nodes = _numbers(corners)
+    nodes = _right_handed(corners, nodes)
+    sizes = cell_volumes(corners)
+    weight, total = np.zeros((2, len(points)))
+    for node in nodes.T:
+        np.add.at(weight, node, sizes)
+        np.add.at(total, node, sizes * density)
+    return points, nodes, total / weight
+
+
 def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the nodes of cells, those of left-handed ones in another order."""
     count = nodes.shape[1]
@@ -80,16 +121,25 @@ def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     return np.where(left[:, None], nodes[:, MIRRORED[count]], nodes)
 
 
-def _cut(points: np.ndarray, nodes: np.ndarray, values: np.ndarray, level: float) -> Surface:
+def _cut(
+    points: np.ndarray,
+    nodes: np.ndarray,
+    values: np.ndarray,
+    level: float,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> Surface:
     """Return the surface of what of the cells is above a level."""
     import pyvista
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
-    count = nodes.shape[1]
+    count, fields = nodes.shape[1], fields or {}
     kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
     grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
     # Through a node or next to it triangles would have no size, and corners fall together.
     grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
+    for name, field_values in fields.items():
+        grid.point_data[name] = field_values.reshape(len(points), -1)
+    grid.cell_data["cell"] = np.arange(len(nodes))
     solid = grid.clip_scalar(scalars="density", invert=False, value=level)
     outside = vtkDataSetSurfaceFilter()
     outside.SetInputData(solid)
@@ -98,7 +148,12 @@ def _cut(points: np.ndarray, nodes: np.ndarray, values: np.ndarray, level: float
     found = pyvista.PolyData(outside.GetOutput()).triangulate().clean()
     triangles = found.faces.reshape(-1, 4)[:, 1:].astype(int)
     within = solid.cell_centers().points[found.cell_data["vtkOriginalCellIds"]]
-    return _outwards(np.asarray(found.points, dtype=float), triangles, within)
+    surface = _outwards(np.asarray(found.points, dtype=float), triangles, within)
+    carried = {
+        name: np.asarray(found.point_data[name]).reshape(-1, *one.shape[1:])
+        for name, one in fields.items()
+    }
+    return replace(surface, cells=np.asarray(found.cell_data["cell"]), fields=carried)
 
 
 def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> Surface:
