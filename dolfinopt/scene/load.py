@@ -38,6 +38,7 @@ from dolfinopt.scene.spelling import cut, input_error, shown
 from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, PATTERN_KEYS, Arm
 from dolfinopt.scene.tables.base import Loc, Refusal, without_none
 from dolfinopt.scene.tables.interpolation import Law
+from dolfinopt.scene.tables.joints import Joint
 from dolfinopt.scene.tables.material import MATERIAL_VALUES
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import WorstBy
@@ -48,6 +49,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+NAMED = {"arms": Arm, "joints": Joint}  # arrays of tables whose members --set knows by name
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 __all__ = [
@@ -72,8 +74,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
 
     `overrides` are strings "key.path=value" as given to --set. The value is read as TOML, or else
     taken as a bare string. `arms.length` means all arms, `arms.0.length` and `arms.arm2.length`
-    one of them; they apply after arms have taken missing keys from the arm before, so that an
-    override changes what it names and nothing else.
+    one of them, `joints.elbow.axis` a joint's. They apply after arms have taken missing keys from
+    the arm before, so that an override changes what it names and nothing else.
 
     Raises:
         InputError: one line that names file, key, value and what is allowed.
@@ -460,21 +462,23 @@ def _parse_value(text: str) -> Any:
 def _override_locs(tree: dict[str, Any], parts: tuple[str, ...], where: str) -> tuple[Loc, ...]:
     """Return the paths that the dotted key `parts` means; raise InputError if there are none."""
     locs: tuple[Loc, ...] = (parts,)
-    if parts[0] == "arms" and len(parts) > 1:
-        arms = tree.get("arms")
-        if not isinstance(arms, list):  # validation will say so
+    table = parts[0]
+    if table in NAMED and len(parts) > 1 and (table in tree or table == "arms"):
+        members = tree.get(table)
+        if not isinstance(members, list):  # validation will say so
             return ()
-        if len(parts) == 2 and parts[1] in Arm.model_fields:
-            locs = tuple(("arms", i, parts[1]) for i in range(len(arms)))
+        fields = NAMED[table].model_fields
+        if len(parts) == 2 and parts[1] in fields:
+            locs = tuple((table, i, parts[1]) for i in range(len(members)))
         else:
-            numbers = {str(i): i for i in range(len(arms))}
-            names = {arm_name(tree, i): i for i in numbers.values()}
+            numbers = {str(i): i for i in range(len(members))}
+            names = {arm_name(tree, i, table): i for i in numbers.values()}
             index = numbers.get(parts[1], names.get(parts[1]))
             if index is None:
                 known = [*numbers, *filter(None, names)]
-                known += Arm.model_fields if len(parts) == 2 else []
-                raise input_error(where, unknown_key(("arms",), parts[1], known, tree))
-            locs = (("arms", index, *parts[2:]),)
+                known += fields if len(parts) == 2 else []
+                raise input_error(where, unknown_key((table,), parts[1], known, tree))
+            locs = ((table, index, *parts[2:]),)
     for loc in locs[:1]:
         _check_known(tree, loc, where)
     return locs

@@ -89,7 +89,18 @@ def test_every_table_is_tried_above():
         "material", "interpolation", "arms", "motion", "payload", "damping", "reduction",
         "simulation", "objective", "constraints", "design", "optimizer", "scenarios", "control",
         "closure",  # a table like the others, which asks for another motion
+        "joints",  # of machines in space, below
     }  # fmt: skip
+
+
+@pytest.mark.serial  # ranks have no part in it
+def test_joints_are_part_of_the_key():
+    path = TWO_ARM.parent / "spatial_arm.toml"
+    keys = {
+        Case(do.load_scene(path, change)).key
+        for change in ([], ["joints.elbow.axis=[0, 0, -1]"], ["joints.elbow.origin=[0, 0, 0.01]"])
+    }
+    assert len(keys) == 3
 
 
 @pytest.mark.serial  # ranks have no part in it
