@@ -36,7 +36,7 @@ from dolfinopt.scene.messages import (
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.spelling import cut, input_error, shown
 from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, PATTERN_KEYS, Arm
-from dolfinopt.scene.tables.base import Loc, Refusal, without_none
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, without_none
 from dolfinopt.scene.tables.interpolation import Law
 from dolfinopt.scene.tables.joints import Joint
 from dolfinopt.scene.tables.material import MATERIAL_VALUES
@@ -49,7 +49,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-NAMED = {"arms": Arm, "joints": Joint}  # arrays of tables whose members --set knows by name
+# Arrays of tables of which --set knows single ones by their name.
+NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint}
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 __all__ = [
