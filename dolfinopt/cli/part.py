@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dolfinopt.cli.options import out_option, overwrite_option, plots_option
+from dolfinopt.cli.part_solid import make_solids
 from dolfinopt.cli.shared import claim, elapsed, scene_of, warn
 from dolfinopt.cli.start import start
 from dolfinopt.errors import ConvergenceError, InputError
@@ -70,6 +71,8 @@ def part(
     Each arm as STEP (solid, and its face for arms.mesh), DXF (R2010 and R12), SVG and STL, all in
     millimetres; part.toml is the machine with these parts, to be simulated like any scene. A table
     tells what it does beside the densities, and beside these cut to solid and void.
+
+    Solid arms as STL and 3MF alone, in millimetres; the other options are for arms in the plane.
     """
     world = start()
     from dolfinopt.parallel import on_root, together
@@ -78,16 +81,24 @@ def part(
     from dolfinopt.part.part import make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
-    if scene.is_spatial:
-        raise InputError(
-            f"{folder}: parts are made of arms in the plane, and those of this run are solids; "
-            "design.vtu holds their densities"
-        )
     target = out or folder / "part"
-    claim(world, target, overwrite, file_names(scene))
-
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
+    if scene.is_spatial:
+        planar = {
+            "--tool-radius": tool_radius is not None,
+            "--tolerance": tolerance is not None,
+            "--curves": curves != "splines",
+            "--polish": polish > 0,
+        }
+        for name in (name for name, given in planar.items() if given):
+            raise InputError(
+                f"{name}: of arms in the plane alone; the arms of {folder} are solids, whose parts "
+                "have no curves; leave it out"
+            )
+        make_solids(world, scene, folder, target, overwrite, plots)
+        return
+    claim(world, target, overwrite, file_names(scene))
     parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)
     with together(world):
         if world.rank == 0:

@@ -115,7 +115,7 @@ def read_domains(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, Domai
         if scene.arms[k].is_solid:
             raise InputError(
                 f"{folder}: arm {scene.arms[k].name!r} is a solid: parts are outlines of arms in "
-                "plane stress, cells = [along, across]"
+                "plane stress, cells = [along, across]; surfaces of solids: `dolfinopt part`"
             )
     check_budget(world, scene)
     partition = partition_arms(world, scene.cell_counts, whole=True)

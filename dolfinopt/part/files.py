@@ -99,11 +99,11 @@ def write_parts(
             pictures(made)
         figures = figures_of(scene, parts, check, polished)
         write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
-        _publish(made, folder, file_names(scene))
+        publish(made, folder, file_names(scene))
     return figures
 
 
-def _publish(made: Path, folder: Path, names: Sequence[str]) -> None:
+def publish(made: Path, folder: Path, names: Sequence[str]) -> None:
     """Replace the files of a folder by those made elsewhere: all or none, the first name last."""
     for left in folder.glob(f"{STAGE}*"):
         shutil.rmtree(left, ignore_errors=True)

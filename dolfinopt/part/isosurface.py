@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +60,7 @@ def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
             the same to the last bit.
         density: (n,) of the same cells.
     """
-    points, nodes, values = _nodal(corners, density)
+    points, nodes, values = nodal_densities(corners, density)
     volume = float(cell_volumes(corners) @ density)
     above, below = 0.0, BELOW * float(values.max())  # levels that enclose too much and too little
     for _ in range(HALVINGS):
@@ -84,7 +85,7 @@ def surface_at(
         level: of the density.
         fields: (n, 4 or 8, ...) values at the same corners, to be carried to the surface's points.
     """
-    points, nodes, values = _nodal(corners, density)
+    points, nodes, values = nodal_densities(corners, density)
     if values.max() <= level - APART:
         empty = np.zeros((0, 3))
         return Surface(empty, empty.astype(int), np.zeros(0, dtype=int))
@@ -101,8 +102,14 @@ def _numbers(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, nodes.reshape(corners.shape[:2])
 
 
-def _nodal(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points (n, 3), nodes of right-handed cells, and the densities (n,) at the points."""
+def nodal_densities(
+    corners: np.ndarray, density: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points (n, 3), nodes of right-handed cells, and the densities (n,) at the points.
+
+    Args:
+        corners, density: as for `design_surface`.
+    """
     points, nodes = _numbers(corners)
     nodes = _right_handed(corners, nodes)
     sizes = cell_volumes(corners)
@@ -129,38 +136,80 @@ def _cut(
     fields: Mapping[str, np.ndarray] | None = None,
 ) -> Surface:
     """Return the surface of what of the cells is above a level."""
-    import pyvista
-    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+    fields = fields or {}
+    surface, found = outside(cut(points, nodes, values, level, fields))
+    carried = {name: found[name].reshape(-1, *one.shape[1:]) for name, one in fields.items()}
+    return replace(surface, fields=carried)
 
-    count, fields = nodes.shape[1], fields or {}
+
+def cut(
+    points: np.ndarray,
+    nodes: np.ndarray,
+    values: np.ndarray,
+    level: float,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> Any:
+    """Return the grid, of VTK, of what of the cells is above a level, with its nodes' density.
+
+    Args:
+        points, nodes, values: of `nodal_densities`.
+        level: of the density.
+        fields: (n, ...) further values at the nodes that the grid is to have, by their names.
+    """
+    import pyvista
+
+    count = nodes.shape[1]
     kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
     grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
     # Through a node or next to it triangles would have no size, and corners fall together.
     grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
-    for name, field_values in fields.items():
+    for name, field_values in (fields or {}).items():
         grid.point_data[name] = field_values.reshape(len(points), -1)
     grid.cell_data["cell"] = np.arange(len(nodes))
-    solid = grid.clip_scalar(scalars="density", invert=False, value=level)
-    outside = vtkDataSetSurfaceFilter()
-    outside.SetInputData(solid)
-    outside.PassThroughCellIdsOn()
-    outside.Update()
-    found = pyvista.PolyData(outside.GetOutput()).triangulate().clean()
+    return grid.clip_scalar(scalars="density", invert=False, value=level)
+
+
+def outside(solid: Any) -> tuple[Surface, dict[str, np.ndarray]]:
+    """Return the surface of a grid of `cut`, and the values (n, ...) at its points by name."""
+    import pyvista
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    faces = vtkDataSetSurfaceFilter()
+    faces.SetInputData(solid)
+    faces.PassThroughCellIdsOn()
+    faces.Update()
+    found = pyvista.PolyData(faces.GetOutput()).triangulate().clean()
     triangles = found.faces.reshape(-1, 4)[:, 1:].astype(int)
     within = solid.cell_centers().points[found.cell_data["vtkOriginalCellIds"]]
     surface = _outwards(np.asarray(found.points, dtype=float), triangles, within)
-    carried = {
-        name: np.asarray(found.point_data[name]).reshape(-1, *one.shape[1:])
-        for name, one in fields.items()
-    }
-    return replace(surface, cells=np.asarray(found.cell_data["cell"]), fields=carried)
+    values = {name: np.asarray(found.point_data[name]) for name in found.point_data}
+    return replace(surface, cells=np.asarray(found.cell_data["cell"])), values
 
 
 def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> Surface:
     """Return a surface whose triangles turn their backs on points (m, 3) of the cells they bound.
 
-    VTK's own are not all counterclockwise seen from outside in every version.
+    VTK's own are not all counterclockwise seen from outside in every version. Triangles that share
+    an edge run along it in opposite directions; which way they turn is what most of them say,
+    by the volume to their point: that of a warped cell may be on the wrong side of one of them.
     """
+    import scipy.sparse as sp
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(triangles)
     a, b, c = points[triangles].swapaxes(0, 1)
-    inwards = np.einsum("na,na->n", np.cross(b - a, c - a), a - within) < 0.0
-    return Surface(points, np.where(inwards[:, None], triangles[:, ::-1], triangles))
+    outwards = np.einsum("na,na->n", np.cross(b - a, c - a), a - within)
+    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    order = np.lexsort(np.sort(edges, axis=1).T)
+    edges, sides = np.sort(edges, axis=1)[order], order % count
+    forth = (triangles[:, [0, 1, 2]] < triangles[:, [1, 2, 0]]).T.ravel()[order]
+    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
+    one, other, alike = sides[pair], sides[pair + 1], forth[pair] != forth[pair + 1]
+    # Every triangle as it is, 0 ... m - 1, and turned, m ... 2 m - 1: which go together.
+    start, end = np.concatenate([one, one + count]), np.where(alike, other, other + count)
+    end = np.concatenate([end, (end + count) % (2 * count)])
+    links = sp.csr_matrix((np.ones(len(start)), (start, end)), shape=(2 * count, 2 * count))
+    sheet = connected_components(links, directed=False)[1]
+    score = np.bincount(sheet, weights=np.concatenate([outwards, -outwards]))
+    turned = score[sheet[:count]] < score[sheet[count:]]
+    return Surface(points, np.where(turned[:, None], triangles[:, ::-1], triangles))

@@ -296,7 +296,7 @@ def test_files_are_there_all_or_none(tmp_path, monkeypatch):
         place.mkdir(parents=True)
         for name in names:
             (place / name).write_text(str(place))
-    files._publish(made, folder, names)
+    files.publish(made, folder, names)
     assert {path.name: path.read_text() for path in folder.iterdir()} == dict.fromkeys(
         names, str(made)
     )
@@ -309,7 +309,7 @@ def test_files_are_there_all_or_none(tmp_path, monkeypatch):
     replace = files.os.replace
     monkeypatch.setattr(files.os, "replace", full)
     with pytest.raises(OutputError, match="No space left"):
-        files._publish(made, folder, names)
+        files.publish(made, folder, names)
     assert [path.name for path in folder.iterdir()] == ["arm1.svg"]
 
 
