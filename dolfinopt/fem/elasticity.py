@@ -8,6 +8,7 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -201,9 +202,12 @@ class ElasticArm:
         comm, inboard, outboard, rigid, interior_nodes, num_interior, num_dofs, expand, restrict:
             of its `InterfaceTransformation`.
         points: (n_nodes, d) reference positions, m.
+        weighed: element matrices k_e and m_e in place of its own in products cell by cell, which
+            are then derivatives by a parameter of these matrices; None of its own.
     """
 
     def __init__(self, substructure: Substructure, K: AssembledMatrix, M: AssembledMatrix):
+        self.weighed: tuple[np.ndarray, np.ndarray] | None = None
         self.substructure = substructure
         self.K, self.M = K, M
         self.mesh, self.operators = substructure.mesh, substructure.operators
@@ -270,9 +274,9 @@ class ElasticArm:
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
-        if (uniform := self.substructure.uniform) is not None:
+        if (uniform := self.substructure.uniform) is not None and self.weighed is None:
             return uniform.stiffness_products(left, right)
-        return cells.stiffness_products(self.operators, left, right)
+        return cells.stiffness_products(self._weighed_operators, left, right)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
@@ -280,9 +284,16 @@ class ElasticArm:
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
-        if (uniform := self.substructure.uniform) is not None:
+        if (uniform := self.substructure.uniform) is not None and self.weighed is None:
             return uniform.mass_products(left, right)
-        return cells.mass_products(self.operators, left, right)
+        return cells.mass_products(self._weighed_operators, left, right)
+
+    @property
+    def _weighed_operators(self) -> ElementOperators:
+        if self.weighed is None:
+            return self.operators
+        stiffness, mass = self.weighed
+        return replace(self.operators, stiffness=stiffness, mass=mass)
 
     # -- the interior ------------------------------------------------------------------------
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
 
 from dolfinopt.part.curves import Curve, Line, direction
 from dolfinopt.part.shape import Shape
@@ -86,26 +88,42 @@ class BodyMesh:
 
         Nodes inside move as harmonically as the sides between them tell.
         """
-        import scipy.sparse as sp
-        from scipy.sparse.linalg import splu
-
         moved = replace(self, shape=shape)
         nodes, places = outline_places(moved)
+        step = np.zeros_like(self.points)
+        step[nodes] = places - self.points[nodes]
+        inner, laplacian = self._inner()
+        if inner.any():
+            right = -(laplacian[inner][:, ~inner] @ step[~inner])
+            step[inner] = splu(laplacian[inner][:, inner].tocsc()).solve(right)
+        return replace(moved, points=self.points + step)
+
+    def at_outline(self, by_nodes: np.ndarray) -> np.ndarray:
+        """Return derivatives (k, 2) by the sides' first nodes, the nodes inside moving with them.
+
+        The transpose of `morphed`.
+
+        Args:
+            by_nodes: (n, 2) derivatives by the places of all nodes.
+        """
+        found = by_nodes.copy()
+        inner, laplacian = self._inner()
+        if inner.any():
+            adjoint = splu(laplacian[inner][:, inner].tocsc()).solve(by_nodes[inner])
+            found[~inner] -= laplacian[inner][:, ~inner].T @ adjoint
+        return found[self.sides[:, 0]]
+
+    def _inner(self) -> tuple[np.ndarray, sp.csr_matrix]:
+        """Return which nodes (n,) lie inside, and the Laplacian (n, n) by which they follow."""
         count = len(self.points)
         ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         # Short sides are stiff: small cells keep their form.
         weight = 1.0 / np.square(np.linalg.norm(np.diff(self.points[ends], axis=1)[:, 0], axis=1))
         graph = sp.coo_matrix((weight, ends.T), (count, count)).tocsr()
         graph = graph + graph.T
-        laplacian = sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
         inner = np.ones(count, dtype=bool)
-        inner[nodes] = False
-        step = np.zeros((count, 2))
-        step[nodes] = places - self.points[nodes]
-        if inner.any():
-            right = -(laplacian[inner][:, ~inner] @ step[~inner])
-            step[inner] = splu(laplacian[inner][:, inner].tocsc()).solve(right)
-        return replace(moved, points=self.points + step)
+        inner[self.sides[:, 0]] = False
+        return inner, (sp.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph).tocsr()
 
 
 def triangle_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

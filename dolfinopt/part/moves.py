@@ -69,13 +69,14 @@ class OutlineMoves:
         partner = _partners(free, number, count, domain.extent) if domain.symmetric else None
         return OutlineMoves(number, count, arm, stays, shape, partner)
 
-    def descent(self, shape: Shape, mesh: BodyMesh, weights: np.ndarray) -> np.ndarray:
+    def descent(self, shape: Shape, mesh: BodyMesh, by_outline: np.ndarray) -> np.ndarray:
         """Return the moves (count,) along -(g - mean g), smoothed over `SMOOTH` cells.
 
         Args:
             shape: of now.
             mesh: of it.
-            weights: g at the first node of every side.
+            by_outline: (k, 2) the objective's derivatives by the first node of every side: g
+                times the normal and the length of outline that belongs to the node.
         """
         rows: list[np.ndarray] = []
         cols, mass, stiff = [], [], []
@@ -85,18 +86,15 @@ class OutlineMoves:
             curve = shape.pieces[k].curve
             assert isinstance(curve, Spline)
             here = np.flatnonzero(mesh.piece == k)
-            last = here[-1]
-            after = np.flatnonzero(mesh.sides[:, 0] == mesh.sides[last, 1])[0]
-            t = np.append(mesh.span[here, 0], 1.0)
-            g = np.append(weights[here], weights[after])
+            at = BSpline.design_matrix(mesh.span[here, 0], curve.knots, DEGREE).toarray()
             B, slope, ds, along = _basis(curve)
             normal = _greville_normals(curve)
             tangent = curve.derivative(along)
             n = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
             n /= np.linalg.norm(n, axis=1)[:, None]
             B = B * (n @ normal.T)  # what a move of each control point does along the normal
-            value = np.interp(along, t, g)
-            np.add.at(by_g, number[number >= 0], (B.T @ (ds * value))[number >= 0])
+            pull = (at * (by_outline[here] @ normal.T)).sum(axis=0)
+            np.add.at(by_g, number[number >= 0], pull[number >= 0])
             np.add.at(by_one, number[number >= 0], (B.T @ ds)[number >= 0])
             M = B.T @ (ds[:, None] * B)
             K = slope.T @ (ds[:, None] * slope)

@@ -1,10 +1,10 @@
 """Polishing: a few steps of shape optimisation of the parts' splines, at constant area.
 
-Where the free outline moves outwards by s, the objective changes by int g s ds, with the density g
-of its derivative by added material: on the mesh along the curves, the derivative by the density of
-the triangles over their areas, under a law of stiffness and mass that is linear, carried on to the
-outline. At the optimum g is the same all around; a step goes along -(g - mean g), smoothed, and a
-small offset gives the area back. A step counts only if the machine, simulated anew, is better.
+Where the free outline moves outwards by s, the objective changes by int g s ds. On the mesh along
+the curves that is its derivative by the places of the nodes, of the discrete model
+(`shape_gradient`). At the optimum g is the same all around; a step goes along -(g - mean g),
+smoothed, and a small offset gives the area back. A step counts only if the machine, simulated
+anew, is better.
 Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032; smoothing: de Gournay (2006),
 doi:10.1137/050624108.
 """
@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from mpi4py import MPI
 
 from dolfinopt.errors import ConvergenceError, InputError
@@ -27,8 +26,8 @@ from dolfinopt.part.mesh import COARSER, Meshes, body_mesh, mesh_parts
 from dolfinopt.part.moves import OutlineMoves
 from dolfinopt.part.part import Part
 from dolfinopt.part.shape import Shape
+from dolfinopt.part.shape_gradient import by_outline
 from dolfinopt.part.widths import thinnest_member
-from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, limits_of
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
@@ -212,43 +211,8 @@ def _directions(
     outlines: Mapping[int, OutlineMoves],
 ) -> dict[int, np.ndarray]:
     """Return the moves of all unknowns of every arm: nine of ten at most 1, none above `SPIKE`."""
-    from dolfinopt.responses.evaluation import gradient
-
-    by_cell = gradient(state.scene, state.partition, state.arms, state.trajectory, Profile())
     sign = -1.0 if objective_of(state.scene).turned else 1.0
-    weights = {k: sign * _on_outline(state, k, by_cell[k], meshes[k]) for k in parts}
-    found = {k: outlines[k].descent(parts[k].shape, meshes[k], weights[k]) for k in parts}
+    pulls = {k: sign * pull for k, pull in by_outline(state, meshes).items()}
+    found = {k: outlines[k].descent(parts[k].shape, meshes[k], pulls[k]) for k in parts}
     size = float(np.quantile(np.abs(np.concatenate(list(found.values()))), 0.9))
     return {k: np.clip(one / size, -SPIKE, SPIKE) if size else one for k, one in found.items()}
-
-
-def _on_outline(state: Simulated, k: int, by_cell: np.ndarray, mesh: BodyMesh) -> np.ndarray:
-    """Return the density of the derivative by added material at the sides' first nodes (n,).
-
-    A linear function of the place that fits the triangles around best, at the node itself.
-    """
-    from scipy.spatial import cKDTree
-
-    arm = state.arms[k]
-    centre = mesh.points[mesh.triangles].mean(axis=1)
-    # The arm's cells may be in another order than the triangles of the file.
-    order = cKDTree(arm.mesh.centroid).query(centre)[1]
-    density = (by_cell / arm.mesh.area)[order]
-    count = len(mesh.points)
-    cells = np.repeat(np.arange(len(mesh.triangles)), 3)
-    holds = sp.csr_matrix(
-        (np.ones(cells.size), (mesh.triangles.ravel(), cells)), (count, len(centre))
-    )
-    around = (holds[mesh.sides[:, 0]] @ holds.T @ holds).tocsr()
-    found = np.empty(len(mesh.sides))
-    for i, node in enumerate(mesh.sides[:, 0]):
-        near = around.indices[around.indptr[i] : around.indptr[i + 1]]
-        away = centre[near] - mesh.points[node]
-        weight = 1.0 / (np.square(away).sum(axis=1) + 1e-300)
-        rows = np.c_[np.ones(len(near)), away] * np.sqrt(weight)[:, None]
-        values = density[near]
-        fit = np.linalg.lstsq(rows, values * np.sqrt(weight), rcond=1e-6)[0][0]
-        found[i] = np.clip(
-            fit, 2.0 * values.min() - values.mean(), 2.0 * values.max() - values.mean()
-        )
-    return found

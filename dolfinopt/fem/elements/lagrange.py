@@ -58,6 +58,18 @@ class LagrangeElement:
                 poisson_ratio=poisson_ratio,
             )
 
+    def matrices(
+        self, mesh: ArmMesh, operators: ElementOperators, coordinates: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return k_e and m_e of plane cells with other corners (n_cells, corners, 3), m."""
+        k_form = compat.compile_form(stiffness_form(operators.space))
+        m_form = mass_form(mesh, self.degree)
+        thickness = operators.thickness
+        return (
+            compat.tabulate_cells(k_form, [thickness, operators.poisson_ratio], coordinates),
+            compat.tabulate_cells(m_form, [thickness], coordinates),
+        )
+
     def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
         """Return those in the reference cell times the inverse Jacobian, see `Element`."""
         if mesh.dim == 3:
