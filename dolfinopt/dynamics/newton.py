@@ -25,6 +25,7 @@ from dolfinopt.dynamics.newton_matrix import (
     next_slow_coordinates,
     windows,
 )
+from dolfinopt.dynamics.patience import spend
 from dolfinopt.dynamics.simplified_newton import simplified_newton_matrix
 from dolfinopt.dynamics.system import State
 
@@ -210,6 +211,7 @@ class _Iteration:
         self.rate[self.active] = 0.0  # of this matrix
         while True:
             self.iterations[self.active[~self.done]] += 1
+            spend(float(np.count_nonzero(~self.done)) * self.stages.length)
             step, shift = matrix.solve(self.at.residual, rest)
             step_size = self.stages.relative(shift, self.at.q + shift)
             if age == 0 and tuning.near:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,7 +23,7 @@ from dolfinopt.fem import cells
 from dolfinopt.fem.assembly import AffineMatrix, NodePairs, UniformMatrix
 from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
-from dolfinopt.fem.floating import Connectivity
+from dolfinopt.fem.floating import Connectivity, joins
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.interior import InteriorSystem
 from dolfinopt.fem.stress import element_centres, stress_operator
@@ -78,11 +79,19 @@ class Substructure:
     @cached_property
     def connectivity(self) -> Connectivity:
         """Which cells share a facet, and which lie at the interfaces."""
+        return Connectivity(*self._graph)
+
+    def joins(self, solid: np.ndarray) -> bool:
+        """Return whether the solid ones (n_cells,) of its cells join both interfaces."""
+        return joins(*self._graph, solid)
+
+    @property
+    def _graph(self) -> tuple[MPI.Comm, Any, np.ndarray, np.ndarray, np.ndarray]:
         operators, T = self.operators, self.T
         nodes = operators.cells
         if T.dim == 3:
             nodes = nodes[:, : compat.cell_corner_count(self.mesh.mesh)]
-        return Connectivity(T.comm, operators.space, nodes, T.inboard, T.outboard)
+        return T.comm, operators.space, nodes, T.inboard, T.outboard
 
     @cached_property
     def _rigid_forces(self) -> tuple[np.ndarray, np.ndarray]:

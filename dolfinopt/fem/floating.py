@@ -93,3 +93,34 @@ class Connectivity:
                 return True
             level *= 0.1
         return False
+
+
+def joins(
+    comm: MPI.Comm,
+    space: Any,
+    cells: np.ndarray,
+    inboard: np.ndarray,
+    outboard: np.ndarray,
+    solid: np.ndarray,
+) -> bool:
+    """Return whether solid cells that share nodes lead from one interface to the other.
+
+    Collective on `comm`, the same on all ranks.
+
+    Args:
+        comm, space, cells, inboard, outboard: as of `Connectivity`.
+        solid: (n_cells,) True for the owned cells that count.
+    """
+    number = space.dofmap.index_map.local_to_global
+    nodes = number(cells[solid].ravel().astype(np.int32)).reshape(-1, cells.shape[1])
+    nodes = np.concatenate(comm.allgather(nodes))
+    ends = [
+        np.concatenate(comm.allgather(number(np.flatnonzero(mask).astype(np.int32))))
+        for mask in (inboard, outboard)
+    ]
+    first, second = np.repeat(nodes[:, 0], nodes.shape[1]), nodes.ravel()
+    size = space.dofmap.index_map.size_global
+    graph = sp.coo_matrix((np.ones(first.size), (first, second)), shape=(size, size))
+    _, group = connected_components(graph, directed=False)
+    here, there = (group[np.intersect1d(end, second)] for end in ends)
+    return bool(np.intersect1d(here, there).size)

@@ -7,8 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mpi4py import MPI
 
 from dolfinopt.arms.patterns import uniform_design
+from dolfinopt.dynamics.patience import counted
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
@@ -19,6 +21,9 @@ from dolfinopt.responses.response import needs
 # "auto" chooses coordinates for the initial design, so many times better than asked for: those of
 # an optimised one err 1.7 to 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
 RESERVE = 3.0
+# Newton iterations for each step of the final design's motion before the cut design's is given up:
+# machines take 16 to 44, a chain far fewer.
+PATIENCE = 400.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +81,24 @@ def assess(
         initial = evaluator.trajectory
     if scene.design.projection:
         cut = {k: np.where(x > 0.5, 1.0, 0.0) for k, x in x_phys.items()}
-        with suppress(ConvergenceError):  # on all ranks: a grey design, cut, may fall apart
-            crisp = evaluator.evaluate_densities(cut, simulated=True)
+        crisp = _crisp(evaluator, cut)
     if scene.design.projection or not moves:
         for k, arm in arms.items():
             arm.initial_vectors = vectors[k]
         evaluation = evaluator.evaluate_densities(x_phys, simulated=True)
     return Assessment(evaluation, crisp, initial, selection)
+
+
+def _crisp(evaluator: Evaluator, cut: Mapping[int, np.ndarray]) -> Evaluation | None:
+    """Return the evaluation of a cut design; None where it falls apart, on all ranks."""
+    arms, trajectory = evaluator.arms, evaluator.trajectory
+    whole = all([arms[k].substructure.joins(x > 0.0) for k, x in cut.items()])
+    if not evaluator.partition.world.allreduce(whole, MPI.MIN):
+        return None
+    steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
+    with suppress(ConvergenceError), counted(PATIENCE * steps):
+        return evaluator.evaluate_densities(cut, simulated=True)
+    return None
 
 
 def _choose(

@@ -184,8 +184,8 @@ class Check:
             )
         if self.crisp is None:
             found.append(
-                "the design cut at the density that keeps the volume falls apart: it cannot be "
-                "compared with the part"
+                "the design cut at the density that keeps the volume falls apart or nearly so: it "
+                "is left out of the table"
             )
         found += [
             f"the part misses a limit: {one.sentence}" for one in self.part.limits if not one.met

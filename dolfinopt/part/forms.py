@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt.dynamics.patience import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.body_mesh import BodyMesh
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from dolfinopt.responses.evaluation import Evaluation
 
 STRESS = "stress"
+PATIENCE = 20.0  # work of the crisp design's simulation before it is given up, over the densities'
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,16 +128,24 @@ def _simulated(
 
 
 def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
-    """Return the columns of the densities and of the crisp design."""
+    """Return the columns of the densities and of the crisp design.
+
+    None of a crisp design whose solid cells do not join the interfaces, or that is so weak that
+    its simulation takes `PATIENCE` times the work of the densities'.
+    """
     from dolfinopt.output.design import read_design
 
     partition, arms = _built(scene)
     x_phys = read_design(folder / "design.npz", partition, arms)
-    density = _design_column(_simulated(scene, partition, arms, x_phys))
+    with counted() as work:
+        density = _design_column(_simulated(scene, partition, arms, x_phys))
     cut = {k: crisp(x, arms[k].mesh.area) for k, x in x_phys.items()}
+    if not all(arms[k].substructure.joins(x > 0.0) for k, x in cut.items()):
+        return density, None
     try:
-        return density, _design_column(_simulated(scene, partition, arms, cut))
-    except ConvergenceError:  # what is left hangs together no longer
+        with counted(PATIENCE * work.done):
+            return density, _design_column(_simulated(scene, partition, arms, cut))
+    except ConvergenceError:  # what is left hangs together by next to nothing
         return density, None
 
 
