@@ -153,13 +153,13 @@ class SimulationResult:
         return draw(arms, self.scene.name)
 
     def plot_stress(self) -> Figure | None:
-        """Return the figure of every cell's largest stress; None if not asked for, or of solids."""
+        """Return the figure of every cell's largest stress; None if not asked for."""
+        from dolfinopt.plots.solid_stress import solid_stress_figure
         from dolfinopt.plots.stress import stress_figure
 
         known = [view for view in self.views if view.stress is not None]
-        if self.scene.is_spatial:
-            return None
-        return stress_figure(known, self.scene.name) if known else None
+        draw = solid_stress_figure if self.scene.is_spatial else stress_figure
+        return draw(known, self.scene.name) if known else None
 
     def plot_machine(self) -> Figure | None:
         """Return the figure of the machine in a few poses along its path."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
@@ -185,11 +186,16 @@ def draw(
         draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title, of_end)
     if trajectory.is_machine:
         draw_drives(folder / "drives.png", trajectory)
-    if animation and not scene.is_spatial:
+    if animation:
         from dolfinopt.plots.animation import draw_motion
+        from dolfinopt.plots.solid_animation import draw_solid_motion
 
         film, q_e = folder / "motion.gif", trajectory.q_e
-        draw_motion(film, views, mechanism, t, q_r, q_e, desired=desired, closure=closure)
+        if scene.is_spatial:
+            moving = cast("SpatialMechanism", mechanism)
+            draw_solid_motion(film, views, moving, t, q_r, q_e, desired)
+        else:
+            draw_motion(film, views, mechanism, t, q_r, q_e, desired=desired, closure=closure)
 
 
 def _draw_in_plane(
@@ -215,12 +221,15 @@ def _draw_in_space(
     from dolfinopt.output.views import designed
     from dolfinopt.plots.solid_design import solid_design_figure
     from dolfinopt.plots.solid_machine import figure_of
+    from dolfinopt.plots.solid_stress import solid_stress_figure
     from dolfinopt.plots.style import save
 
     bodies = trajectory.mechanism.bodies
     masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
     if links := designed(views):
         save(solid_design_figure(links, scene.name, masses), folder / "design.png")
+    if stressed := [view for view in views if view.stress is not None]:
+        save(solid_stress_figure(stressed, scene.name), folder / "stress.png")
     save(figure_of(views, trajectory, scene.name), folder / "machine.png")
 
 

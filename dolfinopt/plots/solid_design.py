@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.mesh.cells import cell_volumes
 from dolfinopt.output.views import AROUND, ArmView
+from dolfinopt.part.isosurface import Surface
 from dolfinopt.plots.solids import (
     STEEL,
     Camera,
@@ -48,17 +49,24 @@ def solid_design_figure(
         masses: of the links by name, kg, if they are known.
     """
     figure, panels, scale = link_panels(views, title)
-    camera = camera_of_links()
     for view, axes in zip(views, panels, strict=True):
-        low, high = _bounds(view)
-        studio = link_studio(view, camera, scale)
-        studio.solid(material(view), STEEL)
-        studio.line(box_lines(low, high), GREY)
-        show(axes, studio.close(), studio.low, studio.high)
-        _draw_ruler(axes, camera, low, high, scale)
+        draw_link(axes, view, scale, lambda studio, surface: studio.solid(surface, STEEL))
         mass = None if masses is None else masses.get(view.name)
         axes.set_title(caption(view, mass), loc="left", fontsize=11, parse_math=False)
     return figure
+
+
+def draw_link(
+    axes: Axes, view: ArmView, scale: float, draw: Callable[[Studio, Surface], None]
+) -> None:
+    """Draw a link's material by `draw`, the box around it and lengths; `scale` in px per m."""
+    camera = camera_of_links()
+    low, high = _bounds(view)
+    studio = link_studio(view, camera, scale)
+    draw(studio, material(view))
+    studio.line(box_lines(low, high), GREY)
+    show(axes, studio.close(), studio.low, studio.high)
+    _draw_ruler(axes, camera, low, high, scale)
 
 
 def caption(view: ArmView, mass: float | None) -> str:

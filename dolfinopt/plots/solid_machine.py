@@ -218,21 +218,29 @@ def draw_path(studio: Studio, path: np.ndarray, colour: str, width: float) -> No
 
 def draw_pose(studio: Studio, machine: Assembly, frames: Frames, n: int, pale: float = 0.0) -> None:
     """Draw links, rigid bodies, joints and load at one instant, with a share of white."""
-    size, mechanism = machine.size, machine.mechanism
-    rod, steel, orange = (lighter(colour, pale) for colour in (BAR, STEEL, ORANGE))
     for i, surface in enumerate(machine.surfaces):
-        origin, outboard = frames.origin[n, i], frames.outboard[n, i]
+        if surface is not None:
+            placed = moved(surface, frames.origin[n, i], frames.rotation[n, i])
+            studio.solid(placed, lighter(STEEL, pale))
+    draw_skeleton(studio, machine, frames, n, pale)
+
+
+def draw_skeleton(
+    studio: Studio, machine: Assembly, frames: Frames, n: int, pale: float = 0.0
+) -> None:
+    """Draw all but the links at one instant: rigid bodies, joints and load."""
+    size, mechanism, rod = machine.size, machine.mechanism, lighter(BAR, pale)
+    for i, surface in enumerate(machine.surfaces):
+        origin = frames.origin[n, i]
         if surface is None:
-            studio.bar(np.stack([origin, outboard]), ROD * size, rod)
-        else:
-            studio.solid(moved(surface, origin, frames.rotation[n, i]), steel)
+            studio.bar(np.stack([origin, frames.outboard[n, i]]), ROD * size, rod)
         if (parent := frames.parents[i]) != GROUND:
             studio.bar(np.stack([frames.outboard[n, parent], origin]), ROD * size, rod)
         if mechanism.joints[i].coordinate is not None:
             half = 0.5 * PIN_LENGTH * size * frames.axes[n, i]
             studio.bar(np.stack([origin - half, origin + half]), PIN * size, rod)
-    end = frames.outboard[n, mechanism.end]
-    studio.ball(end, (BALL if machine.carries else 0.5 * BALL) * size, orange)
+    radius = (BALL if machine.carries else 0.5 * BALL) * size
+    studio.ball(frames.outboard[n, mechanism.end], radius, lighter(ORANGE, pale))
 
 
 def draw_axes(studio: Studio, machine: Assembly, frames: Frames, n: int) -> None:

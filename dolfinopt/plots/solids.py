@@ -90,12 +90,20 @@ class Studio:
         seen.parallel_projection = True
         seen.parallel_scale = 0.5 * self.size[1] / px_per_m
 
-    def solid(self, surface: Surface, colour: Colour, **look: Any) -> Any:
-        """Draw a surface; return its mesh."""
-        mesh = poly_data(surface)
-        if mesh.n_cells:
-            self.add(mesh, color=colour, **look)
-        return mesh
+    def solid(self, surface: Surface, colour: Colour) -> None:
+        """Draw a surface, if there is any."""
+        if len(surface.triangles):
+            self.add(poly_data(surface), color=colour)
+
+    def coloured(
+        self, surface: Surface, values: np.ndarray, colours: str, span: tuple[float, float]
+    ) -> None:
+        """Draw a surface in the colours of values (m,) of its triangles, if there is any."""
+        if len(surface.triangles):
+            mesh = poly_data(surface)
+            mesh.cell_data["values"] = values
+            look = {"cmap": colours, "clim": span, "ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
+            self.add(mesh, scalars="values", **look)
 
     def add(self, mesh: Any, **look: Any) -> Any:
         """Draw a mesh, shaded; return its actor."""
@@ -139,6 +147,7 @@ class Studio:
     def render(self) -> np.ndarray:
         """Return the picture (height, width, 3), uint8."""
         self.plotter.reset_camera_clipping_range()
+        self.plotter.render()  # a screenshot alone would show what was rendered last
         return np.asarray(self.plotter.screenshot(return_img=True))
 
     def close(self) -> np.ndarray:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from runs import ROOT
@@ -14,7 +17,13 @@ from dolfinopt.output.views import AROUND, ArmView, designed
 from dolfinopt.part.isosurface import surface_at
 
 pytest.importorskip("pyvista")
-from dolfinopt.plots import solid_design, solid_machine, solids
+from dolfinopt.plots import (
+    solid_animation,
+    solid_design,
+    solid_machine,
+    solid_stress,
+    solids,
+)
 
 pytestmark = pytest.mark.serial
 CELLS, SIZE = (20, 4, 2), np.array([0.5, 0.1, 0.05])
@@ -88,7 +97,8 @@ def result():
     """A simulation of coarse solid links."""
     changes = ("arms.link1.cells=[8,2,2]", "arms.link2.cells=[8,2,2]", "arms.passive=0.06",
                "simulation.sample=0.01")  # fmt: skip
-    return do.Model(do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes)).simulate()
+    model = do.Model(do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes))
+    return model.simulate(stress=True)
 
 
 def test_frames_lead_to_the_end_effector(result):
@@ -132,4 +142,60 @@ def test_figures_of_a_model_in_space(result):
     assert len(result.plot_design().axes) == 2
     figure = result.plot_machine()
     words = [text.get_text() for text in figure.axes[0].texts]
+    assert len(result.plot_stress().axes) == 3  # and the colour scale
     assert "0.000 s" in words and "0.600 s" in words
+
+
+def test_colours_of_stress():
+    """The half with the larger stress is drawn darker; the caption tells where it is."""
+    view = link(lambda x: np.ones(len(x)))
+    stress = np.where(view.centroid[:, 0] < 0.25, 1e6, 9e7)
+    stress[7] = 1e8
+    view = replace(view, stress=stress, stress_instant=np.full(len(stress), 0.25))
+    x, y, z = 1e3 * view.centroid[7]
+    assert solid_stress.stress_caption(view) == (
+        f"link   largest 100 MPa at x = {x:.4g}, y = {y:.4g}, z = {z:.4g} mm, t = 0.25 s"
+    )
+    (panel, scale) = solid_stress.solid_stress_figure([view], "title").axes
+    assert scale.get_xlim() == (0.0, 100.0)
+    image = np.asarray(panel.images[0].get_array()).astype(int)
+    camera, extent = solid_design.camera_of_links(), panel.images[0].get_extent()
+
+    def colour_at(point):
+        x, y = camera.plane(np.array(point)) - [extent[0], extent[2]]
+        size = image.shape[1] / (extent[1] - extent[0])
+        return image[image.shape[0] - 1 - round(y * size), round(x * size)]
+
+    calm, strained = colour_at([0.2, 0.0, 0.025]), colour_at([0.4, 0.0, 0.025])
+    assert calm[1] > 200 > 60 > strained[1]  # light yellow, dark red
+
+
+def test_film_in_space(result, tmp_path):
+    """Surfaces end at the interfaces of the magnified machine; every frame is another picture."""
+    from PIL import Image
+
+    one = result.trajectory
+    args = (result.views, one.mechanism, one.t, one.q_r, one.q_e)
+    film = solid_animation.make_solid_film(*args, magnification=2.0, frames=4)
+    stage = solid_animation.SolidStage(film, 0.1)
+    try:
+        for i in (1, 2):
+            points = stage.rest[i][0]
+            outer = points[:, 0] > points[:, 0].max() - 1e-6
+            for n in range(4):
+                end = stage.surface_points(i, n)[outer]
+                middle = 0.5 * (end.min(axis=0) + end.max(axis=0))
+                assert middle == pytest.approx(film.frames.outboard[n, i], abs=2e-3)
+    finally:
+        stage.close()
+    bent = film.trace - film.desired
+    assert np.abs(bent - 2.0 * one.deviation).max() < 0.1 * np.abs(bent).max()
+    path = solid_animation.draw_solid_motion(tmp_path / "motion.gif", *args, frames=4)
+    with Image.open(path) as found:
+        assert found.n_frames == 4
+        images = []
+        for n in range(4):
+            found.seek(n)
+            images.append(np.asarray(found.convert("RGB")).astype(int))
+    for before, after in pairwise(images):
+        assert (np.abs(after - before).sum(axis=2) > 60).mean() > 0.01

@@ -30,6 +30,16 @@ class Frames:
     parents: tuple[int, ...]
     axes: np.ndarray
 
+    def __getitem__(self, part: slice | np.ndarray) -> Frames:
+        """Return those at some of the instants."""
+        return Frames(
+            self.origin[part],
+            self.rotation[part],
+            self.outboard[part],
+            self.parents,
+            self.axes[part],
+        )
+
 
 def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
     """Return the frames of all bodies.
