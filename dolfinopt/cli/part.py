@@ -72,7 +72,8 @@ def part(
     millimetres; part.toml is the machine with these parts, to be simulated like any scene. A table
     tells what it does beside the densities, and beside these cut to solid and void.
 
-    Solid arms as STL and 3MF alone, in millimetres; the other options are for arms in the plane.
+    Solid arms as STL and 3MF, in millimetres, and part.toml, which --no-check leaves out; they are
+    not simulated, and the other options are for arms in the plane.
     """
     world = start()
     from dolfinopt.parallel import on_root, together
@@ -96,7 +97,7 @@ def part(
                 f"{name}: of arms in the plane alone; the arms of {folder} are solids, whose parts "
                 "have no curves; leave it out"
             )
-        make_solids(world, scene, folder, target, overwrite, plots)
+        make_solids(world, scene, folder, target, overwrite, check, plots)
         return
     claim(world, target, overwrite, file_names(scene))
     parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)

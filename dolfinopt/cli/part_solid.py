@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from dolfinopt.cli.shared import claim, elapsed, warn
+from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -17,7 +18,13 @@ if TYPE_CHECKING:
 
 
 def make_solids(
-    world: MPI.Comm, scene: Scene, folder: Path, target: Path, overwrite: bool, plots: bool
+    world: MPI.Comm,
+    scene: Scene,
+    folder: Path,
+    target: Path,
+    overwrite: bool,
+    meshed: bool,
+    plots: bool,
 ) -> None:
     """Make the parts of the solid arms of a run, and say what was made (collective).
 
@@ -27,6 +34,7 @@ def make_solids(
         folder: of the run.
         target: for the files.
         overwrite: whether it may hold parts.
+        meshed: whether to mesh them, for part.toml.
         plots: whether to draw them.
     """
     from dolfinopt.parallel import together
@@ -38,10 +46,27 @@ def make_solids(
     with together(world):
         if world.rank == 0:
             warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
-            _write(scene, target, parts, plots)
+            _write(scene, target, parts, _meshes(scene, parts) if meshed else None, plots)
 
 
-def _write(scene: Scene, target: Path, parts: dict[int, SolidPart], plots: bool) -> None:
+def _meshes(scene: Scene, parts: dict[int, SolidPart]) -> dict[str, bytes] | None:
+    """Return the meshes of all parts; None, and a warning, where one cannot be meshed."""
+    from dolfinopt.part.solid_files import mesh_solid_parts
+
+    try:
+        return mesh_solid_parts(scene, parts)
+    except InputError as error:
+        warn([f"no part.toml: {error}"])
+        return None
+
+
+def _write(
+    scene: Scene,
+    target: Path,
+    parts: dict[int, SolidPart],
+    meshes: dict[str, bytes] | None,
+    plots: bool,
+) -> None:
     """Write the files and say what was made (root only)."""
     from dolfinopt.output.folders import prepare_folder
     from dolfinopt.part.solid_files import write_solid_parts
@@ -52,7 +77,7 @@ def _write(scene: Scene, target: Path, parts: dict[int, SolidPart], plots: bool)
         draw_solid_parts(path, [parts[k] for k in sorted(parts)], scene.name)
 
     prepare_folder(target)
-    figures = write_solid_parts(target, scene, parts, picture if plots else None)
+    figures = write_solid_parts(target, scene, parts, meshes, picture if plots else None)
     for name, row in figures["arms"].items():
         click.echo(
             f"{name}: {1e9 * row['volume']:.6g} mm3, {row['mass']:.4g} kg, {row['triangles']} "
@@ -63,4 +88,5 @@ def _write(scene: Scene, target: Path, parts: dict[int, SolidPart], plots: bool)
         if owner is None:
             click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
     click.echo("no STEP of solids: their parts are triangles, in STL and 3MF")
-    click.echo(f"{elapsed():.1f} s; files in {target}")
+    machine = "" if meshes is None else ", the machine with these parts in part.toml"
+    click.echo(f"{elapsed():.1f} s; files in {target}{machine}")

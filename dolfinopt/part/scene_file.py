@@ -47,13 +47,39 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
     return data
 
 
+def solid_scene_text(scene: Scene, folder: Path) -> str:
+    """Return the text of a scene in which the arms are parts, meshed with tetrahedra.
+
+    Args:
+        scene: of the run, in space.
+        folder: where the scene and the meshes NAME.msh will lie.
+    """
+    data = scene.to_tree()
+    data["name"] = f"{scene.name}: part"
+    for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
+        if owner is not None:
+            row.update(_meshed(folder.absolute() / f"{arm.name}.msh"))
+            row["cell_shape"] = "tetrahedron"
+            row["symmetric_z"] = row["extruded"] = False
+    data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
+    head = (
+        "# The arms as parts, meshed with tetrahedra: simulate and study them like any scene.\n"
+        f"# Made of the design of {scene.name}.\n"
+    )
+    return head + toml_text(with_relative_paths(data, folder))
+
+
 def _arm(part: Part, mesh: Path) -> dict[str, Any]:
     """Return the keys of an arm that is a part."""
     corners = np.vstack(part.shape.polygons(part.tolerance))
+    return _meshed(mesh) | {"height": float(np.ptp(corners[:, 1]))}
+
+
+def _meshed(mesh: Path) -> dict[str, Any]:
+    """Return the keys of an arm that has a mesh of solid material."""
     return {
         "mesh": str(mesh),
         "element": "quadratic",
-        "height": float(np.ptp(corners[:, 1])),
         "mesh_size": None,
         "cell_shape": None,
         "cells": None,

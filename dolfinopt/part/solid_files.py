@@ -10,19 +10,27 @@ from pathlib import Path
 from typing import IO, Any
 
 from dolfinopt.disk import write_atomically, write_text
-from dolfinopt.part.files import FIGURES, publish
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.surface_solid import mesh_of_surface
+from dolfinopt.part.files import FIGURES, SCENE, publish
+from dolfinopt.part.scene_file import solid_scene_text
 from dolfinopt.part.solid import MM, triangle_bytes
 from dolfinopt.part.solid_part import SolidPart
 from dolfinopt.part.three_mf import three_mf_bytes
 from dolfinopt.scene.load import Scene
 
-FORMATS = (".stl", ".3mf")
+FORMATS = (".stl", ".3mf", ".msh")
 PICTURE = "part.png"
 
 
 def file_names(scene: Scene) -> list[str]:
     """Return the names of all files, the one that says they are complete first."""
-    return [FIGURES, PICTURE, *(f"{arm}{kind}" for arm in _owners(scene) for kind in FORMATS)]
+    return [
+        FIGURES,
+        SCENE,
+        PICTURE,
+        *(f"{arm}{kind}" for arm in _owners(scene) for kind in FORMATS),
+    ]
 
 
 def _owners(scene: Scene) -> dict[str, int]:
@@ -41,10 +49,32 @@ def figures_of(scene: Scene, parts: Mapping[int, SolidPart]) -> dict[str, Any]:
     return {"name": scene.name, "arms": arms, "units": units}
 
 
+def mesh_solid_parts(scene: Scene, parts: Mapping[int, SolidPart]) -> dict[str, bytes]:
+    """Return .msh files of the parts, by the arms' names, in tetrahedra of the design's cell size.
+
+    Raises:
+        InputError: Gmsh cannot mesh a part, or it has no flat ends at the joints.
+    """
+    found = {}
+    for name, owner in _owners(scene).items():
+        part = parts[owner]
+        points, triangles = part.surface.points, part.surface.triangles
+        try:
+            found[name] = mesh_of_surface(points, triangles, _length(scene, name), part.cell)[0]
+        except InputError as error:
+            raise InputError(f"arm {name!r}: {error}") from None
+    return found
+
+
+def _length(scene: Scene, name: str) -> float:
+    return next(arm.length for arm in scene.arms if arm.name == name)
+
+
 def write_solid_parts(
     folder: Path,
     scene: Scene,
     parts: Mapping[int, SolidPart],
+    meshes: Mapping[str, bytes] | None = None,
     picture: Callable[[Path], None] | None = None,
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
@@ -55,6 +85,7 @@ def write_solid_parts(
         folder: exists.
         scene: of the arms.
         parts: by their place among the arms.
+        meshes: of `mesh_solid_parts`, for part.toml; None: there is none.
         picture: draws part.png.
 
     Raises:
@@ -68,6 +99,10 @@ def write_solid_parts(
             stl = triangle_bytes(MM * surface.corners, title)
             write_atomically(made / f"{name}.stl", partial(_put, stl))
             write_atomically(made / f"{name}.3mf", partial(_put, three_mf_bytes(surface, name)))
+        for name, data in (meshes or {}).items():
+            write_atomically(made / f"{name}.msh", partial(_put, data))
+        if meshes is not None:
+            write_text(made / SCENE, solid_scene_text(scene, folder))
         if picture is not None:
             picture(made / PICTURE)
         figures = figures_of(scene, parts)

@@ -77,6 +77,7 @@ class SolidPart:
         pieces: number of pieces left out because they do not join both interfaces.
         pieces_volume: their volume, m3.
         grayness: of the design.
+        cell: size of the design's cells, m.
     """
 
     name: str
@@ -87,6 +88,7 @@ class SolidPart:
     pieces: int
     pieces_volume: float
     grayness: float
+    cell: float
 
     @property
     def watertight(self) -> bool:
@@ -221,9 +223,8 @@ def make_solid_part(domain: SolidDomain) -> SolidPart:
             f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
             'longer, or with design.projection = "robust"'
         )
-    return SolidPart(
-        domain.name, found, level, domain.volume, distance, pieces, lost, domain.grayness
-    )
+    gray, cell = domain.grayness, domain.cell
+    return SolidPart(domain.name, found, level, domain.volume, distance, pieces, lost, gray, cell)
 
 
 def _at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:

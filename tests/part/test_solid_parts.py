@@ -144,7 +144,7 @@ def test_no_part_can_be_made(domain_with, density, words):
 def finished(tmp_path_factory):
     """What `dolfinopt part` reads of a run of two solid links."""
     path = tmp_path_factory.mktemp("solids") / "run"
-    changes = [f"arms.{name}.cells=[20,6,4]" for name in ("link1", "link2")]
+    changes = [f"arms.{name}.cells=[20,4,2]" for name in ("link1", "link2")]
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes)
     arrays = {}
     for arm in scene.arms[1:]:
@@ -167,13 +167,19 @@ def test_two_ranks_write_the_same_solids(finished, tmp_path, capfd):
         {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
         for name in ("one", "two")
     )
-    kinds = [f"link{k}.{kind}" for k in (1, 2) for kind in ("3mf", "stl")]
-    assert sorted(here) == sorted([*kinds, "part.json", "part.png"]) == sorted(there)
+    kinds = [f"link{k}.{kind}" for k in (1, 2) for kind in ("3mf", "msh", "stl")]
+    assert sorted(here) == sorted([*kinds, "part.json", "part.png", "part.toml"]) == sorted(there)
     assert [name for name in here if name != "part.png" and here[name] != there[name]] == []
     rows = json.loads(here["part.json"])["arms"]
     for row in rows.values():
         assert row["volume"] == pytest.approx(row["design_volume"], rel=1e-4)
         assert row["watertight"] and row["pieces_left_out"] == 0
+    # The machine with the parts: solid, of their mass but for the facets of its mesh.
+    scene = do.load_scene(tmp_path / "one" / "part.toml")
+    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[1])
+    assert mesh.area.sum() == pytest.approx(rows["link1"]["volume"], rel=0.01)
+    assert len(mesh.inboard_facets) and len(mesh.outboard_facets)
+    assert scene.design.volume_fraction == 1.0
 
 
 @pytest.mark.parametrize("option", ["--polish=2", "--tolerance=1e-4", "--curves=arcs"])
