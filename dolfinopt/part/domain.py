@@ -33,6 +33,7 @@ class Domain:
         crisp: whether `field` is a projected design, which leaps from cell to cell.
         links: (n, 2, 2) m, lines between the centroids of solid cells of a projected design that
             share a corner at least, where one of them is in a member no wider than a cell.
+        contacts: number of corners in which two solid cells touch that share nothing else.
         rim, rim_cells: (n, 2, 2) m, the sides of cells on the arm's outline, counterclockwise
             around the cell; (n,) which cell.
         outline: the arm's own, bores included.
@@ -51,6 +52,7 @@ class Domain:
     field: np.ndarray
     crisp: bool
     links: np.ndarray
+    contacts: int
     rim: np.ndarray
     rim_cells: np.ndarray
     outline: Region
@@ -153,6 +155,7 @@ def domain_of(
         field=x_phys if field is None else field,
         crisp=field is None and bool(scene.design.projection),
         links=_links(cells.nodes, mesh.centroid, x_phys, bool(scene.design.projection)),
+        contacts=_contacts(cells.nodes, x_phys > 0.5),
         rim=rim,
         rim_cells=rim_cells,
         outline=region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool)),
@@ -164,6 +167,21 @@ def domain_of(
         symmetric=like.symmetric,
         minimum_member=scene.design.minimum_member,
     )
+
+
+def _contacts(nodes: np.ndarray, solid: np.ndarray) -> int:
+    """Return how many nodes are all that two solid cells beside void share."""
+    import scipy.sparse as sp
+
+    chosen = nodes[solid]
+    cells = np.repeat(np.arange(len(chosen)), chosen.shape[1])
+    touch = sp.csc_matrix((np.ones(chosen.size), (cells, chosen.ravel())))
+    pairs = touch[:, np.diff(touch.indptr) == 2].indices.reshape(-1, 2)
+    if not len(pairs):
+        return 0
+    rows = touch.tocsr()
+    shared = rows[pairs[:, 0]].multiply(rows[pairs[:, 1]]).sum(axis=1)
+    return int((np.asarray(shared) == 1.0).sum())
 
 
 def _links(

@@ -37,6 +37,9 @@ LINK = 0.5
 UNIFORM = 1e-3  # range of a density without outline
 PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
 NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
+# Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
+# one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.06.
+CHECKERED, FEW = 0.4, 100
 # Corners are rounded by the tool's radius and so many tolerances: curves may turn a little sharper.
 ROUNDING = 8.0
 
@@ -110,14 +113,20 @@ def draw_outline(
             tool's that curves within the tolerance can hardly turn sharper than it.
 
     Raises:
-        InputError: the tool does not fit into the arm; no material joins the interfaces; what must
-            stay solid is more than the volume.
+        InputError: the tool does not fit into the arm; the design is a checkerboard; no material
+            joins the interfaces; what must stay solid is more than the volume.
     """
     where = f"arm {domain.name!r}"
     if 2.0 * tool_radius >= domain.height:
         raise InputError(
             f"--tool-radius = {tool_radius:g} m: the tool is as wide as {where}, which is "
             f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
+        )
+    solid = int((domain.x_phys > 0.5).sum())
+    if domain.contacts > max(CHECKERED * solid, FEW):
+        raise InputError(
+            f"{where}: its {solid} solid cells touch each other in {domain.contacts} corners: a "
+            "checkerboard has no outline; give design.filter_radius the length of two cells or more"
         )
     radius = tool_radius + ROUNDING * tolerance if rounding is None else rounding
     radius = 0.0 if tool_radius == 0.0 else radius

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from dolfinopt.part.part import Part
 
-WIDTH, LEAST = 12.0, 1.0  # inches, of the picture and of an arm's height
+WIDTH = 12.0  # inches, of the picture
+LEAST, LEAST_PLATE = 0.4, 1.0  # inches, of an arm's height
 LINE, EDGE = "#d55e00", 1.3
 FACE, BRIGHT, DARK = "#b8c4cc", np.array([0.62, 0.68, 0.72]), np.array([0.20, 0.26, 0.31])
 DEPTH = np.array([0.35, 0.35])  # by which a plate's back is moved, of its thickness
@@ -34,7 +35,7 @@ def figure_of_parts(parts: Sequence[Part], title: str) -> Figure:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    figure, rows = _rows(parts, 0.55, 1.5)
+    figure, rows = _rows(parts, 0.52, 1.15, LEAST)
     for axes, part in zip(rows, parts, strict=True):
         axes.add_collection(filled(1e3 * part.domain.corners, part.domain.x_phys))
         for loop in part.shape.polygons(CHORD * part.domain.cell):
@@ -58,7 +59,7 @@ def figure_of_plates(parts: Sequence[Part], densities: Sequence[float] = ()) -> 
         parts: below each other.
         densities: of their material, kg/m3: captions then tell the masses.
     """
-    figure, rows = _rows(parts, 0.32, 0.0)
+    figure, rows = _rows(parts, 0.32, 0.0, LEAST_PLATE)
     for k, (axes, part) in enumerate(zip(rows, parts, strict=True)):
         loops = [1e3 * loop for loop in part.shape.polygons(CHORD * part.domain.cell)]
         _plate(axes, loops, 1e3 * part.domain.thickness * DEPTH)
@@ -75,20 +76,23 @@ def figure_of_plates(parts: Sequence[Part], densities: Sequence[float] = ()) -> 
     return figure
 
 
-def _rows(parts: Sequence[Part], between: float, around: float) -> tuple[Figure, Sequence[Axes]]:
+def _rows(
+    parts: Sequence[Part], between: float, around: float, least: float
+) -> tuple[Figure, Sequence[Axes]]:
     """Return a figure with axes for every part, below each other and to one scale, mm.
 
     Args:
         parts: whose arms' boxes fit into the axes.
         between, around: room for words at every part and at all of them, inches.
+        least: height of axes, inches.
     """
     boxes = [_box(part) for part in parts]
     left, right = min(low[0] for low, _ in boxes), max(high[0] for _, high in boxes)
     scale = (WIDTH - 1.6) / (right - left)
-    heights = [max(scale * (high[1] - low[1]), LEAST) for low, high in boxes]
+    margin = 0.02 * (right - left)
+    heights = [max(scale * (high[1] - low[1] + margin), least) for low, high in boxes]
     figure = new_figure(WIDTH, sum(heights) + between * len(parts) + around, 130)
     rows = figure.subplots(len(parts), 1, squeeze=False, height_ratios=heights)[:, 0]
-    margin = 0.02 * (right - left)
     for axes, (low, high) in zip(rows, boxes, strict=True):
         axes.set_aspect("equal")
         axes.set_xlim(1e3 * (left - margin), 1e3 * (right + margin))

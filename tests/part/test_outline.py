@@ -11,6 +11,7 @@ from mpi4py import MPI
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.part import outline
 from dolfinopt.part.curves import Arc, Line, direction
 from dolfinopt.part.outline import draw_outline
 from dolfinopt.part.part import make_part
@@ -231,3 +232,18 @@ def test_search_finds_roots_and_leaps(size, root, most):
     found = search(lambda x: tried.append(x) or x, size, 0.0, 1.0, (-1.0, 1.0), 1e-4)
     assert found == pytest.approx(root, abs=2e-3)
     assert len(tried) <= most
+
+
+def test_checkerboard_is_refused_before_it_is_drawn(design, monkeypatch):
+    """Its union of thousands of pieces took minutes; a chain of corners alone is drawn."""
+
+    def place(x, y):
+        return np.round((x - x.min()) / 0.02).astype(int), np.round((y - y.min()) / 0.005).astype(
+            int
+        )
+
+    board = design(lambda x, y: sum(place(x, y)) % 2 == 0, "arms.cells=[50,12]")
+    assert board.contacts > 400
+    monkeypatch.setattr(outline, "_given", None)
+    with pytest.raises(InputError, match="checkerboard"):
+        outline.draw_outline(board, 1e-3, 1e-4)
