@@ -38,7 +38,7 @@ UNIFORM = 1e-3  # range of a density without outline
 PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
 NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
 # Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
-# one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.06.
+# one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
 CHECKERED, FEW = 0.4, 100
 # Corners are rounded by the tool's radius and so many tolerances: curves may turn a little sharper.
 ROUNDING = 8.0
