@@ -103,10 +103,9 @@ def made_small(scene: str) -> str:
     if "sample =" not in scene:
         scene = with_key(scene, "simulation", "sample", "0.01")
     if 'projection = "' in scene:
-        # A design cut at one half after two iterations falls apart, which takes long to find out,
-        # unless it is dense.
-        scene = with_key(scene, "design", "volume_fraction", "0.7")
-        scene = with_key(scene, "design", "initial", "0.7")
+        # A design cut at one half after two iterations falls apart unless it is dense.
+        scene = with_key(scene, "design", "volume_fraction", "0.9")
+        scene = with_key(scene, "design", "initial", "0.9")
     if "cells =" not in scene and "mesh =" not in scene:
         first = scene.index("\n", scene.index("[[arms]]")) + 1
         scene = f"{scene[:first]}cells = {SETTINGS['cells']}\n{scene[first:]}"
