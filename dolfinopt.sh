@@ -187,10 +187,26 @@ check() {
     "$(grep -v '^ *$' "$output" | tail -n 1)")$'\n'
 }
 
+# with_ranks FILE COMMAND ...: runs it under mpirun, its output into FILE, and ends with its status.
+# Ranks that wait for others let the processors to other tests.
+with_ranks() {
+  local file=$1
+  shift
+  trap 'kill "$!" 2>/dev/null' TERM
+  OMPI_MCA_mpi_yield_when_idle=1 /usr/bin/mpirun -n "$ranks" "$@" >"$file" 2>&1 &
+  wait "$!"
+}
+
+# told FILE STATUS: prints FILE and ends with the status.
+told() {
+  cat "$1"
+  return "$2"
+}
+
 run_tests() {
-  local output summary="" failed=()
-  output=$(mktemp) || exit 1
-  trap "rm -f '$output'" EXIT
+  local output several beside status summary="" failed=()
+  output=$(mktemp) && several=$(mktemp) || exit 1
+  trap "rm -f '$output' '$several'" EXIT
   cd "$here" || exit 1
   answer_soon
   export NO_COLOR=1 # mpirun gives the ranks a terminal even when there is none
@@ -198,10 +214,16 @@ run_tests() {
   check "ruff format" "$python" -m ruff format --check .
   check "mypy" "$python" -m mypy
   check "imports" "$venv/bin/lint-imports" --no-cache
+  # Several ranks are never busy all the time: they run beside the tests on one rank, and are told
+  # of afterwards. What takes long need not take it twice; a -m among the arguments wins.
+  with_ranks "$several" "$python" -m pytest -m "not slow" "$@" &
+  beside=$!
+  trap "kill $beside 2>/dev/null; rm -f '$output' '$several'" EXIT
   # One rank a test, in as many processes; the tests of a file share what they build.
   check "pytest" "$python" -m pytest -n "$ranks" --dist loadfile "$@"
-  # What takes long need not take it twice; a -m among the arguments wins.
-  check "pytest, $ranks ranks" /usr/bin/mpirun -n "$ranks" "$python" -m pytest -m "not slow" "$@"
+  wait "$beside"
+  status=$?
+  check "pytest, $ranks ranks" told "$several" "$status"
   printf '== summary\n%s' "$summary"
   if [ ${#failed[@]} -gt 0 ]; then
     printf 'FAILED:%s\n' "$(printf ' %s;' "${failed[@]}")"
