@@ -5,6 +5,7 @@ NumPy and SciPy, which scenes without regions do not need.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -51,14 +52,17 @@ class Cells:
 def region_cells(arm: Arm, centroid: np.ndarray) -> RegionCells:
     """Return the cells whose centroids (n_cells, d), m, are in the arm's regions.
 
-    On a solid arm they go through the whole thickness. On an arm with `symmetric` a region stands
-    for its mirror image about y = 0, too.
+    On an arm with `symmetric` a region stands for its mirror image about y = 0, too; with
+    `symmetric_z` for that about z = 0.
     """
     x, y = centroid.T[:2]
-    each = []
-    for region in arm.regions:
-        inside = region.covers(x, y)
-        each.append(inside | region.covers(x, -y) if arm.symmetric else inside)
+    z = centroid[:, 2] if centroid.shape[1] == 3 else np.zeros(len(x))
+    sides = [(y, z)]
+    if arm.symmetric:
+        sides += [(-b, c) for b, c in sides]
+    if arm.symmetric_z:
+        sides += [(b, -c) for b, c in sides]
+    each = [np.any([r.covers(x, b, c) for b, c in sides], axis=0) for r in arm.regions]
     nothing = np.zeros(len(centroid), dtype=bool)
     masks = {"solid": nothing.copy(), "void": nothing.copy()}
     for region, inside in zip(arm.regions, each, strict=True):
@@ -117,22 +121,23 @@ def _falls_apart(cells: Cells, solid: np.ndarray, void: np.ndarray) -> str | Non
 def grid_regions(arm: Arm) -> tuple[RegionCells, tuple[int, str] | None]:
     """Return the cells of a rectangular arm's regions, and `region_problem`."""
     assert arm.cells is not None
-    along, across = arm.cells[:2]  # the same over the thickness
-    i, j = (n.ravel() for n in np.mgrid[:along, :across])
-    centroid = np.column_stack(
-        [(i + 0.5) * arm.length / along, ((j + 0.5) / across - 0.5) * arm.height]
-    )
-    number = np.arange(along * across).reshape(along, across)
-    columns = arm.passive_columns
+    counts = _grid(arm)
+    sizes = arm.length, arm.height, arm.thickness
+    corner = 0.0, 0.5, 0.5  # where the frame is, in sizes
+    index = [n.ravel() for n in np.mgrid[tuple(slice(n) for n in counts)]]
+    parts = zip(index, counts, corner, sizes, strict=False)
+    centroid = np.column_stack([((i + 0.5) / n - middle) * size for i, n, middle, size in parts])
+    number = np.arange(len(centroid)).reshape(counts)
+    along, columns = counts[0], arm.passive_columns
     cells = Cells(
         centroid=centroid,
-        passive=(i < columns) | (i >= along - columns),
-        inboard=i == 0,
-        outboard=i == along - 1,
+        passive=(index[0] < columns) | (index[0] >= along - columns),
+        inboard=index[0] == 0,
+        outboard=index[0] == along - 1,
         pairs=np.concatenate(
             [
-                np.column_stack([number[:-1].ravel(), number[1:].ravel()]),
-                np.column_stack([number[:, :-1].ravel(), number[:, 1:].ravel()]),
+                np.column_stack([n[:-1].ravel(), n[1:].ravel()])
+                for n in (np.moveaxis(number, axis, 0) for axis in range(len(counts)))
             ]
         ),
     )
@@ -148,7 +153,15 @@ def grid_shares(arm: Arm) -> tuple[float, float]:
         return 0.0, 0.0
     assert arm.cells is not None
     found, _ = grid_regions(arm)
-    columns, across = arm.passive_columns, arm.cells[1]
-    inner = found.solid[columns * across : (arm.cells[0] - columns) * across]
-    count = arm.cells[0] * across
+    along, *others = _grid(arm)
+    columns, across = arm.passive_columns, math.prod(others)
+    inner = found.solid[columns * across : (along - columns) * across]
+    count = along * across
     return float(inner.sum() / count), float(found.void.sum() / count)
+
+
+def _grid(arm: Arm) -> tuple[int, ...]:
+    """Return cells along, across and, where a region needs it, over the thickness."""
+    assert arm.cells is not None
+    deep = any(region.depth is not None for region in arm.regions)
+    return arm.cells if deep else arm.cells[:2]

@@ -256,3 +256,45 @@ def test_regions_of_a_mesh_file():
 def test_regions_that_a_mesh_file_cannot_have(words, reason):
     with pytest.raises(InputError, match=reason):
         built(*BORES, "arms.passive=0.0", regions(words))
+
+
+SPACE = ROOT / "demos" / "spatial_arm.toml"
+BLOCK = ("arms.cells=[12,4,4]", "arms.link2.rigid=true", "design.filter_radius=0.05")
+SLOT = '{kind = "void", box = [0.2, -0.01, 0.3, 0.01], depth = [0.0, 0.006]}'
+RIB = '{kind = "solid", box = [0.1, 0.01, 0.4, 0.02]}'
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("symmetric", ["false", "true"])
+def test_regions_of_solids_have_a_depth(symmetric):
+    """Through the whole thickness, or from z0 to z1 (with its mirror image)."""
+    changes = f"arms.link1.regions=[{SLOT}, {RIB}]", f"arms.symmetric_z={symmetric}"
+    scene = do.load_scene(SPACE, (*BLOCK, *changes))
+    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    mesh = do.build_arms(scene, partition, do.Profile())[1].mesh
+    x, y, z = mesh.centroid.T
+    depth = np.abs(z) if symmetric == "true" else z
+    slot = (x > 0.2) & (x < 0.3) & (np.abs(y) < 0.01) & (depth > 0.0) & (depth < 0.006)
+    assert np.array_equal(mesh.void, slot) and slot.any()
+    rib = (x > 0.1) & (x < 0.4) & (y > 0.01)
+    assert np.array_equal(mesh.passive & (x > 0.1) & (x < 0.4), rib) and rib.any()
+    solid, void = scene.arms[1].fixed_shares
+    assert solid == pytest.approx(mesh.passive.mean())
+    assert void == pytest.approx(slot.mean())
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ("box = [0.2, -0.01, 0.3, 0.01], depth = [0.006, 0.0]", "z0 < z1"),
+        ("box = [0.2, -0.01, 0.3, 0.01], depth = [0.02, 0.03]", "z from -0.01"),
+        ("box = [0.2, -0.1, 0.3, 0.1], depth = [-0.1, 0.1]", "nothing joins"),
+    ],
+)
+def test_depths_that_cannot_be(change, words):
+    with pytest.raises(InputError, match=words):
+        do.load_scene(SPACE, (*BLOCK, f'arms.link1.regions=[{{kind="void", {change}}}]'))
+    with pytest.raises(InputError, match="extruded"):
+        do.load_scene(SPACE, (*BLOCK, f"arms.link1.regions=[{SLOT}]", "arms.extruded=true"))
+    with pytest.raises(InputError, match="only with a solid arm"):
+        do.load_scene(TWO_ARM, (*SMALL, f"arms.arm1.regions=[{SLOT}]"))

@@ -19,7 +19,7 @@ from dolfinopt.scene.tables.material import (
     YieldStrength,
     YoungModulus,
 )
-from dolfinopt.scene.tables.regions import Region
+from dolfinopt.scene.tables.regions import Region, check_regions
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -229,6 +229,17 @@ class Arm(Table):
                 raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", (key,))
         if self.extruded and self.cells is None:
             raise Refusal("expected only with cells = [nx, ny, nz]", ("extruded",), ("mesh",))
+        for number, region in enumerate(self.regions):
+            key = "regions", number, "depth"
+            if region.depth is not None and not self.is_solid:
+                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
+            if region.depth is not None and self.extruded:
+                raise Refusal(
+                    "expected none with extruded = true: the design is the same through the "
+                    "thickness",
+                    key,
+                    ("extruded",),
+                )
         return self
 
     @model_validator(mode="after")
@@ -433,7 +444,7 @@ class Arm(Table):
                 (*at, "cells" if self.cells is not None else "cell_shape"),
             )
         self._check_inertia(scene, at)
-        self._check_regions(at)
+        check_regions(self, at)
         if self.pattern is not None:
             self._check_pattern(before, at)
         if self.design is not None:
@@ -510,26 +521,3 @@ class Arm(Table):
                     (*at, key),
                     (*at, "pattern"),
                 )
-
-    def _check_regions(self, at: Loc) -> None:
-        """Refuse a region outside a rectangular arm; other things the mesh must tell."""
-        for number, region in enumerate(self.regions if self.cells is not None else ()):
-            x0, y0, x1, y1 = region.bounds
-            half = 0.5 * self.height
-            if x0 >= self.length or x1 <= 0.0 or y0 >= half or y1 <= -half:
-                raise Refusal(
-                    f"expected a place in the arm, x from 0 to {self.length} and y from {-half:g} "
-                    f"to {half:g} [m]",
-                    (*at, "regions", number, region.shape),
-                    (*at, "length"),
-                    (*at, "height"),
-                )
-        if not self.regions or self.cells is None:
-            return
-        from dolfinopt.scene.regions import MOST_CELLS, grid_regions
-
-        problem = grid_regions(self)[1] if self.n_cells <= MOST_CELLS else None
-        if problem is not None:
-            number, reason = problem
-            shape = self.regions[number].shape
-            raise Refusal(reason, (*at, "regions", number, shape), (*at, "passive"), (*at, "cells"))
