@@ -448,8 +448,12 @@ def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[S
 
 
 @cache
-def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
-    """Read a body once for every state of its file."""
+def _read_body(sid: str, changed: int, length: float, spatial: bool) -> ShapeIntegrals:
+    """Read a body in the plane or in space once for every state of its file."""
+    if spatial:
+        from dolfinopt.multibody.spatial.body_of_sid import load_body as load_spatial_body
+
+        return load_spatial_body(Path(sid), length)
     return load_body(Path(sid), length)
 
 
@@ -460,9 +464,17 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     """
     arm = scene.arms[index]
     if arm.sid is not None:
-        body = _read_body(arm.sid, os.stat(arm.sid).st_mtime_ns, arm.length)
-        unwanted = body.is_stiffened and scene.simulation.stiffening is False
-        return linear_part(body) if unwanted else body
+        changed = os.stat(arm.sid).st_mtime_ns
+        body = _read_body(arm.sid, changed, arm.length, scene.is_spatial)
+        if not body.is_stiffened or scene.simulation.stiffening is not False:
+            return body
+        if scene.is_spatial:
+            raise InputError(
+                f"{arm.sid}: holds geometric stiffness, which simulation.stiffening = false is to "
+                "leave out; that of a body in space is not told from its inertia in such a file: "
+                "write it without, or take true or 'auto'"
+            )
+        return linear_part(body)
     if scene.is_spatial:
         from dolfinopt.multibody.spatial.links import rigid_link
 

@@ -19,6 +19,7 @@ from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.scene.load import Scene
 
 
 KINDS = (".sid", ".sid.npz", ".fem")
@@ -55,6 +56,7 @@ def export(
 
     Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
     geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
+    With [[joints]] in space; of rigid arms the screen tells mass, centre and inertia.
     """
     if urdf:
         if design is not None or overrides:
@@ -69,15 +71,10 @@ def export(
     if scene.is_dir():
         raise InputError(f"{scene}: a folder; name a scene file, or add --urdf for a robot's run")
     world, loaded = load(scene, overrides)
-    if loaded.is_spatial:
-        raise InputError(
-            f"{scene}: a machine in space: expected arms in plane stress, whose bodies these files "
-            "hold"
-        )
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.disk import write_arrays, write_text
+    from dolfinopt.exchange.mbdyn import fem_text
     from dolfinopt.exchange.sid import sid_arrays, sid_text
-    from dolfinopt.multibody.mbdyn import fem_text
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.order_selection import choose_coordinates
@@ -97,9 +94,9 @@ def export(
     bodies = gather_arms(partition, exported)
     if world.rank != 0:
         return
-    for arm, owner in zip(loaded.arms, loaded.owners, strict=True):
+    for index, (arm, owner) in enumerate(zip(loaded.arms, loaded.owners, strict=True)):
         if owner is None:
-            click.echo(f"{arm.name}: not exported, it is rigid or comes from a file")
+            click.echo(f"{arm.name}: not exported, {_why(loaded, index)}")
             continue
         data, element = bodies[owner]
         write_text(folder / f"{arm.name}.sid", sid_text(data))
@@ -112,16 +109,41 @@ def export(
         )
 
 
+def _why(scene: Scene, index: int) -> str:
+    """Return why an arm has no files; of a rigid one in space what another program needs of it."""
+    if not (scene.is_spatial and scene.arms[index].rigid):
+        return "it is rigid or comes from a file"
+    from dolfinopt.arms.arm import fixed_body
+    from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
+
+    body = fixed_body(scene, index)
+    centre, tensor = inertia_about_centre(body)
+    place = ", ".join(f"{x:.6g}" for x in centre)
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor
+    moments = ", ".join(f"{x:.6g}" for x in (xx, yy, zz, xy, xz, yz))
+    return (
+        f"it is rigid: {body.mass:.6g} kg, centre ({place}) m, xx, yy, zz, xy, xz, yz about it "
+        f"{moments} kg m2"
+    )
+
+
 def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
-    from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
-    from dolfinopt.multibody.standard_input import spatial_moments, to_sid
-
     body = arm.reduce(x_phys)
+    title = f"{arm.mesh.name} of {arm.scene.name}"
+    if arm.mesh.dim == 3:
+        from dolfinopt.multibody.spatial import mbdyn, standard_input
+
+        if arm.elastic.comm.rank != 0:
+            return None
+        return standard_input.to_sid(body, title), mbdyn.modal_element(body)
+    from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
+    from dolfinopt.multibody.plate_moments import spatial_moments
+    from dolfinopt.multibody.standard_input import to_sid
+
     assert arm.basis is not None
     moments = spatial_moments(arm.elastic, arm.basis, thickness)
     nodes = lumped_nodes(arm.elastic, arm.basis)
     if nodes is None:
         return None
-    title = f"{arm.mesh.name} of {arm.scene.name}"
     return to_sid(body, moments, comment=title), modal_element(body, moments, nodes, thickness)

@@ -140,15 +140,13 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
     Args:
         scene: of the run.
         index: of the arm.
-        body: its integrals in space; w and W hold int x and int x x' of the undeformed body.
+        body: its integrals in space.
     """
     from dolfinopt.exchange.urdf.robot import Inertia
+    from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
 
     arm = scene.arms[index]
-    second = body.W[:, 0, 0].reshape(3, 3)
-    centre = body.w[:, 0] / body.mass
-    second = second - body.mass * np.outer(centre, centre)
-    own = Inertia(float(body.mass), centre, np.trace(second) * np.eye(3) - second)
+    own = Inertia(float(body.mass), *inertia_about_centre(body))
     motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
     return own + motor
 

@@ -23,13 +23,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import (
-    DIAGONAL,
     GENERAL,
     SYMMETRIC,
     UNIT,
@@ -37,37 +35,22 @@ from dolfinopt.exchange.sid import (
     Node,
     StandardInputData,
     read_sid,
+    structure_of,
     taylor,
 )
+from dolfinopt.multibody.plate_moments import SpatialMoments, slender_moments
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
-
-if TYPE_CHECKING:
-    from dolfinopt.fem.elasticity import ElasticArm
-    from dolfinopt.reduction import Basis
-
-# What may stand where a body in plane motion has zeros, relative to the matrix's largest entry:
-# finite elements leave 1e-12, files with six digits 1e-6.
-PLANAR = 1e-6
-# How far the centrifugal matrix may be from -Me, relative to Me: lumped masses reach 5 %,
-# geometric stiffening by rotation about z makes its diagonal positive for slender bodies.
-CENTRIFUGAL = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class SpatialMoments:
-    """Integrals over the mass of a plate of constant thickness about its middle plane z = 0.
-
-    Attributes:
-        second: (2, 2) int X X', kg m2.
-        depth: int z^2, kg m2.
-        first: (2, 2, q) int X_i Phi_jk.
-        mixed: (2, 2, q, q) int Phi_ik Phi_jl.
-    """
-
-    second: np.ndarray
-    depth: float
-    first: np.ndarray
-    mixed: np.ndarray
+from dolfinopt.multibody.sid_checks import (
+    CENTRIFUGAL,
+    SMALL,
+    check_definite,
+    check_deviations,
+    check_stresses,
+    check_symmetric,
+    ends,
+    is_stiffened,
+    scales,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,50 +69,6 @@ class PlaneNode:
     point: np.ndarray
     motion: np.ndarray
     K0: np.ndarray | None = None
-
-
-def spatial_moments(arm: ElasticArm, basis: Basis, thickness: float) -> SpatialMoments:
-    """Integrate over the arm's current design (collective on the arm's ranks).
-
-    Args:
-        arm: with its design set.
-        basis: of that design.
-        thickness: t, m; int z^2 = m t^2 / 12.
-    """
-    X, V, MV = arm.points, basis.V, basis.MV
-    q = V.shape[2]
-    rigid = arm.rigid_inertia
-    # The mass matrix treats x and y alike: its product with (x, y) has M x and M y as components.
-    parts = (
-        rigid[:, 0, 0].sum(),
-        np.einsum("ni,nj->ij", X, rigid[:, :, 1]),
-        np.einsum("ni,njk->ijk", X, MV),
-        np.einsum("nik,njl->ijkl", V, MV),
-    )
-    packed = np.concatenate([np.ravel(part) for part in parts])
-    if arm.comm.size > 1:
-        packed = arm.comm.allreduce(packed)
-    mass, second, first, mixed = np.split(packed, np.cumsum([1, 4, 4 * q]))
-    return SpatialMoments(
-        second=second.reshape(2, 2),
-        depth=float(mass[0]) * thickness**2 / 12.0,
-        first=first.reshape(2, 2, q),
-        mixed=mixed.reshape(2, 2, q, q),
-    )
-
-
-def slender_moments(body: ShapeIntegrals) -> SpatialMoments:
-    """Return a guess from the planar integrals alone: all mass on the x axis, moving across it.
-
-    int y^2 = int z^2 = int y Phi = int Phi_x Phi_x = 0, the rest as the planar integrals have it:
-    the same motion in the plane, and out of it that of a thin bar.
-    """
-    q = body.num_modes
-    first, mixed = np.zeros((2, 2, q)), np.zeros((2, 2, q, q))
-    first[0, 0], first[0, 1] = body.j, body.r
-    mixed[1, 1] = body.M
-    mixed[0, 1], mixed[1, 0] = -0.5 * body.G, 0.5 * body.G
-    return SpatialMoments(np.diag([body.inertia, 0.0]), 0.0, first, mixed)
 
 
 # -- to SID ----------------------------------------------------------------------------------
@@ -156,28 +95,26 @@ def to_sid(
     held = PlaneNode("1", np.zeros(2), np.zeros((3, q)))
     tip = PlaneNode("2", body.outboard_point, body.outboard, body.K0_outboard)
     nodes = (held, *further, tip)
-    frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
-    names = tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1))
     moments = moments or slender_moments(body)
     none = np.zeros((q, 1))
     return StandardInputData(
         mass=body.mass,
-        names=names,
+        names=coordinate_names(body),
         nodes=tuple(_node(node, q) for node in nodes),
         comment=comment,
         Me=taylor(body.M, nq=q, structure=SYMMETRIC),
         ksigma=taylor(none, nq=q, structure=ZERO),
         Ke=taylor(body.K, nq=q, structure=SYMMETRIC),
-        De=taylor(body.D, nq=q, structure=_structure(body.D)),
+        De=taylor(body.D, nq=q, structure=structure_of(body.D)),
         **_rigid_matrices(body, moments),
         **_elastic_matrices(body, moments),
     )
 
 
-def _structure(matrix: np.ndarray) -> int:
-    if np.array_equal(matrix, np.diag(np.diag(matrix))):
-        return DIAGONAL
-    return SYMMETRIC if np.array_equal(matrix, matrix.T) else GENERAL
+def coordinate_names(body: ShapeIntegrals) -> tuple[str, ...]:
+    """Return names that hold sqrt(K_kk / M_kk) in Hz."""
+    frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
+    return tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1))
 
 
 def _node(node: PlaneNode, q: int) -> Node:
@@ -287,7 +224,7 @@ def load_body(path: Path, length: float | None = None) -> ShapeIntegrals:
     body = from_sid(read_sid(path), source=str(path))
     if length is not None:
         x, y = body.outboard_point
-        if np.hypot(x - length, y) > PLANAR * length:
+        if np.hypot(x - length, y) > SMALL * length:
             raise InputError(
                 f"{path}: the outboard node is at ({x:.7g}, {y:.7g}) m, but the arm's length is "
                 f"{length:.7g} m; it must be at (length, 0)"
@@ -317,18 +254,19 @@ def from_sid(
             out of the plane, initial stresses, geometric stiffening by some loads only, matrices
             that are no mechanical body's.
     """
-    first, last = _ends(data, inboard, outboard, source)
-    _check_nodes(data, first, last, source)
+    first, last = ends(data, inboard, outboard, source)
+    _check_nodes(first, last, source)
     _check_plane(data, source)
-    _check_definite(data, source)
-    _check_stresses(data, source)
+    inertia = data.inertia(np.zeros(data.num_modes))[2, 2]
+    check_definite(data, {"mass": data.mass, "J(3, 3)": inertia}, source)
+    check_stresses(data, source)
     G, M = 0.5 * data.Ge.M0[:, 2::3], data.Me.M0
-    if np.abs(G + G.T).max() > PLANAR * np.abs(M).max():
+    if np.abs(G + G.T).max() > SMALL * np.abs(M).max():
         raise InputError(f"{source}: the columns 3, 6, ... of Ge must be a skew matrix")
     return plane_body(
         mass=data.mass,
         moment=data.mdCM.M0[:2, 0].copy(),
-        inertia=float(data.inertia(np.zeros(data.num_modes))[2, 2]),
+        inertia=float(inertia),
         C=data.Ct.M0[:, :2].T.copy(),
         j=0.0 - data.Oe.M0[:, 2],
         r=data.Cr.M0[:, 2].copy(),
@@ -342,34 +280,11 @@ def from_sid(
     )
 
 
-def _ends(
-    data: StandardInputData, inboard: str | None, outboard: str | None, source: str
-) -> tuple[Node, Node]:
-    """Return the two interface nodes."""
-    names = [node.name for node in data.nodes]
-    if len(names) < 2:
-        raise InputError(
-            f"{source}: lacks an outboard node, its nodes are: {', '.join(names) or 'none'}; an "
-            "arm needs an inboard node at the origin and an outboard node"
-        )
-    for side, name in (("inboard", inboard), ("outboard", outboard)):
-        if name is not None and name not in names:
-            raise InputError(f"{source}: no {side} node {name!r}; it has {', '.join(names)}")
-    first = data.nodes[0 if inboard is None else names.index(inboard)]
-    last = data.nodes[-1 if outboard is None else names.index(outboard)]
-    if first is last:
-        raise InputError(f"{source}: node {first.name} cannot be both inboard and outboard")
-    return first, last
-
-
-def _check_nodes(data: StandardInputData, first: Node, last: Node, source: str) -> None:
+def _check_nodes(first: Node, last: Node, source: str) -> None:
     """Check that the frame is held at the first node, and that the last moves in the plane."""
-    length = np.abs(last.origin.M0).max()
-    if not length > 0.0:
+    if not np.abs(last.origin.M0).max() > 0.0:
         raise InputError(f"{source}: the outboard node {last.name} is at the origin")
-    push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
-    # Of the two scales the other follows over the arm's length.
-    push, turn = max(push, length * turn), max(turn, push / length)
+    length, push, turn = scales(last)
     checks = [
         (first, "origin", first.origin.M0, length, "at the origin"),
         (first, "phi", first.phi.M0, push, "held in the frame"),
@@ -379,12 +294,7 @@ def _check_nodes(data: StandardInputData, first: Node, last: Node, source: str) 
         (last, "psi", last.psi.M0[:2], turn, "in the plane"),
     ]
     checks += [(node, "AP", node.AP.M0 - np.eye(3), 1.0, "parallel") for node in (first, last)]
-    for node, name, values, scale, must in checks:
-        if np.abs(values).max() > PLANAR * scale:
-            raise InputError(
-                f"{source}: {name} of node {node.name} deviates by {np.abs(values).max():.3g}; the "
-                f"{'inboard' if node is first else 'outboard'} node must be {must}"
-            )
+    check_deviations(checks, first, source)
 
 
 def _check_plane(data: StandardInputData, source: str) -> None:
@@ -397,43 +307,15 @@ def _check_plane(data: StandardInputData, source: str) -> None:
         ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
     )
     for name, values, whole in spatial:
-        if np.abs(values).max() > PLANAR * np.abs(whole).max():
+        if np.abs(values).max() > SMALL * np.abs(whole).max():
             raise InputError(
                 f"{source}: {name} reach(es) {np.abs(values).max():.3g}; an arm must move in the "
                 "x-y plane only"
             )
 
 
-def _check_definite(data: StandardInputData, source: str) -> None:
-    """Check that a mechanical body may have these masses and stiffnesses."""
-    inertia = data.inertia(np.zeros(data.num_modes))[2, 2]
-    for name, number in (("mass", data.mass), ("J(3, 3)", inertia)):
-        if not number > 0.0:
-            raise InputError(f"{source}: {name} = {number:g} must be > 0")
-    for name, matrix in (("Me", data.Me.M0), ("Ke", data.Ke.M0)):
-        if np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] <= 0.0:
-            raise InputError(
-                f"{source}: {name} must be positive definite; the body must be held at its inboard "
-                "node and its coordinates be independent"
-            )
-
-
-def _check_stresses(data: StandardInputData, source: str) -> None:
-    """Check that there are no initial stresses, and that the stiffness is one matrix."""
-    for name, values in (("ksigma", data.ksigma.M0), ("m1 of Ke", data.Ke.M1)):
-        if values.any():
-            raise InputError(
-                f"{source}: {name} holds initial stresses or a stiffness that is not constant, "
-                "which arms do not have here; write the file without"
-            )
-
-
 def _geometric_stiffness(data: StandardInputData, last: Node, source: str) -> np.ndarray | None:
-    """Return K0 (7, q, q) of the seven loads in the plane, None if the body is linear.
-
-    All or none of them: a body that its own inertia stiffens, but no load at its outboard node, or
-    the other way round, is taken for one whose file lacks matrices.
-    """
+    """Return K0 (7, q, q) of the seven loads in the plane, None if the body is linear."""
     q = data.num_modes
     excess = data.Oe.M1[:, :, 2] + data.Me.M0 if data.Oe.order > 0 else np.zeros((q, q))
     rotation = np.abs(excess).max(initial=0.0) > CENTRIFUGAL * np.abs(data.Me.M0).max(initial=0.0)
@@ -442,23 +324,11 @@ def _geometric_stiffness(data: StandardInputData, last: Node, source: str) -> np
         "m1 of Oe beyond -Me": bool(rotation),
         f"m1 of phi of node {last.name}": bool(last.phi.M1[:2].any()),
     }
-    if not any(found.values()):
+    if not is_stiffened(found, source):
         return None
-    if lacking := [name for name, present in found.items() if not present]:
-        present = next(name for name in found if found[name])
-        raise InputError(
-            f"{source}: {present} holds geometric stiffening, which {lacking[0]} lacks; write the "
-            "file with that of all accelerations and of the outboard node's forces, or with none"
-        )
     push = list(data.Ct.M1.transpose(2, 0, 1)[:2])
     tip = [*last.phi.M1[:2], last.psi.M1[2] if last.psi.order else np.zeros((q, q))]
-    for name, matrices in (("Ct", push), (f"phi, psi of node {last.name}", tip)):
-        for matrix in matrices:
-            if np.abs(matrix - matrix.T).max() > PLANAR * np.abs(matrix).max():
-                raise InputError(
-                    f"{source}: m1 of {name} must be symmetric in coordinates and rows or columns: "
-                    "it is the geometric stiffness of one load"
-                )
+    check_symmetric({"Ct": push, f"phi, psi of node {last.name}": tip}, source)
     turn = data.Cr.M1[:, :, 2] if data.Cr.order else np.zeros((q, q))  # its skew part is G
     K0 = 0.0 - np.array([*push, turn, 0.0 - excess, *tip])
     return 0.5 * (K0 + K0.transpose(0, 2, 1))

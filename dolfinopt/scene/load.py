@@ -203,15 +203,20 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
             continue
         from dolfinopt.exchange.sid import read_sid  # NumPy, which other scenes do not need
 
-        x, y = read_sid(Path(arm["sid"])).nodes[-1].origin.M0.ravel()[:2]
-        length = math.hypot(x, y)
+        nodes = read_sid(Path(arm["sid"])).nodes
+        if not nodes:
+            raise InputError(
+                f"{arm['sid']}: no nodes; an arm needs an inboard node at the origin and an "
+                "outboard node"
+            )
+        length = math.hypot(*nodes[-1].origin.M0.ravel())
         if ("arms", i, "length") in inherited or "length" not in arm:
             arm["length"] = length
         for key in ("height", "thickness"):
             arm.setdefault(key, length / 20.0)
         # What a mesh would need says nothing about a body from a file.
         for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
-            if loc[2] in ("passive", *MESH_KEYS):
+            if loc[2] in (*PATTERN_KEYS, *MESH_KEYS):
                 arm.pop(loc[2], None)
 
 

@@ -8,27 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomllib
+from mbdyn_reader import mbdyn_stiffening, read_as_mbdyn_does
 from mpi4py import MPI
 from runs import TWO_ARM
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
+from dolfinopt.exchange.mbdyn import ModalElement, fem_text, read_fem, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.multibody.mbdyn import (
-    ModalElement,
-    fem_text,
-    lumped_nodes,
-    modal_element,
-    read_fem,
-    write_fem,
-)
+from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
+from dolfinopt.multibody.plate_moments import spatial_moments
 from dolfinopt.multibody.shape_integrals import shape_integrals
-from dolfinopt.multibody.standard_input import load_body, spatial_moments
+from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
@@ -86,19 +82,6 @@ def test_round_trip_of_a_stiffened_body_is_exact(tmp_path, stiff_element):
     assert len(stiff_element.loads) == 7
 
 
-def mbdyn_stiffening(groups, a, w, wd, force, moment):
-    """Return what MBDyn adds to the modal stiffness (left-hand side), by the steps of modalad.cc.
-
-    Args:
-        groups: as read.
-        a, w, wd: (3,) acceleration less gravity, angular velocity and acceleration, body frame.
-        force, moment: (3,) that the joint exerts on its first interface node.
-    """
-    products = [w[0] ** 2, w[1] ** 2, w[2] ** 2, w[0] * w[1], w[1] * w[2], w[2] * w[0]]
-    factors = np.concatenate([products, wd, a, -force, -moment])
-    return sum(factors[load - 1] * matrix for load, matrix in groups[19])
-
-
 def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
     """Any motion in the plane, force and moment outboard: rows lose sum_p p K0_p q."""
     body = stiff_parts[0]
@@ -116,67 +99,6 @@ def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
     for load in ({"w": w}, {"force": np.array([-1.0, 0.0, 0.0])}):
         all_loads = {"a": still, "w": still, "wd": still, "force": still, "moment": still, **load}
         assert mbdyn_stiffening(groups, **all_loads)[1, 1] > 0.0
-
-
-def read_as_mbdyn_does(text):
-    """Return the numbers of every record group, by the steps of MBDyn's reader.
-
-    It takes a line when it looks for a group, then as many words as it needs wherever line ends
-    are, then the rest of the line; mode shapes begin with a line that begins with two stars.
-    """
-    position = 0
-
-    def line():
-        nonlocal position
-        end = text.index("\n", position)
-        found, position = text[position:end], end + 1
-        return found
-
-    def words(count):
-        nonlocal position
-        found = []
-        for _ in range(count):
-            while text[position].isspace():
-                position += 1
-            start = position
-            while not text[position].isspace():
-                position += 1
-            found.append(text[start:position])
-        return found
-
-    def numbers(*shape):
-        return np.array(words(int(np.prod(shape))), dtype=float).reshape(shape)
-
-    groups = {}
-    while position < len(text):
-        title = line()
-        if not title.startswith("** RECORD GROUP "):
-            continue
-        group = int(title[len("** RECORD GROUP ") :].split(",")[0])
-        if group == 1:
-            line()
-            revision, *sizes = words(6)
-            count, modes, *others = map(int, sizes)
-            assert revision == "REV0" and others == [0, 0, 0]
-            groups[1] = (count, modes)
-        elif group == 2:
-            groups[2] = words(count)
-        elif group == 8:
-            shapes = []
-            for _ in range(modes):
-                assert line().startswith("**")
-                shapes.append(numbers(count, 6))
-                assert not line().strip()
-            groups[8] = np.array(shapes)
-        else:
-            square, nodal = (modes, modes), (count,)
-            if group == 19:
-                count = int(words(1)[0])
-                groups[19] = [(int(words(1)[0]), numbers(*square)) for _ in range(count)]
-                continue
-            shape = {5: nodal, 6: nodal, 7: nodal, 11: (count, 6), 12: (13,)}.get(group, square)
-            groups[group] = numbers(*shape)
-    return groups
 
 
 def test_mbdyn_reads_it(element):

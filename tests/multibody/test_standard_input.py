@@ -1,12 +1,13 @@
 """Plane bodies in the spatial format: exact round trips, forces against point masses in space."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bodies import Cloud, assert_close, beam, random_cloud
 from mpi4py import MPI
+from standard_input import State, forces_of_sid, random_state
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
@@ -19,21 +20,14 @@ from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.plate_moments import SpatialMoments, slender_moments, spatial_moments
 from dolfinopt.multibody.shape_integrals import (
     TABLE,
     ShapeIntegrals,
     linear_part,
     shape_integrals,
 )
-from dolfinopt.multibody.standard_input import (
-    PlaneNode,
-    SpatialMoments,
-    from_sid,
-    load_body,
-    slender_moments,
-    spatial_moments,
-    to_sid,
-)
+from dolfinopt.multibody.standard_input import PlaneNode, from_sid, load_body, to_sid
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
@@ -136,25 +130,6 @@ def test_round_trip_of_geometric_stiffness(tmp_path, q, known):
 # -- forces ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class State:
-    """Motion of a frame in space and of the coordinates in it, components in the frame."""
-
-    a: np.ndarray
-    w: np.ndarray
-    g: np.ndarray
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-
-
-def random_state(rng, q, plane):
-    a, w, g = rng.normal(size=(3, 3))
-    if plane:
-        a[2] = w[0] = w[1] = g[0] = g[1] = 0.0
-    return State(a, w, g, *rng.normal(scale=0.5, size=(3, q)))
-
-
 def forces_of_points(cloud: Cloud, depth: float, s: State):
     """Return force, moment and elastic rows, point by point; half the mass at z = -+ depth."""
     force, moment, rows = np.zeros(3), np.zeros(3), np.zeros(len(s.q))
@@ -171,40 +146,6 @@ def forces_of_points(cloud: Cloud, depth: float, s: State):
             )
             load = 0.5 * mass * acceleration
             force, moment, rows = force + load, moment + np.cross(p, load), rows + Phi.T @ load
-    return force, moment, rows
-
-
-def forces_of_sid(data, s: State):
-    """Return the same from standard input data, by the equations of the floating frame."""
-    q, w = len(s.q), s.w
-    Gr, Ge = data.Gr.at(s.q).reshape(3, q, 3), data.Ge.at(s.q).reshape(q, q, 3)
-    Ct, Cr, Oe = data.Ct.at(s.q), data.Cr.at(s.q), data.Oe.at(s.q)
-    centre = data.mdCM.at(s.q)[:, 0]
-    # The inertia's second order is not in J: it is half of what Gr has of the first.
-    quadratic = np.einsum("k,l,ilkj->ij", s.q, s.q, data.Gr.M1.reshape(3, q, q, 3))
-    J = data.inertia(s.q) + 0.5 * quadratic
-    products = np.array([w[0] ** 2, w[1] ** 2, w[2] ** 2, w[0] * w[1], w[1] * w[2], w[0] * w[2]])
-    force = (
-        data.mass * s.a
-        + np.cross(s.g, centre)
-        + np.cross(w, np.cross(w, centre))
-        + 2.0 * np.cross(w, Ct.T @ s.qd)
-        + Ct.T @ s.qdd
-    )
-    moment = (
-        np.cross(centre, s.a)
-        + J @ s.g
-        + np.cross(w, J @ w)
-        + np.einsum("ikj,k,j->i", Gr, s.qd, w)
-        + Cr.T @ s.qdd
-    )
-    rows = (
-        Ct @ s.a
-        + Cr @ s.g
-        + np.einsum("ikj,k,j->i", Ge, s.qd, w)
-        + Oe @ products
-        + data.Me.at(s.q) @ s.qdd
-    )
     return force, moment, rows
 
 

@@ -156,12 +156,6 @@ def _check_machine(scene: Scene) -> None:
             ("joints",),
         )
     for k, arm in enumerate(scene.arms):
-        if arm.sid is not None:
-            raise Refusal(
-                "expected none with [[joints]]: such a file is read as that of a body in the plane",
-                ("arms", k, "sid"),
-                ("joints",),
-            )
         if arm.joint_stiffness > 0.0:
             raise Refusal(
                 "expected 0 with [[joints]]: springs of drives are simulated in the plane",

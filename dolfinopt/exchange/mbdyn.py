@@ -1,0 +1,290 @@
+"""MBDyn's plain-ASCII .fem file of a modal element.
+
+Record groups of MBDyn's input manual, "Modal element": header (1), node labels (2), nodal
+coordinates (5 to 7), mode shapes (8), modal mass and stiffness (9, 10), global inertia (12), modal
+damping (13), and what couples the modes to the motion of the frame: either the diagonal of the
+lumped mass matrix (11), of which MBDyn makes its invariants, or the invariants themselves (14 to
+18), never both: MBDyn would add them up.
+
+    14: Inv3_j = int Phi_j           15: Inv4_j = int X x Phi_j       16: Inv8_j = -int X~ Phi_j~
+    17: Inv5_jk = int Phi_j x Phi_k  18: Inv9_jk = int Phi_j~ Phi_k~
+
+Group 19, of stiffened bodies, has their number and then one matrix K_i for every load, each behind
+the load's place in this list, counted from one: products of the angular velocity w1^2, w2^2, w3^2,
+w1 w2, w2 w3, w3 w1, angular acceleration 1 to 3, acceleration 1 to 3 (less gravity), then force and
+moment 1 to 3 of every interface node in the order of the joint's input. All in the body's frame.
+MBDyn's modal rows become (M qdd + ... + K q) + sum_i p_i K_i q of its motion and - f_i K_i q of the
+force and moment f that the joint exerts on the interface node.
+
+The inboard interface, node 1, is the modal node itself; the outboard ones, nodes 2, 3, ..., must be
+the joint's interface nodes in this order. MBDyn uses group 19 with `use automatic differentiation;`
+in the control data. Interfaces move linearly in q: the displacement of the second order,
+-1/2 q'K0 q, is not in this format.
+Source: Masarati, MBDyn input file format, and the reader in MBDyn's mbdyn/struct/modal.cc, of
+group 19 modalad.cc.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dolfinopt.disk import write_atomically
+from dolfinopt.errors import InputError
+
+_TITLES = {
+    1: "HEADER",
+    2: "FINITE ELEMENT NODE LIST",
+    5: "NODAL X COORDINATES",
+    6: "NODAL Y COORDINATES",
+    7: "NODAL Z COORDINATES",
+    8: "MODE SHAPES",
+    9: "MODAL MASS MATRIX",
+    10: "MODAL STIFFNESS MATRIX",
+    11: "DIAGONAL OF LUMPED MASS MATRIX",
+    12: "GLOBAL INERTIA",
+    13: "MODAL DAMPING MATRIX",
+    14: "INVARIANT 3",
+    15: "INVARIANT 4",
+    16: "INVARIANT 8",
+    17: "INVARIANT 5",
+    18: "INVARIANT 9",
+    19: "MODAL STRESS STIFFENING MATRIX",
+}
+LUMPED = 11
+INVARIANTS = (14, 15, 16, 17, 18)
+STIFFENING = 19  # the group that linear bodies do not have
+
+
+@dataclass(frozen=True, eq=False)
+class Invariants:
+    """Integrals over the mass that couple q modes Phi to the motion of the frame, SI units.
+
+    Attributes:
+        three: (3, q) int Phi_j.
+        four: (3, q) int X x Phi_j.
+        five: (3, q, q) int Phi_j x Phi_k.
+        eight: (3, 3, q) -int X~ Phi_j~.
+        nine: (3, 3, q, q) int Phi_j~ Phi_k~.
+    """
+
+    three: np.ndarray
+    four: np.ndarray
+    five: np.ndarray
+    eight: np.ndarray
+    nine: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ModalElement:
+    """A flexible body as MBDyn reads it.
+
+    Attributes:
+        labels: (n,) of the nodes, without blanks.
+        points: (n, 3) m.
+        modes: (n, 6, q) three translations and three rotations of every node.
+        M, K, D: (q, q) modal mass, stiffness and damping.
+        lumped: (n, 6) mass (three times, kg) and moments of inertia (kg m2) of every node; or None.
+        mass: kg.
+        centre: (3,) of mass, m.
+        inertia: (3, 3) about the centre of mass, kg m2.
+        loads: (k,) places of the loads that stiffen the body in group 19's list, ascending; none
+            of a linear body.
+        stiffening: (k, q, q) their matrices, MBDyn's signs.
+        invariants: in place of the lumped masses, or None.
+    """
+
+    labels: tuple[str, ...]
+    points: np.ndarray
+    modes: np.ndarray
+    M: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    lumped: np.ndarray | None
+    mass: float
+    centre: np.ndarray
+    inertia: np.ndarray
+    loads: np.ndarray
+    stiffening: np.ndarray
+    invariants: Invariants | None = None
+
+
+# -- writing ---------------------------------------------------------------------------------
+
+
+def write_fem(path: Path, element: ModalElement) -> None:
+    """Write the file; `read_fem` gets the same numbers back."""
+    write_atomically(path, lambda stream: stream.write(fem_text(element).encode("ascii")))
+
+
+def fem_text(element: ModalElement) -> str:
+    """Return the content of the file, numbers with 17 digits."""
+    count, q = len(element.labels), len(element.M)
+    lines = ["** MBDyn MODAL DATA FILE", '** NODE SET "ALL"', "**"]
+
+    def group(number: int, rows: Iterable[str]) -> None:
+        lines.append(f"** RECORD GROUP {number}, {_TITLES[number]}")
+        lines.extend(rows)
+        lines.append("**")
+
+    header = "**   REVISION,  NODE,  NORMAL, ATTACHMENT, CONSTRAINT, REJECTED MODES."
+    group(1, [header, f"      REV0{count:10d}{q:10d}{0:10d}{0:10d}{0:10d}"])
+    labels = element.labels
+    group(2, (" ".join(f"{name:>9}" for name in labels[k : k + 6]) for k in range(0, count, 6)))
+    for axis in range(3):
+        group(5 + axis, _rows(element.points[:, [axis]]))
+    shapes: list[str] = []
+    for k in range(q):
+        shapes += [f"**    NORMAL MODE SHAPE #  {k + 1}", *_rows(element.modes[:, :, k])]
+    group(8, shapes)
+    group(9, _rows(element.M))
+    group(10, _rows(element.K))
+    if element.lumped is not None:
+        group(LUMPED, _rows(element.lumped))
+    inertia = [*_rows(np.array([[element.mass]])), *_rows(element.centre[None])]
+    group(12, [*inertia, *_rows(element.inertia)])
+    group(13, _rows(element.D))
+    if element.invariants is not None:
+        for number, matrix in zip(INVARIANTS, _packed(element.invariants), strict=True):
+            group(number, _rows(matrix))
+    if len(element.loads):
+        matrices = [str(len(element.loads))]
+        for load, matrix in zip(element.loads, element.stiffening, strict=True):
+            matrices += [str(load), *_rows(matrix)]
+        group(STIFFENING, matrices)
+    return "\n".join(lines) + "\n"
+
+
+def _packed(invariants: Invariants) -> tuple[np.ndarray, ...]:
+    """Return the numbers of groups 14 to 18 in MBDyn's order, as rows of the file.
+
+    Rows of the invariants are outermost; within them modes j, then k, then columns.
+    """
+    one, q = invariants, invariants.three.shape[1]
+    return (
+        one.three,
+        one.four,
+        one.eight.transpose(0, 2, 1).reshape(-1, 3),
+        one.five.reshape(-1, q),
+        one.nine.transpose(0, 2, 3, 1).reshape(-1, 3),
+    )
+
+
+def _rows(values: np.ndarray) -> list[str]:
+    return [" ".join(f"{v: .16e}" if v != 0.0 else " 0." for v in row) for row in values]
+
+
+# -- reading ---------------------------------------------------------------------------------
+
+
+def read_fem(path: Path) -> ModalElement:
+    """Read a .fem file with the record groups that `write_fem` writes.
+
+    Groups may come in any order after the first; others are passed over. Without group 19 the body
+    is linear.
+
+    Raises:
+        InputError: one line with the file, the group and what is wrong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); name a .fem file") from None
+    groups: dict[int, list[str]] = {}
+    number = 0
+    for line in text.splitlines():
+        title = re.match(r"\*\* RECORD GROUP\s+(\d+)", line)
+        if title:
+            number = int(title[1])
+            if number in groups:
+                raise InputError(f"{path}: record group {number} appears twice")
+            groups[number] = []
+        elif number and not line.startswith("**"):
+            groups[number] += line.split()
+    coupling = INVARIANTS if any(k in groups for k in INVARIANTS) else (LUMPED,)
+    if LUMPED in groups and coupling != (LUMPED,):
+        raise InputError(
+            f"{path}: record groups {LUMPED} and {INVARIANTS[0]} to {INVARIANTS[-1]} exclude each "
+            "other: MBDyn would add up what both say; remove one of them"
+        )
+    needed = [k for k in _TITLES if k not in (LUMPED, *INVARIANTS, STIFFENING)]
+    missing = [k for k in sorted([*needed, *coupling]) if k not in groups]
+    if missing:
+        raise InputError(f"{path}: record group {missing[0]}, {_TITLES[missing[0]]}, is missing")
+    return _element(path, groups)
+
+
+def _element(path: Path, groups: dict[int, list[str]]) -> ModalElement:
+    sizes = groups[1][1:]
+    if len(sizes) != 5 or not all(word.isdecimal() for word in sizes):
+        raise InputError(
+            f"{path}: record group 1 has {' '.join(groups[1])!r}, expected REV0 and five integers"
+        )
+    count = int(sizes[0])
+    q = int(sizes[1]) + int(sizes[2]) + int(sizes[3]) - int(sizes[4])
+    if len(groups[2]) != count:
+        raise InputError(f"{path}: record group 2 has {len(groups[2])} labels, expected {count}")
+
+    def numbers(group: int, *shape: int) -> np.ndarray:
+        words = groups[group]
+        if len(words) != np.prod(shape):
+            raise InputError(
+                f"{path}: record group {group} has {len(words)} numbers, expected {np.prod(shape)}"
+            )
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError as error:
+            raise InputError(f"{path}: record group {group}: {error}") from None
+        return values.reshape(shape)
+
+    loads, stiffening = _stiffening(path, groups, q, numbers)
+    inertia = numbers(12, 13)
+    return ModalElement(
+        labels=tuple(groups[2]),
+        points=np.column_stack([numbers(5 + axis, count) for axis in range(3)]),
+        modes=numbers(8, q, count, 6).transpose(1, 2, 0),
+        M=numbers(9, q, q),
+        K=numbers(10, q, q),
+        D=numbers(13, q, q),
+        lumped=numbers(LUMPED, count, 6) if LUMPED in groups else None,
+        mass=float(inertia[0]),
+        centre=inertia[1:4],
+        inertia=inertia[4:].reshape(3, 3),
+        loads=loads,
+        stiffening=stiffening,
+        invariants=None if LUMPED in groups else _invariants(q, numbers),
+    )
+
+
+def _invariants(q: int, numbers: Callable[..., np.ndarray]) -> Invariants:
+    """Return what groups 14 to 18 hold, see `_packed`."""
+    return Invariants(
+        three=numbers(14, 3, q),
+        four=numbers(15, 3, q),
+        five=numbers(17, 3, q, q),
+        eight=numbers(16, 3, q, 3).transpose(0, 2, 1),
+        nine=numbers(18, 3, q, q, 3).transpose(0, 3, 1, 2),
+    )
+
+
+def _stiffening(
+    path: Path, groups: dict[int, list[str]], q: int, numbers: Callable[..., np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return places (k,) and matrices (k, q, q) of group 19; k = 0 without it."""
+    if STIFFENING not in groups:
+        return np.zeros(0, dtype=int), np.zeros((0, q, q))
+    words = groups[STIFFENING]
+    known = int(words[0]) if words and words[0].isdecimal() else 0
+    stride = 1 + q * q
+    table = numbers(STIFFENING, 1 + known * stride)[1:].reshape(known, stride)
+    loads, stiffening = table[:, 0].astype(int), table[:, 1:].reshape(known, q, q)
+    if not known or (loads != table[:, 0]).any() or loads.min() < 1:
+        raise InputError(
+            f"{path}: record group {STIFFENING} must hold a number of matrices >= 1 and, "
+            "before each of them, the place of its load, an integer >= 1"
+        )
+    return loads, stiffening

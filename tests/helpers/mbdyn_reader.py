@@ -1,0 +1,116 @@
+"""MBDyn's modal element as its sources read and evaluate it (modal.cc, modalad.cc)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from standard_input import Forces, State
+
+
+def read_as_mbdyn_does(text: str) -> dict[int, Any]:
+    """Return the numbers of every record group, by the steps of MBDyn's reader.
+
+    It takes a line when it looks for a group, then as many words as it needs wherever line ends
+    are, then the rest of the line; mode shapes begin with a line that begins with two stars.
+    """
+    position = 0
+
+    def line():
+        nonlocal position
+        end = text.index("\n", position)
+        found, position = text[position:end], end + 1
+        return found
+
+    def words(count):
+        nonlocal position
+        found = []
+        for _ in range(count):
+            while text[position].isspace():
+                position += 1
+            start = position
+            while not text[position].isspace():
+                position += 1
+            found.append(text[start:position])
+        return found
+
+    def numbers(*shape):
+        return np.array(words(int(np.prod(shape))), dtype=float).reshape(shape)
+
+    groups = {}
+    while position < len(text):
+        title = line()
+        if not title.startswith("** RECORD GROUP "):
+            continue
+        group = int(title[len("** RECORD GROUP ") :].split(",")[0])
+        if group == 1:
+            line()
+            revision, *sizes = words(6)
+            count, modes, *others = map(int, sizes)
+            assert revision == "REV0" and others == [0, 0, 0]
+            groups[1] = (count, modes)
+        elif group == 2:
+            groups[2] = words(count)
+        elif group == 8:
+            shapes = []
+            for _ in range(modes):
+                assert line().startswith("**")
+                shapes.append(numbers(count, 6))
+                assert not line().strip()
+            groups[8] = np.array(shapes)
+        else:
+            square, nodal = (modes, modes), (count,)
+            if group == 19:
+                count = int(words(1)[0])
+                groups[19] = [(int(words(1)[0]), numbers(*square)) for _ in range(count)]
+                continue
+            shapes = {5: nodal, 6: nodal, 7: nodal, 11: (count, 6), 12: (13,)}
+            # Rows outermost; then the modes; then the columns of a 3 x 3 matrix.
+            shapes |= {14: (3, modes), 15: (3, modes), 16: (3, modes, 3)}
+            shapes |= {17: (3, modes, modes), 18: (3, modes, modes, 3)}
+            groups[group] = numbers(*shapes.get(group, square))
+    return groups
+
+
+def mbdyn_stiffening(groups, a, w, wd, force, moment):
+    """Return what MBDyn adds to the modal stiffness (left-hand side), by the steps of modalad.cc.
+
+    Args:
+        groups: as read.
+        a, w, wd: (3,) acceleration less gravity, angular velocity and acceleration, body frame.
+        force, moment: (3,) that the joint exerts on its first interface node.
+    """
+    products = [w[0] ** 2, w[1] ** 2, w[2] ** 2, w[0] * w[1], w[1] * w[2], w[2] * w[0]]
+    factors = np.concatenate([products, wd, a, -force, -moment])
+    return sum(factors[load - 1] * matrix for load, matrix in groups[19])
+
+
+def mbdyn_forces(groups: dict[int, Any], s: State) -> Forces:
+    """Return force, moment and rows of a body without lumped masses, its interfaces not loaded.
+
+    Those of MBDyn's residual with the opposite sign, in the frame of the modal node; gravity is
+    part of the frame's acceleration.
+    """
+    mass, centre, about_centre = groups[12][0], groups[12][1:4], groups[12][4:].reshape(3, 3)
+    K, D = groups[10], groups[13]
+    inv3, inv4, inv8, inv5, inv9 = (groups[k] for k in (14, 15, 16, 17, 18))
+    a, b, w = s.q, s.qd, s.w
+    J = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    inv8_a, inv8_b = (np.einsum("ijc,j->ic", inv8, x) for x in (a, b))
+    inv9_aa, inv9_ab = (np.einsum("ijkc,j,k->ic", inv9, a, x) for x in (a, b))
+    J = J + inv8_a + inv8_a.T - inv9_aa
+    S = mass * centre + inv3 @ a
+    force = mass * s.a + np.cross(s.g, S) + np.cross(w, np.cross(w, S))
+    force = force + inv3 @ s.qdd + 2.0 * np.cross(w, inv3 @ b)
+    moment = np.cross(S, s.a) + J @ s.g + np.cross(w, J @ w) + inv4 @ s.qdd
+    moment = moment + np.einsum("ijk,j,k->i", inv5, a, s.qdd) + 2.0 * (inv8_b - inv9_ab) @ w
+    rows = groups[9] @ s.qdd + D @ b + K @ a
+    for j in range(len(a)):
+        turned = inv4[:, j] + inv5[:, :, j] @ a
+        coupled = inv8[:, j].T - np.einsum("ikc,k->ic", inv9[:, j], a)
+        rows[j] += inv3[:, j] @ s.a + turned @ s.g + 2.0 * (inv5[:, :, j] @ b) @ w
+        rows[j] -= w @ coupled @ w
+    if 19 in groups:
+        still = np.zeros(3)
+        rows = rows + mbdyn_stiffening(groups, s.a, w, s.g, still, still) @ a
+    return force, moment, rows
