@@ -47,7 +47,8 @@ def bench(
     """Measure what is not measured yet, draw everything; return the path of the summary.
 
     A diagram's rows are kept in FOLDER/<name>.json as soon as they are there: a bench that was
-    ended goes on from the diagram it was at. The summary grows with every diagram.
+    ended goes on from the diagram it was at, in that of solid links from the measurement. The
+    summary grows with every diagram.
 
     Args:
         plan: what is measured on.

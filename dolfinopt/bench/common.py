@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -99,7 +99,8 @@ class Diagram:
         name: of its files.
         title: a sentence.
         columns: of the rows, with units.
-        measure: the rows; `tell` takes what is being measured.
+        measure: the rows; `tell` takes what is being measured. Or measurements by name, each of
+            which is kept as soon as it is there.
         panels: the curves of the rows, logarithmic.
         notes: sentences about the rows.
         abreast: panels beside each other, before a new row begins.
@@ -110,7 +111,7 @@ class Diagram:
     name: str
     title: str
     columns: tuple[str, ...]
-    measure: Callable[[Plan, Tell], list[Row]]
+    measure: Callable[[Plan, Tell], list[Row] | Mapping[str, Callable[[], list[Row]]]]
     panels: Callable[[Sequence[Row]], tuple[Panel, ...]]
     notes: Callable[[Sequence[Row]], list[str]]
     abreast: int = 4
@@ -131,15 +132,29 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> list[Row
     versions = [_version(package) for package in diagram.uses]
     asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
     stamp = json.loads(json.dumps(asked))  # tuples become lists, as in the file
+    kept: dict[str, list[Row]] = {}
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["stamp"] == stamp:
-            return [tuple(row) for row in kept["rows"]]
-    except (OSError, ValueError, KeyError, TypeError):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if found["stamp"] == stamp:
+            kept = {name: [tuple(row) for row in rows] for name, rows in found["rows"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         pass  # not there, or cut off: measured anew
-    rows = [tuple(_plain(cell) for cell in row) for row in diagram.measure(plan, tell)]
-    write_text(path, json.dumps({"stamp": stamp, "rows": rows}))
-    return rows
+    if "" in kept:
+        return kept[""]
+
+    def keep(name: str, rows: list[Row]) -> None:
+        kept[name] = [tuple(_plain(cell) for cell in row) for row in rows]
+        write_text(path, json.dumps({"stamp": stamp, "rows": kept}))
+
+    steps = diagram.measure(plan, tell)
+    if not isinstance(steps, Mapping):
+        keep("", steps)
+        return kept[""]
+    for number, (name, step) in enumerate(steps.items(), 1):
+        if name not in kept:
+            tell(f"{name} ({number} of {len(steps)})")
+            keep(name, step())
+    return [row for name in steps for row in kept[name]]
 
 
 @cache

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 from dolfinx import fem
+from mpi4py import MPI
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt.errors import InputError
@@ -37,6 +38,8 @@ class InterfaceTransformation:
         num_interior: interior dofs that this rank owns.
         num_dofs: of all ranks, the outboard coordinates included.
         numbers: (d n_nodes,) global interior number of each dof, -1 for others.
+        bandwidth: of the interior stiffness, the widest of all ranks' own parts: about the dofs of
+            a cross-section.
     """
 
     def __init__(self, mesh: ArmMesh, operators: ElementOperators, graph: sp.csr_matrix):
@@ -82,8 +85,11 @@ class InterfaceTransformation:
         """Number interior nodes for a narrow band on one rank, in owners' ranges on several."""
         owned = self._space.dofmap.index_map.size_local
         nodes = np.flatnonzero(~(self.inboard | self.outboard)[:owned])
+        width = 0
         if len(nodes):
-            nodes = nodes[_narrow_order(graph[nodes][:, nodes], self.points[nodes])]
+            order, width = _narrow_order(graph[nodes][:, nodes], self.points[nodes])
+            nodes = nodes[order]
+        self.bandwidth = self.dim * (self.comm.allreduce(width, op=MPI.MAX) + 1) - 1
         self.interior_nodes = nodes
         self.num_interior = self.dim * len(nodes)
         first = self.comm.exscan(len(nodes)) or 0
@@ -170,11 +176,11 @@ def rigid_motions(points: np.ndarray) -> np.ndarray:
     return motions
 
 
-def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> np.ndarray:
-    """Return the order of nodes with the narrower band: along the arm, or Cuthill and McKee's.
+def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's.
 
-    On the grid of a slender arm the first is row by row across it, half as wide as the other one,
-    which begins at a corner.
+    The narrower one; on the grid of a slender arm the first, row by row across it, which is half as
+    wide as the other one, which begins at a corner.
 
     Args:
         graph: (n, n) with an entry where two nodes share a cell.
@@ -193,4 +199,6 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> np.ndarray:
         number[order] = np.arange(len(order))
         return int(np.abs(number[rows] - number[columns]).max(initial=0))
 
-    return min(orders, key=bandwidth)
+    widths = [bandwidth(order) for order in orders]
+    best = int(np.argmin(widths))
+    return orders[best], widths[best]

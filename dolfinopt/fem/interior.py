@@ -35,15 +35,20 @@ if TYPE_CHECKING:
     from dolfinopt.fem.multigrid import BlockConjugateGradients
 
 Columns = Callable[[np.ndarray], np.ndarray]
+ITERATIVE = "conjugate gradients"  # name of that solver
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
 # has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
 MOST_WORK = 1e9
-# Of a solid arm beside MUMPS: 120 x 12 x 8 cells, 42 000 rows, have 8e9 and take half of its time.
-MOST_SOLID_WORK = 5e10
-# Rows of a solid arm from which on conjugate gradients are used, or where factors would take more
-# than a part of the free memory: bytes of MUMPS' factor a row at so many rows, growing as a power.
-ITERATIVE_ROWS = 100_000
+# Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
+# takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
+MOST_SOLID_WORK = 1.5e11
+# Conjugate gradients take the same time a row whatever the shape, factors the longer the larger the
+# cross-sections. With those of WIDEST dofs a nearby design takes equally long: slender arms of
+# 250 000 and cubes of 25 000 rows (`dolfinopt bench solid`). Conjugate gradients are used, too,
+# where factors would take more than a part of the memory that is free: bytes of MUMPS' factor a row
+# at so many rows, growing as a power.
+WIDEST = 1200
 FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
 FREE_SHARE = 0.5
 # Of conjugate gradients in energy, relative: stiffness, mass and gradients are then right to it.
@@ -104,11 +109,10 @@ class InteriorSystem:
         """LAPACK's factor, where one rank owns a band that is narrow enough."""
         if self._T.comm.size > 1 or has_options(OPTIONS):
             return None
-        rows, columns, size = self._entries.rows, self._entries.columns, self._T.num_interior
-        most = MOST_WORK if self._T.dim == 2 else MOST_SOLID_WORK
-        if size * float((rows - columns).max(initial=0)) ** 2 > most:
+        size, most = self._T.num_interior, MOST_WORK if self._T.dim == 2 else MOST_SOLID_WORK
+        if size * float(self._T.bandwidth) ** 2 > most:
             return None
-        return BandCholesky(rows, columns, size)
+        return BandCholesky(self._entries.rows, self._entries.columns, size)
 
     @cached_property
     def _band_source(self) -> np.ndarray:
@@ -127,10 +131,16 @@ class InteriorSystem:
         T = self._T
         if T.dim == 2 or has_options(OPTIONS):
             return False
-        rows = T.num_dofs
-        factor = FACTOR_BYTES * rows * (rows / FACTOR_AT) ** FACTOR_GROWTH / T.comm.size
-        short = rows > FACTOR_AT and factor > FREE_SHARE * free_memory()
-        return rows >= ITERATIVE_ROWS or T.comm.allreduce(short, op=MPI.LOR)
+        return T.bandwidth > WIDEST or self._memory_is_short()
+
+    def _memory_is_short(self) -> bool:
+        """Return whether a factor would take too much of a machine's free memory (collective)."""
+        T = self._T
+        here = MPI.Get_processor_name()
+        share = T.comm.allgather(here).count(here) / T.comm.size
+        factor = share * FACTOR_BYTES * T.num_dofs * (T.num_dofs / FACTOR_AT) ** FACTOR_GROWTH
+        short = T.num_dofs > FACTOR_AT and factor > FREE_SHARE * free_memory()
+        return bool(T.comm.allreduce(short, op=MPI.LOR))
 
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:
@@ -139,6 +149,15 @@ class InteriorSystem:
         T = self._T
         with_rigid_motions(self._stiffness.mat, T.points[T.interior_nodes])
         return BlockConjugateGradients(self._stiffness.mat, TOLERANCE)
+
+    @property
+    def solver_name(self) -> str:
+        """What solves the systems (collective)."""
+        if self.is_iterative:
+            return ITERATIVE
+        if self._band is not None:
+            return "LAPACK's band"
+        return str(self._ksp.getPC().getFactorSolverType())
 
     def factorise(self, K: sp.csr_matrix) -> Factor:
         """Return the factor of K_II; nothing is done if K was the last one (collective)."""

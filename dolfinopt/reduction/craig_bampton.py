@@ -9,7 +9,8 @@ import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options, orient
-from dolfinopt.reduction.eigenproblem import complement_solve, interior_pencil, lowest_eigenpairs
+from dolfinopt.reduction.complement import complement_solve
+from dolfinopt.reduction.eigenproblem import interior_pencil, lowest_eigenpairs
 
 
 def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:

@@ -1,4 +1,4 @@
-"""The lowest modes of an arm, and the linear systems of their derivatives."""
+"""The lowest modes of an arm."""
 
 from __future__ import annotations
 
@@ -26,10 +26,6 @@ LOST = 1e-2
 # Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
 # to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
 WIDE = 1e6
-# Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
-# which leaves more digits than an optimiser can use.
-ADJOINT_TOLERANCE = 1e-8
-MAX_ADJOINT = 500  # steps of conjugate gradients for one mode
 # Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
 # finds modes of another symmetry, up to 1e-4 it is not slower.
 RAMP_SHARE = 1e-6
@@ -357,62 +353,3 @@ def _filled(like: PETSc.Vec, values: np.ndarray) -> PETSc.Vec:
     vector = like.duplicate()
     vector.array = values
     return vector
-
-
-# -- derivatives -------------------------------------------------------------------------------
-
-
-def complement_solve(
-    pencil: Pencil, modes: np.ndarray, values: np.ndarray, right: np.ndarray
-) -> np.ndarray:
-    """Solve (K - lambda_k M) mu_k = right_k in the M-complement of the modes, for every k.
-
-    The adjoint of the eigenproblem, less its part within the modes' span. A reduced model depends
-    on nothing but that span, so what the modes do among themselves has no influence: neither close
-    nor repeated eigenvalues divide by zero. In the complement K - lambda_k M is positive definite,
-    and conjugate gradients with the factor of K converge as 1 - lambda_k / lambda_next allows.
-    K times a direction follows from the residual that the direction was solved for.
-
-    Args:
-        pencil: K and M.
-        modes: (rows, k) all modes below the complement, M-orthonormal.
-        values: (k,) their eigenvalues, rad2/s2.
-        right: (rows, k).
-
-    Returns:
-        mu (rows, k).
-
-    Raises:
-        ConvergenceError: the next eigenvalue is too close to the last.
-    """
-    weighted = np.column_stack([pencil.mass(mode) for mode in modes.T])
-
-    def conditioned(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return z = K^-1 r less its part in the modes, K z, and z . r."""
-        z = pencil.inverse(residual)
-        part = pencil.total(weighted.T @ z)
-        z -= modes @ part
-        return z, residual - weighted @ (values * part), float(pencil.total(residual @ z))
-
-    out = np.zeros_like(right)
-    for k, value in enumerate(values):
-        residual = right[:, k] - weighted @ pencil.total(modes.T @ right[:, k])
-        step, K_step, energy = conditioned(residual)
-        image = K_step - value * pencil.mass(step)
-        goal = ADJOINT_TOLERANCE**2 * energy
-        for _ in range(MAX_ADJOINT):
-            if energy <= goal:
-                break
-            length = energy / float(pencil.total(step @ image))
-            out[:, k] += length * step
-            residual -= length * image
-            previous = energy
-            z, K_z, energy = conditioned(residual)
-            image = K_z - value * pencil.mass(z) + (energy / previous) * image
-            step = z + (energy / previous) * step
-        else:
-            raise ConvergenceError(
-                f"arm {pencil.arm.mesh.name!r}: the derivatives of mode {k + 1} do not converge, "
-                "the next mode's frequency is too close; change reduction.coordinates by one"
-            )
-    return out

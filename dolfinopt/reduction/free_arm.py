@@ -10,6 +10,7 @@ from petsc4py import PETSc
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import rigid_motions
 from dolfinopt.reduction.eigenproblem import Pencil
+from dolfinopt.reduction.lobpcg import Operators, by_column, interior_operators
 
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
@@ -77,7 +78,27 @@ class FreeOperators:
         self.free = FreeArm(arm)
         self._m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
         self._m_corner = m_corner if carried is None else m_corner + carried
-        self.pencil = Pencil(arm, self.solve, self.mass_times, self._matrices)
+        iterative = arm.substructure.interior.is_iterative
+        operators = self._operators(interior_operators(arm)) if iterative else None
+        self.pencil = Pencil(arm, self.solve, self.mass_times, self._matrices, operators)
+
+    def _operators(self, inner: Operators) -> Operators:
+        """Return those for columns, with what the interior's approximate inverse gives."""
+
+        def stiffness(V: np.ndarray) -> np.ndarray:
+            product = inner.stiffness(self.split(V)[0])
+            return self._bordered(product, V, self.free.coupling, self.free.corner)
+
+        def precondition(R: np.ndarray) -> np.ndarray:
+            return self._eliminated(inner.precondition, R)
+
+        return Operators(
+            self.arm.num_interior + (len(self.free.corner) if self.last else 0),
+            stiffness,
+            lambda V: by_column(self.mass_times, V),
+            precondition,
+            inner.total,
+        )
 
     def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the interior rows and the outboard coordinates (b, ...), the latter everywhere."""
@@ -92,10 +113,16 @@ class FreeOperators:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 right."""
+        return self._eliminated(self.arm.interior_inverse, right)
+
+    def _eliminated(
+        self, inverse: Callable[[np.ndarray], np.ndarray], right: np.ndarray
+    ) -> np.ndarray:
+        """Return (T'KT)^-1 right, given what stands for the inverse of the interior."""
         interior, outboard = self.split(right)
         lift = self.arm.comm.allreduce(self.free.psi.T @ interior)
         tip = self.free.schur_inverse @ (outboard + lift)
-        return self._joined(self.arm.interior_inverse(interior) + self.free.psi @ tip, tip)
+        return self._joined(inverse(interior) + self.free.psi @ tip, tip)
 
     def stiffness_times(self, rows: np.ndarray) -> np.ndarray:
         """Return T'KT times a vector."""

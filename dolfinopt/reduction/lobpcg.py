@@ -26,10 +26,12 @@ class Operators:
     """What a search needs: products with columns (rows, k) of this rank.
 
     Attributes:
+        rows: of this rank.
         stiffness, mass, precondition: K, M, and an approximation of K^-1.
         total: sum over the ranks.
     """
 
+    rows: int
     stiffness: Columns
     mass: Columns
     precondition: Columns
@@ -40,24 +42,31 @@ def interior_operators(arm: ElasticArm) -> Operators:
     """Return those of the interior of an arm whose systems are solved iteratively."""
     stiffness, cycle = arm.substructure.interior.multigrid(arm.K.matrix)
     return Operators(
+        arm.num_interior,
         stiffness,
-        lambda V: np.column_stack([arm.interior_mass_times(vector) for vector in V.T]),
+        lambda V: by_column(arm.interior_mass_times, V),
         cycle,
         lambda part: part if arm.comm.size == 1 else arm.comm.allreduce(part),
     )
 
 
+def by_column(times: Columns, V: np.ndarray) -> np.ndarray:
+    """Return the products of a matrix with the columns of V (rows, k), one after the other."""
+    return np.column_stack([times(vector) for vector in V.T]) if V.shape[1] else V.copy()
+
+
 def lowest_without_factor(
     arm: ElasticArm, operators: Operators, count: int, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the lowest eigenvalues and vectors of the interior, None if that fails (collective).
+    """Return the lowest eigenvalues and vectors, None if that fails (collective).
 
     Args:
-        arm, operators: see `interior_operators`.
+        arm: for its communicator.
+        operators: of the interior, or of the clamped-free arm.
         count: number of eigenpairs.
         start: (rows, k) vectors of a nearby design, or None.
     """
-    rows, size = arm.num_interior, count + GUARDS
+    rows, size = operators.rows, count + GUARDS
     known = np.empty((rows, 0)) if start is None else start[:, :size]
     first = 0 if arm.comm.size == 1 else arm.comm.exscan(rows) or 0
     columns = 12.9898 + np.arange(size - known.shape[1])

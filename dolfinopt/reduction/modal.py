@@ -6,7 +6,8 @@ import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options, orient
-from dolfinopt.reduction.eigenproblem import complement_solve, lowest_eigenpairs
+from dolfinopt.reduction.complement import complement_solve
+from dolfinopt.reduction.eigenproblem import lowest_eigenpairs
 from dolfinopt.reduction.free_arm import FreeOperators
 
 

@@ -10,7 +10,8 @@ from solids import solid_arm
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem import interior
-from dolfinopt.fem.multigrid import Level
+from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
+from dolfinopt.fem.multigrid import Level, Multigrid
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.reduction import lobpcg
 from dolfinopt.responses.sensitivity import exact_gradient
@@ -26,7 +27,7 @@ def direct() -> Arm:
 
 @pytest.fixture
 def iterative(monkeypatch: pytest.MonkeyPatch) -> Arm:
-    monkeypatch.setattr(interior, "ITERATIVE_ROWS", 0)
+    monkeypatch.setattr(interior, "WIDEST", 0)
     arm = solid_arm(cells=CELLS, stiffening=True)
     assert arm.substructure.interior.is_iterative
     return arm
@@ -85,12 +86,12 @@ def test_warm_start(iterative):
 def test_modes_without_a_factor(monkeypatch):
     """Body with four modes, from cold and from a design nearby; a search knows when it is done."""
     steps, bodies = [], []
-    for rows in (10**9, 0):
-        monkeypatch.setattr(interior, "ITERATIVE_ROWS", rows)
+    for width in (10**9, 0):
+        monkeypatch.setattr(interior, "WIDEST", width)
         arm = solid_arm(cells=(12, 4, 3), coordinates=10)
         for void in (0.1, 0.09):
             bodies.append(arm.state(hollow(arm, void)).body)
-            if rows == 0:
+            if width == 0:
                 found = lobpcg.interior_operators(arm.elastic)
                 steps.append(lobpcg.lobpcg(found, arm.initial.basis, 3, 1e-6)[2])
     assert difference(bodies[0], bodies[2]) < 1e-6
@@ -98,10 +99,71 @@ def test_modes_without_a_factor(monkeypatch):
     assert steps == [0, 0]
 
 
+@pytest.mark.serial
+@pytest.mark.parametrize(("method", "count"), [("craig-bampton", 9), ("modal", 3)])
+def test_gradient_of_modes_without_a_factor(monkeypatch, method, count):
+    """As the direct one, in cycles of all modes at once: one after the other they take 5 times."""
+    cycles, cycle = [], Multigrid.cycle
+
+    def counted(self: Multigrid, B: np.ndarray, level: int = 0) -> np.ndarray:
+        cycles.append(B.shape[1] * (level == 0))
+        return cycle(self, B, level)
+
+    monkeypatch.setattr(Multigrid, "cycle", counted)
+    gradients = []
+    for width in (10**9, 0):
+        monkeypatch.setattr(interior, "WIDEST", width)
+        arm = solid_arm(cells=(12, 4, 3), method=method, coordinates=count)
+        state = arm.state(hollow(arm, 0.1))
+        body = state.body
+        cycles.clear()
+        gradients.append(exact_gradient(state, body))
+    assert np.abs(gradients[1] - gradients[0]).max() < 2e-6 * np.abs(gradients[0]).max()
+    assert 0 < sum(cycles) < 120 * count
+
+
+@pytest.mark.serial
+def test_which_solver(monkeypatch):
+    """Factors where cross-sections are small and memory is free, on this machine's ranks."""
+    monkeypatch.setattr(interior, "FACTOR_AT", 100)
+    free = [1e12]
+    monkeypatch.setattr(interior, "free_memory", lambda: free[0])
+    system = solid_arm(cells=(10, 3, 2)).substructure.interior
+    rows = system._T.num_dofs
+    needed = interior.FACTOR_BYTES * rows * (rows / 100) ** interior.FACTOR_GROWTH
+    found = []
+    for bytes_ in (2.1 * needed, 1.9 * needed):
+        free[0] = bytes_
+        system.__dict__.pop("is_iterative", None)
+        found.append(system.is_iterative)
+    assert found == [False, True]
+    assert system._T.bandwidth == 3 * (4 * 3 + 4 + 1 + 1) - 1
+    monkeypatch.setattr(interior, "WIDEST", system._T.bandwidth - 1)
+    system.__dict__.pop("is_iterative")
+    free[0] = 1e12
+    assert system.is_iterative
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
+def test_shared_rows():
+    """What a rank has of another's rows is added there, at row numbers beyond a 32-bit product."""
+    owned, rank, size = 60_000, COMM.rank, COMM.size
+    mine, other = owned * rank + 7, owned * ((rank + 1) % size) + 7
+    rows = np.array([mine, mine, other], dtype=PETSc.IntType)
+    columns = np.array([mine, mine + 1, other + 1], dtype=PETSc.IntType)
+    order = np.lexsort((columns, rows))
+    entries = InteriorEntries(rows[order], columns[order], np.arange(3)[order])
+    matrix = InteriorMatrix(COMM, entries, owned)
+    for factor in (1.0, 2.0):
+        matrix.update(factor * np.array([1.0, 10.0, 100.0]))
+        values = matrix.mat.getValues([mine], [mine, mine + 1, mine + 2])
+        assert np.allclose(values, [[factor, 110.0 * factor, 0.0]])
+
+
 @pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
 def test_ranks_agree(monkeypatch):
     """The same body on any number of ranks, as the tolerance allows."""
-    monkeypatch.setattr(interior, "ITERATIVE_ROWS", 0)
+    monkeypatch.setattr(interior, "WIDEST", 0)
     arms = [solid_arm(comm, cells=(10, 3, 2)) for comm in (MPI.COMM_SELF, COMM)]
     assert difference(*(arm.state(hollow(arm, 0.01)).body for arm in arms)) < 2e-6
 
