@@ -140,8 +140,7 @@ def _open(mesh: ArmMesh, facet: np.ndarray, open_edges: bool) -> np.ndarray:
         return np.zeros(owned.shape, dtype=bool)
     # Every neighbour of an owned cell is a ghost at least.
     count = np.bincount(facet.ravel())
-    interfaces = np.concatenate([mesh.inboard_facets, mesh.outboard_facets])
-    return (count[owned] == 1) & ~np.isin(owned, interfaces)
+    return (count[owned] == 1) & ~np.isin(owned, mesh.interface_facets)
 
 
 def _faces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

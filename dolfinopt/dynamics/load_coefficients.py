@@ -39,7 +39,7 @@ class LoadCounts:
 
     Attributes:
         frame: of the frame's acceleration and rotation: 4, in space 12.
-        outboard: force and moment at the outboard interface: 3, in space 6.
+        outboard: force and moment at the outboard interfaces: 3, in space 6 of each.
         elastic: of the inertia of the elastic motion: 2 q, in space 9 q.
     """
 
@@ -185,12 +185,14 @@ def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
 
 def _probe_space(w: np.ndarray, W: np.ndarray, outboard: np.ndarray, k: np.ndarray) -> None:
     """Give the coordinates k of a spatial body one load each, in the order of c."""
-    q = (len(k) - 18) // 9
+    b = len(outboard)
+    q = (len(k) - 12 - b) // 9
     partners = np.arange(9).reshape(3, 3).T.ravel()  # W_ba = W_ab'
     w[np.arange(3), k[:3]] = 1.0
     for ab in range(9):
         at = k[3 + ab]
         W[ab, at, 0] = W[partners[ab], 0, at] = 1.0
-        own, modes = k[18 + ab * q : 18 + (ab + 1) * q], 1 + np.arange(q)
+        first = 12 + b + ab * q
+        own, modes = k[first : first + q], 1 + np.arange(q)
         W[ab, own, modes] = W[partners[ab], modes, own] = 1.0
-    outboard[np.arange(6), k[12:18] - 1] = 1.0
+    outboard[np.arange(b), k[12 : 12 + b] - 1] = 1.0

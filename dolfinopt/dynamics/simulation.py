@@ -370,7 +370,7 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
     problems: list[Problem] = []
     for scene, own in zip(scenes, bodies, strict=True):
         lengths = tuple((arm.name, arm.length) for arm in scene.arms)
-        key = (scene.motion, scene.closure, lengths)
+        key = (scene.motion, scene.closure, lengths, scene.joints, scene.end_effector)
         motion = motions.setdefault(key, desired_motion(scene))
         problems.append(build_system(scene, own, motion))
     return problems

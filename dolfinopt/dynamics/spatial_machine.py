@@ -49,19 +49,20 @@ class SpatialMachineSystem(MachineSystem):
 
     @cached_property
     def _softness(self) -> float:
-        """The largest static deflection of a link by a unit force at its end, m/N."""
+        """The largest static deflection of a link's interface by a unit force on it, m/N."""
         found = [0.0]
         for body in self.mechanism.bodies:
             if body.num_modes:
-                soft = body.outboard[:3] @ np.linalg.solve(body.K, body.outboard[:3].T)
-                found.append(float(np.linalg.eigvalsh(0.5 * (soft + soft.T))[-1]))
+                for B in body.outboard.reshape(-1, 6, body.num_modes)[:, :3]:
+                    soft = B @ np.linalg.solve(body.K, B.T)
+                    found.append(float(np.linalg.eigvalsh(0.5 * (soft + soft.T))[-1]))
         return max(found) or 1e-6
 
     @cached_property
     def rigid_scale(self) -> np.ndarray:
         """Weights (R,), J^(1/2) per m or rad, see `MachineSystem.rigid_scale`."""
         bodies, joints = self.mechanism.bodies, self.mechanism.joints
-        reach = sum(float(np.linalg.norm(one.outboard_point)) for one in bodies)
+        reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in bodies)
         reach += sum(float(np.linalg.norm(one.origin)) for one in joints)
         movable = [joints[self.mechanism.movable[i]] for i in self.drives.free]
         slides = np.array([joint.kind == "prismatic" for joint in movable])

@@ -71,7 +71,9 @@ class SpatialSystem(PrescribedSystem):
 
 
 def interface_rotations(mechanism: SpatialMechanism, q: np.ndarray) -> np.ndarray:
-    """Return the largest rotation of every body's outboard interface (bodies,), rad."""
-    parts = zip(mechanism.slices, mechanism.bodies, strict=True)
-    vectors = (q[:, part] @ body.outboard[3:].T for part, body in parts)
-    return np.array([np.linalg.norm(one, axis=1).max(initial=0.0) for one in vectors])
+    """Return the largest rotation of every body's outboard interfaces (bodies,), rad."""
+    found = []
+    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
+        vectors = (q[:, part] @ body.outboard.T).reshape(-1, 6)[:, 3:]
+        found.append(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    return np.array(found)

@@ -59,11 +59,12 @@ class SpatialTrajectory(Trajectory):
 
     @cached_property
     def deflections(self) -> np.ndarray:
-        """Largest outboard deflection of every body in its own frame, over its length (bodies,)."""
+        """Largest deflection of every body's interfaces in its frame, over its length (bodies,)."""
         found = []
         for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
-            u = np.linalg.norm(self.q_e[:, part] @ body.outboard[:3].T, axis=1)
-            length = float(np.linalg.norm(body.outboard_point))
+            moved = (self.q_e[:, part] @ body.outboard.T).reshape(-1, 6)[:, :3]
+            u = np.linalg.norm(moved, axis=1)
+            length = float(np.linalg.norm(body.points, axis=1).max())
             found.append(u.max() / length if body.num_modes and length else 0.0)
         return np.array(found)
 

@@ -82,16 +82,16 @@ class Substructure:
         return Connectivity(*self._graph)
 
     def joins(self, solid: np.ndarray) -> bool:
-        """Return whether the solid ones (n_cells,) of its cells join both interfaces."""
+        """Return whether the solid ones (n_cells,) of its cells join all interfaces."""
         return joins(*self._graph, solid)
 
     @property
-    def _graph(self) -> tuple[MPI.Comm, Any, np.ndarray, np.ndarray, np.ndarray]:
+    def _graph(self) -> tuple[MPI.Comm, Any, np.ndarray, list[np.ndarray]]:
         operators, T = self.operators, self.T
         nodes = operators.cells
         if T.dim == 3:
             nodes = nodes[:, : compat.cell_corner_count(self.mesh.mesh)]
-        return T.comm, operators.space, nodes, T.inboard, T.outboard
+        return T.comm, operators.space, nodes, [T.inboard, *T.ends]
 
     @cached_property
     def _rigid_forces(self) -> tuple[np.ndarray, np.ndarray]:

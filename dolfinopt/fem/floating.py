@@ -32,8 +32,7 @@ class Connectivity:
         comm: MPI.Comm,
         space: Any,
         cells: np.ndarray,
-        inboard: np.ndarray,
-        outboard: np.ndarray,
+        interfaces: list[np.ndarray],
     ):
         """Connect the cells of all ranks.
 
@@ -41,7 +40,7 @@ class Connectivity:
             comm: the arm's ranks.
             space: its `dofmap.index_map` numbers the nodes.
             cells: (n_cells, n) local nodes of the owned cells, corners alone in space.
-            inboard, outboard: (n_nodes,) True for the nodes of the interface.
+            interfaces: (n_nodes,) True for the nodes of each, the inboard one first.
         """
         self.comm = comm
         nodes = space.dofmap.index_map.local_to_global(cells.ravel().astype(np.int32))
@@ -49,8 +48,7 @@ class Connectivity:
         # A facet has at least so many nodes on any mesh, and no two cells share as many but by one.
         least = space.mesh.topology.dim
         ends = [
-            np.concatenate(comm.allgather(mask[cells].sum(axis=1) >= least))
-            for mask in (inboard, outboard)
+            np.concatenate(comm.allgather(mask[cells].sum(axis=1) >= least)) for mask in interfaces
         ]
         count, width = everywhere.shape
         incidence = sp.csr_matrix(
@@ -59,13 +57,13 @@ class Connectivity:
         )
         shared = sp.triu(incidence @ incidence.T, k=1).tocoo()
         facets = shared.data >= least
-        # Two more nodes of the graph stand for the interfaces. The outboard one is rigid: it
-        # connects the cells at it with each other, but does not hold them.
+        # More nodes of the graph stand for the interfaces. The outboard ones are rigid: they
+        # connect the cells at them with each other, but do not hold them.
         pairs = [(shared.row[facets], shared.col[facets])]
         pairs += [
             (np.flatnonzero(end), np.full(end.sum(), count + k)) for k, end in enumerate(ends)
         ]
-        self._count = count
+        self._count, self._ends = count, len(ends)
         self._first, self._second = (np.concatenate(side) for side in zip(*pairs, strict=True))
 
     def floats(self, young: np.ndarray) -> bool:
@@ -79,9 +77,9 @@ class Connectivity:
             young: (n_cells,) Young's moduli of the owned cells, Pa.
         """
         low, high = extremes(self.comm, young)
-        moduli = np.concatenate([*self.comm.allgather(young), [np.inf, np.inf]])
+        moduli = np.concatenate([*self.comm.allgather(young), [np.inf] * self._ends])
         weakest = np.minimum(moduli[self._first], moduli[self._second])
-        moduli[-2:] = 0.0  # an interface does not float itself
+        moduli[-self._ends :] = 0.0  # an interface does not float itself
         level = high / HARMLESS
         while level > low:
             kept = weakest >= level
@@ -99,16 +97,15 @@ def joins(
     comm: MPI.Comm,
     space: Any,
     cells: np.ndarray,
-    inboard: np.ndarray,
-    outboard: np.ndarray,
+    interfaces: list[np.ndarray],
     solid: np.ndarray,
 ) -> bool:
-    """Return whether solid cells that share nodes lead from one interface to the other.
+    """Return whether solid cells that share nodes lead from the first interface to all others.
 
     Collective on `comm`, the same on all ranks.
 
     Args:
-        comm, space, cells, inboard, outboard: as of `Connectivity`.
+        comm, space, cells, interfaces: as of `Connectivity`.
         solid: (n_cells,) True for the owned cells that count.
     """
     number = space.dofmap.index_map.local_to_global
@@ -116,11 +113,11 @@ def joins(
     nodes = np.concatenate(comm.allgather(nodes))
     ends = [
         np.concatenate(comm.allgather(number(np.flatnonzero(mask).astype(np.int32))))
-        for mask in (inboard, outboard)
+        for mask in interfaces
     ]
     first, second = np.repeat(nodes[:, 0], nodes.shape[1]), nodes.ravel()
     size = space.dofmap.index_map.size_global
     graph = sp.coo_matrix((np.ones(first.size), (first, second)), shape=(size, size))
     _, group = connected_components(graph, directed=False)
-    here, there = (group[np.intersect1d(end, second)] for end in ends)
-    return bool(np.intersect1d(here, there).size)
+    at = [group[np.intersect1d(end, second)] for end in ends]
+    return all(np.intersect1d(at[0], other).size for other in at[1:])

@@ -1,7 +1,7 @@
 """The interface transformation T of an arm: interior dofs and the outboard coordinates.
 
 Nodal fields are arrays (n_nodes, d, columns) over this rank's nodes, ghosts included; d directions.
-There are b = 3 outboard coordinates in the plane, 6 in space.
+There are b = 3 outboard coordinates in the plane, in space 6 of every outboard interface.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ class InterfaceTransformation:
 
     The inboard interface is clamped in the tangent frame; the outboard interface is rigid with
     displacements and rotations of its reference point as coordinates: u_x, u_y, theta in the plane,
-    u_x, u_y, u_z and a rotation vector in space. "Interior" are all other dofs.
+    u_x, u_y, u_z and a rotation vector in space. Of several outboard interfaces each moves by
+    itself, its coordinates behind those of the one before. "Interior" are all other dofs.
 
     Attributes:
         comm: the arm's ranks.
         points: (n_nodes, d) reference positions, m.
         dim: d.
         num_coordinates: b, outboard.
-        inboard, outboard: (n_nodes,) True for the nodes of the interface.
+        inboard, outboard: (n_nodes,) True for the nodes of the interface; of any outboard one.
+        ends: those of every outboard interface by itself.
         rigid: (n_nodes, d, b) nodal fields of unit outboard coordinates, zero in the interior.
         interior_nodes: owned ones, in the order of the interior dofs.
         num_interior: interior dofs that this rank owns.
@@ -60,12 +62,42 @@ class InterfaceTransformation:
         self._ghosted = fem.Function(operators.space)
         self.inboard = self._nodes_of(mesh, mesh.inboard_facets, "inboard")
         self.outboard = self._nodes_of(mesh, mesh.outboard_facets, "outboard")
-        nodes = np.flatnonzero(self.outboard)
-        motions = rigid_motions(self.points[nodes] - mesh.outboard_point)
-        self.num_coordinates = motions.shape[2]
-        self.rigid = np.zeros((len(self.points), self.dim, self.num_coordinates))
-        self.rigid[nodes] = motions
+        self.ends = [self.outboard]
+        self.rigid = self._rigid_field(self.outboard, mesh.outboard_point)
+        if mesh.further:
+            self._add_further(mesh)
+        self.num_coordinates = self.rigid.shape[2]
         self._number_interior(graph)
+
+    def _rigid_field(self, at: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """Return the rigid motions (n_nodes, d, 3 or 6) about a point of the nodes `at`."""
+        nodes = np.flatnonzero(at)
+        motions = rigid_motions(self.points[nodes] - point)
+        field = np.zeros((len(self.points), *motions.shape[1:]))
+        field[nodes] = motions
+        return field
+
+    def _add_further(self, mesh: ArmMesh) -> None:
+        """Add the further outboard interfaces.
+
+        Raises:
+            InputError: two interfaces share a node: rigid both, they could not move.
+        """
+        for one in mesh.further:
+            self.ends.append(self._nodes_of(mesh, one.facets, one.name))
+        names = ["inboard", "outboard", *(one.name for one in mesh.further)]
+        masks = [self.inboard, *self.ends]
+        for k, mask in enumerate(masks):
+            for j in range(k):
+                if self.comm.allreduce(int((mask & masks[j]).sum())):
+                    raise InputError(
+                        f"arm {mesh.name!r}: interfaces {names[j]!r} and {names[k]!r} share nodes; "
+                        "each is rigid: leave a cell between them"
+                    )
+        points = [mesh.outboard_point, *mesh.further_points]
+        fields = [self._rigid_field(at, x) for at, x in zip(self.ends, points, strict=True)]
+        self.rigid = np.concatenate(fields, axis=2)
+        self.outboard = np.any(self.ends, axis=0)
 
     def _nodes_of(self, mesh: ArmMesh, facets: np.ndarray, side: str) -> np.ndarray:
         """Return (n_nodes,) True for the nodes of the interface `side`."""

@@ -16,7 +16,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.mesh.cells import cell_areas, cell_volumes, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import gmsh_on_root, mesh_geo
-from dolfinopt.mesh.groups import INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.groups import FURTHER, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
 
@@ -24,6 +24,21 @@ if TYPE_CHECKING:
     from dolfinopt.scene.regions import Cells
 
 SNAP = 1e-9  # distance of a node from its line of the grid, in cells, up to which it is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class InterfaceFacets:
+    """An outboard interface of a solid arm besides the first.
+
+    Attributes:
+        name: of `arms.interfaces`.
+        facets: local numbers.
+        point: (3,) reference point, m.
+    """
+
+    name: str
+    facets: np.ndarray
+    point: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +56,7 @@ class ArmMesh:
         inboard_facets, outboard_facets: facets of the interfaces, local numbers.
         outboard_point: (d,) reference point of the outboard interface, m.
         notes: what is doubtful about its file, a sentence each.
+        further: outboard interfaces besides that one.
     """
 
     name: str
@@ -54,6 +70,18 @@ class ArmMesh:
     outboard_facets: np.ndarray
     outboard_point: np.ndarray
     notes: tuple[str, ...] = ()
+    further: tuple[InterfaceFacets, ...] = ()
+
+    @property
+    def further_points(self) -> np.ndarray:
+        """Reference points of the further outboard interfaces (i, d), m."""
+        return np.reshape([one.point for one in self.further], (-1, self.dim)).astype(float)
+
+    @property
+    def interface_facets(self) -> np.ndarray:
+        """Facets of all interfaces, local numbers."""
+        more = [one.facets for one in self.further]
+        return np.concatenate([self.inboard_facets, self.outboard_facets, *more])
 
     @property
     def dim(self) -> int:
@@ -99,7 +127,12 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
             from dolfinopt.mesh.box import box_arm
 
             size = arm.length, arm.height, arm.thickness
-            return with_regions(box_arm(comm, arm.name, size, arm.cells, ends), like, scales)
+            mesh = box_arm(comm, arm.name, size, arm.cells, ends)
+            if arm.interfaces:
+                from dolfinopt.mesh.interfaces import with_interfaces
+
+                mesh = with_interfaces(mesh, arm, ends)
+            return with_regions(mesh, like, scales)
         mesh = structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, ends)
     return with_regions(mesh, like, scales)
 
@@ -176,6 +209,12 @@ def _solid_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
     with together(comm):
         mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+        tags = parts[2]
+        further = [
+            InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(one.point))
+            for k, one in enumerate(arm.interfaces)
+        ]
+        mesh = replace(mesh, further=tuple(further))
         if arm.solid_ends > 0.0:
             mesh.passive[:] |= cKDTree(points).query(mesh.centroid)[0] < arm.solid_ends
     return mesh

@@ -13,6 +13,7 @@ from dolfinopt.mesh.gmsh_session import QUADRILATERAL, TRIANGLE
 
 # Physical groups of the model.
 INBOARD, OUTBOARD, DESIGN, PASSIVE = 1, 2, 3, 4
+FURTHER = 11  # the first of a solid's further interfaces; the next ones follow
 NAMES = {INBOARD: "inboard", OUTBOARD: "outboard", DESIGN: "design", PASSIVE: "passive"}
 
 

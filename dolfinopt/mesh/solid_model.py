@@ -1,8 +1,8 @@
 """Geometry and mesh files of solid arms -> a Gmsh model with the groups this program knows.
 
-Reads .step, .msh and .geo. Interfaces are faces named inboard and outboard; in a STEP file without
-such names they are the bores about the joint axes, or the flat ends there. Volumes, or STEP
-products, whose names begin with passive stay solid.
+Reads .step, .msh and .geo. Interfaces are faces named inboard and outboard, further ones as in
+`arms.interfaces`; in a STEP file without such names they are the bores about the joint axes, or the
+flat ends there. Volumes, or STEP products, whose names begin with passive stay solid.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.cells import cell_volumes, facet_corners
 from dolfinopt.mesh.checks import FRAME_TOLERANCE, remedy
 from dolfinopt.mesh.gmsh_session import silent_terminal
-from dolfinopt.mesh.groups import DESIGN, INBOARD, NAMES, OUTBOARD, PASSIVE, group_named
+from dolfinopt.mesh.groups import (
+    DESIGN,
+    FURTHER,
+    INBOARD,
+    NAMES,
+    OUTBOARD,
+    PASSIVE,
+    group_named,
+)
 from dolfinopt.mesh.step_names import StepShapes, read_shapes
 from dolfinopt.scene.tables.arms import Arm
 
@@ -30,6 +38,7 @@ FLAT = 1e-6  # volume of a cell over the cube of its longest edge, below which i
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.
 TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 Entities = dict[int, list[int]]
+ENDS = (INBOARD, OUTBOARD)
 
 
 def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
@@ -77,19 +86,22 @@ def _read_groups(gmsh: Any, arm: Arm) -> Entities:
     gmsh.open(arm.mesh)
     if Path(str(arm.mesh)).suffix.lower() == ".geo":
         _mesh(gmsh, arm)
-    model, found = gmsh.model, _none()
+    model, found = gmsh.model, _none(arm)
     for dim, tag in model.getPhysicalGroups():
         if dim < 2:
             continue
         kinds = (INBOARD, OUTBOARD) if dim == 2 else (PASSIVE, DESIGN)
-        group = group_named(model.getPhysicalName(dim, tag), *kinds)
+        name = model.getPhysicalName(dim, tag)
+        group = _further(arm).get(name.strip().casefold()) if dim == 2 else None
+        group = group or group_named(name, *kinds)
         if group is not None:
             found[group] += model.getEntitiesForPhysicalGroup(dim, tag).tolist()
-    for tag in (INBOARD, OUTBOARD):
+    names = _interface_names(arm)
+    for tag, name in names.items():
         if not found[tag]:
             raise InputError(
-                f'no faces in a group "{NAMES[tag]}"; name the interface\'s faces so: '
-                f'Physical Surface("{NAMES[tag]}") = {{...}}'
+                f'no faces in a group "{name}"; name the interface\'s faces so: '
+                f'Physical Surface("{name}") = {{...}}'
             )
     if not found[DESIGN]:
         volumes = [volume for _, volume in model.getEntities(3)]
@@ -97,8 +109,19 @@ def _read_groups(gmsh: Any, arm: Arm) -> Entities:
     return found
 
 
-def _none() -> Entities:
-    return {tag: [] for tag in NAMES}
+def _none(arm: Arm) -> Entities:
+    return {tag: [] for tag in (*NAMES, *_further(arm).values())}
+
+
+def _further(arm: Arm) -> dict[str, int]:
+    """Return the groups of the arm's further interfaces by their names, small letters."""
+    return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
+
+
+def _interface_names(arm: Arm) -> dict[int, str]:
+    """Return the names of all interfaces by their groups."""
+    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.interfaces)}
+    return {INBOARD: NAMES[INBOARD], OUTBOARD: NAMES[OUTBOARD], **more}
 
 
 def _read_step(gmsh: Any, arm: Arm) -> Entities:
@@ -109,7 +132,7 @@ def _read_step(gmsh: Any, arm: Arm) -> Entities:
     faces_named = read_shapes(text)[1]
     gmsh.option.setString("Geometry.OCCTargetUnit", "M")
     gmsh.open(arm.mesh)
-    model, found = gmsh.model, _none()
+    model, found = gmsh.model, _none(arm)
     solids = model.getEntities(3)
     if not solids:
         raise InputError("it holds no solid; export the body as one")
@@ -122,8 +145,10 @@ def _read_step(gmsh: Any, arm: Arm) -> Entities:
     for name, parts in zip(names, children, strict=True):
         group = group_named(name, PASSIVE) or DESIGN
         found[group] += [tag for _, tag in parts]
-    for tag, x in ((INBOARD, 0.0), (OUTBOARD, arm.length)):
-        found[tag] = _named(model, faces_named, tag, everywhere) or _joint_faces(model, x, arm)
+    places = ((0.0, 0.0), *(point[:2] for point in arm.interface_points))
+    for tag, place in zip(_interface_names(arm), places, strict=True):
+        named = _named(model, faces_named, tag, everywhere, arm)
+        found[tag] = named or _joint_faces(model, tag, place, arm)
     model.removePhysicalGroups()
     _mesh(gmsh, arm)
     return found
@@ -136,29 +161,36 @@ def _vertices(model: Any, faces: Iterable[tuple[int, int]]) -> np.ndarray:
     return np.reshape(np.concatenate(corners), (-1, 3)) if corners else np.empty((0, 3))
 
 
-def _named(model: Any, shapes: StepShapes, group: int, everywhere: np.ndarray) -> list[int]:
+def _named(
+    model: Any, shapes: StepShapes, group: int, everywhere: np.ndarray, arm: Arm
+) -> list[int]:
     """Return the faces that a STEP file names as the group's."""
-    if not any(group_named(name, group) for name in shapes.names):
+    further = _further(arm)
+
+    def belongs(name: str) -> bool:
+        return (further.get(name) or group_named(name, INBOARD, OUTBOARD)) == group
+
+    if not any(map(belongs, shapes.names)):
         return []
     found = [
         face[1]
         for face in model.getEntities(2)
-        if any(
-            group_named(name, group)
-            for name in shapes.names_at(_vertices(model, [face]), everywhere)
-        )
+        if any(map(belongs, shapes.names_at(_vertices(model, [face]), everywhere)))
     ]
     if not found:
-        raise InputError(f'the faces named "{NAMES[group]}" are not where the file says')
+        raise InputError(
+            f'the faces named "{_interface_names(arm)[group]}" are not where the file says'
+        )
     return found
 
 
-def _joint_faces(model: Any, x: float, arm: Arm) -> list[int]:
-    """Return the faces of the interface at the joint axis (x, 0), which runs along z.
+def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -> list[int]:
+    """Return the faces of the interface at the joint axis (x, y), which runs along z.
 
     The bore: the cylinder about the axis with the smallest radius, in one or more faces; where
-    there is none, the flat end in the plane through it.
+    there is none, the flat end in the plane through it, of the arm's two ends.
     """
+    x, y = place
     near = NEAR * arm.height
     bores: list[tuple[float, int]] = []
     ends = []
@@ -166,16 +198,22 @@ def _joint_faces(model: Any, x: float, arm: Arm) -> list[int]:
         low, high = model.getParametrizationBounds(2, tag)
         grid = np.stack(np.meshgrid(*np.linspace(low, high, 9).T), axis=2).ravel()
         points = np.reshape(model.getValue(2, tag, grid), (-1, 3))
-        radius = np.linalg.norm(points[:, :2] - [x, 0.0], axis=1)
+        radius = np.linalg.norm(points[:, :2] - [x, y], axis=1)
         if np.ptp(radius) < near:
             bores.append((float(radius.mean()), tag))
-        if np.abs(points[:, 0] - x).max() < near:
+        if group < FURTHER and np.abs(points[:, 0] - x).max() < near:
             ends.append(tag)
     if bores:
         smallest = min(bores)[0]
         return [tag for radius, tag in bores if radius - smallest < near]
     if ends:
         return ends
+    if group >= FURTHER:
+        name = _interface_names(arm)[group]
+        raise InputError(
+            f'no faces of interface "{name}": expected a face named so, or a bore about the line '
+            f"along z through its point ({x:g}, {y:g}) m"
+        )
     raise InputError(
         f"no interface at x = {x:g} m: expected a face named so, a bore about the line along z "
         f"through ({x:g}, 0) m, or a flat end in x = {x:g} m; the origin is the inboard joint "
@@ -199,9 +237,9 @@ def _set_groups(gmsh: Any, groups: Entities) -> None:
     model.removePhysicalGroups()
     for tag, entities in groups.items():
         if entities:
-            dim = 2 if tag in (INBOARD, OUTBOARD) else 3
+            dim = 2 if tag in ENDS or tag >= FURTHER else 3
             model.addPhysicalGroup(dim, entities, tag)
-            model.setPhysicalName(dim, tag, NAMES[tag])
+            model.setPhysicalName(dim, tag, NAMES.get(tag, f"interface {tag}"))
     model.mesh.renumberNodes()  # DOLFINx wants 1, 2, ...
 
 
@@ -230,11 +268,13 @@ def _checked(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     sides = facet_corners(3, cells.shape[1])
     known = {tuple(row) for row in np.sort(np.concatenate([cells[:, s] for s in sides]), axis=1)}
     used, found = points[np.unique(cells)], []
-    for tag, x in ((INBOARD, 0.0), (OUTBOARD, arm.length)):
+    for tag, name in _interface_names(arm).items():
         facets = _elements(gmsh, 2, groups[tag])
         if not {tuple(row) for row in np.sort(facets, axis=1)} <= known:
-            raise InputError(f'group "{NAMES[tag]}" has facets of no cells; repair the mesh')
-        _check_place(points[facets].reshape(-1, 3), NAMES[tag], x, arm)
+            raise InputError(f'group "{name}" has facets of no cells; repair the mesh')
+        if tag in ENDS:  # the reference point of another may lie anywhere
+            x = 0.0 if tag == INBOARD else arm.length
+            _check_place(points[facets].reshape(-1, 3), name, x, arm)
         found += [points[facets].reshape(-1, 3), points[facets].mean(axis=1)]
     for k, (key, size) in enumerate((("height", arm.height), ("thickness", arm.thickness)), 1):
         wide = float(np.ptp(used[:, k]))

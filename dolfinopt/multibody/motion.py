@@ -116,7 +116,9 @@ def check_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
     motion = scene.motion
     if scene.is_spatial:
-        along_table(np.zeros(1), motion, columns_of(scene))
+        from dolfinopt.multibody.spatial.motion import joint_motion
+
+        joint_motion(np.zeros(1), scene)
         return
     end = motion.horizon if motion.path == "rotation" else motion.duration
     rigid_motion(np.linspace(0.0, end, DENSE), scene)
@@ -131,7 +133,7 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     motion = scene.motion
     corners, timed = np.zeros(0), False
     if motion.path in ("points", "joints"):
-        curve, timed = _curve(motion, columns_of(scene), file_stamp(motion))
+        curve, timed = curve_of_table(scene)
         corners = np.array(curve.kinks)
     if not timed:
         rows = _when(corners, motion) if 0 < len(corners) <= MAX_CORNERS else []
@@ -140,6 +142,15 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
     apart &= instants < motion.horizon * (1.0 - SAME_TIME)
     return (0.0, *instants[apart].tolist(), motion.horizon)
+
+
+def curve_of_table(scene: Scene) -> tuple[Curve, bool]:
+    """Return the curve through the scene's table, and whether its parameter is time."""
+    if scene.is_spatial and scene.motion.path == "points":
+        from dolfinopt.multibody.spatial.end_path import end_curve
+
+        return end_curve(scene)
+    return _curve(scene.motion, columns_of(scene), file_stamp(scene.motion))
 
 
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
@@ -192,7 +203,11 @@ def along_table(
     t: np.ndarray, motion: Motion, columns: tuple[str, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a table's curve (n, k) and two time derivatives, in its own time or by the law."""
-    curve, timed = _curve(motion, columns, file_stamp(motion))
+    return along_curve(t, motion, *_curve(motion, columns, file_stamp(motion)))
+
+
+def along_curve(t: np.ndarray, motion: Motion, curve: Curve, timed: bool) -> Derivatives:
+    """Return a curve (n, k) and two time derivatives, in its own time or by the scene's law."""
     if timed:
         return curve(t)
     s, sd, sdd = (value[:, None] for value in time_law(motion)(t, motion.duration))
@@ -204,23 +219,33 @@ def along_table(
 def _curve(motion: Motion, columns: tuple[str, ...], stamp: int) -> tuple[Curve, bool]:
     """Return the curve through the scene's table, and whether its parameter is time."""
     assert motion.file is not None
-    table = read_table(motion.file, columns)
+    return curve_through(read_table(motion.file, columns), motion)
+
+
+def curve_through(table: Table, motion: Motion, measured: int | None = None) -> tuple[Curve, bool]:
+    """Return the curve through a table of the scene, and whether its parameter is time.
+
+    Args:
+        table: its rows.
+        motion: duration, law and limits.
+        measured: number of columns, the first ones, whose distance counts; default: all.
+    """
     if table.t is None:
-        return curve_by_chord(table), False
+        return curve_by_chord(table, measured), False
     last = table.t[-1]
     if abs(last - motion.duration) > 1e-9 * motion.duration:
         raise InputError(
-            f"{motion.file}: line {table.lines[-1]}, column t = {last:g}: expected "
+            f"{table.file}: line {table.lines[-1]}, column t = {last:g}: expected "
             f"motion.duration = {motion.duration:g} [s] in the last row; set motion.duration = "
             f"{last:g}"
         )
     limits, default = limits_of(motion), Motion.model_fields["law"].default
     if motion.law == default and not limits.any:
         return curve_in_time(table), True
-    return _stop_to_stop(motion, table), True
+    return _stop_to_stop(motion, table, measured), True
 
 
-def _stop_to_stop(motion: Motion, table: Table) -> Curve:
+def _stop_to_stop(motion: Motion, table: Table, measured: int | None = None) -> Curve:
     """Return the motion through a table with times that runs straight by the law between stops.
 
     Raises:
@@ -236,7 +261,7 @@ def _stop_to_stop(motion: Motion, table: Table) -> Curve:
                 f"the row at a later {TIME} to stop there, leave it out, or leave out the column "
                 f"{TIME}, the law's name and the limits"
             )
-        length = float(np.linalg.norm(table.rows[j] - table.rows[i]))
+        length = float(np.linalg.norm((table.rows[j] - table.rows[i])[:measured]))
         law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
         time = float(table.t[j] - table.t[i])
         if time < law.least * (1.0 - SAME_TIME):

@@ -15,7 +15,7 @@ Source: Wallrapp (1994), doi:10.1080/08905459408905214; Schwertassek & Wallrapp 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +60,7 @@ TABLE = (
     Integral("outboard_point"),
     Integral("K0", "mass", modes=(1, 2)),
     Integral("K0_outboard", modes=(1, 2)),
+    Integral("further_points"),
 )
 
 
@@ -77,13 +78,14 @@ class ShapeIntegrals:
         W: (g, 1 + q, 1 + q) int N' E_c N; kg m2.
         K: (q, q) stiffness Phi' K Phi.
         D: (q, q) damping.
-        outboard: (3, q) in the plane, (6, q) in space: displacement and rotation of the outboard
-            interface in each mode.
-        outboard_point: (d,) its reference position, m.
+        outboard: (b, q) displacement and rotation of the outboard interfaces in each mode: b is 3
+            in the plane, in space 6 of every interface.
+        outboard_point: (d,) reference position of the first of them, m.
         K0: (d + g, q, q) geometric stiffness by the inertia of unit accelerations of the frame:
             a_x, a_y, wd and -w^2 in the plane, kg and kg m; (0, q, q) of a body that is linear.
-        K0_outboard: (3, q, q), (6, q, q) in space: that of unit forces and moments at the outboard
-            interface, 1/m and 1 for modes in m; (0, q, q) likewise.
+        K0_outboard: (b, q, q) that of unit forces and moments at the outboard interfaces, 1/m and
+            1 for modes in m; (0, q, q) likewise.
+        further_points: (i, d) reference positions of the others, m; none in the plane.
     """
 
     mass: float
@@ -95,6 +97,12 @@ class ShapeIntegrals:
     outboard_point: np.ndarray
     K0: np.ndarray
     K0_outboard: np.ndarray
+    further_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def points(self) -> np.ndarray:
+        """Reference positions of all outboard interfaces in space (1 + i, 3), m."""
+        return np.concatenate([self.outboard_point[None], self.further_points])
 
     @property
     def num_modes(self) -> int:
@@ -312,6 +320,7 @@ def shape_integrals(
         outboard_point=arm.mesh.outboard_point,
         K0=K0[: len(E) + d],
         K0_outboard=K0[len(E) + d :],
+        further_points=arm.mesh.further_points,
     )
 
 

@@ -191,7 +191,8 @@ def solid_domain(mesh: ArmMesh, x_phys: np.ndarray) -> SolidDomain:
     facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
     around = np.array(facet_corners(3, corners.shape[1]))
     once = np.bincount(facets.ravel())[facets] == 1
-    marks = once, np.isin(facets, mesh.inboard_facets), np.isin(facets, mesh.outboard_facets)
+    outboard = np.setdiff1d(mesh.interface_facets, mesh.inboard_facets)
+    marks = once, np.isin(facets, mesh.inboard_facets), np.isin(facets, outboard)
     if around.shape[1] == 4:
         around = around[:, [0, 1, 3, 2]]
     faces = corners[:, around]

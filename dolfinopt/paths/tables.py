@@ -184,15 +184,19 @@ def _ends(table: Table) -> tuple[float, ...]:
     return tuple(sorted(ends - {float(table.t[0]), float(table.t[-1])}))
 
 
-def curve_by_chord(table: Table) -> Curve:
+def curve_by_chord(table: Table, measured: int | None = None) -> Curve:
     """Return the natural cubic spline through the rows, over their distance from row to row.
 
     The parameter is the length of the chords up to a point, from 0 to 1 at the last row.
 
+    Args:
+        table: its rows.
+        measured: number of columns, the first ones, in which the distance is taken; default: all.
+
     Raises:
         InputError: two rows in succession are the same; names file and line.
     """
-    chords = np.linalg.norm(np.diff(table.rows, axis=0), axis=1)
+    chords = np.linalg.norm(np.diff(table.rows[:, :measured], axis=0), axis=1)
     same = np.flatnonzero(chords == 0.0)
     if same.size:
         raise InputError(

@@ -79,12 +79,16 @@ def make_solid_film(
     """
     mechanism = _without_stiffening(mechanism)
     machine = assemble(views, mechanism, modes=True)
-    ideal, end = q_r if desired is None else desired, mechanism.end
+    ideal = q_r if desired is None else desired
     rigid = body_frames(mechanism, ideal, np.zeros_like(q_e))
     if magnification is None:
-        away = body_frames(mechanism, q_r, q_e).outboard - rigid.outboard
+        bent = body_frames(mechanism, q_r, q_e)
+        away = np.concatenate([bent.outboard - rigid.outboard, bent.held - rigid.held], axis=1)
         parts = zip(mechanism.slices, mechanism.bodies, strict=True)
-        turns = [np.abs(q_e[:, part] @ body.outboard[3:].T).max() for part, body in parts]
+        turns = [
+            np.abs((q_e[:, part] @ body.outboard.T).reshape(-1, 6)[:, 3:]).max()
+            for part, body in parts
+        ]
         turn = max(*turns, float(np.abs(q_r - ideal).max()))
         largest = float(np.linalg.norm(away, axis=2).max())
         magnification = round_magnification(largest, machine.size, float(turn))
@@ -96,8 +100,8 @@ def make_solid_film(
         q_e=magnification * q_e[at],
         frames=moving[at],
         rigid=rigid[at],
-        desired=rigid.outboard[:, end],
-        trace=moving.outboard[:, end],
+        desired=rigid.end,
+        trace=moving.end,
         at=at,
         magnification=magnification,
     )
@@ -241,7 +245,8 @@ class SolidStage:
         """Draw the rigid machine as lines, and the path up to this frame."""
         film = self.film
         rigid, chain = film.rigid, film.machine.mechanism.chain
-        places = [p for i in chain for p in (rigid.origin[frame, i], rigid.outboard[frame, i])]
+        places = [p for i in chain for p in (rigid.held[frame, i], rigid.origin[frame, i])]
+        places = [*places[1:], rigid.end[frame]]
         draw_path(self.studio, np.array(places), GREY, 1.0)
         if (n := film.at[frame]) > 0:
             draw_path(self.studio, film.trace[: n + 1], ORANGE, 2.0)

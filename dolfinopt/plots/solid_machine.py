@@ -61,7 +61,7 @@ class Assembly:
     @property
     def carries(self) -> bool:
         """Whether there is a load at the end-effector."""
-        load = self.mechanism.loads[self.mechanism.end]
+        load = self.mechanism.loads.get((self.mechanism.end, self.mechanism.end_interface))
         return load is not None and load.body.mass > 0.0
 
 
@@ -70,7 +70,7 @@ def assemble(
 ) -> Assembly:
     """Return the machine with its links' material; `modes` as for `material`."""
     reach = sum(
-        float(np.linalg.norm(body.outboard_point) + np.linalg.norm(joint.origin))
+        float(np.linalg.norm(body.points, axis=1).max() + np.linalg.norm(joint.origin))
         for body, joint in zip(mechanism.bodies, mechanism.joints, strict=True)
     )
     surfaces = tuple(material(view, modes=modes) if view.designed else None for view in views)
@@ -102,7 +102,7 @@ def solid_machine_figure(
     """
     machine = assemble(views, mechanism)
     frames = body_frames(mechanism, q_r, np.zeros((len(t), mechanism.num_coordinates)))
-    path = frames.outboard[:, mechanism.end]
+    path = frames.end
     at = path_poses(path)
     camera = camera_of(machine, frames)
     low, high = seen_part(machine, frames, camera, path)
@@ -233,14 +233,21 @@ def draw_skeleton(
     for i, surface in enumerate(machine.surfaces):
         origin = frames.origin[n, i]
         if surface is None:
-            studio.bar(np.stack([origin, frames.outboard[n, i]]), ROD * size, rod)
-        if (parent := frames.parents[i]) != GROUND:
-            studio.bar(np.stack([frames.outboard[n, parent], origin]), ROD * size, rod)
+            for end in _ends(frames, n, i):
+                studio.bar(np.stack([origin, end]), ROD * size, rod)
+        if frames.parents[i] != GROUND:
+            studio.bar(np.stack([frames.held[n, i], origin]), ROD * size, rod)
         if mechanism.joints[i].coordinate is not None:
             half = 0.5 * PIN_LENGTH * size * frames.axes[n, i]
             studio.bar(np.stack([origin - half, origin + half]), PIN * size, rod)
     radius = (BALL if machine.carries else 0.5 * BALL) * size
-    studio.ball(frames.outboard[n, mechanism.end], radius, lighter(ORANGE, pale))
+    studio.ball(frames.end[n], radius, lighter(ORANGE, pale))
+
+
+def _ends(frames: Frames, n: int, i: int) -> list[np.ndarray]:
+    """Return where something sits on a rigid body (3,), and its first outboard interface, m."""
+    places = [frames.held[n, k] for k, parent in enumerate(frames.parents) if parent == i]
+    return [frames.outboard[n, i], *places]
 
 
 def draw_axes(studio: Studio, machine: Assembly, frames: Frames, n: int) -> None:

@@ -96,6 +96,7 @@ def _inputs(free: FreeArm) -> Rows:
     turns = [1.0, 1.0 / length, 1.0] if arm.mesh.dim == 2 else [1.0, 1.0, *(1.0 / length,) * 3, 1.0]
     shift = arm.mesh.dim
     by_load = mass * np.array([*(1.0,) * shift, *(length,) * (len(turns) - shift)])
+    by_load = np.tile(by_load, len(free.corner) // len(turns))
     by_frame = np.array(turns)
     return (
         np.hstack([loads[0] * by_load, inertia[0] * by_frame]),

@@ -15,7 +15,13 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.cells import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
-from dolfinopt.reduction.free_arm import FreeArm, Rows, frame_loads, interface_loads
+from dolfinopt.reduction.free_arm import (
+    FreeArm,
+    Rows,
+    frame_fields,
+    frame_loads,
+    interface_loads,
+)
 from dolfinopt.reduction.subspace import Expansion, dot, orthonormalise, ritz, solve_at
 
 # Relative residual of solutions at a shift, in the norm of M after multiplication by K^-1.
@@ -75,7 +81,7 @@ def krylov_adjoint(
     interior = (interior - weighted[0] @ inner) @ turn.T
     outboard = (outboard - weighted[1] @ inner) @ turn.T
     stiffness, mass = np.zeros_like(basis.V), np.zeros_like(basis.V)
-    frame = np.zeros((*basis.V.shape[:2], len(basis.outboard)))
+    frame = np.zeros_like(frame_fields(arm))
     for block in reversed(recursion.blocks):
         kept, H = block.expansion.kept, block.expansion.coefficients[:, block.expansion.kept]
         old, new = slice(0, len(H) - len(kept)), slice(len(H) - len(kept), len(H))
@@ -135,8 +141,11 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
     blocks: list[_Block] = []
     omegas = [2.0 * np.pi * shift for shift in options.shifts]
     chains: list[tuple[float, _Group | None, np.ndarray]] = [
-        (omega, group, np.arange(len(free.corner)))
-        for group in (interface_loads, frame_loads)
+        (omega, group, np.arange(columns))
+        for group, columns in (
+            (interface_loads, len(free.corner)),
+            (frame_loads, 3 if arm.mesh.dim == 2 else 6),
+        )
         for omega in omegas
     ]
     while V.shape[2] < options.coordinates:

@@ -92,8 +92,8 @@ class Eigenfrequency(Response):
                 own[place] = period_gradient(by_place[place], one, by_values)
         by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
-        size = 6 if scene.is_spatial else 3
-        zero = [np.zeros((size, size))] * len(scene.arms)
+        sizes = [6 * len(arm.interface_points) if scene.is_spatial else 3 for arm in scene.arms]
+        zero = [np.zeros((size, size)) for size in sizes]
         with together(partition.world):
             for place, matrix in by_carried.items():
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]

@@ -80,7 +80,8 @@ def choose_coordinates(
     if scene.reduction.coordinates != "auto":
         return None
     comparison = _Comparison(scene, partition, arms, x_phys, profile)
-    least, goal = scene.reduction.fewest, scene.reduction.tolerance / reserve
+    least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
+    goal = scene.reduction.tolerance / reserve
     most = min(max(MOST, least), comparison.limit)
     tried: dict[int, float] = {}
     low, high = least - 1, least

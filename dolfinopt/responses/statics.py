@@ -16,8 +16,9 @@ class StaticResponse:
     """What static loads do to one arm whose inboard interface is clamped; k load cases.
 
     Attributes:
-        loads: (3, k) force (N) and moment (N m) at the outboard interface; of solids (6, k).
-        tip: (3, k) or (6, k) its displacement (m) and rotation (rad).
+        loads: (3, k) force (N) and moment (N m) at the outboard interface; of solids (6, k), of
+            those with several interfaces (b, k), zero at the others.
+        tip: likewise displacements (m) and rotations (rad).
     """
 
     loads: np.ndarray
@@ -35,7 +36,7 @@ class StaticResponse:
 
     @property
     def displacement(self) -> np.ndarray:
-        """Displacement of the outboard point (k, d), m."""
+        """Displacement of the first outboard point (k, d), m."""
         return self.tip[: 2 if len(self.tip) == 3 else 3].T
 
     def deflection(self, exponent: float) -> float:
@@ -60,5 +61,7 @@ def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
         arm: of the design.
         loads: (k, 3) F_x, F_y (N) and moment (N m) of every case; of a solid arm (k, 6).
     """
-    columns = np.array(loads, dtype=float).T
-    return StaticResponse(columns, np.linalg.solve(arm.constraint_modes().stiffness, columns))
+    S, columns = arm.constraint_modes().stiffness, np.array(loads, dtype=float).T
+    if len(S) > len(columns):  # further interfaces are free
+        columns = np.concatenate([columns, np.zeros((len(S) - len(columns), columns.shape[1]))])
+    return StaticResponse(columns, np.linalg.solve(S, columns))

@@ -135,9 +135,10 @@ def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> Shap
     q = body.num_modes
     w, W = np.zeros_like(body.w), np.zeros_like(body.W)
     if len(W) == len(SPACE):
-        outboard = by_P[:, 12:18].T
+        b = len(body.outboard)
+        outboard = by_P[:, 12 : 12 + b].T
         w[:, 1:], W[:, 1:, 0] = by_P[:, :3].T, by_P[:, 3:12].T
-        W[:, 1:, 1:] = by_P[:, 18:].reshape(q, 9, q).swapaxes(0, 1)
+        W[:, 1:, 1:] = by_P[:, 12 + b :].reshape(q, 9, q).swapaxes(0, 1)
     else:
         outboard = by_P[:, 4:7].T
         w[:, 1:] = by_P[:, :2].T
@@ -145,6 +146,6 @@ def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> Shap
         W[0, 1:, 1:], W[1, 1:, 1:] = by_P[:, 7 : 7 + q], by_P[:, 7 + q :]
     zero = {
         key: np.zeros_like(getattr(body, key))
-        for key in ("D", "outboard_point", "K0", "K0_outboard")
+        for key in ("D", "outboard_point", "further_points", "K0", "K0_outboard")
     }
     return replace(body, mass=0.0, w=w, W=W, K=by_K, outboard=outboard, **zero)

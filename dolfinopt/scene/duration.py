@@ -8,11 +8,12 @@ from functools import lru_cache
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.paths.tables import last_instant, read_table
+from dolfinopt.paths.tables import TIME, column_names, last_instant, read_table
 from dolfinopt.paths.time_laws import Law, Limits, law_for
 from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points
+SPACE_POINT = ("x", "y", "z")
 SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
 
 
@@ -70,7 +71,8 @@ def path_length(motion: Motion) -> float:
     if motion.path == "arc":
         return np.pi * motion.radius
     if motion.path == "line":
-        return float(np.hypot(*np.subtract(motion.end, motion.start)))
+        way = np.subtract(motion.end, motion.start)
+        return float(np.hypot(*way) if len(way) == 2 else np.linalg.norm(way))
     assert motion.file is not None
     return _chords(motion.file, file_stamp(motion))
 
@@ -78,7 +80,12 @@ def path_length(motion: Motion) -> float:
 @lru_cache(maxsize=64)
 def _chords(file: str, stamp: int) -> float:
     """Return the length of the straight lines through a table of points, m."""
-    rows = read_table(file, POINT).rows
+    names = [name for name in column_names(file) if name != TIME]
+    if "z" not in names:
+        rows = read_table(file, POINT).rows
+    else:
+        known = names if {*SPACE_POINT} <= {*names} else SPACE_POINT  # or told what is missing
+        rows = read_table(file, known).rows[:, [known.index(name) for name in SPACE_POINT]]
     return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
 
 

@@ -18,6 +18,7 @@ from dolfinopt.scene.tables.constraints import Constraints
 from dolfinopt.scene.tables.control import Control
 from dolfinopt.scene.tables.damping import Damping
 from dolfinopt.scene.tables.design import Design
+from dolfinopt.scene.tables.interfaces import interface_number
 from dolfinopt.scene.tables.interpolation import Interpolation
 from dolfinopt.scene.tables.joints import Joint
 from dolfinopt.scene.tables.material import MATERIAL_VALUES, Material
@@ -134,6 +135,23 @@ class Scene(Table):
     def movable(self) -> tuple[Joint, ...]:
         """Joints in space that have a coordinate, in their order."""
         return tuple(joint for joint in self.joints if joint.moves)
+
+    @property
+    def end_effector(self) -> tuple[int, int]:
+        """Return the arm that carries the payload and the number of its interface, 0 outboard."""
+        names = [arm.name for arm in self.arms]
+        arm = len(names) - 1 if self.payload.arm is None else names.index(self.payload.arm)
+        return arm, interface_number(self.arms[arm], self.payload.interface) or 0
+
+    @property
+    def used_interfaces(self) -> frozenset[tuple[int, int]]:
+        """Return the interfaces, as of `end_effector`, on which joints or the payload sit."""
+        index = {arm.name: i for i, arm in enumerate(self.arms)}
+        found = {self.end_effector}
+        for joint in self.joints:
+            if (k := index.get(joint.parent)) is not None:
+                found.add((k, interface_number(self.arms[k], joint.parent_interface) or 0))
+        return frozenset(found)
 
     @property
     def dependent_joints(self) -> int:

@@ -32,8 +32,8 @@ class SpatialCloud:
         masses: (n,) kg.
         modes: (n, 3, q) displacement of every point.
         K, D: (q, q).
-        outboard: (6, q) displacement and rotation vector of the outboard interface.
-        outboard_point: (3,) m.
+        outboard: (6 i, q) displacement and rotation vector of every outboard interface.
+        ends: (i, 3) their reference points, m.
     """
 
     points: np.ndarray
@@ -42,7 +42,7 @@ class SpatialCloud:
     K: np.ndarray
     D: np.ndarray
     outboard: np.ndarray
-    outboard_point: np.ndarray
+    ends: np.ndarray
 
     def body(self) -> ShapeIntegrals:
         """Return the shape integrals as sums over the points."""
@@ -51,11 +51,13 @@ class SpatialCloud:
         W = np.einsum("n,nak,nbl->abkl", self.masses, N, N).reshape(9, 1 + q, 1 + q)
         w = np.einsum("n,nak->ak", self.masses, N)
         none = np.zeros((0, q, q))
-        geometry = self.outboard, self.outboard_point
-        return ShapeIntegrals(self.masses.sum(), w, W, self.K, self.D, *geometry, none, none)
+        ends = self.outboard, self.ends[0]
+        return ShapeIntegrals(
+            self.masses.sum(), w, W, self.K, self.D, *ends, none, none, self.ends[1:]
+        )
 
 
-def spatial_cloud(rng: np.random.Generator, q: int) -> SpatialCloud:
+def spatial_cloud(rng: np.random.Generator, q: int, interfaces: int = 1) -> SpatialCloud:
     """Return a body without any symmetry, of about 1 kg and 1 m."""
     root, damping = rng.normal(size=(2, q, q))
     return SpatialCloud(
@@ -64,19 +66,24 @@ def spatial_cloud(rng: np.random.Generator, q: int) -> SpatialCloud:
         modes=rng.normal(scale=0.3, size=(9, 3, q)),
         K=root @ root.T + np.eye(q),
         D=damping @ damping.T,
-        outboard=rng.normal(scale=0.3, size=(6, q)),
-        outboard_point=np.array([1.0, 0.2, -0.1]),
+        outboard=rng.normal(scale=0.3, size=(6 * interfaces, q)),
+        ends=np.array([[1.0, 0.2, -0.1], [0.4, 0.3, 0.2]])[:interfaces],
     )
 
 
 def random_joint(
-    rng: np.random.Generator, kind: str, parent: int, coordinate: int | None, rotor: float = 0.0
+    rng: np.random.Generator,
+    kind: str,
+    parent: int,
+    coordinate: int | None,
+    rotor: float = 0.0,
+    interface: int = 0,
 ) -> Joint:
     """Return a joint anywhere, its axis in any direction."""
     axis, origin, turn = rng.normal(size=(3, 3))
     return Joint(
         "joint", kind, parent, coordinate, axis / np.linalg.norm(axis), 0.3 * origin,
-        exponential(turn), rotor,
+        exponential(turn), rotor, interface,
     )  # fmt: skip
 
 
@@ -86,15 +93,17 @@ class CloudTree:
 
     clouds: tuple[SpatialCloud, ...]
     joints: tuple[Joint, ...]
-    carried: tuple[SpatialCloud | None, ...]
+    carried: dict[tuple[int, int], SpatialCloud]  # by body and interface
     gravity: np.ndarray
     end: int
 
     def mechanism(self) -> SpatialMechanism:
         """Return the same tree of shape integrals."""
-        carried = tuple(None if one is None else one.body() for one in self.carried)
+        carried = {site: one.body() for site, one in self.carried.items()}
+        first = tuple(carried.pop((i, 0), None) for i in range(len(self.clouds)))
         bodies = tuple(cloud.body() for cloud in self.clouds)
-        return SpatialMechanism(bodies, self.joints, carried, self.gravity, self.end)
+        tree = bodies, self.joints, first, self.gravity, self.end
+        return SpatialMechanism(*tree, carried_further=carried)
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
@@ -122,13 +131,14 @@ class CloudTree:
         taken as polynomials of t by blocks: exp of a block Toeplitz matrix holds its series.
         """
         series = (y, yd, 0.5 * ydd)
-        ends: dict[int, np.ndarray] = {GROUND: _polynomial(np.eye(4))}
+        ends: dict[tuple[int, int], np.ndarray] = {(GROUND, 0): _polynomial(np.eye(4))}
         first = sum(joint.coordinate is not None for joint in self.joints)
         masses, places, second = [], [], []
         for i, (joint, cloud) in enumerate(zip(self.joints, self.clouds, strict=True)):
             part = slice(first, first + len(cloud.K))
             first = part.stop
-            frame = ends[joint.parent] @ _polynomial(_place(joint.rotation, joint.origin))
+            inner = ends[joint.parent, joint.interface]
+            frame = inner @ _polynomial(_place(joint.rotation, joint.origin))
             if (k := joint.coordinate) is not None:
                 generator = _place(0.0 * np.eye(3), joint.axis)
                 if joint.kind == "revolute":
@@ -136,18 +146,21 @@ class CloudTree:
                 generator[3, 3] = 0.0
                 frame = frame @ expm(_polynomial(*(generator * c[k] for c in series)))
             moved = [c[part] for c in series]
-            u = [cloud.outboard[:3] @ e for e in moved]
-            theta = [skew(cloud.outboard[3:] @ e) for e in moved]
-            u[0] = u[0] + cloud.outboard_point
-            shift = _polynomial(
-                _place(np.eye(3), u[0]), *(_place(0.0 * np.eye(3), x) for x in u[1:])
-            )
-            turn = [np.pad(x, (0, 1)) for x in theta]
-            ends[i] = frame @ shift @ expm(_polynomial(*turn))
+            for s, point in enumerate(cloud.ends):
+                B = cloud.outboard[6 * s : 6 * s + 6]
+                u, theta = [B[:3] @ e for e in moved], [skew(B[3:] @ e) for e in moved]
+                u[0] = u[0] + point
+                shift = _polynomial(
+                    _place(np.eye(3), u[0]), *(_place(0.0 * np.eye(3), x) for x in u[1:])
+                )
+                turn = [np.pad(x, (0, 1)) for x in theta]
+                ends[i, s] = frame @ shift @ expm(_polynomial(*turn))
             X = [cloud.points + cloud.modes @ moved[0], *(cloud.modes @ e for e in moved[1:])]
             bodies = [(frame, cloud.masses, X)]
-            if (load := self.carried[i]) is not None:
-                bodies.append((ends[i], load.masses, [load.points, *(0.0 * load.points,) * 2]))
+            for (k, s), load in self.carried.items():
+                if k == i:
+                    still = [load.points, *(0.0 * load.points,) * 2]
+                    bodies.append((ends[i, s], load.masses, still))
             for place, mass, points in bodies:
                 c0, c1, c2 = (place[:4, 4 * j : 4 * j + 4] for j in range(3))
                 R0, R1, R2 = (c[:3, :3] for c in (c0, c1, c2))
@@ -176,21 +189,24 @@ def _polynomial(*coefficients: np.ndarray) -> np.ndarray:
 
 
 def random_tree(rng: np.random.Generator) -> CloudTree:
-    """Return two branches with every kind of joint, rigid and flexible bodies, and loads."""
-    rigid = spatial_cloud(rng, 0)
-    clouds = (rigid, spatial_cloud(rng, 3), spatial_cloud(rng, 2), spatial_cloud(rng, 3), rigid)
+    """Return two branches with every kind of joint, rigid and flexible bodies, and loads.
+
+    They leave a flexible body at two interfaces, and a rigid one is held at its second one.
+    """
+    rigid, fork = spatial_cloud(rng, 0, 2), spatial_cloud(rng, 3, 2)
+    clouds = (rigid, fork, spatial_cloud(rng, 2), spatial_cloud(rng, 3, 2), rigid)
     kinds = (
-        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3), ("prismatic", 1, 1, 0.4),
-        ("fixed", 1, None, 0.0), ("revolute", 3, 2, 0.0),
+        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3, 1), ("prismatic", 1, 1, 0.4),
+        ("fixed", 1, None, 0.0, 1), ("revolute", 3, 2, 0.0, 1),
     )  # fmt: skip
     joints = tuple(random_joint(rng, *one) for one in kinds)
-    loads = (None, spatial_cloud(rng, 0), None, None, spatial_cloud(rng, 0))
+    loads = {site: spatial_cloud(rng, 0) for site in ((1, 0), (1, 1), (3, 0), (4, 0))}
     return CloudTree(clouds, joints, loads, rng.normal(size=3), 4)
 
 
 def stiffened(rng: np.random.Generator, body: ShapeIntegrals) -> ShapeIntegrals:
     """Return a body with some geometric stiffness."""
-    K0 = rng.normal(scale=0.2, size=(18, body.num_modes, body.num_modes))
+    K0 = rng.normal(scale=0.2, size=(12 + len(body.outboard), *(body.num_modes,) * 2))
     K0 = K0 + K0.swapaxes(1, 2)
     return replace(body, K0=K0[:12], K0_outboard=K0[12:])
 
@@ -206,7 +222,7 @@ def changes(rng: np.random.Generator, body: ShapeIntegrals) -> dict[str, np.ndar
         if one.name == "W":  # W_ba = W_ab'
             blocks = change.reshape(3, 3, *change.shape[1:])
             change = (blocks + blocks.transpose(1, 0, 3, 2)).reshape(change.shape)
-        if one.name != "outboard_point":
+        if not one.name.endswith(("_point", "_points")):
             found[one.name] = change
     return found
 

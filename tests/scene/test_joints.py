@@ -116,7 +116,9 @@ REFUSED = [
     (("payload", "inertia"), [0.5, 0.2, 0.1, 0, 0, 0], "payload.inertia = "),
     (("arms", 1), ARM, "arms.1.cells (link) = [8, 2]: expected three integers"),
     (("arms", 1, "joint_stiffness"), 1e4, "expected 0 with [[joints]]"),
-    (("motion", "path"), "arc", 'motion.path = "arc"'),
+    (("motion", "path"), "arc", 'motion.path = "arc": expected "joints" | "points" | "line"'),
+    (("motion",), {"path": "line"}, "[-1.0, 0.0] (default): expected an array of three"),
+    (("motion", "initial_joints"), [0.1], "motion.initial_joints"),
     (("motion", "gravity"), [0, -9.81], "expected an array of three numbers with [[joints]]"),
     (("motion", "joint_height"), 0.3, "expected -0.5, the default, with [[joints]]"),
     (("motion", "cart_mass"), 2.0, "expected 0.0, the default, with [[joints]]"),
@@ -140,6 +142,76 @@ def test_refusals(source, path, value, text):
     assert text in message and len(message.splitlines()) == 1
 
 
+# A frame with an interface on its side, on which a tool hangs; the payload is on the frame's end.
+SIDE = {"name": "side", "point": [0.2, 0.01, 0.0]}
+
+
+def with_fork():
+    """Return the robot whose slide carries the tool at its side and the payload at its end."""
+    data = with_tool()
+    data["arms"][1]["interfaces"] = [dict(SIDE)]
+    data["joints"][2]["parent_interface"] = "side"
+    data["payload"]["arm"] = "slide"
+    return data
+
+
+def test_interfaces_of_a_scene(source):
+    """Where joints and payload sit; the end-effector is the arm with the payload."""
+    scene = scene_from_dict(with_fork(), source)
+    assert scene.end_effector == (1, 0) and scene.used_interfaces == {(0, 0), (1, 0), (1, 1)}
+    machine = build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
+    assert (machine.joints[2].parent, machine.joints[2].interface) == (1, 1)
+    assert np.array_equal(machine.bodies[1].points, [[0.4, 0, 0], [0.2, 0.01, 0]])
+    assert machine.sites == ((0,), (0, 1), ()) and set(machine.loads) == {(1, 0)}
+    assert machine.chain == (0, 1)
+    data = with_fork()  # the payload at the side, beside the tool
+    data["payload"]["interface"] = "Side"
+    scene = scene_from_dict(data, source)
+    machine = build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
+    assert (machine.end, machine.end_interface) == (1, 1) and set(machine.loads) == {(1, 1)}
+    data["arms"][2]["interfaces"] = [{**SIDE, "name": "a", "radius": 0.01}]
+    data["payload"] = {"arm": "tool", "interface": "a"}
+    data["reduction"]["coordinates"] = 12
+    assert scene_from_dict(data, source).arms[2].num_outboard == 12
+
+
+FORKS = [
+    (("joints", 2, "parent_interface"), "top", 'joints.2.parent_interface (wrist) = "top": '
+     'expected the name of an interface of slide: "outboard" | "side"'),
+    (("joints", 0, "parent_interface"), "side", "expected none on the ground"),
+    (("joints", 2, "parent_interface"), "outboard", "nothing sits on it"),
+    (("payload", "interface"), "top", 'payload.interface = "top": expected the name of an'),
+    (("payload", "arm"), "hand", 'payload.arm = "hand": expected the name of an arm'),
+    (("arms", 1, "interfaces", 0, "name"), "Outboard", "are the arm's ends"),
+    (("arms", 1, "interfaces", 0, "radius"), 0.1, "expected none with a rigid arm"),
+    (("arms", 1, "interfaces"), [SIDE, SIDE], "expected a name that no other interface"),
+    (("arms", 2, "interfaces"), [SIDE], "expected a number > 0 [m] with an arm made of cells"),
+    (("arms", 2, "interfaces"), [{**SIDE, "radius": 0.01}], "nothing sits on it"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "value", "text"), FORKS)
+def test_refused_interfaces(source, path, value, text):
+    data = with_fork()
+    data["reduction"]["coordinates"] = 12
+    node = data
+    for part in path[:-1]:
+        node = node[part]
+    node[path[-1]] = value
+    with pytest.raises(InputError) as caught:
+        scene_from_dict(data, source)
+    message = str(caught.value)
+    assert text in message and len(message.splitlines()) == 1
+
+
+def test_coordinates_of_several_interfaces(source):
+    data = with_fork()
+    data["arms"][2]["interfaces"] = [{**SIDE, "radius": 0.01}]
+    data["payload"] = {"arm": "tool", "interface": "side"}
+    with pytest.raises(InputError, match=r"expected an integer >= 12 .* interfaces, 2, have six"):
+        scene_from_dict(data, source)
+
+
 def test_arm_without_joint(source):
     data = copy.deepcopy(ROBOT)
     data["joints"].pop()
@@ -161,6 +233,8 @@ def test_plane_scenes_have_no_keys_of_space():
         "motion.gravity=[0,0,-9.81]",
         "payload.inertia=[1,1,1,0,0,0]",
         "payload.offset=[0,0,0.1]",
+        "payload.arm=arm1",
+        "arms.arm1.interfaces=[{name='side', point=[0.5, 0.03, 0], radius=0.01}]",
     ):
         with pytest.raises(InputError, match=r"without \[\[joints\]\]"):
             load_scene("demos/two_arm.toml", [change])

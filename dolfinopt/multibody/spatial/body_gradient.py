@@ -11,13 +11,9 @@ import numpy as np
 
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.body_motion import Weights, with_outboard
-from dolfinopt.multibody.spatial.inverse_dynamics import (
-    Link,
-    Loads,
-    inward_pass,
-    outward_pass,
-)
-from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
+from dolfinopt.multibody.spatial.inverse_dynamics import Link, inward_pass, outward_pass
+from dolfinopt.multibody.spatial.kinematics import Interface, Load
+from dolfinopt.multibody.spatial.mechanism import GROUND, Site, SpatialMechanism
 from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.spatial.rotations import cross, times, transposed_times
 
@@ -51,23 +47,24 @@ def body_gradient(
     for i in reversed(mechanism.order):
         link, virtual, own = links[i], moves[i], multipliers[:, mechanism.slices[i]]
         by = np.einsum("nij,ni->nj", link.body.load_by_motion, virtual)
-        outboard, K0 = np.zeros_like(link.body.constants.B), np.zeros((0, *own.shape[1:] * 2))
+        stiffened, size = link.body.constants.K0 is not None, len(link.body.constants.B)
+        outboard = np.zeros_like(link.body.constants.B)
+        K0 = np.zeros((size if stiffened else 0, *own.shape[1:] * 2))
         if link.body.is_flexible:
             by += (own[:, None] @ link.body.rows_by_motion)[:, 0]
-            if link.body.constants.K0 is not None:
-                K0 = np.zeros((6, *own.shape[1:] * 2))
-        if link.interface is not None:
-            outer = np.zeros_like(by)
-            for k in mechanism.children[i]:
+        for s, interface in link.interfaces.items():
+            outer = np.zeros((len(own), 9))
+            for k in mechanism.hanging(i, s):
                 outer += np.einsum("nij,ni->nj", links[k].joint.motion_by_interface, by_motion[k])
-            if link.carried is not None:
-                outer += np.einsum("nij,ni->nj", link.carried.load_by_motion, ends[i])
+            if s in link.carried:
+                outer += np.einsum("nij,ni->nj", link.carried[s].load_by_motion, ends[i, s])
             if link.body.is_flexible:
-                weights = _interface_weights(link, loads, i, virtual, own, outer)
-                outboard = weights.linear(link.body.rates, own)
-                if link.body.constants.K0 is not None:
-                    K0 = weights.quadratic(link.body.rates, own)
-            by += np.einsum("nij,ni->nj", link.interface.motion_by_body, outer)
+                load = loads.outboard[i][s]
+                weights = _interface_weights(interface, load, virtual, own, outer)
+                outboard[interface.rows_of] = weights.linear(link.body.rates, own)
+                if stiffened:
+                    K0[interface.rows_of] = weights.quadratic(link.body.rates, own)
+            by += np.einsum("nij,ni->nj", interface.motion_by_body, outer)
         by_motion[i] = by
         gradient[i] = with_outboard(link.body.integral_gradient(virtual, own), outboard, K0)
     return [gradient[i] for i in range(len(links))]
@@ -78,49 +75,48 @@ def _virtual_motion(
     links: list[Link],
     multipliers: np.ndarray,
     of_forces: np.ndarray,
-) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray]]:
+) -> tuple[dict[int, np.ndarray], dict[Site, np.ndarray]]:
     """Return displacement and rotation (n, 6) of every frame, and of every outboard interface.
 
     In the components of the frame, and of the interface: what multiplies their loads.
     """
     moves: dict[int, np.ndarray] = {}
-    ends: dict[int, np.ndarray] = {}
+    ends: dict[Site, np.ndarray] = {}
     for i in mechanism.order:
         link, joint = links[i], mechanism.joints[i]
-        inner = np.zeros((len(multipliers), 6)) if joint.parent == GROUND else ends[joint.parent]
+        inner = np.zeros((len(multipliers), 6))
+        if joint.parent != GROUND:
+            inner = ends[joint.parent, joint.interface]
         moved = np.einsum("nij,ni->nj", link.joint.load_by_body, inner)
         if joint.coordinate is not None:
             moved = moved + of_forces[:, joint.coordinate, None] * link.joint.driven
         moves[i] = moved
-        if link.interface is None:
-            continue
-        p, phi = _moved_interface(link, moved, multipliers[:, mechanism.slices[i]])
-        if link.body.is_flexible:
-            R = link.interface.turning.R
-            p, phi = transposed_times(R, p), transposed_times(R, phi)
-        ends[i] = np.hstack([p, phi])
+        for s, interface in link.interfaces.items():
+            p, phi = _moved_interface(interface, moved, multipliers[:, mechanism.slices[i]])
+            if link.body.is_flexible:
+                R = interface.turning.R
+                p, phi = transposed_times(R, p), transposed_times(R, phi)
+            ends[i, s] = np.hstack([p, phi])
     return moves, ends
 
 
 def _moved_interface(
-    link: Link, virtual: np.ndarray, own: np.ndarray
+    interface: Interface, virtual: np.ndarray, own: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return virtual displacement and rotation of an interface (n, 3), the body's components."""
-    assert link.interface is not None
     p, phi = virtual[:, :3], virtual[:, 3:]
-    p = p + cross(phi, np.broadcast_to(link.interface.place, p.shape))
-    if link.body.is_flexible:
-        B = link.interface.B
+    p = p + cross(phi, np.broadcast_to(interface.place, p.shape))
+    if interface.body.is_flexible:
+        B = interface.B
         moved = own @ B.T if B.ndim == 2 else np.einsum("nik,nk->ni", B, own)
         p = p + moved[:, :3]
-        phi = phi + times(link.interface.turning.J, moved[:, 3:])
+        phi = phi + times(interface.turning.J, moved[:, 3:])
     return p, phi
 
 
 def _interface_weights(
-    link: Link,
-    loads: Loads,
-    i: int,
+    interface: Interface,
+    load: Load,
     virtual: np.ndarray,
     own: np.ndarray,
     outer: np.ndarray,
@@ -128,19 +124,16 @@ def _interface_weights(
     """Return the derivatives (n, 6) by (u, theta), their rates and variation.
 
     Args:
-        link: body i.
-        loads: of all bodies.
-        i: its index.
-        virtual: (n, 6) of its frame.
-        own: (n, q) its multipliers.
+        interface: of a flexible body.
+        load: on it.
+        virtual: (n, 6) of the body's frame.
+        own: (n, q) the body's multipliers.
         outer: (n, 9) derivatives by the interface's motion.
     """
-    interface, load = link.interface, loads.outboard[i]
-    assert interface is not None and load is not None
     value, rate, second = (
         np.einsum("nij,ni->nj", x, outer) for x in interface.motion_by_displacement
     )
-    p, phi = _moved_interface(link, virtual, own)
+    p, phi = _moved_interface(interface, virtual, own)
     B = interface.B
     moved = own @ B.T if B.ndim == 2 else np.einsum("nik,nk->ni", B, own)
     turning = interface.turning

@@ -12,19 +12,20 @@ from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.spatial.rotations import ONE
 
 
-def body_loads(links: list[Link], outboard: list[Load | None]) -> list[np.ndarray]:
+def body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.ndarray]:
     """Return p = (a, A_ab, force, moment) (n, 18) of every body.
 
-    The moment is what works on the rotation vector of the interface.
+    The moment is what works on the rotation vector of the interface. Of several interfaces force
+    and moment of one stand behind those of the other.
     """
     found = []
-    for link, load in zip(links, outboard, strict=True):
+    for link, loads in zip(links, outboard, strict=True):
         count = len(link.body.a)
-        pull = np.zeros((count, 6))
-        if load is not None:
-            assert link.interface is not None
-            flexible = link.body.is_flexible
-            pull = link.interface.conjugate(load) if flexible else np.hstack(load)
+        pull = np.zeros((count, len(link.body.constants.B)))
+        for s, load in loads.items():
+            flexible, interface = link.body.is_flexible, link.interfaces[s]
+            own = interface.conjugate(load) if flexible else np.hstack(load)
+            pull[:, interface.rows_of] = own
         found.append(np.hstack([link.body.a, link.body.A.reshape(count, 9), pull]))
     return found
 

@@ -325,6 +325,7 @@ class Weights:
 def with_outboard(
     found: dict[str, np.ndarray | float], outboard: np.ndarray, K0_outboard: np.ndarray
 ) -> ShapeIntegrals:
-    """Return derivatives by all integrals from those of inertia and of the outboard interface."""
+    """Return derivatives by all integrals from those of inertia and of the outboard interfaces."""
     every = found | {"outboard": outboard, "K0_outboard": K0_outboard}
+    every["further_points"] = np.zeros((len(outboard) // 6 - 1, 3))
     return ShapeIntegrals(outboard_point=np.zeros(3), **every)  # type: ignore[arg-type]

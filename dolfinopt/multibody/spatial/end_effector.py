@@ -17,9 +17,8 @@ class _Chain:
     Attributes:
         bodies: their indices.
         rotations: (n, 3, 3) of every body's frame against the world's.
-        interfaces: of every body.
-        levers: (n, 3) from every body's outboard interface to the end-effector, the body's
-            components.
+        interfaces: of every body the one on which the next body or the end-effector sits.
+        levers: (n, 3) from these interfaces to the end-effector, the body's components.
         joints: of every body.
         at_joints: (n, 3) from every joint's frame to the end-effector, its components.
         end: (n, 3) the end-effector, m.
@@ -28,11 +27,12 @@ class _Chain:
     def __init__(self, mechanism: SpatialMechanism, motion: JointMotion, q: np.ndarray) -> None:
         count = len(motion.q)
         self.bodies = mechanism.chain
+        outer = [mechanism.joints[i].interface for i in self.bodies[1:]]
         still = (np.zeros((count, 3)),) * 3
         self.rotations, self.interfaces, self.joints = [], [], []  # type: ignore[var-annotated]
         rotation, place = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))
         origins = []
-        for i in self.bodies:
+        for i, number in zip(self.bodies, [*outer, mechanism.end_interface], strict=True):
             k, own = mechanism.joints[i].coordinate, None
             if k is not None:
                 own = (motion.q[:, k], motion.qd[:, k], motion.qdd[:, k])
@@ -40,7 +40,7 @@ class _Chain:
             place = place + times(rotation, np.broadcast_to(joint.r, place.shape))
             rotation = rotation @ joint.R
             e = q[:, mechanism.slices[i]]
-            interface = Interface(BodyMotion(mechanism.constants[i], still, (e, e, e)))
+            interface = Interface(BodyMotion(mechanism.constants[i], still, (e, e, e)), number)
             self.joints.append(joint)
             self.rotations.append(rotation)
             self.interfaces.append(interface)
@@ -81,8 +81,8 @@ def end_effector_gradient(
         weights: (n, 3).
 
     Returns:
-        By q (n, N), by the joints (n, joints), and by every body's outboard modes (6, q) and
-        their geometric stiffness (6, q, q), under the names of the shape integrals.
+        By q (n, N), by the joints (n, joints), and by every body's outboard modes (b, q) and
+        their geometric stiffness (b, q, q), under the names of the shape integrals.
     """
     chain = _Chain(mechanism, motion, q)
     by_q, by_joints = np.zeros_like(q), np.zeros_like(motion.q)
@@ -100,9 +100,10 @@ def end_effector_gradient(
         load = (force, cross(chain.levers[at], force))
         by_q[:, part] = interface.rows(load)
         pull, e = interface.conjugate(load), q[:, part]
-        by_bodies[i] = {"outboard": pull.T @ e}
-        if mechanism.constants[i].K0_outboard is not None:
+        by_bodies[i]["outboard"][interface.rows_of] = pull.T @ e
+        if (K0 := mechanism.constants[i].K0_outboard) is not None:
             pulled = np.einsum("np,nk->npk", pull, e).reshape(len(e), -1)
             bent = (-0.5 * (e.T @ pulled)).reshape(e.shape[1], 6, -1).swapaxes(0, 1)
-            by_bodies[i]["K0_outboard"] = bent
+            by_bodies[i]["K0_outboard"] = np.zeros_like(K0)
+            by_bodies[i]["K0_outboard"][interface.rows_of] = bent
     return by_q, by_joints, by_bodies

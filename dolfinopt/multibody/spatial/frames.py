@@ -8,7 +8,7 @@ import numpy as np
 
 from dolfinopt.multibody.spatial.body_motion import BodyMotion
 from dolfinopt.multibody.spatial.kinematics import Interface, MovingJoint
-from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
+from dolfinopt.multibody.spatial.mechanism import GROUND, Site, SpatialMechanism
 from dolfinopt.multibody.spatial.rotations import times
 
 
@@ -19,9 +19,12 @@ class Frames:
     Attributes:
         origin: (n, b, 3) of every body's frame, where its joint is, m.
         rotation: (n, b, 3, 3) from every body's frame to the world's.
-        outboard: (n, b, 3) of every body's outboard interface, m.
+        outboard: (n, b, 3) of every body's first outboard interface, m.
         parents: of every body, or `GROUND`.
         axes: (n, b, 3) unit vectors along the joints' axes.
+        held: (n, b, 3) of the interface that every body hangs on; the world's origin of those on
+            the ground, m.
+        end: (n, 3) of the end-effector, m.
     """
 
     origin: np.ndarray
@@ -29,6 +32,8 @@ class Frames:
     outboard: np.ndarray
     parents: tuple[int, ...]
     axes: np.ndarray
+    held: np.ndarray
+    end: np.ndarray
 
     def __getitem__(self, part: slice | np.ndarray) -> Frames:
         """Return those at some of the instants."""
@@ -38,6 +43,8 @@ class Frames:
             self.outboard[part],
             self.parents,
             self.axes[part],
+            self.held[part],
+            self.end[part],
         )
 
 
@@ -51,26 +58,34 @@ def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -
     """
     count, bodies = len(q_r), len(mechanism.bodies)
     still = (np.zeros((count, 3)),) * 3
-    origin, outboard = np.zeros((2, count, bodies, 3))
-    rotation, turned = np.zeros((2, count, bodies, 3, 3))  # of frames, of outboard interfaces
+    origin, outboard, held = np.zeros((3, count, bodies, 3))
+    rotation = np.zeros((count, bodies, 3, 3))
+    place: dict[Site, np.ndarray] = {}  # of interfaces
+    turned: dict[Site, np.ndarray] = {}
     for i in mechanism.order:
         joint, own = mechanism.joints[i], None
         if (k := joint.coordinate) is not None:
             own = (q_r[:, k], *np.zeros((2, count)))
         moving = MovingJoint(joint, still, own)
-        place, R = np.zeros((count, 3)), np.broadcast_to(np.eye(3), (count, 3, 3))
+        R = np.broadcast_to(np.eye(3), (count, 3, 3))
         if joint.parent != GROUND:
-            place, R = outboard[:, joint.parent], turned[:, joint.parent]
-        origin[:, i] = place + times(R, np.broadcast_to(moving.r, place.shape))
-        rotation[:, i] = turned[:, i] = R @ moving.R
+            site = joint.parent, joint.interface
+            held[:, i], R = place[site], turned[site]
+        origin[:, i] = held[:, i] + times(R, np.broadcast_to(moving.r, (count, 3)))
+        rotation[:, i] = R @ moving.R
         e = q_e[:, mechanism.slices[i]]
-        interface = Interface(BodyMotion(mechanism.constants[i], still, (e, e, e)))
-        away = np.broadcast_to(interface.place, place.shape)
-        outboard[:, i] = origin[:, i] + times(rotation[:, i], away)
-        if mechanism.constants[i].num_modes:
-            turned[:, i] = rotation[:, i] @ interface.turning.R
+        body = BodyMotion(mechanism.constants[i], still, (e, e, e))
+        for s in range(len(body.constants.points)):
+            interface = Interface(body, s)
+            away = np.broadcast_to(interface.place, (count, 3))
+            place[i, s] = origin[:, i] + times(rotation[:, i], away)
+            turned[i, s] = rotation[:, i]
+            if body.is_flexible:
+                turned[i, s] = rotation[:, i] @ interface.turning.R
+        outboard[:, i] = place[i, 0]
     axes = np.stack(
         [rotation[:, i] @ joint.axis for i, joint in enumerate(mechanism.joints)], axis=1
     )
     parents = tuple(joint.parent for joint in mechanism.joints)
-    return Frames(origin, rotation, outboard, parents, axes)
+    end = place[mechanism.end, mechanism.end_interface]
+    return Frames(origin, rotation, outboard, parents, axes, held, end)

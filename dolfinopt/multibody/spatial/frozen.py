@@ -1,8 +1,9 @@
-"""A machine in space frozen in one pose: what every body carries at its outboard interface."""
+"""A machine in space frozen in one pose: what every body carries at its outboard interfaces."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -21,17 +22,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CarriedInertia:
-    """Inertia of something rigid under displacement and rotation of an interface.
+    """Inertia of what is rigid under displacements and rotations of interfaces.
 
     Attributes:
-        entries: of the matrix (6, 6), row by row; kg, kg m, kg m2.
+        entries: of the matrix (b, b), row by row; kg, kg m, kg m2. b is 6 of every interface.
     """
 
     entries: tuple[float, ...]
 
     def matrix(self) -> np.ndarray:
-        """Return it as (6, 6)."""
-        return np.array(self.entries).reshape(6, 6)
+        """Return it as (b, b)."""
+        size = math.isqrt(len(self.entries))
+        return np.array(self.entries).reshape(size, size)
 
 
 def mass_matrix(body: ShapeIntegrals) -> np.ndarray:
@@ -85,38 +87,50 @@ class FrozenTree:
             found.append(MovingJoint(joint, still, own).load_by_body[0].T)
         return found
 
-    def _beyond(self, k: int) -> list[tuple[int, np.ndarray]]:
-        """Return the bodies outboard of body k's interface, and their motion by that of it."""
+    def _shift(self, body: int, interface: int) -> np.ndarray:
+        """Return the motion of a body's interface by that of its frame (6, 6)."""
+        shift = np.eye(6)
+        shift[:3, 3:] = -skew(self.mechanism.bodies[body].points[interface])
+        return shift
+
+    def _beyond(self, body: int, interface: int) -> list[tuple[int, np.ndarray]]:
+        """Return the bodies outboard of an interface, and their motion by that of it."""
         found: list[tuple[int, np.ndarray]] = []
-        for i in self.mechanism.children[k]:
+        for i in self.mechanism.hanging(body, interface):
             own = self._steps[i]
-            shift = np.eye(6)
-            shift[:3, 3:] = -skew(self.mechanism.bodies[i].outboard_point)
             found.append((i, own))
-            found += [(j, T @ shift @ own) for j, T in self._beyond(i)]
+            for s in self.mechanism.sites[i]:
+                shift = self._shift(i, s) @ own
+                found += [(j, T @ shift) for j, T in self._beyond(i, s)]
         return found
 
-    def _loads_beyond(self, k: int) -> list[tuple[int, np.ndarray]]:
-        """Return what is carried at body k's interface and outboard, and its motion likewise."""
-        found = [(k, np.eye(6))]
-        for i, T in self._beyond(k):
-            shift = np.eye(6)
-            shift[:3, 3:] = -skew(self.mechanism.bodies[i].outboard_point)
-            found.append((i, shift @ T))
-        return found
+    def _loads_beyond(
+        self, body: int, interface: int
+    ) -> Iterator[tuple[ShapeIntegrals, np.ndarray]]:
+        """Yield what is carried at an interface and outboard of it, and its motion likewise."""
+        loads = self.mechanism.every_load
+        if (body, interface) in loads:
+            yield loads[body, interface], np.eye(6)
+        for i, T in self._beyond(body, interface):
+            for s in self.mechanism.sites[i]:
+                if (i, s) in loads:
+                    yield loads[i, s], self._shift(i, s) @ T
 
     def carried(self) -> list[CarriedInertia]:
-        """Return what every body carries, about its outboard point, in its own frame."""
+        """Return what every body carries, about its interfaces' points, in its own frame."""
         found = []
-        for k in range(len(self.mechanism.bodies)):
-            M = np.zeros((6, 6))
-            for i, T in self._beyond(k):
-                M += T.T @ mass_matrix(self.mechanism.bodies[i]) @ T
-            for i, T in self._loads_beyond(k):
-                load = self.mechanism.carried[i]
-                if load is not None:
+        for k, body in enumerate(self.mechanism.bodies):
+            size = 6 * len(body.points)
+            whole = np.zeros((size, size))
+            for s in self.mechanism.sites[k]:
+                M = np.zeros((6, 6))
+                for i, T in self._beyond(k, s):
+                    M += T.T @ mass_matrix(self.mechanism.bodies[i]) @ T
+                for load, T in self._loads_beyond(k, s):
                     M += T.T @ mass_matrix(load) @ T
-            found.append(CarriedInertia(tuple(self._kept(M).ravel().tolist())))
+                place = slice(6 * s, 6 * s + 6)
+                whole[place, place] = self._kept(M)
+            found.append(CarriedInertia(tuple(whole.ravel().tolist())))
         return found
 
     def _kept(self, M: np.ndarray) -> np.ndarray:
@@ -136,14 +150,14 @@ class FrozenTree:
         return out
 
     def cotangents(self, by_carried: Sequence[np.ndarray]) -> list[ShapeIntegrals]:
-        """Return the derivatives by every body's integrals from those by `carried` (6, 6)."""
+        """Return the derivatives by every body's integrals from those by `carried` (b, b)."""
         by_matrix: dict[int, np.ndarray] = {}
         for k, by in enumerate(by_carried):
-            if not by.any():
-                continue
-            inner = self._kept_transposed(by)
-            for i, T in self._beyond(k):
-                by_matrix[i] = by_matrix.get(i, np.zeros((6, 6))) + T @ inner @ T.T
+            for s in self.mechanism.sites[k] if by.any() else ():
+                place = slice(6 * s, 6 * s + 6)
+                inner = self._kept_transposed(by[place, place])
+                for i, T in self._beyond(k, s):
+                    by_matrix[i] = by_matrix.get(i, np.zeros((6, 6))) + T @ inner @ T.T
         zero, bodies = np.zeros((6, 6)), range(len(self.mechanism.bodies))
         return [by_integrals(by_matrix.get(i, zero)) for i in bodies]
 
@@ -159,5 +173,6 @@ def rigid_integrals_in_space(arm: ElasticArm) -> ShapeIntegrals:
     second = 0.5 * (second + second.T)
     centred = np.trace(second) * ONE - second  # about the origin, its mass there
     inertia = centred[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    body = rigid_spatial_body(0.0, np.zeros(3), inertia, arm.mesh.outboard_point)
+    points = arm.mesh.outboard_point, arm.mesh.further_points
+    body = rigid_spatial_body(0.0, np.zeros(3), inertia, *points)
     return replace(body, mass=float(parts[0]), w=parts[1:4, None])

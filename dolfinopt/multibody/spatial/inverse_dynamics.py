@@ -24,14 +24,14 @@ class Link:
     Attributes:
         joint: that holds it.
         body: itself.
-        interface: its outboard one; None where nothing hangs on it.
-        carried: what it carries there, as it moves; or None.
+        interfaces: its outboard ones on which something sits, by number.
+        carried: what it carries there without a joint, as it moves, by number.
     """
 
     joint: MovingJoint
     body: BodyMotion
-    interface: Interface | None
-    carried: BodyMotion | None
+    interfaces: dict[int, Interface]
+    carried: dict[int, BodyMotion]
 
 
 def outward_pass(mechanism: SpatialMechanism, motion: JointMotion, rates: Rates) -> list[Link]:
@@ -46,20 +46,18 @@ def outward_pass(mechanism: SpatialMechanism, motion: JointMotion, rates: Rates)
             own = (motion.q[:, k], motion.qd[:, k], motion.qdd[:, k])
         inner = ground
         if joint.parent != GROUND:
-            outboard = links[joint.parent].interface
-            assert outboard is not None
-            inner = outboard.motion
+            inner = links[joint.parent].interfaces[joint.interface].motion
         moving = MovingJoint(joint, inner, own)
         part = mechanism.slices[i]
         e, ed, edd = (x[:, part] for x in rates)
         body = BodyMotion(mechanism.constants[i], moving.motion, (e, ed, edd))
-        load, interface, carried = mechanism.loads[i], None, None
-        if mechanism.children[i] or load is not None:
-            interface = Interface(body)
-        if load is not None:
-            assert interface is not None
-            carried = BodyMotion(load, interface.motion, (none, none, none))
-        links[i] = Link(moving, body, interface, carried)
+        interfaces = {s: Interface(body, s) for s in mechanism.sites[i]}
+        carried = {
+            s: BodyMotion(mechanism.loads[i, s], interface.motion, (none, none, none))
+            for s, interface in interfaces.items()
+            if (i, s) in mechanism.loads
+        }
+        links[i] = Link(moving, body, interfaces, carried)
     return [links[i] for i in range(len(links))]
 
 
@@ -68,28 +66,28 @@ class Loads:
     """What loads the bodies of a tree; (force, moment), each (n, 3).
 
     Attributes:
-        outboard: on every body's interface, in the body's components; None where nothing is.
+        outboard: on every body's interfaces by number, in the body's components.
         joints: on every body's frame by all that hangs on it, itself included.
     """
 
-    outboard: list[Load | None]
+    outboard: list[dict[int, Load]]
     joints: list[Load]
 
 
 def inward_pass(mechanism: SpatialMechanism, links: list[Link]) -> Loads:
     """Return the loads of all bodies as they move."""
-    outboard: list[Load | None] = [None] * len(links)
+    outboard: list[dict[int, Load]] = [{} for _ in links]
     joints: dict[int, Load] = {}
     for i in reversed(mechanism.order):
         link = links[i]
         force, moment = link.body.load
-        if link.interface is not None:
-            parts = [links[k].joint.at_interface(joints[k]) for k in mechanism.children[i]]
-            if link.carried is not None:
-                parts.append(link.carried.load)
+        for s, interface in link.interfaces.items():
+            parts = [links[k].joint.at_interface(joints[k]) for k in mechanism.hanging(i, s)]
+            if s in link.carried:
+                parts.append(link.carried[s].load)
             total = (sum(part[0] for part in parts), sum(part[1] for part in parts))
-            outboard[i] = load = link.interface.in_body(total)  # type: ignore[arg-type]
-            more = link.interface.at_origin(load)
+            outboard[i][s] = load = interface.in_body(total)  # type: ignore[arg-type]
+            more = interface.at_origin(load)
             force, moment = force + more[0], moment + more[1]
         joints[i] = (force, moment)
     return Loads(outboard, [joints[i] for i in range(len(links))])
@@ -98,13 +96,12 @@ def inward_pass(mechanism: SpatialMechanism, links: list[Link]) -> Loads:
 def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
     """Return the elastic residual (n, N)."""
     rows = [np.zeros((len(links[0].body.a), 0))]
-    for link, load in zip(links, loads.outboard, strict=True):
+    for link, outboard in zip(links, loads.outboard, strict=True):
         if not link.body.is_flexible:
             continue
         own = link.body.rows
-        if load is not None:
-            assert link.interface is not None
-            own = own + link.interface.rows(load)
+        for s, load in outboard.items():
+            own = own + link.interfaces[s].rows(load)
         rows.append(own)
     return np.concatenate(rows, axis=1)
 

@@ -30,22 +30,28 @@ Load = tuple[np.ndarray, np.ndarray]
 
 
 class Interface:
-    """The outboard interface of a body, displaced by u and turned by the rotation vector theta.
+    """An outboard interface of a body, displaced by u and turned by the rotation vector theta.
 
     (u, theta) = B e - 1/2 e'K0 e. Derivatives by them and their rates have six columns, u first.
 
     Attributes:
         body: as it moves.
+        rows_of: its place among the coordinates of all interfaces of the body.
+        point: (3,) reference position, m.
     """
 
-    def __init__(self, body: BodyMotion) -> None:
-        """Take the body."""
-        self.body = body
+    def __init__(self, body: BodyMotion, number: int = 0) -> None:
+        """Take the body, and which of its interfaces it is."""
+        self.body, constants = body, body.constants
+        self.rows_of = slice(6 * number, 6 * number + 6)
+        self.point, self._B = constants.points[number], constants.B[self.rows_of]
+        K0 = constants.K0_outboard
+        self._K0 = None if K0 is None else K0[self.rows_of]
 
     @cached_property
     def _stiffening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """K0 of the interface's loads times e, e', e'' (n, 6, q); None of a linear body."""
-        K0 = self.body.constants.K0_outboard
+        K0 = self._K0
         if K0 is None:
             return None
         flat = K0.transpose(1, 0, 2).reshape(K0.shape[1], -1)
@@ -55,13 +61,13 @@ class Interface:
     @cached_property
     def B(self) -> np.ndarray:
         """Derivative of (u, theta) by e (6, q), or (n, 6, q)."""
-        B, bent = self.body.constants.B, self._stiffening
+        B, bent = self._B, self._stiffening
         return B if bent is None else B - bent[0]
 
     @cached_property
     def _displacement(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(u, theta) and its two derivatives (n, 6)."""
-        B, (e, ed, edd) = self.body.constants.B, self.body.rates
+        B, (e, ed, edd) = self._B, self.body.rates
         x, xd, xdd = e @ B.T, ed @ B.T, edd @ B.T
         if (bent := self._stiffening) is not None:
             x = x - 0.5 * np.einsum("npk,nk->np", bent[0], e)
@@ -72,7 +78,7 @@ class Interface:
     @cached_property
     def place(self) -> np.ndarray:
         """Reference point from the body's origin (n, 3), m; of a rigid body (1, 3)."""
-        point = self.body.constants.body.outboard_point
+        point = self.point
         if not self.body.is_flexible:
             return point[None]
         return point + self._displacement[0][:, :3]
@@ -188,7 +194,7 @@ class Interface:
         """Return the derivative of the rows by e (n, q, q), a load of `in_body` held."""
         B_theta = self.B[..., 3:, :]
         own = B_theta.swapaxes(-1, -2) @ self.turning.by_theta(load[1], -1.0) @ B_theta
-        K0 = self.body.constants.K0_outboard
+        K0 = self._K0
         return own if K0 is None else own - np.tensordot(self.conjugate(load), K0, 1)
 
 

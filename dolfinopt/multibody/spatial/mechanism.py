@@ -8,6 +8,7 @@ Featherstone, Rigid Body Dynamics Algorithms (2008); Schwertassek & Wallrapp (19
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -20,6 +21,7 @@ from dolfinopt.multibody.spatial.rotations import ONE
 
 GROUND = -1
 JointType = Literal["revolute", "prismatic", "fixed"]
+Site = tuple[int, int]  # body, and which of its outboard interfaces
 TRANSPOSED = np.arange(9).reshape(3, 3).T.ravel()  # of W_ab: the places of W_ba
 
 
@@ -36,6 +38,7 @@ class Joint:
         origin: (3,) of the joint's frame in the parent's interface frame, m.
         rotation: (3, 3) from the joint's frame to the parent's interface frame.
         rotor: inertia of what drives it, times the gear ratio squared, kg m2 (prismatic: kg).
+        interface: number of the parent's outboard interface, 0 for the first.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Joint:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rotation: np.ndarray = field(default_factory=lambda: ONE)
     rotor: float = 0.0
+    interface: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +62,10 @@ class Constants:
         W_rest, W_modes: (9 (1 + q),), (q, 9 (1 + q)): W_ab eta = W_rest + e W_modes.
         modes: (9, q q) of W_ab among the modes.
         M: (q, q) mass.
-        B: (6, q) outboard displacement and rotation.
+        B: (6 i, q) displacement and rotation of its i outboard interfaces.
         K0: (12, q, q) of the frame's accelerations a and A_ab, or None of a linear body.
-        K0_outboard: (6, q, q), or None.
+        K0_outboard: (6 i, q, q), or None.
+        points: (i, 3) reference positions of the interfaces.
     """
 
     body: ShapeIntegrals
@@ -73,6 +78,7 @@ class Constants:
     B: np.ndarray
     K0: np.ndarray | None
     K0_outboard: np.ndarray | None
+    points: np.ndarray
 
     @property
     def num_modes(self) -> int:
@@ -97,6 +103,7 @@ def constants_of(body: ShapeIntegrals) -> Constants:
         B=body.outboard,
         K0=body.K0 if stiffened else None,
         K0_outboard=body.K0_outboard if stiffened else None,
+        points=body.points,
     )
 
 
@@ -107,16 +114,20 @@ class SpatialMechanism(ElasticBodies):
     Attributes:
         bodies: in the order of the elastic coordinates.
         joints: that hold them, in the same order.
-        carried: what every body carries at its outboard interface, a rigid body in the frame of
-            the interface, or None; an empty tuple for nothing at all.
+        carried: what every body carries at its first outboard interface, a rigid body in the frame
+            of the interface, or None; an empty tuple for nothing at all.
         gravity: (3,) m/s2.
-        end: index of the body whose outboard interface is the end-effector.
+        end: index of the body that has the end-effector.
+        end_interface: which of its interfaces that is, 0 the first.
+        carried_further: what bodies carry at other interfaces, likewise, by (body, interface).
     """
 
     joints: tuple[Joint, ...]
     carried: tuple[ShapeIntegrals | None, ...]
     gravity: np.ndarray
     end: int
+    end_interface: int = 0
+    carried_further: Mapping[Site, ShapeIntegrals] = field(default_factory=dict)
 
     @cached_property
     def constants(self) -> tuple[Constants, ...]:
@@ -124,10 +135,30 @@ class SpatialMechanism(ElasticBodies):
         return tuple(map(constants_of, self.bodies))
 
     @cached_property
-    def loads(self) -> tuple[Constants | None, ...]:
-        """Constants of what every body carries."""
-        carried = self.carried or (None,) * len(self.bodies)
-        return tuple(None if one is None else constants_of(one) for one in carried)
+    def every_load(self) -> dict[Site, ShapeIntegrals]:
+        """All that bodies carry, by (body, interface)."""
+        first = {(i, 0): one for i, one in enumerate(self.carried) if one is not None}
+        return first | dict(self.carried_further)
+
+    @cached_property
+    def loads(self) -> dict[Site, Constants]:
+        """Constants of `every_load`."""
+        return {site: constants_of(one) for site, one in self.every_load.items()}
+
+    @cached_property
+    def sites(self) -> tuple[tuple[int, ...], ...]:
+        """Of every body the interfaces on which something sits, ascending."""
+        found: list[set[int]] = [set() for _ in self.bodies]
+        for joint in self.joints:
+            if joint.parent != GROUND:
+                found[joint.parent].add(joint.interface)
+        for body, interface in self.every_load:
+            found[body].add(interface)
+        return tuple(tuple(sorted(one)) for one in found)
+
+    def hanging(self, body: int, interface: int) -> tuple[int, ...]:
+        """Return the bodies that hang on an interface."""
+        return tuple(k for k in self.children[body] if self.joints[k].interface == interface)
 
     @cached_property
     def order(self) -> tuple[int, ...]:
@@ -182,6 +213,7 @@ def rigid_spatial_body(
     centre: np.ndarray | tuple[float, ...],
     inertia: np.ndarray | tuple[float, ...],
     outboard_point: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
+    further_points: np.ndarray | tuple[tuple[float, ...], ...] = (),
 ) -> ShapeIntegrals:
     """Return a spatial body without elastic coordinates.
 
@@ -191,21 +223,23 @@ def rigid_spatial_body(
         inertia: (6,) xx, yy, zz, xy, xz, yz of the inertia tensor about the centre, as in URDF,
             kg m2.
         outboard_point: (3,) of its outboard interface, m.
+        further_points: (i, 3) of others, m.
     """
     r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
     # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
     second = 0.5 * np.trace(tensor) * ONE - tensor + mass * np.outer(r, r)
-    square = np.zeros((0, 0))
+    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
     return ShapeIntegrals(
         mass=float(mass),
         w=(mass * r)[:, None],
         W=second.reshape(9, 1, 1),
         K=square,
         D=square,
-        outboard=np.zeros((6, 0)),
+        outboard=np.zeros((6 + 6 * len(further), 0)),
         outboard_point=np.asarray(outboard_point, dtype=float),
         K0=np.zeros((0, 0, 0)),
         K0_outboard=np.zeros((0, 0, 0)),
+        further_points=further,
     )
 
 

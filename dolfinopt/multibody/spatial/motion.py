@@ -28,9 +28,13 @@ class JointMotion:
 
 
 def joint_motion(t: np.ndarray, scene: Scene) -> JointMotion:
-    """Return the joints at instants t (n,), s, by the scene's table.
+    """Return the joints at instants t (n,), s: of the scene's table, or of the end-effector's path.
 
     Raises:
-        InputError: the table cannot be used.
+        InputError: the table cannot be used, or the path cannot be followed.
     """
+    if scene.motion.path != "joints":
+        from dolfinopt.multibody.spatial.inverse_kinematics import follower
+
+        return JointMotion(*follower(scene).at(t))
     return JointMotion(*along_table(t, scene.motion, columns_of(scene)))

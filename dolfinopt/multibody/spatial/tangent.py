@@ -2,8 +2,8 @@
 
 Both passes of `inverse_dynamics` are differentiated by the coordinates that are asked for. A body
 feels those inboard of it through the nine numbers (a, w, wd) of its frame, those outboard of it
-through the six of the load on its interface: its rows are a block of its own coordinates and a
-rank of fifteen.
+through the six of the load on each of its interfaces: its rows are a block of its own coordinates
+and a rank of fifteen with one interface.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dolfinopt.multibody.spatial.inverse_dynamics import (
     inward_pass,
     outward_pass,
 )
-from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
+from dolfinopt.multibody.spatial.mechanism import GROUND, Site, SpatialMechanism
 from dolfinopt.multibody.spatial.motion import JointMotion
 
 
@@ -197,33 +197,33 @@ def linearise(
 
 
 _Derivatives = list[np.ndarray | None]  # None: nothing moves
+_Ends = dict[Site, np.ndarray | None]
 
 
 def _outward_derivatives(
     mechanism: SpatialMechanism, links: list[Link], places: _Places
-) -> tuple[_Derivatives, _Derivatives]:
+) -> tuple[_Derivatives, _Ends]:
     """Return the derivatives of the motion of every body and interface (n, 9, 3 S)."""
     count, width = len(links[0].body.a), 3 * places.size
     motions: _Derivatives = [None] * len(links)
-    ends: _Derivatives = [None] * len(links)
+    ends: _Ends = {}
     for i in mechanism.order:
-        link, parent = links[i], mechanism.joints[i].parent
-        inner = None if parent == GROUND else ends[parent]
+        link, joint = links[i], mechanism.joints[i]
+        inner = None if joint.parent == GROUND else ends[joint.parent, joint.interface]
         moved = None if inner is None else link.joint.motion_by_interface @ inner
         if (columns := places.of_joint(link)) is not None:
             moved = np.zeros((count, 9, width)) if moved is None else moved
             for column, one in zip(columns, link.joint.motion_by_joint, strict=True):
                 moved[:, :, column] += one
         motions[i] = moved
-        if link.interface is None:
-            continue
-        end = None if moved is None else link.interface.motion_by_body @ moved
-        if len(places.kept[i]):
-            end = np.zeros((count, 9, width)) if end is None else end
-            parts = zip(places.of_body(i), link.interface.motion_by_rates, strict=True)
-            for place, derivative in parts:
-                end[:, :, place] += derivative[:, :, places.kept[i]]
-        ends[i] = end
+        for s, interface in link.interfaces.items():
+            end = None if moved is None else interface.motion_by_body @ moved
+            if len(places.kept[i]):
+                end = np.zeros((count, 9, width)) if end is None else end
+                parts = zip(places.of_body(i), interface.motion_by_rates, strict=True)
+                for place, derivative in parts:
+                    end[:, :, place] += derivative[:, :, places.kept[i]]
+            ends[i, s] = end
     return motions, ends
 
 
@@ -233,7 +233,7 @@ def _inward_derivatives(
     loads: Loads,
     places: _Places,
     motions: _Derivatives,
-    ends: _Derivatives,
+    ends: _Ends,
 ) -> SpatialTangent:
     """Return the tangent from the derivatives of all motions."""
     count, size, rigid = len(links[0].body.a), places.size, places.rigid
@@ -246,12 +246,15 @@ def _inward_derivatives(
         if not (felt or link.body.is_flexible):
             continue
         load = np.zeros((count, 6, 3 * size))
-        outboard: np.ndarray | None = None
-        if link.interface is not None:
-            outboard = _on_interface(mechanism, links, loads, places, i, on_joints, ends[i])
-            load += outboard
-            lever = np.broadcast_to(link.interface.place, link.body.a.shape)
-            load[:, 3:] += _cross(lever, outboard[:, :3])
+        outboard: dict[int, np.ndarray] = {}
+        for s, interface in link.interfaces.items():
+            end = ends[i, s]
+            pull = outboard[s] = _on_interface(
+                mechanism, links, loads, places, (i, s), on_joints, end
+            )
+            load += pull
+            lever = np.broadcast_to(interface.place, link.body.a.shape)
+            load[:, 3:] += _cross(lever, pull[:, :3])
         if link.body.is_flexible:
             tangents.append(_body_tangent(mechanism, link, loads, places, i, outboard, moved))
         if not felt:
@@ -262,11 +265,10 @@ def _inward_derivatives(
             own = link.body.load_by_rates
             for place, derivative in zip(places.of_body(i), own, strict=True):
                 load[:, :, place] += derivative[:, :, kept]
-            if link.interface is not None:
-                outer = loads.outboard[i]
-                assert outer is not None
-                displaced = np.broadcast_to(link.interface.B, (count, *link.interface.B.shape[-2:]))
-                load[:, 3:, places.of_body(i)[0]] -= _cross(outer[0], displaced[:, :3, kept])
+            for s, interface in link.interfaces.items():
+                displaced = np.broadcast_to(interface.B, (count, *interface.B.shape[-2:]))
+                force = loads.outboard[i][s][0]
+                load[:, 3:, places.of_body(i)[0]] -= _cross(force, displaced[:, :3, kept])
         on_joints[i] = load
         if (columns := places.of_joint(link)) is not None:
             drives[:, columns[0]] = link.joint.driven @ load
@@ -288,30 +290,28 @@ def _on_interface(
     links: list[Link],
     loads: Loads,
     places: _Places,
-    i: int,
+    site: Site,
     on_joints: dict[int, np.ndarray],
     end: np.ndarray | None,
 ) -> np.ndarray:
-    """Return the derivative of the load on body i's interface, in the body's components."""
+    """Return the derivative of the load on a body's interface, in the body's components."""
+    i, s = site
     link, count = links[i], len(links[0].body.a)
-    assert link.interface is not None
-    total = np.zeros((count, 6, 3 * places.size))
-    for k in mechanism.children[i]:
+    interface, total = link.interfaces[s], np.zeros((count, 6, 3 * places.size))
+    for k in mechanism.hanging(i, s):
         joint = links[k].joint
         total += joint.load_by_body @ on_joints[k]
         if (columns := places.of_joint(links[k])) is not None:
             total[:, :, columns[0]] += joint.load_by_joint(loads.joints[k])
-    if link.carried is not None and end is not None:
-        total += link.carried.load_by_motion @ end
+    if s in link.carried and end is not None:
+        total += link.carried[s].load_by_motion @ end
     if not link.body.is_flexible:
         return total
     shape = total.shape
-    turned = link.interface.turning.R[:, None] @ total.reshape(count, 2, 3, -1)
+    turned = interface.turning.R[:, None] @ total.reshape(count, 2, 3, -1)
     total = turned.reshape(shape)
     if len(kept := places.kept[i]):
-        outer = loads.outboard[i]
-        assert outer is not None
-        by_e = link.interface.load_by_displacement(outer) @ link.interface.B
+        by_e = interface.load_by_displacement(loads.outboard[i][s]) @ interface.B
         total[:, :, places.of_body(i)[0]] += by_e[:, :, kept]
     return total
 
@@ -322,7 +322,7 @@ def _body_tangent(
     loads: Loads,
     places: _Places,
     i: int,
-    outboard: np.ndarray | None,
+    outboard: dict[int, np.ndarray],
     moved: np.ndarray | None,
 ) -> BodyTangent:
     """Return the derivative of body i's rows."""
@@ -330,12 +330,10 @@ def _body_tangent(
     K, D = body.rows_by_rates
     count, q = body.rates[0].shape
     left, right = [np.zeros((count, q, 0))], [np.zeros((count, 0, 3 * places.size))]
-    if link.interface is not None and outboard is not None:
-        outer = loads.outboard[i]
-        assert outer is not None
-        K = K + link.interface.rows_by_e(outer)
-        left.append(link.interface.rows_by_load)
-        right.append(outboard)
+    for s, interface in link.interfaces.items():
+        K = K + interface.rows_by_e(loads.outboard[i][s])
+        left.append(interface.rows_by_load)
+        right.append(outboard[s])
     if moved is not None:
         left.append(body.rows_by_motion)
         right.append(moved)

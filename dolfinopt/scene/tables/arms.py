@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table
 from dolfinopt.scene.tables.inertia import Moment, Tensor, tensor_problem
+from dolfinopt.scene.tables.interfaces import Interface, check_interfaces
 from dolfinopt.scene.tables.material import (
     CatalogueName,
     MassDensity,
@@ -49,7 +50,9 @@ JOINT_KEYS = (
 )  # fmt: skip
 MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
 # never taken from the arm before
-OWN_KEYS = ("name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid")
+OWN_KEYS = (
+    "name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
+)  # fmt: skip
 # What an arm with a pattern has from there.
 PATTERN_KEYS = ("passive", "symmetric", "symmetric_z", "extruded", "regions")
 
@@ -201,6 +204,11 @@ class Arm(Table):
     )
     regions: tuple[Region, ...] = Field(
         default=(), description="parts of the arm that stay solid or void"
+    )
+    interfaces: tuple[Interface, ...] = Field(
+        default=(),
+        description="in space: further outboard interfaces, each with six coordinates, on which "
+        "joints or the payload sit; not taken from the arm before",
     )
 
     @model_validator(mode="after")
@@ -429,7 +437,17 @@ class Arm(Table):
         halves = 2 if self.element == "quadratic" else 1  # nodes are also halfway
         along, *across = (halves * count for count in self.cells)
         nodes = (along - 1) * math.prod(count + 1 for count in across)
-        return 3 * nodes + 6 if self.is_solid else 2 * nodes + 3
+        return 3 * nodes + self.num_outboard if self.is_solid else 2 * nodes + 3
+
+    @property
+    def num_outboard(self) -> int:
+        """Count the coordinates of the arm's outboard interfaces: 3, in space 6 of each."""
+        return 6 * (1 + len(self.interfaces)) if self.is_solid else 3
+
+    @property
+    def interface_points(self) -> tuple[tuple[float, float, float], ...]:
+        """Return the reference points of all outboard interfaces in the arm's frame, m."""
+        return (self.length, 0.0, 0.0), *(one.point for one in self.interfaces)
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse a name that is taken, and what does not fit the arm whose design it has."""
@@ -444,6 +462,7 @@ class Arm(Table):
                 (*at, "cells" if self.cells is not None else "cell_shape"),
             )
         self._check_inertia(scene, at)
+        check_interfaces(scene, at[-1])
         check_regions(self, at)
         if self.pattern is not None:
             self._check_pattern(before, at)
@@ -497,6 +516,12 @@ class Arm(Table):
                 (*at, "pattern"),
             )
         pattern = designed[self.pattern]
+        if pattern.interfaces:
+            raise Refusal(
+                f"expected an arm without interfaces: {self.pattern} has some, around which cells "
+                "stay solid",
+                (*at, "pattern"),
+            )
         for one, name in ((pattern, self.pattern), (self, self.name)):
             if one.mesh is not None:
                 raise Refusal(

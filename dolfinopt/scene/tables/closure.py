@@ -58,7 +58,8 @@ class Closure(Table):
         """Refuse a loop of too few arms, and what a closed loop cannot be combined with."""
         if scene.is_spatial:
             raise Refusal(
-                "expected no [closure] with [[joints]]: closed loops are simulated in the plane",
+                "expected no [closure] with [[joints]]: closed loops are simulated in the plane; "
+                "leave the table out, and prescribe the joints that would follow",
                 (*at, "kind"),
                 ("joints",),
             )

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.arms import check_arm_name
 from dolfinopt.scene.tables.base import Loc, Position, Refusal, Table
+from dolfinopt.scene.tables.interfaces import OUTBOARD, refuse_unknown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -19,6 +20,7 @@ Component = Annotated[float, Field(ge=-1e6, le=1e6)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 GROUND = "ground"
 TIME = "t"  # column of a table of joint coordinates
+PATHS = ("joints", "points", "line")  # of machines in space
 # What a machine in the plane has instead of joints.
 PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
 
@@ -39,6 +41,10 @@ class Joint(Table):
     type: JointType = Field(description="what moves: an angle, a distance, or nothing [-]")
     parent: str = Field(
         description='name of the arm whose outboard interface it sits on, or "ground" [-]'
+    )
+    parent_interface: str = Field(
+        default=OUTBOARD,
+        description="name of the parent's interface that it sits on, one of arms.interfaces [-]",
     )
     child: str = Field(description="name of the arm that it holds, whose frame is the joint's [-]")
     axis: tuple[Component, Component, Component] | None = Field(
@@ -89,6 +95,7 @@ class Joint(Table):
         if self.parent not in (GROUND, *names):
             allowed = " | ".join(map(shown, (GROUND, *names)))
             raise Refusal(f"expected the ground or the name of an arm: {allowed}", (*at, "parent"))
+        self._check_interface(scene, at)
         for other in before:
             if other.child == self.child:
                 raise Refusal(
@@ -99,6 +106,14 @@ class Joint(Table):
         if len(before) == len(scene.joints) - 1:
             _check_tree(scene)
             _check_machine(scene)
+
+    def _check_interface(self, scene: Scene, at: Loc) -> None:
+        """Refuse an interface that the parent does not have."""
+        if self.parent != GROUND:
+            parent = next(arm for arm in scene.arms if arm.name == self.parent)
+            refuse_unknown(parent, self.parent_interface, (*at, "parent_interface"))
+        elif self.parent_interface != OUTBOARD:
+            raise Refusal("expected none on the ground", (*at, "parent_interface"), (*at, "parent"))
 
 
 def _check_tree(scene: Scene) -> None:
@@ -134,8 +149,18 @@ def _check_tree(scene: Scene) -> None:
 def _check_machine(scene: Scene) -> None:
     """Refuse what only a machine in the plane has, or what has no equations in space yet."""
     motion = scene.motion
-    if motion.path != "joints":
-        raise Refusal('expected "joints" with [[joints]]', ("motion", "path"), ("joints",))
+    if motion.path not in PATHS:
+        allowed = " | ".join(map(shown, PATHS))
+        raise Refusal(f"expected {allowed} with [[joints]]", ("motion", "path"), ("joints",))
+    for key in ("start", "end"):
+        if motion.path == "line" and len(getattr(motion, key)) == 2:
+            raise Refusal(
+                "expected an array of three numbers with [[joints]]", ("motion", key), ("joints",)
+            )
+    movable = scene.movable
+    if motion.initial_joints is not None and len(motion.initial_joints) != len(movable):
+        names = ", ".join(joint.name for joint in movable)
+        raise Refusal(f"expected {len(movable)} numbers, of {names}", ("motion", "initial_joints"))
     for key in PLANE_KEYS:
         default = type(motion).model_fields[key].default
         if getattr(motion, key) != default:
@@ -158,7 +183,8 @@ def _check_machine(scene: Scene) -> None:
     for k, arm in enumerate(scene.arms):
         if arm.joint_stiffness > 0.0:
             raise Refusal(
-                "expected 0 with [[joints]]: springs of drives are simulated in the plane",
+                "expected 0 with [[joints]]: springs of drives are simulated in the plane; leave "
+                "it out, [control] has stiffness and damping of the drives",
                 ("arms", k, "joint_stiffness"),
                 ("joints",),
             )

@@ -12,7 +12,10 @@ from dolfinopt.scene.tables.base import Duration, FileName, Length, Loc, Positio
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
-Path2D = Literal["arc", "line", "points", "joints", "rotation"]
+Point = tuple[Position, Position] | tuple[Position, Position, Position]
+JointValue = Annotated[float, Field(ge=-1e4, le=1e4)]  # rad, m
+Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
+PathKind = Literal["arc", "line", "points", "joints", "rotation"]
 TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
 Base = Literal["cart", "fixed"]
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
@@ -23,7 +26,7 @@ PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm,
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
-    path: Path2D = Field(
+    path: PathKind = Field(
         default="arc",
         description="path of the end-effector (arc, line, table of points), a table of joint "
         "coordinates, or a first joint that runs up to constant speed [-]",
@@ -37,11 +40,22 @@ class Motion(Table):
         le=1,
         description="factor on the y coordinate of the arc; 0 gives a straight line [-]",
     )
-    start: tuple[Position, Position] = Field(
-        default=(-1.0, 0.0), description="start point of the line [m]"
+    start: Point = Field(
+        default=(-1.0, 0.0), description="start point of the line; in space three numbers [m]"
     )
-    end: tuple[Position, Position] = Field(
-        default=(1.0, 0.0), description="end point of the line [m]"
+    end: Point = Field(
+        default=(1.0, 0.0), description="end point of the line; in space three numbers [m]"
+    )
+    rpy: tuple[Angle, Angle, Angle] | None = Field(
+        default=None,
+        description="orientation of the end-effector along a line in space: roll, pitch and yaw "
+        "about the world's axes x, y and z; default: free [rad]",
+    )
+    initial_joints: tuple[JointValue, ...] | None = Field(
+        default=None,
+        description="joint coordinates near those at the start of an end-effector's path in "
+        "space, for [[joints]] that move: which solution of inverse kinematics is meant; default: "
+        "0 [rad, m]",
     )
     file: FileName | None = Field(
         default=None,
@@ -125,7 +139,8 @@ class Motion(Table):
         if self.path == "line" and self.start == self.end:
             raise Refusal("expected another point than motion.start", ("end",), ("start",))
         self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
-        self.refuse_unused(self.path == "line", "path", "start", "end")
+        self.refuse_unused(self.path == "line", "path", "start", "end", "rpy")
+        self.refuse_unused(self.path in ("points", "line"), "path", "initial_joints")
         self.refuse_unused(tabulated, "path", "file")
         self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
         joints = self.path in ("joints", "rotation")
@@ -164,12 +179,19 @@ class Motion(Table):
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         if scene.is_spatial:
             return  # `tables.joints` knows
-        if len(self.gravity) == 3:
-            raise Refusal(
-                "expected an array of two numbers without [[joints]]: the machine moves in the "
-                "plane",
-                ("motion", "gravity"),
-            )
+        for key in ("gravity", "start", "end"):
+            if len(getattr(self, key)) == 3:
+                raise Refusal(
+                    "expected an array of two numbers without [[joints]]: the machine moves in "
+                    "the plane",
+                    ("motion", key),
+                )
+        for key in ("rpy", "initial_joints"):
+            if getattr(self, key) is not None:
+                raise Refusal(
+                    "expected none without [[joints]]: the machine moves in the plane",
+                    ("motion", key),
+                )
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from dolfinopt.scene.spelling import shown
 from dolfinopt.scene.tables.base import Loc, Position, Refusal, Table
 from dolfinopt.scene.tables.inertia import Moment, Tensor, tensor_problem
+from dolfinopt.scene.tables.interfaces import OUTBOARD, check_used, refuse_unknown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -26,7 +28,16 @@ class Payload(Table):
     )
     offset: tuple[Position, Position, Position] = Field(
         default=(0.0, 0.0, 0.0),
-        description="its centre in the frame of the last arm's outboard interface; in space [m]",
+        description="its centre in the frame of the end-effector's interface; in space [m]",
+    )
+    arm: str | None = Field(
+        default=None,
+        description="name of the arm that carries it and is the end-effector, whose deviation "
+        "and path count; default: the last one; in space [-]",
+    )
+    interface: str = Field(
+        default=OUTBOARD,
+        description="name of that arm's interface where it sits, one of arms.interfaces [-]",
     )
 
     @property
@@ -46,5 +57,18 @@ class Payload(Table):
                 raise Refusal(
                     "expected [0, 0, 0], the default, without [[joints]]", (*at, "offset")
                 )
-        elif problem := tensor_problem(self.inertia):
+            for key in ("arm", "interface"):
+                if getattr(self, key) != type(self).model_fields[key].default:
+                    raise Refusal(
+                        "expected none without [[joints]]: the last arm carries it", (*at, key)
+                    )
+            return
+        if problem := tensor_problem(self.inertia):
             raise Refusal(problem, (*at, "inertia"))
+        names = [arm.name for arm in scene.arms]
+        if self.arm is not None and self.arm not in names:
+            allowed = " | ".join(map(shown, names))
+            raise Refusal(f"expected the name of an arm: {allowed}", (*at, "arm"))
+        carrier = scene.arms[-1 if self.arm is None else names.index(self.arm)]
+        refuse_unknown(carrier, self.interface, (*at, "interface"))
+        check_used(scene)

@@ -10,6 +10,7 @@ from dolfinopt.scene.tables.base import Frequency, Loc, Refusal, Table
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
+    from dolfinopt.scene.tables.arms import Arm
 
 ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
 Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
@@ -82,6 +83,12 @@ class Reduction(Table):
         """The least number of coordinates that the method can have."""
         return {"craig-bampton": 3, "krylov": 3 * len(self.shifts)}.get(self.method, 1)
 
+    def fewest_of(self, arm: Arm) -> int:
+        """Return the least number of coordinates that the method can have of an arm."""
+        if self.fewest == 1 or not (arm.flexible and arm.is_solid):
+            return self.fewest
+        return self.fewest // 3 * arm.num_outboard
+
     @model_validator(mode="after")
     def _check_unused(self) -> Reduction:
         self.refuse_unused(self.method == "krylov", "method", "shifts")
@@ -92,15 +99,13 @@ class Reduction(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse more coordinates than an arm has dofs, and undamped resonances in a Gramian."""
         for i, arm in enumerate(scene.arms):
-            if (
-                arm.flexible
-                and arm.is_solid
-                and self.fewest > 1
-                and 0 < self.count < 2 * self.fewest
-            ):
+            least = self.fewest_of(arm)
+            if arm.flexible and 0 < self.count < least and arm.is_solid:
+                has = "interface has six coordinates"
+                if arm.interfaces:
+                    has = f"interfaces, {1 + len(arm.interfaces)}, have six coordinates each"
                 raise Refusal(
-                    f"expected an integer >= {2 * self.fewest} with a solid arm: its outboard "
-                    "interface has six coordinates",
+                    f"expected an integer >= {least} with a solid arm: its outboard {has}",
                     ("reduction", "coordinates"),
                     ("arms", i, "cells"),
                 )

@@ -1,0 +1,188 @@
+"""Inverse kinematics in space: closed form, a six-axis robot, joints from the table, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomllib
+from scipy.spatial.transform import Rotation
+
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.motion import breakpoints, check_motion
+from dolfinopt.multibody.spatial.end_path import end_path, relative_vectors
+from dolfinopt.multibody.spatial.links import end_chain
+from dolfinopt.multibody.spatial.motion import joint_motion
+from dolfinopt.multibody.spatial.rotations import exponential
+from dolfinopt.scene.load import load_scene, scene_from_dict
+
+pytestmark = pytest.mark.serial
+ARM, ROBOT = "demos/spatial_arm.toml", "demos/robot_link.toml"
+L1, L2 = 0.5, 0.45  # m, of the demo
+EXACT = 1e-10
+
+
+def write(file, names, *columns):
+    """Write a table of columns (n,) or (n, k)."""
+    rows = np.column_stack(columns).tolist()
+    file.write_text("\n".join([names, *(",".join(map(repr, row)) for row in rows)]) + "\n")
+    return file
+
+
+def scene_of(demo, *changes):
+    return load_scene(demo, ["motion.path=points", *changes])
+
+
+def differences(scene, t, key, h=1e-3):
+    """Return the derivative of a joint motion by differences of fourth order."""
+    a, b, c, d = (getattr(joint_motion(t + k * h, scene), key) for k in (-2, -1, 1, 2))
+    return (a - 8.0 * b + 8.0 * c - d) / (12.0 * h)
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory):
+    """Yaw, pitch, pitch through three points, elbow below the chord."""
+    t, points = [0.0, 0.25, 0.6], [[0.6, 0.0, 0.2], [0.5, 0.3, 0.4], [0.1, 0.6, 0.3]]
+    file = write(tmp_path_factory.mktemp("paths") / "points.csv", "t,x,y,z", t, points)
+    return scene_of(ARM, f"motion.file={file}", "motion.initial_joints=[0, 0.8, -1]")
+
+
+def test_yaw_pitch_pitch(bent):
+    """Against the closed form, and rates against differences; at rest at both ends."""
+    t = np.linspace(0.0, 0.6, 41)
+    q = joint_motion(t, bent).q
+    x, y, z = end_path(t, bent).p.T
+    r = np.hypot(x, y)
+    elbow = -np.arccos((r**2 + z**2 - L1**2 - L2**2) / (2.0 * L1 * L2))
+    shoulder = np.arctan2(z, r) - np.arctan2(L2 * np.sin(elbow), L1 + L2 * np.cos(elbow))
+    assert np.abs(q - np.stack([np.arctan2(y, x), shoulder, elbow], axis=1)).max() < EXACT
+    inner = np.linspace(0.01, 0.59, 23)
+    motion = joint_motion(inner, bent)
+    assert np.abs(differences(bent, inner, "q") - motion.qd).max() < 1e-7
+    assert np.abs(differences(bent, inner, "qd") - motion.qdd).max() < 1e-6
+    ends = joint_motion(np.array([0.0, 0.6, 0.7]), bent)
+    assert np.abs(ends.qd).max() < EXACT and np.abs(ends.qdd[2]).max() < EXACT
+    one = joint_motion(inner[5:6], bent)
+    assert np.abs(one.q - motion.q[5:6]).max() < 1e-14  # whichever instants are asked for
+
+
+def test_other_solution_by_the_guess(bent):
+    """The elbow on the other side; whole turns as near as the guess."""
+    guess = "motion.initial_joints=[6.2, -0.3, 1]"
+    other = scene_of(ARM, f"motion.file={bent.motion.file}", guess)
+    a, b = (joint_motion(np.array([0.3]), scene).q[0] for scene in (bent, other))
+    assert b[0] == pytest.approx(a[0] + 2.0 * np.pi, abs=EXACT)
+    assert b[2] == pytest.approx(-a[2], abs=EXACT)
+
+
+def test_line_by_a_law():
+    """Along a line by the law, with its limits; steps end where its phases do."""
+    data = tomllib.loads(Path(ARM).read_text())
+    data["motion"] = {
+        "path": "line", "start": [0.6, 0.0, 0.2], "end": [0.3, 0.4, 0.3], "law": "trapezoidal",
+        "max_speed": 1.0, "max_acceleration": 5.0, "horizon": 1.0, "initial_joints": [0, 0.8, -1],
+    }  # fmt: skip
+    scene = scene_from_dict(data, ARM)
+    length = np.linalg.norm([0.3, 0.4, 0.1])
+    assert scene.motion.duration == pytest.approx(length / 1.0 + 1.0 / 5.0)
+    t = np.linspace(0.0, scene.motion.duration, 9)
+    found = end_chain(scene).at(joint_motion(t, scene).q).place
+    along = (found - scene.motion.start) @ (np.array([-0.3, 0.4, 0.1]) / length)
+    assert np.abs(np.linalg.norm(found - scene.motion.start, axis=1) - along).max() < EXACT
+    assert breakpoints(scene)[1:3] == pytest.approx((0.2, scene.motion.duration - 0.2))
+    data["motion"]["rpy"] = [0.0, 0.0, 0.0]
+    with pytest.raises(InputError, match=r"cannot be at .* turned as it is to be: .* rad off"):
+        check_motion(scene_from_dict(data, ARM))
+
+
+JOINTS = np.array([0.3, -1.2, 1.5, -0.8, -1.4, 0.2])
+TURNED = np.array([0.8, 0.4, -0.5, 0.3, 0.3, -0.6])
+
+
+@pytest.mark.parametrize("kind", ["roll,pitch,yaw", "rx,ry,rz"])
+def test_six_axes(kind, tmp_path):
+    """Poses of a robot with an offset wrist: forward of inverse, and the joints they were of."""
+    chain = end_chain(load_scene(ROBOT))
+    t = np.linspace(0.0, 1.8, 5)
+    q = JOINTS + ((t / 1.8) ** 2 * (3.0 - 2.0 * t / 1.8))[:, None] * TURNED
+    pose = chain.at(q)
+    turned = Rotation.from_matrix(pose.rotation)
+    rows = turned.as_euler("xyz") if kind == "roll,pitch,yaw" else turned.as_rotvec()
+    file = write(tmp_path / "poses.csv", f"t,x,y,z,{kind}", t, pose.place, rows)
+    guess = f"motion.initial_joints={(JOINTS + 0.1).tolist()}"
+    scene = scene_of(ROBOT, f"motion.file={file}", guess)
+    assert np.abs(joint_motion(t, scene).q - q).max() < EXACT
+    between = np.linspace(0.01, 1.79, 37)
+    motion, path = joint_motion(between, scene), end_path(between, scene)
+    found = chain.at(motion.q)
+    assert np.abs(found.place - path.p).max() < EXACT
+    assert np.abs(found.rotation - path.turning[0]).max() < EXACT
+    assert np.abs(differences(scene, between, "q") - motion.qd).max() < 1e-8
+    assert np.abs(differences(scene, between, "qd") - motion.qdd).max() < 1e-7
+
+
+def test_jacobian_and_bias():
+    """Of all joints, against differences along a motion."""
+    chain = end_chain(load_scene(ROBOT))
+    qd, h = TURNED[None], 1e-4
+    here, *pair = (chain.at(JOINTS[None] + k * h * qd) for k in (0, -1, 1))
+    velocity = here.jacobian[0] @ qd[0]
+    moved = (pair[1].place - pair[0].place) / (2.0 * h)
+    turned = Rotation.from_matrix(pair[1].rotation @ pair[0].rotation.swapaxes(1, 2)).as_rotvec()
+    assert np.abs(velocity - np.hstack([moved, turned / (2.0 * h)])[0]).max() < 1e-7
+    rates = (pair[1].jacobian[0] - pair[0].jacobian[0]) @ qd[0] / (2.0 * h)
+    assert np.abs(chain.at(JOINTS[None], qd).bias[0] - rates).max() < 1e-7
+
+
+def test_joints_of_the_table(tmp_path):
+    """Columns of joints are prescribed; two others follow a path in the plane that is left."""
+    yaw = 0.3 + np.array([0.0, 0.0, 0.0])
+    points = np.outer([0.6, 0.5, 0.3], [np.cos(0.3), np.sin(0.3), 0.0])
+    points[:, 2] = [0.1, 0.2, 0.4]
+    file = write(tmp_path / "a.csv", "t,x,y,z,yaw", [0.0, 0.2, 0.4], points, yaw)
+    end = "motion.horizon=0.4"
+    scene = scene_of(ARM, f"motion.file={file}", end, "motion.initial_joints=[9, 0.8, -1]")
+    free = write(tmp_path / "b.csv", "t,x,y,z", [0.0, 0.2, 0.4], points)
+    other = scene_of(ARM, f"motion.file={free}", end, "motion.initial_joints=[0, 0.8, -1]")
+    t = np.linspace(0.0, 0.4, 11)
+    a, b = (joint_motion(t, one) for one in (scene, other))
+    for key in ("q", "qd", "qdd"):
+        assert getattr(a, key) == pytest.approx(getattr(b, key), abs=EXACT)
+    # With another yaw the point leaves the plane of the two.
+    write(tmp_path / "a.csv", "t,x,y,z,yaw", [0.0, 0.2, 0.4], points, [0.3, 0.4, 0.3])
+    with pytest.raises(InputError, match=r"\(shoulder, elbow\) leave it [0-9.e-]+ m off at best"):
+        joint_motion(t, scene)
+
+
+def test_rotation_vectors_go_on():
+    """Beyond half a turn and past a whole one."""
+    angles = np.linspace(0.0, 9.0, 13)
+    R = exponential(np.array([0.3, -0.2, 0.5])) @ exponential(angles[:, None] * [0.0, 0.6, 0.8])
+    assert np.abs(relative_vectors(R) - angles[:, None] * [0.0, 0.6, 0.8]).max() < 1e-12
+
+
+REFUSED = [
+    (ARM, "x,y,z", [[0.6, 0, 0.2], [2.0, 0, 0.2]], "", "cannot be at .* m off at best"),
+    (ARM, "x,y,z", [[2.6, 0, 0.2], [0.6, 0, 0.2]], "", r"at t = 0 s .* or motion.initial_joints"),
+    (ARM, "x,y,z", [[0.5, 0, 0.2], [-0.5, 0, 0.2]], "", "singular position"),
+    (ARM, "x,y", [[0.6, 0], [0.5, 0]], "", "missing column 'z'"),
+    (ROBOT, "x,y,z,roll", [[0.6, 0, 0.2, 0], [0.5, 0, 0.2, 0]], "", "missing column 'pitch'"),
+    (ARM, "x,y,z,wrist", [[0.6, 0, 0.2, 0], [0.5, 0, 0.2, 0]], "", "unknown column 'wrist'"),
+    (ARM, "x,y,z,yaw,shoulder,elbow", [[0.6, 0, 0.2, 0, 0, 0], [0.5, 0, 0.2, 0, 0, 0]], "",
+     "its table prescribes all joints"),
+    (ROBOT, "x,y,z", [[0.6, 0, 0.2], [0.5, 0, 0.2]], "",
+     r"expected at most 3 joints, .* found 6 .*orientation \(roll, pitch, yaw or rx, ry, rz\)"),
+    (ARM, "x,y,z", [[0.6, 0, 0.2], [0.5, 0, 0.2]], "payload.arm=link1",
+     r"joints that do not move the end-effector \(elbow\)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("demo", "names", "rows", "change", "text"), REFUSED)
+def test_refusals(demo, names, rows, change, text, tmp_path):
+    file = write(tmp_path / "path.csv", names, rows)
+    end = "motion.duration=0.5", "motion.horizon=0.5"
+    changes = [one for one in (f"motion.file={file}", *end, change) if one]
+    with pytest.raises(InputError, match=text) as caught:
+        check_motion(scene_of(demo, *changes))
+    assert len(str(caught.value).splitlines()) == 1
