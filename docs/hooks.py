@@ -30,10 +30,13 @@ TABLES = {
     "A key that an arm leaves out has the value of the arm before it.",
     "arms.regions": "An array of tables below an arm's, one `[[arms.regions]]` a part of the arm "
     "that stays solid or void.",
+    "arms.interfaces": "An array of tables below an arm's, one `[[arms.interfaces]]` a further place "
+    "where a joint or the payload sits; machines in space.",
+    "joints": "An array of tables, one `[[joints]]` a joint of a machine in space.",
     "motion": "What the machine does.",
     "control": "Drives with feed-forward and feedback; without this table joints are prescribed.",
     "closure": "What closes the chain: a slider or a pin at the end of the last arm.",
-    "payload": "What the end of the last arm carries.",
+    "payload": "What the end-effector carries.",
     "damping": "Damping of the arms.",
     "reduction": "The reduced model of every arm.",
     "simulation": "Integration in time.",
@@ -90,7 +93,7 @@ def scene_reference() -> str:
         table, _, key = info.key.rpartition(".")
         if table not in known:
             known.add(table)
-            array = table in ("arms", "arms.regions", "scenarios")
+            array = table in ("arms", "arms.regions", "arms.interfaces", "joints", "scenarios")
             title = f"`[[{table}]]`" if array else f"`[{table}]`" if table else TABLES[""]
             lines += [f"\n## {title} {{#{table or 'top'}}}\n"]
             lines += [f"{TABLES.get(table, '')}\n"] if table else []

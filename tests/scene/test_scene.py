@@ -127,6 +127,7 @@ def test_demo_states_every_other_key():
         *("minimum_member", "minimum_gap"),
         # in space
         *("type", "parent", "child", "axis", "origin", "rpy", "centre", "offset"),
+        *("parent_interface", "point", "arm", "interface", "initial_joints"),
         *("pattern", "box", "circle", "material", "yield_strength"),
         "kkt_tolerance",
         "exact_iterations",
@@ -525,6 +526,10 @@ BAD_VALUES = [
     ("arms.0.passive", 0.26, "0.26", "volume_fraction = 0.5 can be met"),
     ("motion.gravity", [0, 0, -9.81], "[0, 0, -9.81]", "two numbers without [[joints]]"),
     ("payload.offset", [0, 1], "[0, 1]", "an array of three numbers"),
+    ("payload.arm", "arm1", '"arm1"', "none without [[joints]]"),
+    ("payload.interface", "side", '"side"', "none without [[joints]]"),
+    ("motion.rpy", [0, 0, 0], "[0, 0, 0]", 'with motion.path = "arc"'),
+    ("motion.initial_joints", [0.1], "[0.1]", 'with motion.path = "arc"'),
     ("payload.inertia", [1, 1], "[1, 1]", "an array of six numbers"),
     ("motion.path", "circle", '"circle"', '"arc" | "line" | "points" | "joints"'),
     ("motion.path", "joints", "None (default)", 'a table (CSV) with motion.path = "joints"'),
@@ -737,8 +742,8 @@ def test_every_key_refuses_something():
     refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
     refused |= {f"arms.regions.{key}" for key in ("kind", "box", "circle")}  # see test_regions
     known = {info.key for info in describe_keys()}
-    tables = ("control", "closure", "joints")  # see test_joints
-    optional = {key for key in known if key.partition(".")[0] in tables}
+    tables = ("control", "closure", "joints", "arms.interfaces")  # see test_joints
+    optional = {key for key in known if key.startswith(tables)}
     assert known - optional <= refused
 
 
@@ -922,7 +927,7 @@ def test_scene_that_is_no_table(data, found):
         ("payload.mas", "payload.mas", "payload.mass", "mass, inertia"),
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
         ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
-        ("radius", "radius", "motion.radius", "name, material"),
+        ("radius", "radius", "arms.interfaces.radius or motion.radius", "name, material"),
         (
             "tolerance",
             "tolerance",
@@ -1180,6 +1185,7 @@ def test_described_defaults():
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
         *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
+        *("arms.interfaces.name", "arms.interfaces.point"),
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
     }

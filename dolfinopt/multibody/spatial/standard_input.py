@@ -76,8 +76,7 @@ def outboard_interfaces(
     body: ShapeIntegrals,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield point (3,), modes (6, q) and K0 (6, q, q) or (0, q, q) of every outboard interface."""
-    points = body.outboard_point.reshape(-1, 3)
-    for k, point in enumerate(points):
+    for k, point in enumerate(body.points):
         rows = slice(6 * k, 6 * k + 6)
         yield point, body.outboard[rows], body.K0_outboard[rows]
 
