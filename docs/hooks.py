@@ -30,8 +30,8 @@ TABLES = {
     "A key that an arm leaves out has the value of the arm before it.",
     "arms.regions": "An array of tables below an arm's, one `[[arms.regions]]` a part of the arm "
     "that stays solid or void.",
-    "arms.interfaces": "An array of tables below an arm's, one `[[arms.interfaces]]` a further place "
-    "where a joint or the payload sits; machines in space.",
+    "arms.interfaces": "An array of tables below an arm's, one `[[arms.interfaces]]` a further "
+    "place where a joint or the payload sits; machines in space.",
     "joints": "An array of tables, one `[[joints]]` a joint of a machine in space.",
     "motion": "What the machine does.",
     "control": "Drives with feed-forward and feedback; without this table joints are prescribed.",

@@ -188,19 +188,22 @@ def _polynomial(*coefficients: np.ndarray) -> np.ndarray:
     return out
 
 
-def random_tree(rng: np.random.Generator) -> CloudTree:
+def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     """Return two branches with every kind of joint, rigid and flexible bodies, and loads.
 
-    They leave a flexible body at two interfaces, and a rigid one is held at its second one.
+    With two interfaces the branches leave a flexible body at both of them, and others are held at
+    the second one.
     """
-    rigid, fork = spatial_cloud(rng, 0, 2), spatial_cloud(rng, 3, 2)
-    clouds = (rigid, fork, spatial_cloud(rng, 2), spatial_cloud(rng, 3, 2), rigid)
+    last = interfaces - 1
+    rigid, fork = (spatial_cloud(rng, q, interfaces) for q in (0, 3))
+    clouds = (rigid, fork, spatial_cloud(rng, 2), spatial_cloud(rng, 3, interfaces), rigid)
     kinds = (
-        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3, 1), ("prismatic", 1, 1, 0.4),
-        ("fixed", 1, None, 0.0, 1), ("revolute", 3, 2, 0.0, 1),
+        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3, last), ("prismatic", 1, 1, 0.4),
+        ("fixed", 1, None, 0.0, last), ("revolute", 3, 2, 0.0, last),
     )  # fmt: skip
     joints = tuple(random_joint(rng, *one) for one in kinds)
-    loads = {site: spatial_cloud(rng, 0) for site in ((1, 0), (1, 1), (3, 0), (4, 0))}
+    sites = sorted({(1, 0), (1, last), (3, 0), (4, 0)})
+    loads = {site: spatial_cloud(rng, 0) for site in sites}
     return CloudTree(clouds, joints, loads, rng.normal(size=3), 4)
 
 

@@ -100,7 +100,7 @@ def test_frames_of_urdf():
 def tree():
     """A tree of point masses, its joints and elastic coordinates with rates at three instants."""
     rng = np.random.default_rng(7)
-    found = random_tree(rng)
+    found = random_tree(rng, interfaces=2)
     joints, elastic = rng.normal(size=(3, 3, 4)), 0.4 * rng.normal(size=(3, 3, 8))
     return found, JointMotion(*joints), tuple(elastic)
 
