@@ -52,18 +52,7 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
         scene = load_scene(path, overrides)
         check_motion(scene)
         check_forces(scene)
-        for index, arm in enumerate(scene.arms):
-            if arm.sid is not None:
-                from dolfinopt.arms.arm import fixed_body
-
-                body = fixed_body(scene, index)
-                if scene.simulation.stiffening is True and not body.is_stiffened:
-                    warn(
-                        [
-                            f"{arm.sid} holds no geometric stiffness, which simulation.stiffening "
-                            f"= true asks for: arm {arm.name!r} is linear"
-                        ]
-                    )
+        warn(doubts_of_files(scene))
         warn(implausible(scene))
         return scene
 
@@ -72,6 +61,32 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     scene = on_root(world, load)
     check_budget(world, scene)
     return world, scene
+
+
+def doubts_of_files(scene: Scene) -> list[str]:
+    """Return what a body from a file lacks that its scene may need, a sentence each.
+
+    Raises:
+        InputError: a file holds no such body.
+    """
+    found = []
+    for index, arm in enumerate(scene.arms):
+        if arm.sid is None:
+            continue
+        from dolfinopt.arms.arm import fixed_body  # not of scenes without files
+
+        body = fixed_body(scene, index)
+        if scene.simulation.stiffening is True and not body.is_stiffened:
+            found.append(
+                f"{arm.sid} holds no geometric stiffness, which simulation.stiffening = true asks "
+                f"for: arm {arm.name!r} is linear"
+            )
+        if scene.is_spatial and not body.outboard[2:5].any():
+            found.append(
+                f"{arm.sid}: its outboard node moves in x and y and turns about z alone; out of "
+                f"that plane arm {arm.name!r} is rigid"
+            )
+    return found
 
 
 def claim(

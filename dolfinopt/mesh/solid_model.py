@@ -12,11 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.cells import cell_volumes, facet_corners
 from dolfinopt.mesh.checks import FRAME_TOLERANCE, remedy
 from dolfinopt.mesh.gmsh_session import silent_terminal
 from dolfinopt.mesh.groups import (
@@ -28,13 +25,13 @@ from dolfinopt.mesh.groups import (
     PASSIVE,
     group_named,
 )
+from dolfinopt.mesh.solid_checks import check_cells, facet_keys, keys_of
 from dolfinopt.mesh.step_names import StepShapes, read_shapes
 from dolfinopt.scene.tables.arms import Arm
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
 CELLS_ACROSS = 4  # of the smaller of height and thickness, of a file without mesh_size
 NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
-FLAT = 1e-6  # volume of a cell over the cube of its longest edge, below which it has none
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.
 TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 Entities = dict[int, list[int]]
@@ -55,7 +52,7 @@ def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
     try:
         with silent_terminal():
             groups = (_read_step if _is_step(arm) else _read_groups)(gmsh, arm)
-        _set_groups(gmsh, groups)
+        _set_groups(gmsh, groups, arm)
         return _checked(gmsh, groups, arm)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
@@ -221,7 +218,7 @@ def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -
     )
 
 
-def _set_groups(gmsh: Any, groups: Entities) -> None:
+def _set_groups(gmsh: Any, groups: Entities, arm: Arm) -> None:
     """Put our groups in place of the file's, after a look at the kinds of cells."""
     model = gmsh.model
     solids = groups[DESIGN] + groups[PASSIVE]
@@ -233,6 +230,12 @@ def _set_groups(gmsh: Any, groups: Entities) -> None:
         raise InputError(
             f"it has cells of kind {names}; expected straight tetrahedra or hexahedra alone "
             "(Mesh.ElementOrder = 1)"
+        )
+    shape = "tetrahedron" if kinds == {TETRAHEDRON} else "hexahedron"
+    if arm.cell_shape != shape:
+        raise InputError(
+            f'its cells are not what arms.cell_shape = "{arm.cell_shape}" says; expected '
+            f'cell_shape = "{shape}"'
         )
     model.removePhysicalGroups()
     for tag, entities in groups.items():
@@ -247,30 +250,20 @@ def _checked(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     """Check that a mesh can be the arm of a scene, and return points of its interfaces.
 
     Raises:
-        InputError: flat cells; several parts; an interface that is no face of cells, or is not at
-            its joint; another height or thickness than the arm's.
+        InputError: flat, folded or overlapping cells; several parts; an interface that is no face
+            of cells, or is not at its joint; another height or thickness than the arm's.
     """
     tags, places, _ = gmsh.model.mesh.getNodes()
     points = np.zeros((int(tags.max()) + 1, 3))
     points[tags.astype(int)] = places.reshape(-1, 3)
     cells = _elements(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
     cells = cells[:, TENSOR[cells.shape[1]]]
-    corners = points[cells]
-    longest = np.ptp(corners, axis=1).max(axis=1)
-    flat = cell_volumes(corners) < FLAT * longest**3
-    if flat.any():
-        x, y, z = corners[flat][0].mean(axis=0)
-        raise InputError(
-            f"{flat.sum()} cells are flat, the first at ({x:.4g}, {y:.4g}, {z:.4g}) m; repair the "
-            "mesh"
-        )
-    _check_parts(cells)
-    sides = facet_corners(3, cells.shape[1])
-    known = {tuple(row) for row in np.sort(np.concatenate([cells[:, s] for s in sides]), axis=1)}
+    check_cells(points, cells)
+    known, largest = facet_keys(cells), int(cells.max())
     used, found = points[np.unique(cells)], []
     for tag, name in _interface_names(arm).items():
         facets = _elements(gmsh, 2, groups[tag])
-        if not {tuple(row) for row in np.sort(facets, axis=1)} <= known:
+        if facets.max() > largest or not np.isin(keys_of(facets, largest), known).all():
             raise InputError(f'group "{name}" has facets of no cells; repair the mesh')
         if tag in ENDS:  # the reference point of another may lie anywhere
             x = 0.0 if tag == INBOARD else arm.length
@@ -296,18 +289,6 @@ def _elements(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
         kind = "faces" if dim == 2 else "volumes"
         raise InputError(f"its {kind} carry no elements of one kind; save the mesh of all of them")
     return np.concatenate(rows)
-
-
-def _check_parts(cells: np.ndarray) -> None:
-    count, width = cells.shape
-    start = np.arange(0, count * width + 1, width)
-    incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), start))
-    pieces = connected_components(incidence @ incidence.T, directed=False)[0]
-    if pieces > 1:
-        raise InputError(
-            f"it consists of {pieces} separate parts; neighbouring volumes must share their faces "
-            "and nodes"
-        )
 
 
 def _check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:

@@ -267,7 +267,7 @@ def _time_motion(
         except (ValidationError, InputError):  # told where the scene is checked, or its motion
             least, limited = None, False
         stated = motion.get("duration")
-        if stated is None and least is not None:
+        if stated is None and least:  # of a table with one row the motion tells
             motion["duration"] = least
             derived.append(("motion", "duration"))
         if not (limited and isinstance(stated, (int, float)) and least is not None):

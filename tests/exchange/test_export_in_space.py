@@ -112,3 +112,22 @@ def test_a_body_that_does_not_bend_needs_no_file(tmp_path):
     scene["arms"][2] = {"name": "link2", "sid": str(tmp_path / "bar.sid")}
     with pytest.raises(InputError, match=r"bar\.sid: nelastq = 0, .* rigid = true, mass"):
         do.Model(scene)
+
+
+@pytest.mark.serial
+def test_a_body_of_the_plane_is_told(tmp_path):
+    """In space it is rigid out of its plane, which nobody expects."""
+    from bodies import beam
+
+    from dolfinopt.cli.shared import doubts_of_files
+    from dolfinopt.exchange.sid import write_sid
+    from dolfinopt.multibody.standard_input import to_sid
+    from dolfinopt.scene.load import scene_from_dict
+
+    write_sid(tmp_path / "beam.sid", to_sid(beam().body()))
+    scene = meshed()
+    scene["arms"][2] = {"name": "link2", "sid": str(tmp_path / "beam.sid")}
+    told = doubts_of_files(scene_from_dict(scene))
+    assert len(told) == 2
+    assert "beam.sid holds no geometric stiffness" in told[0]
+    assert "out of that plane arm 'link2' is rigid" in told[1]

@@ -106,6 +106,27 @@ def test_body_of_a_step_file(shared_tmp_path, monkeypatch):
     assert np.linalg.inv(body.K)[1, 1] * bending == pytest.approx(1.0, abs=0.02)
 
 
+def row_of_cubes(path: Path) -> Path:
+    """Write one layer of hexahedra along the arm as Gmsh's file."""
+    points = [
+        (x, y * HEIGHT, z * THICKNESS)
+        for x in np.linspace(0.0, LENGTH, 3)
+        for y in (-0.5, 0.5)
+        for z in (-0.5, 0.5)
+    ]
+    ring = (1, 3, 4, 2)  # around a cross-section, in Gmsh's order
+    elements = [(3, k, [4 * x + i for i in ring]) for k, x in ((1, 0), (2, 2))]
+    elements += [(5, 3, [4 * x + i for x in (k, k + 1) for i in ring]) for k in (0, 1)]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "3"]
+    lines += ['2 1 "inboard"', '2 2 "outboard"', '3 3 "body"', "$EndPhysicalNames", "$Nodes"]
+    lines += [str(len(points)), *(f"{i} {x} {y} {z}" for i, (x, y, z) in enumerate(points, 1))]
+    lines += ["$EndNodes", "$Elements", str(len(elements))]
+    for i, (kind, group, corners) in enumerate(elements, 1):
+        lines.append(f"{i} {kind} 2 {group} {group} {' '.join(map(str, corners))}")
+    path.write_text("\n".join([*lines, "$EndElements", ""]))
+    return path
+
+
 @pytest.mark.serial
 def test_refusals(shared_tmp_path):
     plain = written(shared_tmp_path, "bar.step", bored=False)
@@ -122,6 +143,8 @@ def test_refusals(shared_tmp_path):
     nameless.write_text(BOX.replace("Inboard", "left"))
     with pytest.raises(InputError, match='no faces in a group "inboard"'):
         mesh_of(nameless, mesh_size=0.02)
+    with pytest.raises(InputError, match='expected cell_shape = "hexahedron"'):
+        mesh_of(row_of_cubes(shared_tmp_path / "cubes.msh"))
     flat = shared_tmp_path / "flat.msh"
     flat.write_text("$MeshFormat\n4.1 0 8\n$EndMeshFormat\n")
     with pytest.raises(InputError, match=r"flat\.msh: mesh of arm 'a'"):

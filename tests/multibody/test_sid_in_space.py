@@ -153,7 +153,10 @@ REFUSED = {
         ["Oe has no m1", "matrices of order 1"],
     ),
     "mass": (lambda d: replace(d, mass=-1.0), ["mass = -1 must be > 0"]),
-    "inertia": (lambda d: changed(d, "J", "M0", (1, 0), -9.0), ["smallest moment of J"]),
+    "inertia": (
+        lambda d: changed(d, "J", "M0", (1, 0), -9.0),
+        ["J has a moment of -"],
+    ),
     "stiffness": (lambda d: changed(d, "Ke", "M0", (0, 0), -9.0), ["Ke must be positive definite"]),
     "stress": (lambda d: changed(d, "ksigma", "M0", (0, 0), 1.0), ["initial stresses"]),
     "Ge": (lambda d: changed(d, "Ge", "M0", (0, 0), 1.0), ["Ge must make a skew matrix"]),

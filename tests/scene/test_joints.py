@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.motion import check_motion
 from dolfinopt.multibody.spatial.links import build_spatial_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
@@ -210,6 +211,16 @@ def test_coordinates_of_several_interfaces(source):
     data["payload"] = {"arm": "tool", "interface": "side"}
     with pytest.raises(InputError, match=r"expected an integer >= 12 .* interfaces, 2, have six"):
         scene_from_dict(data, source)
+
+
+def test_a_table_of_one_row(source, tmp_path):
+    """The table is told, not the duration that would follow from it."""
+    (tmp_path / "one.csv").write_text("t,yaw,lift\n0,0,0\n")
+    data = copy.deepcopy(ROBOT) | {"motion": ROBOT["motion"] | {"file": str(tmp_path / "one.csv")}}
+    data |= {"reduction": {"coordinates": 6}}
+    data["arms"][1] |= {"rigid": False, "cells": [4, 1, 1]}
+    with pytest.raises(InputError, match=r"one\.csv: 1 row\(s\) below the column names"):
+        check_motion(scene_from_dict(data, source))
 
 
 def test_arm_without_joint(source):

@@ -116,7 +116,11 @@ def _check_nodes(first: Node, last: Node, source: str) -> None:
 def _check_body(data: StandardInputData, source: str) -> None:
     """Check what any mechanical body fulfils, and that nothing is left out."""
     principal = np.linalg.eigvalsh(data.inertia(np.zeros(data.num_modes)))
-    check_definite(data, {"mass": data.mass, "the smallest moment of J": principal[0]}, source)
+    if principal[0] < -SMALL * np.abs(principal).max():  # 0 of a thin bar about its axis
+        raise InputError(
+            f"{source}: J has a moment of {principal[0]:g} kg m2; none can be negative"
+        )
+    check_definite(data, {"mass": data.mass, "the largest moment of J": principal[-1]}, source)
     check_stresses(data, source)
     if data.Oe.order == 0:
         raise InputError(
