@@ -448,13 +448,22 @@ def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[S
 
 
 @cache
-def _read_body(sid: str, changed: int, length: float, spatial: bool) -> ShapeIntegrals:
-    """Read a body in the plane or in space once for every state of its file."""
-    if spatial:
-        from dolfinopt.multibody.spatial.body_of_sid import load_body as load_spatial_body
-
-        return load_spatial_body(Path(sid), length)
+def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
+    """Read a body in the plane once for every state of its file."""
     return load_body(Path(sid), length)
+
+
+@cache
+def _read_spatial_body(
+    sid: str,
+    changed: int,
+    length: float,
+    interfaces: tuple[tuple[str, tuple[float, float, float]], ...],
+) -> ShapeIntegrals:
+    """Read a body in space once for every state of its file."""
+    from dolfinopt.multibody.spatial.body_of_sid import load_body as load_spatial_body
+
+    return load_spatial_body(Path(sid), length, dict(interfaces))
 
 
 def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
@@ -465,7 +474,11 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     arm = scene.arms[index]
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
-        body = _read_body(arm.sid, changed, arm.length, scene.is_spatial)
+        if scene.is_spatial:
+            interfaces = tuple((one.name, one.point) for one in arm.interfaces)
+            body = _read_spatial_body(arm.sid, changed, arm.length, interfaces)
+        else:
+            body = _read_body(arm.sid, changed, arm.length)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body
         if scene.is_spatial:

@@ -129,6 +129,31 @@ def test_stiffness_of_a_slender_link_is_told_from_its_mass():
     assert_close(again.W, body.W)
 
 
+@pytest.mark.parametrize("stiff", [False, True])
+def test_several_interfaces(tmp_path, stiff):
+    """A node each, the outboard one last; loads on all of them stiffen, in MBDyn's file, too."""
+    rng = np.random.default_rng(9)
+    body = spatial_cloud(rng, q, interfaces=2).body()
+    if stiff:
+        K0 = rng.normal(size=(24, q, q))
+        K0 = K0 + K0.swapaxes(1, 2)
+        body = replace(body, K0=K0[:12], K0_outboard=K0[12:])
+    data = to_sid(body)
+    assert [node.name for node in data.nodes] == ["1", "3", "2"]
+    write_sid(tmp_path / "a.sid", data)
+    again = load_body(tmp_path / "a.sid", further={"3": (0.4, 0.3, 0.2)})
+    for name in ("outboard", "points", "K0_outboard"):
+        assert np.array_equal(getattr(again, name), getattr(body, name)), name
+    element = modal_element(body)
+    assert element.labels == ("1", "2", "3")
+    assert np.array_equal(element.points[1:], body.points)
+    assert np.array_equal(np.concatenate(element.modes[1:]), body.outboard)
+    assert list(element.loads) == list(range(1, 25 if stiff else 1))
+    assert np.array_equal(element.stiffening[12:], body.K0_outboard)
+    with pytest.raises(InputError, match="no node 'tool'; it has 1, 3, 2"):
+        from_sid(data, further=["tool"])
+
+
 def changed(data, name, which, place, value):
     matrix = getattr(data, name)
     values = getattr(matrix, which).copy()
@@ -189,6 +214,12 @@ def test_length_of_a_file(tmp_path, cloud):
     write_sid(tmp_path / "a.sid", to_sid(cloud.body()))
     with pytest.raises(InputError, match=r"at \(1, 0.2, -0.1\) m, but the arm's length is 1 m"):
         load_body(tmp_path / "a.sid", length=1.0)
+    straight = replace(cloud, ends=np.array([[1.0, 0.0, 0.0], [0.4, 0.3, 0.2]]))
+    two = replace(straight, outboard=np.tile(cloud.outboard, (2, 1))).body()
+    write_sid(tmp_path / "b.sid", to_sid(two))
+    assert len(load_body(tmp_path / "b.sid", 1.0, {"3": (0.4, 0.3, 0.2)}).points) == 2
+    with pytest.raises(InputError, match=r"node 3 is at \(0.4, 0.3, 0.2\) m, but the arm's inter"):
+        load_body(tmp_path / "b.sid", 1.0, {"3": (0.4, 0.3, 0.0)})
 
 
 # -- MBDyn -----------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ zero as far as the rest of the file allows it: exact in the limit of a slender l
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,25 +31,37 @@ from dolfinopt.multibody.spatial.body_motion import PERMUTATION
 from dolfinopt.multibody.spatial.rotations import ONE
 from dolfinopt.multibody.spatial.standard_input import PRODUCTS
 
+Place = tuple[float, float, float]
 
-def load_body(path: Path, length: float | None = None) -> ShapeIntegrals:
+
+def load_body(
+    path: Path, length: float | None = None, further: Mapping[str, Place] | None = None
+) -> ShapeIntegrals:
     """Read an SID file and return its body in space, see `from_sid`.
 
     Args:
         path: of the file; its first node is the inboard, its last one the outboard node.
         length: joint axis to joint axis, m, with which the file must agree.
+        further: names of the nodes that are further interfaces, and where they must be, m.
 
     Raises:
-        InputError: the file is damaged, its body is not of that kind or of another length.
+        InputError: the file is damaged, its body is not of that kind, of another length or with
+            other interfaces.
     """
-    body = from_sid(read_sid(path), source=str(path))
-    if length is not None:
-        x, y, z = body.outboard_point
-        if np.linalg.norm([x - length, y, z]) > SMALL * length:
-            raise InputError(
-                f"{path}: the outboard node is at ({x:.7g}, {y:.7g}, {z:.7g}) m, but the arm's "
-                f"length is {length:.7g} m; it must be at (length, 0, 0)"
-            )
+    further = further or {}
+    body = from_sid(read_sid(path), further=tuple(further), source=str(path))
+    if length is None:
+        return body
+    wanted: list[Place] = [(length, 0.0, 0.0), *further.values()]
+    for name, point, expected in zip(("", *further), body.points, wanted, strict=True):
+        if np.linalg.norm(point - expected) > SMALL * length:
+            x, y, z = point
+            if name:
+                where, told = f"node {name}", f"the arm's interface {name!r} is at {expected} m"
+            else:
+                where, told = "the outboard node", f"the arm's length is {length:.7g} m"
+                told += "; it must be at (length, 0, 0)"
+            raise InputError(f"{path}: {where} is at ({x:.7g}, {y:.7g}, {z:.7g}) m, but {told}")
     return body
 
 
@@ -56,6 +69,7 @@ def from_sid(
     data: StandardInputData,
     inboard: str | None = None,
     outboard: str | None = None,
+    further: Sequence[str] = (),
     source: str = "SID",
 ) -> ShapeIntegrals:
     """Return the body in space of standard input data.
@@ -66,6 +80,7 @@ def from_sid(
         data: of any program.
         inboard: name of the inboard node, by default the first.
         outboard: name of the outboard node, by default the last.
+        further: names of the nodes that are further interfaces.
         source: what messages call the data.
 
     Raises:
@@ -74,33 +89,48 @@ def from_sid(
             Oe, matrices that are no mechanical body's.
     """
     first, last = ends(data, inboard, outboard, source)
-    _check_nodes(first, last, source)
+    tips = [last, *(_node(data, name, source) for name in further)]
+    _check_nodes(first, tips, source)
     _check_body(data, source)
     q = data.num_modes
     K0, K0_outboard = np.zeros((0, q, q)), np.zeros((0, q, q))
     symmetric, turned = _from_rows(data.Oe.M1, _first_order(data.Cr))
-    if _is_stiffened(data, symmetric, last, source):
+    if _is_stiffened(data, symmetric, tips, source):
         push = -data.Ct.M1.transpose(2, 0, 1)
-        K0_outboard = -np.concatenate([_first_order(last.phi), _first_order(last.psi)])
-        loads = {"Ct": list(push), f"phi, psi of node {last.name}": list(K0_outboard)}
+        own = [-_first_order(matrix) for tip in tips for matrix in (tip.phi, tip.psi)]
+        K0_outboard = np.concatenate(own)
+        names = ", ".join(tip.name for tip in tips)
+        loads = {"Ct": list(push), f"phi, psi of node {names}": list(K0_outboard)}
         check_symmetric(loads, source)
         rotation, symmetric = _told_apart(symmetric, turned, data.Me.M0)
         K0 = np.concatenate([push, rotation.reshape(9, q, q)])
+    points = np.stack([tip.origin.M0[:, 0] for tip in tips])
     return ShapeIntegrals(
         mass=data.mass,
         w=np.column_stack([data.mdCM.M0[:, 0], data.Ct.M0.T]),
         W=_second_moments(data, symmetric),
         K=0.5 * (data.Ke.M0 + data.Ke.M0.T),
         D=data.De.M0.copy(),
-        outboard=np.concatenate([last.phi.M0, last.psi.M0]),
-        outboard_point=last.origin.M0[:, 0].copy(),
+        outboard=np.concatenate([matrix.M0 for tip in tips for matrix in (tip.phi, tip.psi)]),
+        outboard_point=points[0],
         K0=0.5 * (K0 + K0.swapaxes(1, 2)),
         K0_outboard=0.5 * (K0_outboard + K0_outboard.swapaxes(1, 2)),
+        further_points=points[1:],
     )
 
 
-def _check_nodes(first: Node, last: Node, source: str) -> None:
-    """Check that the frame is held at the first node, and that the last one is parallel to it."""
+def _node(data: StandardInputData, name: str, source: str) -> Node:
+    """Return the node of that name."""
+    for node in data.nodes:
+        if node.name.casefold() == name.casefold():
+            return node
+    names = ", ".join(node.name for node in data.nodes)
+    raise InputError(f"{source}: no node {name!r}; it has {names}")
+
+
+def _check_nodes(first: Node, tips: Sequence[Node], source: str) -> None:
+    """Check that the frame is held at the first node, and that the others are parallel to it."""
+    last = tips[0]
     if not np.abs(last.origin.M0).max() > 0.0:
         raise InputError(f"{source}: the outboard node {last.name} is at the origin")
     length, push, turn = scales(last)
@@ -109,7 +139,7 @@ def _check_nodes(first: Node, last: Node, source: str) -> None:
         (first, "phi", first.phi.M0, push, "held in the frame"),
         (first, "psi", first.psi.M0, turn, "held in the frame"),
     ]
-    checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, last)]
+    checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, *tips)]
     check_deviations(checks, first, source)
 
 
@@ -148,17 +178,19 @@ def _from_rows(Oe: np.ndarray, Cr: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return symmetric, np.einsum("abc,...c->ab...", -PERMUTATION, Cr)
 
 
-def _is_stiffened(data: StandardInputData, symmetric: np.ndarray, last: Node, source: str) -> bool:
+def _is_stiffened(
+    data: StandardInputData, symmetric: np.ndarray, tips: Sequence[Node], source: str
+) -> bool:
     """Return whether the body has geometric stiffness; it is the same for all loads."""
     excess = data.Me.M0 - np.einsum("aakl->kl", symmetric)
-    push, tip = bool(_first_order(data.Ct).any()), bool(_first_order(last.phi).any())
+    push = bool(_first_order(data.Ct).any())
+    stiffens = {f"m1 of phi of node {tip.name}": bool(_first_order(tip.phi).any()) for tip in tips}
     large = np.abs(excess).max() > CENTRIFUGAL * np.abs(data.Me.M0).max()
     found = {
         "m1 of Ct": push,
-        "m1 of Oe beyond -2 Me": bool(large) or (push and tip),
-        f"m1 of phi of node {last.name}": tip,
+        "m1 of Oe beyond -2 Me": bool(large) or (push and all(stiffens.values())),
     }
-    return is_stiffened(found, source)
+    return is_stiffened(found | stiffens, source)
 
 
 def _told_apart(

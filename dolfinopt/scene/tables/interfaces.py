@@ -29,7 +29,8 @@ class Interface(Table):
     """A rigid part of an arm's surface besides its outboard interface."""
 
     name: Annotated[str, AfterValidator(_check_name)] = Field(
-        description="unique name of the arm's interface, also that of its faces in a mesh file [-]"
+        description="unique name of the arm's interface, also that of its faces in a mesh file and "
+        "of its node in a SID file [-]"
     )
     point: tuple[Position, Position, Position] = Field(
         description="its reference point in the arm's frame [m]"
@@ -64,17 +65,19 @@ def check_interfaces(scene: Scene, index: int) -> None:
             "expected none without [[joints]]: an arm in the plane carries the next one at its end",
             (*at, "interfaces"),
         )
-    for key in ("pattern", "sid"):
-        if getattr(arm, key) is not None:
-            raise Refusal(f"expected none with {key}", (*at, "interfaces"), (*at, key))
+    if arm.pattern is not None:
+        raise Refusal("expected none with pattern", (*at, "interfaces"), (*at, "pattern"))
+    meshed = arm.flexible and arm.cells is not None
     known = [one.name.casefold() for one in arm.interfaces]
     for k, one in enumerate(arm.interfaces):
         here = (*at, "interfaces", k)
         if one.name.casefold() in known[:k]:
             raise Refusal("expected a name that no other interface of the arm has", (*here, "name"))
-        if (one.radius is None) != (arm.rigid or arm.cells is None):
+        if (one.radius is None) == meshed:
             made = "a rigid arm" if arm.rigid else "an arm made of cells"
-            if not arm.rigid and arm.cells is None:
+            if arm.sid is not None:
+                made = f'a body from a file, which has a node "{one.name}"'
+            elif not arm.rigid and arm.cells is None:
                 made = f'a mesh file, which has faces in a group "{one.name}"'
             expected = "a number > 0 [m]" if one.radius is None else "none"
             raise Refusal(f"expected {expected} with {made}", (*here, "radius"))
