@@ -15,6 +15,7 @@ from solids import DENSITY, HEIGHT, LENGTH, POISSON, THICKNESS, YOUNG
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.elements.base import isotropic
+from dolfinopt.fem.elements.solid import _condensed, _full, _recovery
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.box import box_arm
@@ -24,7 +25,8 @@ from dolfinopt.profiling import Profile
 COMM = MPI.COMM_WORLD
 SIZE = LENGTH, HEIGHT, THICKNESS
 # CalculiX 2.20, 50 x 4 x 8 C3D20R, one face fully clamped, Hz: two bending planes in turn, then
-# the third mode over the thickness and torsion.
+# the third mode over the thickness and torsion. Quadratic hexahedra graded to the clamp (48 x 8 x
+# 6, symmetry used) give 0.02 to 0.04 % less, and fall by 0.03 % on halved cells.
 CALCULIX = np.array([66.025, 131.345, 410.674, 799.482, 1136.69, 1166.71])
 
 KINDS = [
@@ -103,34 +105,98 @@ def frequencies(name: str, shape: str, cells: tuple[int, int, int]) -> np.ndarra
 
 @pytest.mark.serial
 def test_clamped_link():
-    """Bending within 0.4 % of CalculiX at 60 x 6 x 4 cells, torsion, which converges last, 1.6 %.
+    """Within 0.3 % of CalculiX at 60 x 6 x 4 cells, but 0.36 % of the third mode of bending.
 
+    Of these 0.21 % are (k h)^2 / 8 of cells of length h and wave number k, a third of it by the
+    stiffness and two thirds by the mass; 0.12 % come from the clamp's edges.
     Quadratic tetrahedra, 25 x 2 x 2 boxes cut into six: 0.5 % and 2.5 %.
     """
     errors = frequencies("incompatible", "hexahedron", (60, 6, 4)) / CALCULIX - 1.0
     assert (errors > 0.0).all()
-    assert errors[:4].max() < 0.003 and errors[4] < 0.004 and errors[5] < 0.016
+    assert errors[[0, 1, 2, 3, 5]].max() < 0.0023 and errors[4] < 0.0037
     errors = frequencies("quadratic", "tetrahedron", (25, 2, 2)) / CALCULIX - 1.0
     assert 0.0 < errors.min() and errors[:5].max() < 0.005 and errors[5] < 0.025
 
 
 @pytest.mark.serial
 def test_refinement():
-    """Errors fall by four on halved cells; those of linear hexahedra, which lock, are 20 times."""
+    """Errors of bending fall by four on halved cells; linear hexahedra, which lock, have 20 times.
+
+    Against quadratic cells as far from the clamp's edges, which are left out so; torsion, which has
+    nothing to do with these, against CalculiX. The coarse cells have it before the third bending.
+    """
     meshes = [(15, 3, 2), (30, 6, 4)]
-    exact = frequencies("quadratic", "hexahedron", (20, 3, 2))
-    coarse, fine = (frequencies("incompatible", "hexahedron", one) / exact - 1.0 for one in meshes)
-    rates = np.log2(coarse / fine)
+    exact = frequencies("quadratic", "hexahedron", (20, 3, 2)).copy()
+    exact[5] = CALCULIX[5]
+    coarse, fine = (frequencies("incompatible", "hexahedron", one) for one in meshes)
+    coarse, fine = coarse[[0, 1, 2, 3, 5, 4]] / exact - 1.0, fine / exact - 1.0
+    rates = np.log2(np.abs(coarse / fine))
     assert rates.min() > 1.7, rates
     locked = frequencies("linear", "hexahedron", meshes[1])[:2] / exact[:2] - 1.0
     assert (locked > 20.0 * fine[:2]).all()
+
+
+def torsion_constant(height: float, thickness: float, cells: tuple[int, int]) -> float:
+    """Return J of a slice of cells whose section turns and warps, the same along the slice."""
+    long = thickness / cells[1]
+    mesh = box_arm(MPI.COMM_SELF, "a", (long, height, thickness), (1, *cells))
+    arm = Substructure(mesh, ELEMENTS["incompatible"].operators(mesh, 1.0, 0.0), Profile())
+    ones = np.ones(mesh.num_cells)
+    elastic = arm.at(2.0 * ones, ones)  # G = 1
+    x, y, z = elastic.points.T
+    _, section = np.unique(np.round(elastic.points[:, 1:], 9), axis=0, return_inverse=True)
+    fields = np.zeros((len(x), 3, section.max() + 2))
+    fields[range(len(x)), 0, section.ravel()] = 1.0
+    fields[:, 1, -1], fields[:, 2, -1] = -x * z, x * y
+    energy = elastic.energy_matrix(fields)
+    warping = np.linalg.lstsq(energy[:-1, :-1], energy[:-1, -1], rcond=None)[0]
+    return float(energy[-1, -1] - energy[-1, :-1] @ warping) / long
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("height", "thickness", "cells", "error"),
+    [
+        (2.0, 1.0, (6, 4), 0.003),
+        (1.0, 1.0, (2, 2), -0.052),
+        (1.0, 1.0, (3, 3), -0.003),
+        (4.0, 1.0, (12, 3), 0.0005),
+        (2.0, 1.0, (12, 8), 0.0016),
+        (1.0, 1.0, (1, 1), -0.763),
+    ],
+)
+def test_torsion_of_sections(height, thickness, cells, error):
+    """Saint-Venant's torsion constant; without the coupling of twisting 3 % at 6 x 4 cells.
+
+    Timoshenko & Goodier, Theory of Elasticity (1970), section 109. A bar of a single cell is too
+    soft by 76 %, it would be too stiff by 19 %.
+    """
+    k = np.arange(1, 100, 2)
+    series = np.sum(np.tanh(0.5 * np.pi * k * height / thickness) / k**5)
+    exact = height * thickness**3 / 3.0 * (1.0 - 192.0 * thickness / (np.pi**5 * height) * series)
+    found = torsion_constant(height, thickness, cells)
+    assert found / exact - 1.0 == pytest.approx(error, abs=6e-4)
+
+
+def test_ways_of_a_cell_without_energy():
+    """Distorted cells have those of a rigid body alone."""
+    rng = np.random.default_rng(2)
+    box = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), axis=-1)
+    box = box.reshape(8, 3)[:, ::-1]
+    corners = (box + rng.uniform(-0.15, 0.15, (40, 8, 3))) * [8e-3, 7e-3, 5e-3]
+    k = _full(corners, 1, POISSON, True)
+    values = np.linalg.eigvalsh(_condensed(k, _recovery(k)))
+    assert np.abs(values[:, :6]).max() < 1e-14 * values[:, -1].min()
+    assert values[:, 6].min() > 2e-3 * values[:, -1].max()
 
 
 def test_compliance_of_a_beam():
     """Stretch, both bendings with shear, torsion; the clamp stiffens by about a height's length.
 
     Saint-Venant's beam clamped without strain of its section is shorter by some (0.1 to 0.2) of
-    the section's size; torsion by more, as its warping is held.
+    the section's size. Torsion whose warping is held at both ends: by 0.018 L, which quadratic
+    cells (30 x 4 x 3) and 60 x 12 x 8 of these agree on to 0.002; it would be 0.05 without the
+    coupling of twisting.
     """
     arm = solid("incompatible", box_arm(COMM, "a", SIZE, (30, 6, 4)))
     C = np.linalg.inv(arm.constraint_modes().stiffness)
@@ -149,7 +215,7 @@ def test_compliance_of_a_beam():
     }
     for at, value in beam.items():
         assert 0.985 < C[at] / value < 0.997, at
-    assert 0.93 < C[3, 3] / (L / (G * J)) < 0.97  # both ends' warping held
+    assert 0.975 < C[3, 3] / (L / (G * J)) < 0.983  # both ends' warping held
     none = np.ones((6, 6), dtype=bool)
     none[range(6), range(6)] = none[1, 5] = none[5, 1] = none[2, 4] = none[4, 2] = False
     scale = np.sqrt(np.outer(np.diag(C), np.diag(C)))

@@ -14,6 +14,7 @@ from dolfinopt.fem.elements.geometry import (
     shape_derivatives,
     shape_functions,
 )
+from dolfinopt.fem.elements.twist import twisting_strains
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
@@ -87,10 +88,13 @@ def _full(corners: np.ndarray, degree: int, poisson_ratio: float, modes: bool) -
         gradients = nodal_gradients(part, degree, points)
         if modes:
             gradients = np.concatenate([gradients, mode_gradients(part, points)], axis=2)
+            twist = twisting_strains(part, points)
         size = 3 * gradients.shape[2]
         k = np.zeros((len(part), size, size))
         for p in range(len(points)):
             B = strains(gradients[:, p])
+            if modes:
+                B[:, :, :24] += twist[:, p]
             k += B.transpose(0, 2, 1) @ (volume[:, p, None, None] * (C @ B))
         found.append(0.5 * (k + k.transpose(0, 2, 1)))
     return np.concatenate(found)
