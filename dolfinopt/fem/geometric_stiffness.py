@@ -8,7 +8,8 @@ K u_p = f_p, whose stress stiffens the body in its modes:
 
     K0_p[i, j] = int t sigma(u_p)_ab (d_a phi_i . d_b phi_j) dA
 
-with p unit loads, d directions and b outboard coordinates.
+with p unit loads, d directions and b outboard coordinates. In space the rigid interface's rotation
+of second order adds to it, see `face_rotation`.
 
 Source: Wallrapp & Schwertassek, Int. J. Numer. Methods Eng. 32 (1991) 1751-1766,
 doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.fem.cells import combine, sum_at_nodes
+from dolfinopt.fem.face_rotation import FaceRotation
 from dolfinopt.fem.uniform_stress import StiffenedModes
 
 if TYPE_CHECKING:
@@ -82,7 +84,21 @@ class UnitLoads:
             own = self._stiffened(V).stiffness()
         else:
             own = self._stiffness(V)
-        return own if arm.comm.size == 1 else arm.comm.allreduce(own)
+        K0 = own if arm.comm.size == 1 else arm.comm.allreduce(own)
+        if self._face is not None:
+            K0 = K0 + self._face.stiffness(self._face_tensors, V)
+        return K0
+
+    @cached_property
+    def _face(self) -> FaceRotation | None:
+        return FaceRotation(self.arm) if self.fields.shape[1] == 3 else None
+
+    @cached_property
+    def _face_tensors(self) -> np.ndarray:
+        """D (m, p, 3, 3) of `FaceRotation` (collective)."""
+        assert self._face is not None
+        points = self.arm.points
+        return self._face.tensors(self.fields, _accelerations(np.ones_like(points), points))
 
     @cached_property
     def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
@@ -146,7 +162,16 @@ class UnitLoads:
             by_V, forces, direct = self._gradient(V, by_K0)
         if by_fields is not None:
             forces = forces + by_fields
-        by_stiffness = np.zeros_like(compliance)
+        by_stiffness, face = np.zeros_like(compliance), None
+        if self._face is not None and len(by_K0):
+            by_face, face, turned = self._face.gradient(self._face_tensors, V, by_K0)
+            by_V = by_V + by_face
+            direct = direct + self._face.stiffness_products(face, self.fields)
+            forces = forces + turned[:, :, : forces.shape[2]]
+            if work is not None:
+                outboard = turned[:, :, inertial:]
+                by_V[:, :, : len(compliance)] += combine(outboard, compliance)
+                work = work + np.tensordot(modes.field, outboard, ((0, 1), (0, 1)))
         if static:
             if work is None:
                 outboard, forces = forces[:, :, inertial:], forces[:, :, :inertial]
@@ -154,7 +179,7 @@ class UnitLoads:
                 work = np.tensordot(modes.field, outboard, ((0, 1), (0, 1)))
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
-        return GeometricGradient(self, by_V, direct, adjoint, by_stiffness)
+        return GeometricGradient(self, by_V, direct, adjoint, by_stiffness, face)
 
     def stiffness_products(
         self, left: np.ndarray, V: np.ndarray, adjoint: np.ndarray
@@ -231,6 +256,8 @@ class GeometricGradient:
         direct: (n_cells,) by Young's modulus, modes and fields held.
         adjoint: (n_nodes, d, k) of the fields of the first k loads.
         by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
+        face: (n_nodes, 3, p) what K u_p - f_p is multiplied by at the interface in space, see
+            `FaceRotation.gradient`.
     """
 
     loads: UnitLoads
@@ -238,6 +265,7 @@ class GeometricGradient:
     direct: np.ndarray
     adjoint: np.ndarray
     by_stiffness: np.ndarray
+    face: np.ndarray | None = None
 
     def by_young_beside(self, left: np.ndarray, V: np.ndarray) -> np.ndarray:
         """Return `by_young` plus sum_k left_k' k_e V_k (n_cells,), in one product.
@@ -257,7 +285,10 @@ class GeometricGradient:
     @property
     def by_inertia(self) -> np.ndarray:
         """Fields whose products with dM 1_x and dM X are the part by the mass (n_nodes, d, 2)."""
-        return _by_inertia(self.adjoint[:, :, : self.loads.num_inertial])
+        adjoint = self.adjoint[:, :, : self.loads.num_inertial]
+        if self.face is not None:
+            adjoint = adjoint - self.face[:, :, : self.loads.num_inertial]
+        return _by_inertia(adjoint)
 
     @property
     def by_density(self) -> np.ndarray:

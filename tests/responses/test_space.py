@@ -16,7 +16,8 @@ from dolfinopt.optimization.gradient_check import taylor_test
 pytestmark = pytest.mark.serial
 DEMO = ROOT / "demos" / "spatial_arm.toml"
 COARSE = ("arms.link1.cells=[8,2,2]", "arms.link2.cells=[8,2,2]", "arms.passive=0.06",
-          "simulation.sample=0.01", "objective.load_cases=6")  # fmt: skip
+          "simulation.sample=0.01", "objective.load_cases=6",
+          "simulation.stiffening=false")  # fmt: skip
 SOLID = ("design.initial=1.0", "design.volume_fraction=1.0")
 
 
@@ -31,12 +32,13 @@ def folder(tmp_path_factory):
 
 
 def test_deviation_of_the_demo(folder):
-    """Nonlinear beams with rigid end faces give 18.62 mm; the demo's own cells 18.620 mm.
+    """Within 1 % of nonlinear beams with rigid end faces, 18.62 mm; the demo's own cells 18.72 mm.
 
-    The coarse cells of this test are 2.7 % too stiff.
+    Without stiffening, which nonlinear beams have, it would be 18.85 mm there.
     """
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary["max_deviation"] == pytest.approx(18.1138e-3, rel=1e-4)
+    assert summary["max_deviation"] == pytest.approx(18.62e-3, rel=0.01)
+    assert summary["max_deviation"] == pytest.approx(18.761e-3, rel=1e-4)
     assert summary["max_deviation_time"] == pytest.approx(0.416, abs=0.003)
     assert summary["mass"] == pytest.approx({"column": 0.0, "link1": 1.08, "link2": 0.972})
     assert set(summary["drive_peak"]) == {"yaw", "shoulder", "elbow"}
