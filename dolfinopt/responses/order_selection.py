@@ -217,14 +217,14 @@ def _timed(scene: Scene) -> Scene:
 
 
 def _leading(basis: Basis, count: int) -> Basis:
-    """Return the first Craig-Bampton coordinates: fixed-interface modes stand behind three."""
+    """Return the first Craig-Bampton coordinates: constraint modes, then fixed-interface modes."""
     part = slice(count)
     return Basis(
         basis.V[:, :, part],
         basis.MV[:, :, part],
         basis.stiffness[part, part],
         basis.outboard[:, part],
-        basis.start[:, : count - 3],
+        basis.start[:, : count - len(basis.outboard)],
     )
 
 
