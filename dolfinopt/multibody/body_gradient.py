@@ -232,6 +232,7 @@ def _integral_gradient(
         D=multipliers.T @ qd,
         outboard=outboard,
         outboard_point=np.zeros(2),
+        further_points=np.zeros((0, 2)),
         K0=_by_geometric_stiffness(frame, virtual),
         K0_outboard=K0_outboard,
     )

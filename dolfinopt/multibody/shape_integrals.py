@@ -183,7 +183,10 @@ def plane_body(
     W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
     W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
     w, K0 = np.column_stack([moment, C]), np.zeros((0, q, q)) if K0 is None else K0
-    return ShapeIntegrals(float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:])
+    further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
+    return ShapeIntegrals(
+        float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:], further
+    )
 
 
 # -- what follows from the table -------------------------------------------------------------
