@@ -11,10 +11,13 @@ from solids import HEIGHT, LENGTH, THICKNESS
 
 from dolfinopt.arms.arm import Arm as Flexible
 from dolfinopt.errors import InputError
+from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.cells import facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
+from dolfinopt.scene.tables.interfaces import Interface
 
 COMM = MPI.COMM_WORLD
 KEYS = {"name": "a", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": None}
@@ -39,8 +42,8 @@ def sums(mesh: ArmMesh) -> np.ndarray:
     return COMM.allreduce(np.array([mesh.area.sum(), mesh.area[mesh.passive].sum()]))
 
 
-def written(folder: Path, name: str, bored: bool) -> Path:
-    """Write the box, or a bar with bores about both joint axes, as a file of Gmsh's."""
+def written(folder: Path, name: str, bored: bool, *more: float) -> Path:
+    """Write the box, or a bar with bores about both joint axes and more, as a file of Gmsh's."""
     path = folder / name
     with gmsh_on_root(COMM) as gmsh:
         if COMM.rank == 0:
@@ -52,7 +55,7 @@ def written(folder: Path, name: str, bored: bool) -> Path:
             if bored:
                 holes = [
                     (3, occ.addCylinder(x, 0.0, -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, 0.01))
-                    for x in (0.0, LENGTH)
+                    for x in (0.0, LENGTH, *more)
                 ]
                 occ.cut(bar, holes)
             occ.dilate(occ.getEntities(3), 0.0, 0.0, 0.0, 1e3, 1e3, 1e3)  # files are in mm
@@ -73,6 +76,41 @@ def test_geo_with_groups(shared_tmp_path):
     hexahedra = mesh_of(path, mesh_size=0.02, cell_shape="hexahedron")
     assert np.allclose(sums(hexahedra), [volume, 0.2 * volume], rtol=1e-9)
     assert mesh.dim == 3 and np.array_equal(mesh.outboard_point, [LENGTH, 0.0, 0.0])
+
+
+def facets_at(mesh: ArmMesh, facets: np.ndarray) -> np.ndarray:
+    """Return the middles (n, 3) of facets of tetrahedra, of all ranks."""
+    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
+    middles = corners[:, np.array(facet_corners(3, 4))].mean(axis=2)
+    found = middles[np.isin(compat.cell_facets(mesh.mesh, mesh.num_cells), facets)]
+    return np.concatenate(COMM.allgather(found))
+
+
+def test_further_interfaces(shared_tmp_path):
+    """Faces by name, in capitals or not, also where it begins like another's; a bore by place."""
+    lug = Interface(name="outboard lug", point=(0.05, 0.5 * HEIGHT, 0.0))
+    path = shared_tmp_path / "lug.geo"
+    if COMM.rank == 0:
+        box = f"{{-1, {0.5 * HEIGHT - 1e-6}, -1, 0.100001, 1, 1}}"
+        path.write_text(
+            BOX + f'Physical Surface("Outboard lug") = {{Surface In BoundingBox {box}}};'
+        )
+    COMM.barrier()
+    mesh = mesh_of(path, mesh_size=0.02, interfaces=(lug,))
+    middles = facets_at(mesh, mesh.further[0].facets)
+    assert len(middles) and np.abs(middles[:, 1] - 0.5 * HEIGHT).max() < 1e-12
+    assert middles[:, 0].max() < 0.1
+    assert np.array_equal(mesh.further_points, [lug.point])
+    bored = written(shared_tmp_path, "three.step", True, 0.2)
+    hub = Interface(name="hub", point=(0.2, 0.0, 0.0))
+    mesh = mesh_of(bored, mesh_size=0.01, passive=0.005, interfaces=(hub,))
+    radius = np.linalg.norm(facets_at(mesh, mesh.further[0].facets)[:, :2] - [0.2, 0.0], axis=1)
+    assert len(radius) >= 8 and np.abs(radius - 0.01).max() < 2e-3
+    near = np.linalg.norm(mesh.centroid[:, :2] - [0.2, 0.0], axis=1) < 0.013
+    assert mesh.passive[near].all()
+    away = Interface(name="hub", point=(0.3, 0.0, 0.0))
+    with pytest.raises(InputError, match='no faces of interface "hub": expected a face named so'):
+        mesh_of(bored, mesh_size=0.02, interfaces=(away,))
 
 
 @pytest.mark.parametrize("bored", [False, True])
