@@ -103,11 +103,15 @@ def is_stiffened(found: Mapping[str, bool], source: str) -> bool:
 
 
 def check_symmetric(matrices: Mapping[str, Sequence[np.ndarray]], source: str) -> None:
-    """Check that the geometric stiffness (q, q) of every load is symmetric."""
+    """Check that what one load or rotation does to the coordinates (q, q) is symmetric.
+
+    Relative to the largest under the same name: of a load that does nothing rounding is left.
+    """
     for name, loads in matrices.items():
+        scale = max(np.abs(matrix).max() for matrix in loads)
         for matrix in loads:
-            if np.abs(matrix - matrix.T).max() > SMALL * np.abs(matrix).max():
+            if np.abs(matrix - matrix.T).max() > SMALL * scale:
                 raise InputError(
                     f"{source}: m1 of {name} must be symmetric in coordinates and rows or columns: "
-                    "it is the geometric stiffness of one load"
+                    "it is what one load or rotation does to the stiffness"
                 )

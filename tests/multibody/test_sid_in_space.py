@@ -187,11 +187,15 @@ REFUSED = {
     "Ge": (lambda d: changed(d, "Ge", "M0", (0, 0), 1.0), ["Ge must make a skew matrix"]),
     "push alone": (
         lambda d: changed(d, "Ct", "M1", (0, 0, 2), 1.0),
-        ["m1 of Ct holds geometric stiffening, which m1 of Oe beyond -2 Me lacks"],
+        ["m1 of Ct holds geometric stiffening, which m1 of phi of node 2 lacks"],
     ),
     "rotation alone": (
         lambda d: changed(d, "Oe", "M1", (0, 0, 1), 9.0),
-        ["m1 of Oe beyond -2 Me holds geometric stiffening, which m1 of Ct lacks"],
+        ["do not add up to -2 Me", "m1 of Ct and phi lack"],
+    ),
+    "rotation": (
+        lambda d: changed(d, "Oe", "M1", (0, 1, 3), 9.0),
+        ["m1 of Oe must be symmetric"],
     ),
     "not symmetric": (
         lambda d: moved(changed(d, "Ct", "M1", (0, 0, 2), 1.0), 1, "phi", "M1", (0, 0, 1), 1.0),

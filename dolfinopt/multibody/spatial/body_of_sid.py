@@ -159,7 +159,11 @@ def _check_body(data: StandardInputData, source: str) -> None:
         )
     coriolis = data.Ge.M0.reshape(data.num_modes, -1, 3)
     if np.abs(coriolis + coriolis.swapaxes(0, 1)).max() > SMALL * np.abs(data.Me.M0).max():
-        raise InputError(f"{source}: every third column of Ge must make a skew matrix")
+        raise InputError(
+            f"{source}: every third column of Ge must make a skew matrix: a block of three columns "
+            "for each coordinate, not one of all coordinates for each axis"
+        )
+    check_symmetric({"Oe": list(data.Oe.M1.transpose(2, 0, 1))}, source)
 
 
 def _first_order(matrix: Taylor) -> np.ndarray:
@@ -182,15 +186,18 @@ def _is_stiffened(
     data: StandardInputData, symmetric: np.ndarray, tips: Sequence[Node], source: str
 ) -> bool:
     """Return whether the body has geometric stiffness; it is the same for all loads."""
-    excess = data.Me.M0 - np.einsum("aakl->kl", symmetric)
     push = bool(_first_order(data.Ct).any())
-    stiffens = {f"m1 of phi of node {tip.name}": bool(_first_order(tip.phi).any()) for tip in tips}
-    large = np.abs(excess).max() > CENTRIFUGAL * np.abs(data.Me.M0).max()
-    found = {
-        "m1 of Ct": push,
-        "m1 of Oe beyond -2 Me": bool(large) or (push and all(stiffens.values())),
-    }
-    return is_stiffened(found | stiffens, source)
+    found = {f"m1 of phi of node {tip.name}": bool(_first_order(tip.phi).any()) for tip in tips}
+    if push or any(found.values()):
+        return is_stiffened({"m1 of Ct": push} | found, source)
+    excess = data.Me.M0 - np.einsum("aakl->kl", symmetric)
+    if np.abs(excess).max() > CENTRIFUGAL * np.abs(data.Me.M0).max():
+        raise InputError(
+            f"{source}: columns 1 to 3 of m1 of Oe do not add up to -2 Me: either they hold "
+            "geometric stiffness, which m1 of Ct and phi lack, or nodes have moments of inertia of "
+            "their own, which bodies do not have here"
+        )
+    return False
 
 
 def _told_apart(
