@@ -38,7 +38,8 @@ class IncompatibleElement:
         k_e = k_uu - k_ua k_aa^-1 k_au,
 
     so that k_e stays proportional to Young's modulus. 2 Gauss points a direction. The modes move
-    no nodes and carry no mass: m_e is that of the bilinear functions.
+    no nodes and carry no mass: m_e is that of the bilinear functions. Hexahedra have the shear of
+    their twisting coupled, see `twist.twisting_strains`.
 
     Source: Taylor, Beresford & Wilson, Int. J. Numer. Methods Eng. 10 (1976) 1211-1219,
     doi:10.1002/nme.1620100602.

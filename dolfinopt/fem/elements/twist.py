@@ -33,10 +33,10 @@ def twisting_strains(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     stiffness is too large by 3 % with 6 x 4 cells. But for Saint-Venant's torsion of a section with
     sides along y and z the integral of w_yy^2 is that of t^2 - p^2, as w is harmonic and its normal
     derivative on the sides linear. With t = -r, a_1 a_2 = h_y h_z (p^2 - t^2): the coupling takes
-    the missing energy off, for s = 1 all of it. It does so as in difference formulas of high order
-    (Collatz 1960, doi:10.1007/978-3-642-88434-4, "Mehrstellenverfahren"). s < 1 leaves energy to
-    every way of twisting, so that the rank of k_e stays 18, and keeps bars of two cells close to
-    their stiffness.
+    the missing energy off, for s = 1 all of it where h_y = h_z. It does so as in difference
+    formulas of high order (Collatz, The Numerical Treatment of Differential Equations, 3rd ed.,
+    Springer 1960: Mehrstellenverfahren). s < 1 leaves energy to every way of twisting, so that the
+    rank of k_e stays 18, and keeps bars of two cells close to their stiffness.
 
     The coupled part has no mean over the cell, and none for linear displacements: the patch test
     is passed on cells of any shape. On these a is that of the axes at their centre.
@@ -52,7 +52,8 @@ def twisting_strains(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     grow = (points - 0.5)[:, ALONG]
     amplitudes = _coupled(_amplitudes(corners, centre, inverse, length))
     tensors = np.stack([_shear(inverse, length, *pair) for pair in PAIRS], axis=2)
-    return np.einsum("ep,pk,esk,ekn->epsn", ratio, grow, tensors, amplitudes)
+    growing = (ratio[:, :, None] * grow)[:, :, None] * tensors[:, None]
+    return growing @ amplitudes[:, None]
 
 
 def _amplitudes(
