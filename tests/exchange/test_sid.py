@@ -314,6 +314,7 @@ DAMAGED = {
     "infinite": (edited("m0( 1, 1) = 50.0", "m0( 1, 1) = 1D999"), ["1D999", "finite"]),
     "no value": (edited("= 3.00000000000D+00", ""), ["line 5", "a number"]),
     "no integer": (edited("nelastq                         =   2", "nelastq = 2.5"), ["line 6"]),
+    "too many": (edited("nelastq                         =   2", "nelastq = 501"), ["0 to 500"]),
     "too many names": (edited("ielastq (   2)", "ielastq (   3)"), ["line 8", "1..2"]),
     "no refmod": (edited("           refmod\n", ""), ["line 4", "'refmod'"]),
     "no mass": (edited("mass        ", "weight        "), ["line 5", "'mass'", "weight"]),

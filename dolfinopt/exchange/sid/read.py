@@ -24,6 +24,7 @@ from dolfinopt.exchange.sid.data import (
 )
 
 T = TypeVar("T")
+MOST = 500  # coordinates: every matrix is kept with its derivative by all of them
 
 _END = re.compile(r"end\s+(?:of\s+)?(\w+)\s*$", re.IGNORECASE)
 _ITEM = re.compile(
@@ -186,7 +187,7 @@ class _Reader:
             "refmod",
             {
                 "mass": lambda: self.once(found, "mass", self.real),
-                "nelastq": lambda: self.once(found, "nelastq", lambda: self.integer(0, 100_000)),
+                "nelastq": lambda: self.once(found, "nelastq", lambda: self.integer(0, MOST)),
                 "ielastq": name,
             },
         )
