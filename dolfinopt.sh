@@ -175,55 +175,70 @@ drop_chatter() {
 
 # check NAME COMMAND ...: keeps the last line of the output and the verdict for the summary.
 check() {
-  local name=$1 begin=$SECONDS verdict=ok
+  local name=$1 begin=$SECONDS
   shift
   echo "== $name"
   "$@" 2>&1 | drop_chatter | tee "$output"
-  if [ "${PIPESTATUS[0]}" != 0 ]; then
-    verdict=FAILED
-    failed+=("$name")
-  fi
-  summary+=$(printf '%-6s  %-20s %4d s  %s' "$verdict" "$name" $((SECONDS - begin)) \
-    "$(grep -v '^ *$' "$output" | tail -n 1)")$'\n'
+  judge "$name" "${PIPESTATUS[0]}" $((SECONDS - begin)) "$output"
 }
 
-# with_ranks FILE COMMAND ...: runs it under mpirun, its output into FILE, and ends with its status.
-# Ranks that wait for others let the processors to other tests.
-with_ranks() {
-  local file=$1
+# judge NAME STATUS TIME FILE: a line of the summary.
+judge() {
+  local verdict=ok
+  if [ "$2" != 0 ]; then
+    verdict=FAILED
+    failed+=("$1")
+  fi
+  summary+=$(printf '%-6s  %-20s %4d s  %s' "$verdict" "$1" "$3" \
+    "$(grep -v '^ *$' "$4" | tail -n 1)")$'\n'
+}
+
+# beside FILE COMMAND ...: runs it, its output into FILE, and ends with its status.
+beside() {
+  local file=$1 begin=$SECONDS status
   shift
   trap 'kill "$!" 2>/dev/null' TERM
-  OMPI_MCA_mpi_yield_when_idle=1 /usr/bin/mpirun -n "$ranks" "$@" >"$file" 2>&1 &
+  "$@" >"$file" 2>&1 &
   wait "$!"
+  status=$?
+  echo $((SECONDS - begin)) >"$file.time"
+  return "$status"
 }
 
-# told FILE STATUS: prints FILE and ends with the status.
+# told NAME PROCESS FILE: waits for what runs beside; prints its output and judges it.
 told() {
-  cat "$1"
-  return "$2"
+  local status
+  wait "$2"
+  status=$?
+  echo "== $1"
+  drop_chatter <"$3" | tee "$output"
+  judge "$1" "$status" "$(<"$3.time")" "$output"
 }
 
 run_tests() {
-  local output several beside status summary="" failed=()
-  output=$(mktemp) && several=$(mktemp) || exit 1
-  trap "rm -f '$output' '$several'" EXIT
+  local output folder types several summary="" failed=()
+  folder=$(mktemp -d) || exit 1
+  output=$folder/output
+  trap "rm -rf '$folder'" EXIT
   cd "$here" || exit 1
   answer_soon
   export NO_COLOR=1 # mpirun gives the ranks a terminal even when there is none
   check "ruff check" "$python" -m ruff check .
   check "ruff format" "$python" -m ruff format --check .
-  check "mypy" "$python" -m mypy
   check "imports" "$venv/bin/lint-imports" --no-cache
-  # Several ranks are never busy all the time: they run beside the tests on one rank, and are told
-  # of afterwards. What takes long need not take it twice; a -m among the arguments wins.
-  with_ranks "$several" "$python" -m pytest -m "not slow" "$@" &
-  beside=$!
-  trap "kill $beside 2>/dev/null; rm -f '$output' '$several'" EXIT
+  # Types, and tests on several ranks, which are never busy all the time, beside the tests on one
+  # rank; they are told of afterwards. Ranks that wait for others let the processors to other tests.
+  # What takes long need not take it twice; a -m among the arguments wins.
+  beside "$folder/types" "$python" -m mypy &
+  types=$!
+  OMPI_MCA_mpi_yield_when_idle=1 beside "$folder/several" \
+    /usr/bin/mpirun -n "$ranks" "$python" -m pytest -m "not slow" "$@" &
+  several=$!
+  trap "kill $types $several 2>/dev/null; rm -rf '$folder'" EXIT
   # One rank a test, in as many processes; the tests of a file share what they build.
   check "pytest" "$python" -m pytest -n "$ranks" --dist loadfile "$@"
-  wait "$beside"
-  status=$?
-  check "pytest, $ranks ranks" told "$several" "$status"
+  told "mypy" "$types" "$folder/types"
+  told "pytest, $ranks ranks" "$several" "$folder/several"
   printf '== summary\n%s' "$summary"
   if [ ${#failed[@]} -gt 0 ]; then
     printf 'FAILED:%s\n' "$(printf ' %s;' "${failed[@]}")"

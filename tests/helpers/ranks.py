@@ -1,5 +1,8 @@
 """Tests alone and under mpirun: ranks agree on every outcome, and nothing hangs.
 
+Ranks that wait for what the root does alone sleep meanwhile: MPI would keep their processors busy,
+which other tests need.
+
 Under mpirun every rank runs every test. After each phase of a test the ranks exchange how it went;
 a failure on one of them is a failure on all, reported by rank 0. A rank that failed while others
 wait for it inside a collective call would wait for ever: after a grace period it ends the run.
@@ -14,13 +17,39 @@ import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mpi4py import MPI
 
+from dolfinopt import parallel
+
 TIME_LIMIT = 180.0  # s a test, unless marked timeout(seconds)
 GRACE = 10.0  # s a failed rank waits for the others
 SERIAL_FILE = re.compile(r"^pytestmark = pytest\.mark\.serial\b", re.MULTILINE)
+
+
+def rest_while_the_root_works() -> None:
+    """Let `parallel.on_root` begin with a wait of all other ranks, asleep.
+
+    To be called before other modules of dolfinopt import it.
+    """
+    at_once = parallel.on_root
+
+    def on_root(world: MPI.Comm, action: Any, *arguments: Any) -> Any:
+        def act(*given: Any) -> Any:
+            try:
+                return action(*given)
+            finally:
+                world.Ibarrier().Wait()
+
+        if world.rank > 0:
+            done = world.Ibarrier()
+            while not done.Test():
+                time.sleep(2e-4)
+        return at_once(world, action if world.size == 1 else act, *arguments)
+
+    parallel.on_root = on_root
 
 
 class Ranks:
@@ -35,6 +64,8 @@ class Ranks:
 
     def __init__(self, config: pytest.Config) -> None:
         self.comm = MPI.COMM_WORLD.Dup()
+        if self.comm.size > 1:
+            rest_while_the_root_works()
         self.stderr = os.fdopen(os.dup(2), "w")
         self.unread: list[str] = []
         self.left_out = 0

@@ -23,6 +23,7 @@ def small(*settings, iterations=6):
 
 
 QUICK = ["motion.horizon=2.0", "simulation.tolerance=1e-3"]
+SMALLEST = ["motion.horizon=1.9", "simulation.tolerance=1e-2", "arms.cells=[24,3]"]
 
 
 @pytest.mark.slow
@@ -48,20 +49,20 @@ def test_volume_limits():
     """Each arm keeps its own limit; a shared limit lets material move to the inner arm."""
     for shared in (False, True):
         settings = ["design.shared_volume=true"] if shared else []
-        result = do.optimize(small(*settings, iterations=25))
+        result = do.optimize(small(*SMALLEST, *settings, iterations=25))
         mine = {k: arm.volume_fraction(result.x_phys[k]) for k, arm in result.arms.items()}
         fractions = list(do.gather_arms(result.partition, mine).values())
         if WORLD.rank == 0:
             assert np.mean(fractions) == pytest.approx(0.5, abs=2e-3)
             if shared:
-                assert fractions[0] > 0.52 and fractions[1] < 0.48  # 0.531, 0.469
+                assert fractions[0] > 0.52 and fractions[1] < 0.48  # 0.594, 0.405
             else:
                 assert fractions == pytest.approx([0.5, 0.5], abs=2e-3)
 
 
 @pytest.mark.serial
 def test_stops_when_the_design_rests():
-    result = do.optimize(small("optimizer.tolerance=0.05", iterations=200))
+    result = do.optimize(small(*SMALLEST, "optimizer.tolerance=0.05", iterations=200))
     assert result.converged and result.iterations < 200
     if WORLD.rank == 0:
         assert result.history[-1].change <= 0.05 < result.history[-2].change
@@ -88,18 +89,20 @@ def test_constraints_keep_their_bounds():
     """Bounds that the free optimum breaks hold in the end, and cost compliance."""
     # Loose ones, only to be told the values: they change the free design by rounding.
     loose = ["constraints.first_frequency=0.1", "constraints.tip_deflection=1.0"]
-    free = do.optimize(small(*QUICK, *loose, iterations=40))
-    assert free.evaluation.loaded_frequencies[0] < 5.03 < free.evaluation.loaded_frequencies[1]
-    assert max(free.evaluation.constraints[4:]) > 7e-5 - 1.0
-    for bound in ("constraints.first_frequency=5.06", "constraints.tip_deflection=6.0e-5"):
-        kept = do.optimize(small(*QUICK, bound, iterations=40))
+    posed = ["objective.kind=static", *SMALLEST]
+    free = do.optimize(small(*posed, *loose, iterations=40)).evaluation
+    assert free.loaded_frequencies[0] < 3.62 < free.loaded_frequencies[1]
+    assert max(free.tip_deflections) > 1e-4
+    for bound in ("constraints.first_frequency=3.64", "constraints.tip_deflection=9.5e-5"):
+        result = do.optimize(small(*posed, bound, iterations=40))
+        kept = result.evaluation
         # MMA approaches an active bound to a fraction of its last change.
-        assert max(kept.evaluation.constraints) == pytest.approx(0.0, abs=1e-3)
-        assert kept.evaluation.compliance > free.evaluation.compliance * 1.002
+        assert max(kept.constraints) == pytest.approx(0.0, abs=1e-3)
+        assert kept.objective > free.objective * 1.002
         if WORLD.rank == 0:
-            assert kept.history[-1].volume_fraction == pytest.approx(0.5, abs=1e-3)
+            assert result.history[-1].volume_fraction == pytest.approx(0.5, abs=1e-3)
         if "frequency" in bound:
-            assert kept.evaluation.loaded_frequencies[0] == pytest.approx(5.06, rel=1e-3)
+            assert kept.loaded_frequencies[0] == pytest.approx(3.64, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -149,12 +152,12 @@ def test_resume_gives_the_same_bits(shared_tmp_path, monkeypatch):
         for folder in folders.values():
             folder.mkdir()
     WORLD.barrier()
-    whole = do.optimize(small(), folders["whole"])
+    whole = do.optimize(small(*SMALLEST), folders["whole"])
     for stop in (0, 1, 4, 6):
         folder = folders[stop]
-        interrupted = small(iterations=stop)
+        interrupted = small(*SMALLEST, iterations=stop)
         do.optimize(interrupted, folder)
-        resumed = do.optimize(small(), folder, resume=True)
+        resumed = do.optimize(small(*SMALLEST), folder, resume=True)
         for k in whole.x_phys:
             np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
         rows = [replace(row, seconds=0.0) for row in resumed.history]
@@ -166,7 +169,6 @@ def test_resume_gives_the_same_bits(shared_tmp_path, monkeypatch):
 # Sharper in every iteration, but not so sharp that arms fall apart, which are slow to simulate.
 GENTLE = ["design.continuation=2", "design.sharpness=4.0", "design.filter_radius=0.05"]
 ROBUST = "design.projection=robust"
-SMALLEST = ["motion.horizon=1.9", "simulation.tolerance=1e-2", "arms.cells=[24,3]"]
 # One line an option of which the next iteration remembers something.
 REMEMBERED = [
     ["arms.element=incompatible", "simulation.stiffening=true"],
@@ -235,20 +237,28 @@ def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
         assert list(memory.cells[k].shape) == [arm.mesh.num_cells, 5]
 
 
+def rows_of(folder):
+    """Return how many designs a run has told of, once it has something to go on from."""
+    history = folder / "history.csv"
+    if not (folder / checkpoint.NAME).exists() or not history.exists():
+        return 0
+    return history.read_text().count("\n") - 1
+
+
 @pytest.mark.serial
 @pytest.mark.slow
 def test_sigkill_and_resume(tmp_path):
     """Killed at any moment, a resumed run writes the same design to the last bit."""
-    line = ["optimize", TWO_ARM, *overrides("arms.cells=[40,4]", "optimizer.max_iterations=30")]
+    changes = [*QUICK, "arms.cells=[24,3]", "optimizer.max_iterations=20"]
+    line = ["optimize", TWO_ARM, *overrides(*changes)]
     line += ["--no-plots", "--out"]
     run(*line, tmp_path / "whole")
-    for moment in (0.0, 0.4):
-        folder = tmp_path / str(moment)
+    for rows in (1, 6):
+        folder = tmp_path / str(rows)
         process = subprocess.Popen(command(*line, folder), env=environment())
         deadline = time.monotonic() + 60.0
-        while not (folder / checkpoint.NAME).exists() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        time.sleep(moment)
+        while rows_of(folder) < rows and time.monotonic() < deadline:
+            time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL  # it was still at work
         run(*line, folder, "--resume")
@@ -277,12 +287,12 @@ def test_more_iterations_may_be_asked_for_on_resume(shared_tmp_path):
 @pytest.mark.serial
 @pytest.mark.slow
 def test_same_design_on_any_number_of_ranks(tmp_path):
-    """One rank, and four of which two have no arm: sums run in the arms' order."""
+    """One rank, and three of which one has no arm: sums run in the arms' order."""
     designs = []
-    for ranks in (1, 4):
+    for ranks in (1, 3):
         folder = tmp_path / str(ranks)
         line = ["optimize", TWO_ARM, "--no-plots", "--out", folder]
-        line += overrides("arms.cells=[40,4]", "optimizer.max_iterations=3")
+        line += overrides(*SMALLEST, "optimizer.max_iterations=2")
         if ranks == 1:
             run(*line)
         else:

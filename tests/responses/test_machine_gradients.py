@@ -27,7 +27,7 @@ GRAVITY = {"gravity": [0.0, -9.81]}
 def arms(objective: Tree, stiffening: bool, **changes: Any) -> Tree:
     """Return the two-arm scene on few cells."""
     tree = two_arm("arms.cells=[20,3]", "motion.horizon=2.2", objective=objective)
-    simulation = {"stiffening": stiffening, "tolerance": 1e-6}
+    simulation = {"stiffening": stiffening, "tolerance": 1e-6, "sample": 0.01}
     return with_keys(with_keys(tree, {"simulation": simulation}), changes)
 
 

@@ -136,6 +136,8 @@ def test_gradient_of_all_scenarios(combination, options):
         "motion.horizon=2.2",
         f"objective.scenarios={combination}",
         "objective.load_cases=6",
+        "simulation.tolerance=1e-3",
+        "simulation.sample=0.01",
         scenarios((*MATERIAL, DAMPING), PATH, weights=[1.0, 0.3]),
         cells=(16, 3),
     )

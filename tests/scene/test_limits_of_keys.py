@@ -26,6 +26,9 @@ USED = {
     "reduction.tolerance": ["reduction.coordinates=auto"],
     "motion.start": ["motion.path=line"],
     "motion.end": ["motion.path=line"],
+    # With stiffening they are refused after a long search, as payload.mass is.
+    "arms.joint_inertia": ["simulation.stiffening=false", "reduction.coordinates=3"],
+    "payload.inertia": ["simulation.stiffening=false", "reduction.coordinates=3"],
     "motion.horizon": ["motion.duration=1e5", "simulation.sample=1e3"],
     "motion.gravity": ["motion.duration=2", "motion.horizon=2"],
     "motion.base_position": ["motion.base=fixed"],

@@ -498,8 +498,8 @@ def test_failures_end_with_status_one(folder, monkeypatch):
 # -- killed ----------------------------------------------------------------------------------
 
 
-REOPTIMISED = [TWO_ARM, "payload", "--vary", "payload.mass=4:7:3", "--reoptimize", *SETTINGS,
-               "--set", "optimizer.max_iterations=5", "--no-plots", "--out"]  # fmt: skip
+REOPTIMISED = [TWO_ARM, "payload", "--vary", "payload.mass=4,7", "--reoptimize", *SETTINGS,
+               "--set", "simulation.tolerance=1e-2", "--no-plots", "--out"]  # fmt: skip
 
 
 def computed_cases(said):
@@ -535,7 +535,7 @@ def test_killed_study_goes_on(whole, tmp_path, capsys, ranks):
         begun.wait()
     done = len(list(tmp_path.glob("cases/*/summary.json")))
     every = len(list(whole.glob("cases/*/summary.json")))
-    assert 2 <= done < every == 19  # four designs made, they and the initial one with three masses
+    assert 2 <= done < every == 11  # three designs made, they and the initial one with two masses
     for path in tmp_path.glob("cases/*/summary.json"):
         json.loads(path.read_text())
     capsys.readouterr()
