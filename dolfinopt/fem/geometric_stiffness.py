@@ -26,6 +26,7 @@ import numpy as np
 
 from dolfinopt.fem.cells import combine, sum_at_nodes
 from dolfinopt.fem.face_rotation import FaceRotation
+from dolfinopt.fem.gradient_pairs import PLANE_TERMS, SOLID_TERMS, pairs, pairs_transposed
 from dolfinopt.fem.uniform_stress import StiffenedModes
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class UnitLoads:
 
     @cached_property
     def _terms(self) -> Sequence[Sequence[tuple[int, int, int]]]:
-        return _TERMS if self.fields.shape[1] == 2 else _SOLID_TERMS
+        return PLANE_TERMS if self.fields.shape[1] == 2 else SOLID_TERMS
 
     @cached_property
     def stresses(self) -> np.ndarray:
@@ -119,9 +120,9 @@ class UnitLoads:
         i, j = np.triu_indices(q)
         packed = np.zeros((self.num_loads, len(i)))
         for _, points, H in self._parts(V):
-            pairs = np.empty((packed.shape[1], H.shape[3]))
+            products = np.empty((packed.shape[1], H.shape[3]))
             for stress, terms in zip(self.stresses[:, :, points], self._terms, strict=True):
-                packed += stress @ _pairs(H, terms, pairs).T
+                packed += stress @ pairs(H, terms, products).T
         K0 = np.empty((self.num_loads, q, q))
         K0[:, i, j] = K0[:, j, i] = packed
         return K0
@@ -165,18 +166,14 @@ class UnitLoads:
         by_stiffness, face = np.zeros_like(compliance), None
         if self._face is not None and len(by_K0):
             by_face, face, turned = self._face.gradient(self._face_tensors, V, by_K0)
-            by_V = by_V + by_face
-            direct = direct + self._face.stiffness_products(face, self.fields)
+            by_V, direct = by_V + by_face, direct + self._face.stiffness_products(face, self.fields)
             forces = forces + turned[:, :, : forces.shape[2]]
-            if work is not None:
-                outboard = turned[:, :, inertial:]
-                by_V[:, :, : len(compliance)] += combine(outboard, compliance)
-                work = work + np.tensordot(modes.field, outboard, ((0, 1), (0, 1)))
+            if work is not None:  # those of the interface's loads are folded already
+                work = work + _fold(turned[:, :, inertial:], by_V, modes.field, compliance)
         if static:
             if work is None:
-                outboard, forces = forces[:, :, inertial:], forces[:, :, :inertial]
-                by_V[:, :, : len(compliance)] += combine(outboard, compliance)
-                work = np.tensordot(modes.field, outboard, ((0, 1), (0, 1)))
+                work = _fold(forces[:, :, inertial:], by_V, modes.field, compliance)
+                forces = forces[:, :, :inertial]
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
         return GeometricGradient(self, by_V, direct, adjoint, by_stiffness, face)
@@ -210,14 +207,14 @@ class UnitLoads:
         by_young = np.empty(count)
         by_modes, by_nodes = np.empty((count, n, dim, q)), np.empty((count, n, dim, loads))
         for cells, points, H in self._parts(V):
-            size, pairs = cells.stop - cells.start, np.empty((len(i), H.shape[3]))
-            by_stress = [by_pairs @ _pairs(H, terms, pairs) for terms in self._terms]
+            size, products = cells.stop - cells.start, np.empty((len(i), H.shape[3]))
+            by_stress = [by_pairs @ pairs(H, terms, products) for terms in self._terms]
             forces = np.concatenate(by_stress).T.reshape(size, -1, loads)
             nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
             by_young[cells] = np.einsum("ekp,ekp->e", self._cell_values(cells), nodal)
             nodal *= arm.young[cells, None, None]
             by_nodes[cells] = nodal.reshape(size, n, dim, loads)
-            by_H = _pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points], self._terms)
+            by_H = pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points], self._terms)
             by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, dim * q)
             nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
             by_modes[cells] = nodal.reshape(size, n, dim, q)
@@ -297,6 +294,14 @@ class GeometricGradient:
         unit = np.zeros_like(arm.points)
         unit[:, 0] = 1.0
         return arm.cell_mass_products(self.by_inertia, np.stack([unit, arm.points], axis=2))
+
+
+def _fold(
+    outboard: np.ndarray, by_V: np.ndarray, psi: np.ndarray, compliance: np.ndarray
+) -> np.ndarray:
+    """Add derivatives by u_F = Psi C (n_nodes, d, b) to those by Psi; return Psi' times them."""
+    by_V[:, :, : len(compliance)] += combine(outboard, compliance)
+    return np.tensordot(psi, outboard, ((0, 1), (0, 1)))
 
 
 def _by_inertia(adjoint: np.ndarray) -> np.ndarray:
@@ -381,49 +386,3 @@ def _runs(count: int, step: int) -> Iterator[slice]:
     """Yield slices of `step` cells each, the last one shorter, that together are all of them."""
     for first in range(0, count, step):
         yield slice(first, min(first + step, count))
-
-
-def _pairs(H: np.ndarray, terms: Sequence[tuple[int, int, int]], out: np.ndarray) -> np.ndarray:
-    """Return d_a phi_i . d_b phi_j (pairs, points), what one stress multiplies, in `out`.
-
-    Mode by mode in place: index arrays would take ten times as long.
-    """
-    (a, b, c), *others = terms
-    term = np.empty(H.shape[3])
-    for one, i, j in zip(out, *np.triu_indices(H.shape[2]), strict=True):
-        np.multiply(H[a, c, i], H[b, c, j], out=one)
-        for d, e, f in others:
-            one += np.multiply(H[d, f, i], H[e, f, j], out=term)
-    return out
-
-
-# Directions a, b and component c of every term of stress xx, yy, xy.
-_TERMS = (
-    ((0, 0, 0), (0, 0, 1)),
-    ((1, 1, 0), (1, 1, 1)),
-    ((0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1)),
-)
-# Of stress xx, yy, zz, xy, yz, zx.
-_SOLID_TERMS = tuple(
-    tuple((d, e, c) for d, e in sorted({(a, b), (b, a)}) for c in range(3))
-    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
-)
-
-
-def _pairs_transposed(
-    H: np.ndarray, by_pairs: np.ndarray, kinds: Sequence[Sequence[tuple[int, int, int]]]
-) -> np.ndarray:
-    """Return the derivatives (d, d, q, points) by H, given those by `_pairs` (s, pairs, points).
-
-    The latter are scaled in place.
-    """
-    by_H, term = np.zeros_like(H), np.empty(H.shape[3])
-    for place, (i, j) in enumerate(zip(*np.triu_indices(H.shape[2]), strict=True)):
-        for weight, terms in zip(by_pairs[:, place], kinds, strict=True):
-            if i == j:  # both factors are the same: once, twice as heavy
-                weight *= 2.0
-            for a, b, c in terms:
-                by_H[a, c, i] += np.multiply(weight, H[b, c, j], out=term)
-                if i != j:
-                    by_H[b, c, j] += np.multiply(weight, H[a, c, i], out=term)
-    return by_H
