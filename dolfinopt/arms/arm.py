@@ -33,8 +33,26 @@ from dolfinopt.scene import load as scenes
 
 THRESHOLDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 
+# Share of the least change that an optimisation looks at, or of the simulation's tolerance, that
+# iterative solutions may leave; and what they leave, in their tolerance, with any contrast and
+# islands (docs/pages/theory/elements.md): up to five times it in a cell's derivative, of the
+# largest, once in mass and inertia. In geometric stiffness, itself a correction, it is forty times.
+SHARE, LEFT = 1e-3, 5.0
+FIELD_TOLERANCES = 1e-10, 1e-6  # bounds
+
 # How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
 CLIPPED = 1e-10
+
+
+def field_tolerance(scene: scenes.Scene) -> float:
+    """Return the relative tolerance in energy that a scene leaves to static fields.
+
+    Gradients have to be right to a part of the change of x and of the residual at which an
+    optimisation ends, the bodies to a part of the simulation's tolerance.
+    """
+    optimizer = scene.optimizer
+    least = min(optimizer.tolerance, optimizer.kkt_tolerance, scene.simulation.tolerance * LEFT)
+    return float(np.clip(SHARE * least / LEFT, *FIELD_TOLERANCES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +101,7 @@ class Arm:
             except InputError as error:
                 raise InputError(f"{scene.source}: {error}") from None
             operators = element.operators(self.mesh, arm.depth, self.solid.poisson_ratio)
-            self.substructure = Substructure(self.mesh, operators, profile)
+            self.substructure = Substructure(self.mesh, operators, profile, field_tolerance(scene))
             # A design that is another arm's is filtered there.
             radius = scene.filter_radius(index) if pattern is None else 0.0
             # A member along an edge would be half as thin if the filter mirrored it there.

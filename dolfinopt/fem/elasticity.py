@@ -48,8 +48,18 @@ class Substructure:
         interior: the interior block in PETSc; one factorisation, of the design that asked last.
     """
 
-    def __init__(self, mesh: ArmMesh, operators: ElementOperators, profile: Profile):
+    def __init__(
+        self,
+        mesh: ArmMesh,
+        operators: ElementOperators,
+        profile: Profile,
+        tolerance: float | None = None,
+    ):
         """Number the interior dofs and lay down the sparsity patterns (collective).
+
+        Args:
+            mesh, operators, profile: see above.
+            tolerance: of iterative solutions, see `InteriorSystem`.
 
         Raises:
             InputError: the mesh lacks an interface.
@@ -73,7 +83,7 @@ class Substructure:
                 )
                 self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        self.interior = InteriorSystem(self.T, self._stiffness, self._mass, profile)
+        self.interior = InteriorSystem(self.T, self._stiffness, self._mass, profile, tolerance)
         self._last: ElasticArm | None = None
 
     @cached_property

@@ -32,7 +32,7 @@ from dolfinopt.solver import (
 )
 
 if TYPE_CHECKING:
-    from dolfinopt.fem.multigrid import BlockConjugateGradients
+    from dolfinopt.fem.block_gradients import BlockConjugateGradients
 
 Columns = Callable[[np.ndarray], np.ndarray]
 ITERATIVE = "conjugate gradients"  # name of that solver
@@ -51,7 +51,8 @@ MOST_SOLID_WORK = 1.5e11
 WIDEST = 1200
 FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
 FREE_SHARE = 0.5
-# Of conjugate gradients in energy, relative: stiffness, mass and gradients are then right to it.
+# Of conjugate gradients in energy, relative, where nobody says what is needed: stiffness is then
+# right to its square, mass and inertia to it, gradients of frozen loads to five times it.
 TOLERANCE = 1e-8
 TIGHT = 1e-12  # where a Krylov space is made of solutions
 
@@ -69,6 +70,7 @@ class InteriorSystem:
         stiffness: AffineMatrix | UniformMatrix,
         mass: AffineMatrix | UniformMatrix,
         profile: Profile,
+        tolerance: float | None = None,
     ):
         """Set up for such matrices; nothing is selected before it is asked for.
 
@@ -77,8 +79,10 @@ class InteriorSystem:
             stiffness: over local dofs, or in blocks over local nodes.
             mass: over local nodes.
             profile: of this rank.
+            tolerance: in place of `TOLERANCE`.
         """
         self._T, self._profile = T, profile
+        self._tolerance = tolerance or TOLERANCE
         self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
         self._factor: Factor | None = None
         self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
@@ -144,11 +148,12 @@ class InteriorSystem:
 
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:
-        from dolfinopt.fem.multigrid import BlockConjugateGradients, with_rigid_motions
+        from dolfinopt.fem.block_gradients import BlockConjugateGradients
+        from dolfinopt.fem.multigrid import with_rigid_motions
 
         T = self._T
         with_rigid_motions(self._stiffness.mat, T.points[T.interior_nodes])
-        return BlockConjugateGradients(self._stiffness.mat, TOLERANCE)
+        return BlockConjugateGradients(self._stiffness.mat, self._tolerance)
 
     @property
     def solver_name(self) -> str:

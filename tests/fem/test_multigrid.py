@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from solids import solid_arm
+from solids import solid_arm, solid_scene
 
-from dolfinopt.arms.arm import Arm
-from dolfinopt.fem import interior
+from dolfinopt.arms.arm import Arm, field_tolerance
+from dolfinopt.fem import block_gradients, interior
 from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
 from dolfinopt.fem.multigrid import Level, Multigrid
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
@@ -52,13 +52,13 @@ def difference(one: ShapeIntegrals, other: ShapeIntegrals) -> float:
 @pytest.mark.serial
 @pytest.mark.parametrize("void", [0.1, 0.01, 1e-3])  # contrasts of 1e3, 1e6, 1e9 but for the floor
 def test_as_the_direct_solution(direct, iterative, void):
-    """Body and gradient to 2e-6 of their largest entries; 47 steps without contrast, 58 with it."""
+    """Body and gradient to 50 times the tolerance of 1e-7; geometric stiffness is the worst."""
     states = [arm.state(hollow(arm, void)) for arm in (direct, iterative)]
-    assert difference(*(state.body for state in states)) < 2e-6
+    assert difference(*(state.body for state in states)) < 5e-6
     by = states[0].body
     gradients = [exact_gradient(state, by) for state in states]
     largest = COMM.allreduce(np.abs(gradients[0]).max(initial=0.0), MPI.MAX)
-    assert np.abs(gradients[0] - gradients[1]).max(initial=0.0) < 2e-6 * largest
+    assert np.abs(gradients[0] - gradients[1]).max(initial=0.0) < 5e-6 * largest
     assert iterative.substructure.interior._iterative.steps < 70
 
 
@@ -80,6 +80,53 @@ def test_warm_start(iterative):
     cold_modes = nearby.elastic.constraint_modes()
     assert solver._iterative.steps > warm
     assert np.allclose(warm_modes.stiffness, cold_modes.stiffness, rtol=1e-9, atol=1e-3)
+
+
+@pytest.mark.serial
+def test_contrast(direct, iterative):
+    """Void of 1e-3 to 1e-9 around a beam and an island: the same stiffness, few steps more."""
+    x, y, z = direct.mesh.centroid.T
+    core = (np.abs(y) < 0.015) & (np.abs(z) < 0.005)
+    solid = (~core & (np.abs(z) < 0.015)) | (core & (np.abs(x - 0.25) < 0.03))
+    solver, steps = iterative.substructure.interior, []
+    for void in (1e-3, 1e-6, 1e-9):
+        young, density = (value * np.where(solid, 1.0, void) for value in (70e9, 2700.0))
+        solver._solutions.clear()
+        right, found = (
+            arm.substructure.at(young, density).constraint_modes().stiffness
+            for arm in (direct, iterative)
+        )
+        assert np.abs(found / right - 1.0).diagonal().max() < 1e-9
+        steps.append(solver._iterative.steps)
+    assert max(steps) < 1.3 * steps[0]
+
+
+@pytest.mark.serial
+def test_smaller_aggregates(iterative, monkeypatch):
+    """Where steps are many, the next design's hierarchy coarsens more gradually and takes fewer."""
+    solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
+    iterative.state(x).elastic.constraint_modes()
+    cold = solver._iterative.steps
+    monkeypatch.setattr(block_gradients, "SLOW", 0.0)
+    solver._solutions.clear()
+    iterative.state(0.99 * x).elastic.constraint_modes()
+    grid = solver._iterative.grid
+    assert grid.gradual and grid.setups == 2
+    assert solver._iterative.steps < 0.8 * cold
+
+
+@pytest.mark.serial
+def test_tolerance_of_fields():
+    """What an optimisation and a simulation leave: stricter ones ask for more, within bounds."""
+    scene = solid_scene()
+    assert field_tolerance(scene) == pytest.approx(1e-7)
+    for table, keys, expected in (
+        ("simulation", {"tolerance": 1e-6}, 1e-9),
+        ("optimizer", {"tolerance": 1e-4}, 2e-8),
+        ("optimizer", {"tolerance": 0.0}, 1e-10),
+    ):
+        changed = getattr(scene, table).model_copy(update=keys)
+        assert field_tolerance(scene.model_copy(update={table: changed})) == pytest.approx(expected)
 
 
 @pytest.mark.serial
