@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
+from dolfinopt.scene.completion import complete
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.messages import (
     Override,
@@ -126,7 +127,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
     _measure_bodies(tree, inherited)
-    derived = (*_time_motion(tree, source, changes), *_limit_volume(tree))
+    derived = complete(tree, source, changes)
     try:
         scene = Scene.model_validate(tree)
     except ValidationError as error:
@@ -239,55 +240,6 @@ def _size_rigid(tree: dict[str, Any]) -> None:
             arm.setdefault("thickness", size)
 
 
-def _time_motion(
-    tree: dict[str, Any], source: str, changes: list[Override]
-) -> tuple[tuple[str, str], ...]:
-    """Complete duration and horizon of the motion where they follow from other values.
-
-    Returns:
-        The keys that do, as (table, key).
-
-    Raises:
-        InputError: a stated duration is too short for the limits.
-    """
-    motion = tree.get("motion")
-    if not isinstance(motion, dict):
-        return ()
-    asked = ("file", "max_speed", "max_acceleration", "max_jerk")
-    derived: list[tuple[str, str]] = []
-    if any(motion.get(key) is not None for key in asked):
-        from dolfinopt.scene.duration import (  # NumPy, which others do not need
-            SAME_TIME,
-            least_duration,
-        )
-
-        rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
-        try:
-            least, limited = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
-        except (ValidationError, InputError):  # told where the scene is checked, or its motion
-            least, limited = None, False
-        stated = motion.get("duration")
-        if stated is None and least:  # of a table with one row the motion tells
-            motion["duration"] = least
-            derived.append(("motion", "duration"))
-        if not (limited and isinstance(stated, (int, float)) and least is not None):
-            pass  # what the duration is, validation will say
-        elif stated < least * (1.0 - SAME_TIME):
-            where = blamed(source, changes, (("motion", "duration"),))
-            keys = ", ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
-            raise input_error(
-                where,
-                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s] by the "
-                f"limits ({keys}); leave it out to use this value, or raise the limits",
-            )
-    duration = motion.get("duration")
-    default = Motion.model_fields["horizon"].default
-    if "horizon" not in motion and isinstance(duration, (int, float)) and duration > default:
-        motion["horizon"] = duration
-        derived.append(("motion", "horizon"))
-    return tuple(derived)
-
-
 def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
     """Return the absolute path of the file that the scene `source` names as `value`.
 
@@ -312,24 +264,6 @@ def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
         f"{key} = {shown(value)}: expected the path of a file, from the scene's folder or the "
         f"working directory; found {tried}",
     )
-
-
-def _limit_volume(tree: dict[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Leave out the limit of the volume where mass is asked for and none is stated.
-
-    Returns:
-        Its key, as (table, key), where it is not stated.
-    """
-    tables = {key: tree.get(key) for key in ("design", "objective", "constraints")}
-    design, objective, limits = (one if isinstance(one, dict) else {} for one in tables.values())
-    if design.get("volume_fraction") is not None:
-        return ()
-    design.pop("volume_fraction", None)
-    if objective.get("kind") == "mass" or limits.get("mass") is not None:
-        if tables["design"] is None:
-            tree["design"] = design
-        design["volume_fraction"] = None
-    return (("design", "volume_fraction"),)
 
 
 def _read_toml(source: str) -> dict[str, Any]:

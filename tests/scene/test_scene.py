@@ -159,7 +159,7 @@ def test_demo_states_every_other_key():
         "mesh_size",
         "cell_shape",
         "element",
-        *("symmetric", "symmetric_z", "extruded"),
+        *("symmetric", "symmetric_z", "extruded", "depth"),
         "stiffening",
         *("speed", "start_angle", "cart_mass"),
         *("joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio"),

@@ -25,7 +25,7 @@ class Reduction(Table):
     coordinates: Coordinates = Field(
         default=4,
         description='number of elastic coordinates q of each arm; "auto": the smallest number '
-        "that meets reduction.tolerance [-]",
+        "that meets reduction.tolerance; default in space: 6 for each outboard interface [-]",
     )
     tolerance: float = Field(
         default=1e-3,
