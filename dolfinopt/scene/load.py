@@ -124,6 +124,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
     _size_rigid(tree)
+    _share_interfaces(tree)
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
     _measure_bodies(tree, inherited)
@@ -219,6 +220,16 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
         for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
             if loc[2] in (*PATTERN_KEYS, *MESH_KEYS):
                 arm.pop(loc[2], None)
+
+
+def _share_interfaces(tree: dict[str, Any]) -> None:
+    """Give arms that share another's design its interfaces, which are part of the mesh."""
+    arms = tree.get("arms")
+    known = [arm for arm in arms if isinstance(arm, dict)] if isinstance(arms, list) else []
+    for arm in known:
+        for other in known if "design" in arm and "interfaces" not in arm else ():
+            if other.get("name") == arm["design"] and "interfaces" in other:
+                arm["interfaces"] = _copied(other["interfaces"])
 
 
 def _size_rigid(tree: dict[str, Any]) -> None:

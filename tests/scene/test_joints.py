@@ -206,9 +206,16 @@ def test_refused_interfaces(source, path, value, text):
 
 
 def test_coordinates_of_several_interfaces(source):
+    """Six of each; an arm that shares the design has the interfaces, too."""
     data = with_fork()
     data["arms"][2]["interfaces"] = [{**SIDE, "radius": 0.01}]
     data["payload"] = {"arm": "tool", "interface": "side"}
+    twin = copy.deepcopy(data)
+    twin["arms"].append({"name": "twin", "design": "tool"})
+    twin["joints"].append({**WRIST, "name": "second", "parent": "tool", "child": "twin"})
+    twin["reduction"]["coordinates"] = 12
+    arms = scene_from_dict(twin, source).arms
+    assert arms[3].interfaces == arms[2].interfaces != ()
     with pytest.raises(InputError, match=r"expected an integer >= 12 .* interfaces, 2, have six"):
         scene_from_dict(data, source)
 

@@ -128,7 +128,7 @@ def test_demo_states_every_other_key():
         # in space
         *("type", "parent", "child", "axis", "origin", "rpy", "centre", "offset"),
         *("parent_interface", "point", "arm", "interface", "initial_joints"),
-        *("pattern", "box", "circle", "material", "yield_strength"),
+        *("pattern", "box", "circle", "depth", "material", "yield_strength"),
         "kkt_tolerance",
         "exact_iterations",
         "exponent",
@@ -740,7 +740,9 @@ def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
 def test_every_key_refuses_something():
     refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
     refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    refused |= {f"arms.regions.{key}" for key in ("kind", "box", "circle")}  # see test_regions
+    refused |= {
+        f"arms.regions.{key}" for key in ("kind", "box", "circle", "depth")
+    }  # see test_regions
     known = {info.key for info in describe_keys()}
     tables = ("control", "closure", "joints", "arms.interfaces")  # see test_joints
     optional = {key for key in known if key.startswith(tables)}

@@ -208,7 +208,7 @@ class Arm(Table):
     interfaces: tuple[Interface, ...] = Field(
         default=(),
         description="in space: further outboard interfaces, each with six coordinates, on which "
-        "joints or the payload sit; not taken from the arm before",
+        "joints or the payload sit; taken from the arm whose design this one shares alone",
     )
 
     @model_validator(mode="after")
