@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem import cells
-from dolfinopt.fem.assembly import AffineMatrix, NodePairs, UniformMatrix
+from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs, UniformMatrix
 from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity, joins
@@ -73,10 +73,14 @@ class Substructure:
         self._stiffness: AffineMatrix | UniformMatrix
         self._mass: AffineMatrix | UniformMatrix
         with together(mesh.comm):
-            if dim == 3 and self.uniform is not None:  # where memory counts
+            if dim == 3:  # where memory counts
                 pairs = NodePairs(operators.cells, size)
-                self._stiffness = UniformMatrix(pairs, self.uniform.stiffness)
-                self._mass = UniformMatrix(pairs, self.uniform.mass)
+                if self.uniform is not None:
+                    self._stiffness = UniformMatrix(pairs, self.uniform.stiffness)
+                    self._mass = UniformMatrix(pairs, self.uniform.mass)
+                else:
+                    self._stiffness = BlockMatrix(pairs, operators.stiffness)
+                    self._mass = BlockMatrix(pairs, operators.mass)
             else:
                 self._stiffness = AffineMatrix(
                     _dofs(operators.cells, dim), operators.stiffness, dim * size

@@ -24,9 +24,11 @@ CELL, FILL, AT = 6.9e3, 0.2e3, 38_400  # bytes a cell, more for every doubling, 
 CELL_SECONDS, GROWTH = 32e-6, 0.33  # s a cell at AT, and the power of n with which it grows
 FEW = 100_000  # cells of all arms, 1 GB: not worth a look
 QUADRATIC = 1.3  # bytes a node of a quadratic element over those of others
-# Bytes of a hexahedron over those of a quadrilateral: 41 800 dofs take 0.22 GB with conjugate
-# gradients, which replace the factor where memory is short.
-SOLID = 3.0
+# Bytes of a hexahedron over those of a quadrilateral, with conjugate gradients, which replace the
+# factor where memory is short: 378 000 dofs 3.1 GB, 996 000 8.2 GB (`dolfinopt bench solid`); and
+# of a solid arm on several ranks over one on one: 12.7 GB.
+SOLID = 3.6
+SHARED = 1.5
 CELLS_ACROSS = 12  # of a STEP file without mesh_size, see `geometry.py`
 SOLID_CELLS_ACROSS = 4  # of a solid's, see `solid_model.py`
 
@@ -44,7 +46,10 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     if sum(size.values()) <= FEW:
         return
     partition = partition_arms(world, scene.cell_counts)
-    mine = sum(_bytes(size[k]) for k in partition.arms) / partition.comm.size + PROCESS
+    shared = {k: SHARED if scene.arms[k].is_solid else 1.0 for k in partition.arms}
+    if partition.comm.size == 1:
+        shared = dict.fromkeys(shared, 1.0)
+    mine = sum(shared[k] * _bytes(size[k]) for k in shared) / partition.comm.size + PROCESS
     seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
     partition.comm.Free()
     ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))

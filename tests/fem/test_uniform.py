@@ -9,6 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from dolfinopt.fem import uniform_stress
+from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
@@ -106,3 +107,17 @@ def test_nodes_of_a_grid_lie_on_its_lines() -> None:
     for values, first, step in ((points[:, 0], 0.0, 0.0025), (points[:, 1], -0.03, 0.02)):
         lines = first + step * np.rint((values - first) / step)
         assert np.array_equal(values, lines)
+
+
+@pytest.mark.serial
+def test_matrices_of_blocks():
+    """By pairs of nodes, with matrices of every cell's own: what the entries one by one give."""
+    cells = np.array([[0, 1, 2, 4], [4, 2, 3, 5], [1, 2, 3, 0]])
+    rng = np.random.default_rng(1)
+    for b in (1, 3):
+        elements = rng.standard_normal((3, 4 * b, 4 * b))
+        dofs = (b * cells[:, :, None] + np.arange(b)).reshape(3, 4 * b)
+        scale = np.array([2.0, 0.0, -1.0])
+        found = BlockMatrix(NodePairs(cells, 6), elements).assemble(scale)
+        right = AffineMatrix(dofs, elements, 6 * b).assemble(scale)
+        assert np.allclose(found.toarray(), right.toarray(), rtol=1e-14, atol=1e-14)

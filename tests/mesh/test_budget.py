@@ -10,6 +10,7 @@ import sys
 import pytest
 from mpi4py import MPI
 from runs import TWO_ARM
+from solids import solid_scene
 
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.errors import InputError
@@ -62,6 +63,19 @@ def test_quadratic_elements_count_their_nodes(monkeypatch, free, fits):
         check_budget(COMM, scene)
         return
     with pytest.raises(InputError, match=re.escape("about 7.68e+04 cells need 3.")):
+        check_budget(COMM, scene)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("free", "fits"), [(9.5e9, True), (8e9, False)])
+def test_solids_with_conjugate_gradients(monkeypatch, free, fits):
+    """8.2 GB for a link of 996 000 degrees of freedom on one rank."""
+    monkeypatch.setattr(budget, "free_memory", lambda: free)
+    scene = solid_scene(cells=(360, 36, 24))
+    if fits:
+        check_budget(COMM, scene)
+        return
+    with pytest.raises(InputError, match=re.escape("about 3.11e+05 cells need 9.02 GB")):
         check_budget(COMM, scene)
 
 
