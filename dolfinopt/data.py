@@ -24,6 +24,7 @@ def template_folder() -> Path:
     return Path(__file__).parent / "scene" / "templates"
 
 
-def page_folder() -> Path:
-    """Return the folder of the templates that make report.html."""
-    return Path(__file__).parent / "paper" / "pages"
+def page_folders() -> tuple[Path, ...]:
+    """Return the folders of the templates of HTML pages: of all pages, and of report.html."""
+    here = Path(__file__).parent
+    return here / "study" / "pages", here / "paper" / "pages"

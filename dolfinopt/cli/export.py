@@ -41,7 +41,7 @@ KINDS = (".sid", ".sid.npz", ".fem")
     "--before",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="with --urdf: an earlier run of the robot, for a table of both",
+    help="with --urdf: an earlier run of the robot, for a table and a page of both",
 )
 def export(
     scene: Path,

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import click
 
@@ -133,27 +132,22 @@ def _write(
     scene: RobotScene, folder: Path, joints: list[str], t: np.ndarray, rows: np.ndarray
 ) -> None:
     """Write scene, table and record, and say what they are."""
-    from dolfinopt.disk import write_atomically
     from dolfinopt.exchange.urdf.scene import RECORD, TRAJECTORY
     from dolfinopt.exchange.urdf.trajectory import trajectory_text
-    from dolfinopt.output.folders import prepare_folder, write_new
+    from dolfinopt.output.folders import check_new, prepare_folder, write_new
     from dolfinopt.scene.json_schema import SCHEMA_FILE, scene_schema
     from dolfinopt.scene.load import load_scene
 
     path = folder / f"{scene.robot.file.stem}.toml"
-    texts = {
-        path: scene.text(),
-        folder / TRAJECTORY: trajectory_text(joints, t, rows),
-        folder / RECORD: json.dumps(scene.record(folder), indent=2) + "\n",
+    new: dict[Path, str | bytes] = {
+        folder / scene.mesh_name(one): one.mesh.data for one in scene.bodies if one.mesh
     }
-    meshes = {folder / scene.mesh_name(one): one.mesh for one in scene.bodies if one.mesh}
-    for mesh in meshes:
-        if mesh.exists():
-            raise InputError(f"{mesh}: exists already and stays as it is; give another --out")
+    new[folder / TRAJECTORY] = trajectory_text(joints, t, rows)
+    new[folder / RECORD] = json.dumps(scene.record(folder), indent=2) + "\n"
+    new[path] = scene.text()  # last: where it is, the others are
+    check_new(new)
     prepare_folder(folder)
-    write_new(texts, {folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
-    for file, solid in meshes.items():
-        write_atomically(file, partial(_put, solid.data))
+    write_new(new, {folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
     click.echo(
         f"{path}: {len(scene.bodies)} arms, {len(joints)} joints that move, "
         f"{float(t[-1]):g} s of motion"
@@ -167,7 +161,3 @@ def _write(
         load_scene(path)
     except InputError as error:
         warn([f"correct the scene before you simulate it: {error}"])
-
-
-def _put(data: bytes, stream: IO[bytes]) -> None:
-    stream.write(data)

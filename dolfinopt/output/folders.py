@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -91,27 +91,41 @@ def remove_stale(
             ) from None
 
 
-def write_new(texts: Mapping[Path, str], replaced: Mapping[Path, str]) -> None:
-    """Write text files: all of `texts`, which must be new, and those of `replaced`.
+def check_new(files: Iterable[Path]) -> None:
+    """Raise InputError if one of the files exists."""
+    for path in files:
+        if path.exists():
+            raise InputError(
+                f"{path}: exists already and stays as it is; give another name or folder"
+            )
+
+
+def write_new(new: Mapping[Path, str | bytes], replaced: Mapping[Path, str]) -> None:
+    """Write all files of `new`, none of which may be there yet, and those of `replaced`.
+
+    They get their names, in this order, when all of them are on the disk.
 
     Raises:
-        InputError: one exists, or cannot be written; then none of `texts` is left.
+        InputError: one exists, or cannot be written; then none of `new` is left.
     """
-    for path in texts:
-        if path.exists():
-            raise InputError(f"{path}: exists already and stays as it is; give another name")
-    written: list[Path] = []
+    check_new(new)
+    parts: dict[Path, Path] = {}
     path = Path()
     try:
-        for path, text in [*texts.items(), *replaced.items()]:
+        for path, content in [*new.items(), *replaced.items()]:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path in texts:
-                written.append(path)
-            path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        for done in written:
-            done.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+            parts[path] = path.with_name(f".{path.name}.{os.getpid()}.part")
+            data = content if isinstance(content, bytes) else content.encode()
+            parts[path].write_bytes(data)
+        for path, part in parts.items():
+            os.replace(part, path)
+    except BaseException as error:
+        for done in (*parts.values(), *(path for path in parts if path in new)):
+            with suppress(OSError):
+                done.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        raise
 
 
 # -- studies: many questions may be answered in one folder, each under a name of its own ----------

@@ -90,7 +90,9 @@ def _convergence(rows: pd.DataFrame, outcomes: Outcomes) -> list[Numbered]:
             )
             for made, history in histories.items()
         ]
-        panel = Panel("", "iteration [-]", label, tuple(lines), y_log=key == "objective")
+        panel = Panel(
+            "", "iteration [-]", label, tuple(lines), y_log=True if key == "objective" else None
+        )
         return _plot(number, f"Convergence of the {name} by reduction", [panel])
 
     return [

@@ -5,7 +5,6 @@ The page is one file without anything from elsewhere: pictures are inside, it op
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from dolfinopt.data import page_folder
 from dolfinopt.paper.figures import LABELS, Numbered, all_figures
 from dolfinopt.paper.reproduction import (
     INITIAL,
@@ -28,7 +26,9 @@ from dolfinopt.paper.reproduction import (
     setting_of,
 )
 from dolfinopt.paper.statements import Check, mm
-from dolfinopt.study.tables import DesignFigure, LineFigure, as_text
+from dolfinopt.study.html import embedded, html_page
+from dolfinopt.study.tables import DesignFigure, LineFigure
+from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
@@ -96,19 +96,11 @@ def page(
     folder: Path,
 ) -> str:
     """Return report.html; the figures' pictures lie in the folder."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
     scene, objectives = plan.scene, results[results.table == "objectives"]
     optimised = [o for case, o in outcomes.by_case.items() if case.action == "optimize"]
-    templates = Environment(
-        loader=FileSystemLoader(page_folder()),
-        autoescape=lambda name: str(name).endswith(".html"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
     size = max(cell_sizes(scene).values(), default=0.0)
-    text = templates.get_template("report.html").render(
-        as_text=as_text,
+    return html_page(
+        "report.html",
         setting=setting_of(scene),
         initial=objectives.iloc[0],
         best=objectives[objectives.kind == "esl"].iloc[0],
@@ -124,7 +116,6 @@ def page(
         overridden=_overridden(scene),
         failures=outcomes.failures,
     )
-    return text.lstrip()
 
 
 def _sections(
@@ -152,7 +143,7 @@ def _sections(
                 "title": title,
                 "checks": [check for check in checks if set(check.figures) <= set(numbers)],
                 "plots": [
-                    (one, _png((folder / f"{one.name}.png").read_bytes()), _about(one))
+                    (one, embedded((folder / f"{one.name}.png").read_bytes()), _about(one))
                     for one in shown
                     if not isinstance(one.figure, DesignFigure)
                 ],
@@ -175,12 +166,6 @@ def _about(numbered: Numbered) -> str:
     curves = dict.fromkeys(line.label for panel in panels for line in panel.lines)
     axes = f"{panels[0].y_label} over {panels[0].x_label}"
     return f"{numbered.title}: {axes} of {', '.join(curves)}"
-
-
-def _png(data: bytes) -> dict[str, Any]:
-    """Return a PNG as the page embeds it."""
-    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # of its header
-    return {"data": base64.b64encode(data).decode(), "width": width, "height": height}
 
 
 def _reduction_table(rows: pd.DataFrame) -> tuple[str, pd.DataFrame]:
@@ -223,18 +208,8 @@ def _loss_table(rows: pd.DataFrame) -> tuple[str, pd.DataFrame]:
 
 def _overridden(scene: Scene) -> list[str]:
     """Return where the scene is not the paper's, which every figure here is compared with."""
-
-    def flat(one: Scene) -> dict[str, Any]:
-        data = one.to_dict()
-        nested = pd.json_normalize({**data, "arms": dict(enumerate(data["arms"]))})
-        return {str(key): values[0] for key, values in nested.to_dict("list").items()}
-
-    theirs, ours = flat(load_paper()), flat(scene)
-    return [
-        f"{key} = {ours.get(key)} in place of {theirs.get(key)}"
-        for key in dict.fromkeys([*theirs, *ours])
-        if theirs.get(key) != ours.get(key)
-    ]
+    differing = differences(load_paper(), scene).items()
+    return [f"{key} = {ours} in place of {theirs}" for key, (theirs, ours) in differing]
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -257,7 +232,7 @@ def _gallery(cases: Iterable[Case], outcomes: Outcomes) -> list[dict[str, Any]]:
             {
                 "name": view.name,
                 "width": f"{100.0 * part:.4g}",
-                "png": _png(arm_picture(view, round(WIDTH * part))),
+                "png": embedded(arm_picture(view, round(WIDTH * part))),
             }
             for view, part in zip(views, parts)
         ]

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 DPI = 110
 WIDTH, HEIGHT = 12.0, 16.0  # inches, the most that the links take
+COLUMN = 6.0  # inches, of the links side by side
 SIDE, HEAD, LABEL, RULER = 0.55, 0.6, 0.4, 0.55  # inches: margins, title, above and below a link
 MILLI = 1e3
 
@@ -53,6 +54,38 @@ def solid_design_figure(
         draw_link(axes, view, scale, lambda studio, surface: studio.solid(surface, STEEL))
         mass = None if masses is None else masses.get(view.name)
         axes.set_title(caption(view, mass), loc="left", fontsize=11, parse_math=False)
+    return figure
+
+
+def solid_designs_figure(
+    labels: Sequence[str], rows: Sequence[Sequence[ArmView]], title: str
+) -> Figure:
+    """Draw the links of several designs to one scale: a row a design, links side by side.
+
+    Args:
+        labels: of the designs.
+        rows: links of each.
+        title: above the picture.
+    """
+    camera, columns = camera_of_links(), max(map(len, rows))
+    spans = np.array(
+        [np.ptp(camera.plane(box_corners(*_bounds(v))), axis=0) for row in rows for v in row]
+    )
+    inches = COLUMN / spans[:, 0].max()
+    height = len(rows) * (float(spans[:, 1].max()) * inches + LABEL + 0.1) + HEAD
+    figure = new_figure(COLUMN * columns + 0.4, height, DPI)
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    for axes, row, label in zip(grid, rows, labels, strict=True):
+        for one in axes[len(row) :]:
+            one.set_visible(False)
+        for one, view in zip(axes, row):
+            studio = link_studio(view, camera, inches * DPI)
+            studio.solid(material(view), STEEL)
+            studio.line(box_lines(*_bounds(view)), GREY)
+            show(one, studio.close(), studio.low, studio.high)
+            one.set_title(view.name, loc="right", fontsize=9, color=GREY)
+        axes[0].set_title(label, loc="left", fontsize=10, parse_math=False)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
     return figure
 
 

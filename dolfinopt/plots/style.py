@@ -6,6 +6,7 @@ Matplotlib is imported where it is used: most commands draw nothing.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -241,6 +242,13 @@ def new_figure(width: float, height: float, dpi: int = 110, *, laid_out: bool = 
         figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     FigureCanvasAgg(figure)
     return figure
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
 
 
 def save(figure: Figure, path: PathLike) -> Path:

@@ -37,7 +37,7 @@ def before_after(before: Summary, after: Summary) -> Table:
     ]
     frame = pd.DataFrame(rows, columns=["figure", "before", "after", "unit"])
     ratio = frame["after"] / frame["before"]
-    frame.insert(3, "change [%]", 100.0 * (ratio - 1.0))
+    frame.insert(3, "change [%]", (100.0 * (ratio - 1.0)).round(2) + 0.0)
     return Table("before_after", f"{after['name']}: before and after", frame)
 
 

@@ -214,7 +214,8 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
         axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **style)
     values = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
     x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
-    if len(values) and (spans_decade(values) or (panel.y_log and values.min() > 0.0)):
+    over = bool(len(values)) and panel.y_log is not False and spans_decade(values)
+    if over or (panel.y_log and len(values) and values.min() > 0.0):
         log_scale(axes, values)
     elif len(values) and values.min() >= 0.0 and values.min() < 0.5 * values.max():
         axes.set_ylim(bottom=0.0)
@@ -374,6 +375,10 @@ FRAMES = {
 def design_figure(figure: DesignFigure) -> Figure:
     """Return the designs below each other, arms side by side, to one scale."""
     views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
+    if figure.designs[0][1].is_spatial:
+        from dolfinopt.plots.solid_design import solid_designs_figure
+
+        return solid_designs_figure([label for label, _, _ in figure.designs], views, figure.title)
     columns = max(map(len, views))
     tall = max(np.ptp(v.corners[..., 1]) / np.ptp(v.corners[..., 0]) for row in views for v in row)
     wide = 6.0

@@ -77,7 +77,7 @@ class Panel:
         title, x_label, y_label: above and beside it.
         lines: curves.
         x_log2: numbers that are doubled rather than added to, as those of coordinates.
-        y_log: logarithmic y although the values span no decade.
+        y_log: logarithmic y although the values span no decade; False: never logarithmic.
     """
 
     title: str
@@ -85,7 +85,7 @@ class Panel:
     y_label: str
     lines: tuple[Line, ...]
     x_log2: bool = False
-    y_log: bool = False
+    y_log: bool | None = None
 
 
 @dataclass(frozen=True)

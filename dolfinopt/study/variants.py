@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,6 +140,26 @@ def changed(scene: Scene, *overrides: str) -> Scene:
     check_motion(other)
     check_forces(other)
     return other
+
+
+def differences(scene: Scene, other: Scene) -> dict[str, tuple[Any, Any]]:
+    """Return by its key every value in which scenes differ, here and there; None: not set."""
+    here, there = (dict(_values(one.to_dict())) for one in (scene, other))
+    every = dict.fromkeys([*here, *there])
+    return {
+        key: (here.get(key), there.get(key)) for key in every if here.get(key) != there.get(key)
+    }
+
+
+def _values(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield key and value of all that a scene's data hold; rows of tables by their names."""
+    if isinstance(data, list) and data and isinstance(data[0], Mapping):
+        data = {row.get("name", number): row for number, row in enumerate(data)}
+    if not isinstance(data, Mapping):
+        yield key, data
+        return
+    for name, value in data.items():
+        yield from _values(value, f"{key}.{name}" if key else str(name))
 
 
 def with_objective(scene: Scene, kind: str, *settings: str) -> Scene:

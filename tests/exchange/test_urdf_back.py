@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from mpi4py import MPI
+from pages import Reader
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 from runs import ROOT, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
@@ -21,6 +22,7 @@ from dolfinopt.exchange.urdf.read import read_robot
 from dolfinopt.exchange.urdf.robot import Inertia, Robot
 from dolfinopt.exchange.urdf.scene import read_origin
 from dolfinopt.exchange.urdf.write import NewLink, robot_text
+from dolfinopt.plots.style import new_figure
 from dolfinopt.profiling import Profile
 from dolfinopt.study.before_after import before_after
 
@@ -125,7 +127,26 @@ def test_export_says_what_it_cannot_write(tmp_path):
             read_origin(record)
 
 
-def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
+@pytest.fixture
+def drawn(monkeypatch):
+    """What the page has drawn of machines and links, by small pictures in their place."""
+    titles = []
+
+    def machine(views, mechanism, t, q_r, title):
+        assert len(views) == len(mechanism.bodies) and len(t) == len(q_r)
+        titles.append(title)
+        return new_figure(1.0, 1.0, 20)
+
+    def links(views, title, masses):
+        titles.append((title, [view.name for view in views], list(masses)))
+        return new_figure(1.0, 1.0, 20)
+
+    monkeypatch.setattr("dolfinopt.plots.solid_machine.solid_machine_figure", machine)
+    monkeypatch.setattr("dolfinopt.plots.solid_design.solid_design_figure", links)
+    return titles
+
+
+def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     """A finished run's link in the robot: its mass, its surface, and the same scene again."""
     run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
     coarse = ("--set", "arms.forearm.cells=[12,4,4]", "--set", "design.initial=1.0",
@@ -136,6 +157,11 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
     assert "kg, was 7.879 kg" in said and "largest tool deflection" in said
     rows = pd.read_csv(tmp_path / "run" / "urdf" / "before_after.csv", index_col="figure")
     assert not rows["change [%]"].abs().max() > 0 and set(rows["unit"]) == {"kg", "mm", "Hz", "N m"}
+    assert drawn == ["before", "after", ("forearm", ["before", "after"], ["before", "after"])]
+    page = Reader((tmp_path / "run" / "urdf" / "before_after.html").read_text())
+    assert len(page.all("img")) == 3 + 1 + 6 and len(page.all("h1")) == 1  # deflection, drives
+    assert all(len(one["alt"]) > 10 and one["src"][:5] == "data:" for one in page.all("img"))
+    assert len(page.all("tr")) == 1 + len(rows) and page.all("li") == []  # of one scene
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
     assert same_kinematics(before, after)

@@ -2,12 +2,12 @@
 
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from browser import browser, open_browser
 from mpi4py import MPI
+from pages import Reader
 from test_paper import tiny_plan
 
 from dolfinopt.output.views import ArmView
@@ -18,7 +18,6 @@ from dolfinopt.paper.statements import check_paper, failed_checks
 pytestmark = pytest.mark.serial  # the root writes it
 
 WORLD = MPI.COMM_WORLD
-VOID = {"meta", "link", "img", "input", "br", "path", "rect", "circle"}
 PHONE, DESK = (390, 844), (1280, 900)  # px
 
 
@@ -40,31 +39,6 @@ def folder(made):
     return made[1]
 
 
-class Reader(HTMLParser):
-    """Collects what a page consists of; fails where tags are not closed in order."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.open, self.headings = [], [], []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-
-    def handle_endtag(self, tag):
-        assert tag not in VOID and self.open and self.open.pop() == tag, tag
-
-    def all(self, name):
-        return [attributes for tag, attributes in self.tags if tag == name]
-
-
 @pytest.fixture
 def page(folder):
     return Reader((folder / "report.html").read_text(encoding="utf-8"))
@@ -74,7 +48,7 @@ def test_page_says_where_the_scene_is_not_the_papers(folder):
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert "two flexible arms that move 6 kg along a semicircle." in text
     assert "simulation.sample = 0.01 in place of 0.001" in text
-    assert "arms.0.cells = [16, 3] in place of [200, 12]" in text
+    assert "arms.arm1.cells = [16, 3] in place of [200, 12]" in text
     assert "payload.mass =" not in text and "$" not in text.split("</style>")[1].split("<script")[0]
 
 
