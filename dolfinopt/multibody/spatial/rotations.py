@@ -86,6 +86,9 @@ def exponential(theta: np.ndarray) -> np.ndarray:
 def about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Return the rotations (n, 3, 3) about a unit axis (3,) by angles (n,)."""
     A = skew(axis)
+    # Of a column NumPy takes other instructions, and another last bit, where the end of its stride
+    # touches the memory of the result.
+    angle = np.ascontiguousarray(angle)
     s, c = np.sin(angle), np.cos(angle)
     return ONE + s[:, None, None] * A + (1.0 - c)[:, None, None] * (A @ A)
 
