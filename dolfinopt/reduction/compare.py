@@ -34,7 +34,8 @@ class BasisErrors:
     Attributes:
         frequency: (k,) relative excess of its first natural frequencies, clamped-free.
         mac: (k,) of the modes that belong to them.
-        compliance: (3,) relative loss of the outboard interface's compliance under unit loads.
+        compliance: (3,) or (6,) relative loss of the outboard interface's compliance under unit
+            loads.
         angle: (k,) rad, between the richer basis' first modes and the span.
     """
 
@@ -67,5 +68,8 @@ def basis_errors(arm: ElasticArm, basis: Basis, reference: Basis, count: int) ->
 
 
 def tip_compliance(basis: Basis) -> np.ndarray:
-    """Return displacement by load (3,) of the outboard interface: m/N, m/N, rad/(N m)."""
+    """Return displacement by load (3,) of the outboard interface: m/N, m/N, rad/(N m).
+
+    In space (6,): three in m/N, three in rad/(N m).
+    """
     return np.diag(basis.outboard @ np.linalg.solve(basis.stiffness, basis.outboard.T))

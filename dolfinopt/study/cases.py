@@ -40,7 +40,8 @@ SCENARIO = (
     "scenarios",
 )
 # These values of material and arms do no more to the reduced arms than scale their integrals, where
-# the basis does not depend on them: Krylov's shifts and the Gramian's band are frequencies.
+# the basis does not depend on them: Krylov's shifts and the Gramian's band are frequencies. The
+# thickness in the plane alone: in space it is one of the cells' sides.
 SCALING = ("young_modulus", "density", "thickness")
 SCALABLE = ("craig-bampton", "modal")
 
@@ -116,7 +117,7 @@ class Case:
         motion_alone = scene.objective.needs("motion") and not any(vars(scene.constraints).values())
         if motion_alone and scene.reduction.method in SCALABLE:
             for row in (kept["material"], *kept["arms"]):
-                for key in SCALING:
+                for key in SCALING[:2] if scene.is_spatial else SCALING:
                     row.pop(key, None)
         return _digest([kept, self.design_key])
 

@@ -44,6 +44,10 @@ SWEPT = (4, 6, 8, 12, 16, 24, 48)  # coordinates of "coordinates"
 OPTIMISED = (4, 12, 48)  # coordinates of "reduction"
 COMPARED = (4, 12)
 MOTION = "made for the loads of the motion"
+# Loads at the outboard interface that bend or twist an arm, and their places among all of them.
+BENDING = {"tip compliance lost, F_y [%]": 1, "moment [%]": 2}
+BENDING_IN_SPACE = {"tip compliance lost, F_y [%]": 1, "F_z [%]": 2, "M_x [%]": 3, "M_y [%]": 4,
+                    "M_z [%]": 5}  # fmt: skip
 Rows = list[tuple[Mapping[str, Any], Case]]
 
 
@@ -242,8 +246,8 @@ def _bases(compared: pd.DataFrame, called: str) -> Table:
             known |= {f"frequency {k} off by [%]": _percent(v) for k, v in enumerate(frequency, 1)}
             known |= {f"MAC {k} [-]": round(value, 6) for k, value in enumerate(mac, 1)}
             known["largest angle [deg]"] = round(math.degrees(max(b.angle)), 4)
-            known["tip compliance lost, F_y [%]"] = _percent(b.compliance[1])
-            rows.append(known | {"moment [%]": _percent(b.compliance[2])})
+            loads = BENDING if len(b.compliance) == 3 else BENDING_IN_SPACE
+            rows.append(known | {name: _percent(b.compliance[i]) for name, i in loads.items()})
     title = f"What the bases miss of {called}: first natural modes and tip."
     return Table("bases", title, pd.DataFrame(rows))
 

@@ -28,7 +28,7 @@ MODES = 3  # natural modes that `compare` looks at
 # Keys that leave the reduced bodies as they are, or scale them: in plane stress mass and stiffness
 # are linear in the thickness.
 SCALING = r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
-SCALING += r"|arms\.(.+\.)?thickness"
+THICKNESS = r"arms\.(.+\.)?thickness"
 
 
 def simulate_scenarios(
@@ -90,7 +90,8 @@ class BasisFigures:
         arm: its name.
         frequency: relative excess of the natural frequencies.
         mac: modal assurance criterion of the modes that belong to them.
-        compliance: relative loss under unit loads at the outboard interface, F_x, F_y, moment.
+        compliance: relative loss under unit loads at the outboard interface, F_x, F_y, moment; in
+            space three forces and three moments.
         angle: rad, between the reference's modes and the basis.
     """
 
@@ -143,9 +144,10 @@ def compare(
 # -- samples ---------------------------------------------------------------------------------
 
 
-def scales_bodies(keys: Iterable[str]) -> bool:
+def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    return all(re.fullmatch(SCALING, key) for key in keys)
+    known = SCALING if scene.is_spatial else f"{SCALING}|{THICKNESS}"
+    return all(re.fullmatch(known, key) for key in keys)
 
 
 def with_sample(scene: Scene, changes: Sequence[str], number: int) -> Scene:

@@ -348,7 +348,9 @@ def _sample(case: Case, design: Path | None, place: _Place, progress: Progress) 
     begun = time.perf_counter()
     progress.tell(case.title, text="...")
     scenes = [with_sample(case.scene, one, k) for k, one in enumerate(case.samples, case.first)]
-    scaled = scales_bodies(change.partition("=")[0] for one in case.samples for change in one)
+    scaled = scales_bodies(
+        case.scene, (change.partition("=")[0] for one in case.samples for change in one)
+    )
     nominal = Case(case.scene, "simulate", design).key
     if scaled and nominal not in place.nominal:
         place.nominal.clear()

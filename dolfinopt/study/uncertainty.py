@@ -162,7 +162,7 @@ def sample_cases(
     Further samples leave those that are complete as they are.
     """
     keys = {change.partition("=")[0] for one in samples for change in one}
-    size = CHUNK if scales_bodies(keys) else REDUCED
+    size = CHUNK if scales_bodies(scene, keys) else REDUCED
     return [
         Case(scene, "sample", design, label, tuple(samples[first : first + size]), first)
         for first in range(0, len(samples), size)
@@ -201,7 +201,8 @@ def parse_input(scene: Scene, text: str) -> Input:
             raise InputError(
                 f"does not change what a given design does; expected a key of {', '.join(TABLES)}"
             )
-        if parts[0] == "arms" and parts[-1] in SIZES:
+        sizes = (*SIZES, "thickness") if scene.is_spatial else SIZES
+        if parts[0] == "arms" and parts[-1] in sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
         low, high = _range(key)
         try:

@@ -65,7 +65,7 @@ def test_samples_are_scenes_by_themselves(changes, scaling, shared_tmp_path):
     """Whether bodies are scaled or reduced anew: as `evaluate` has it, arms built for it alone."""
     base = scene(*FINE)
     samples = sample_texts([*changes], np.array([[*changes.values()]]))
-    assert scales_bodies(changes) == scaling
+    assert scales_bodies(base, changes) == scaling
     cases = sample_cases(base, samples, "", None)
     found, computed, failures = respond(cases, shared_tmp_path)
     assert computed == 2 and not failures
