@@ -21,6 +21,7 @@ from dolfinopt.density.symmetry import AxisSymmetry, Extrusion
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of
+from dolfinopt.fem.interior import Guesses
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
@@ -362,6 +363,16 @@ class Arm:
         for place, one in zip(self.places, vectors[1:], strict=True):
             if one.shape[1]:
                 self.initial.loaded[place] = one
+
+    @property
+    def guesses(self) -> Guesses | None:
+        """What the next design's iterative solves set out from; None where there is nothing."""
+        return self.substructure.interior.guesses
+
+    @guesses.setter
+    def guesses(self, guesses: Guesses | None) -> None:
+        if self.substructure.interior.is_iterative:
+            self.substructure.set_guesses(guesses)
 
     def forget_modes(self) -> None:
         """Let the next searches for modes set out from nothing."""

@@ -48,6 +48,16 @@ class BlockConjugateGradients:
         self._first_rate = 0.0  # right after the hierarchy was made
         self._fresh = True
 
+    @property
+    def progress(self) -> tuple[float, float]:
+        """Steps a digit of the first solution with this hierarchy, -1 before, and of the last."""
+        return (-1.0 if self._fresh else self._first_rate), self.rate
+
+    @progress.setter
+    def progress(self, rates: tuple[float, float]) -> None:
+        self._fresh = rates[0] < 0.0
+        self._first_rate, self.rate = max(0.0, rates[0]), rates[1]
+
     def update(self) -> None:
         """Take over new values of the matrix (collective)."""
         slow = self._first_rate > SLOW and not self.grid.gradual

@@ -25,7 +25,7 @@ from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity, joins
 from dolfinopt.fem.interface import InterfaceTransformation
-from dolfinopt.fem.interior import InteriorSystem
+from dolfinopt.fem.interior import Guesses, InteriorSystem
 from dolfinopt.fem.stress import element_centres, stress_operator
 from dolfinopt.fem.uniform import single, uniform_cells
 from dolfinopt.fem.uniform_stress import UniformStress
@@ -160,6 +160,13 @@ class Substructure:
         if derivatives is None or stress is None:  # turned by half a turn k_e and m_e are the same
             return None
         return UniformStress(self.uniform, derivatives, stress)
+
+    def set_guesses(self, guesses: Guesses | None) -> None:
+        """Let iterative solves set out as others did, see `InteriorSystem.guesses` (collective)."""
+        K = None
+        if guesses is not None and not self.interior.has_hierarchy_of(guesses):
+            K = AssembledMatrix(self._stiffness, guesses.young, Profile()).matrix
+        self.interior.set_guesses(guesses, K)
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.
@@ -322,7 +329,7 @@ class ElasticArm:
 
     def factorise(self) -> Factor:
         """Return the factor of K_II of this design, see `InteriorSystem`."""
-        return self.substructure.interior.factorise(self.K.matrix)
+        return self.substructure.interior.factorise(self.K.matrix, self.young)
 
     def interior_stiffness(self) -> PETSc.Mat:
         """Return K_II, valid until another design of the arm asks for its own or is factorised."""
@@ -343,7 +350,7 @@ class ElasticArm:
             ConvergenceError: K_II is singular but for rounding.
         """
         interior = self.substructure.interior
-        interior.factorise(self.K.matrix)
+        interior.factorise(self.K.matrix, self.young)
         with self.profile.phase("solves"):
             out, failed = interior.solve(self.K.matrix, right, purpose)
         self.profile.counts.solves += right.shape[1]
@@ -358,6 +365,7 @@ class ElasticArm:
     def interior_inverse(self, right: np.ndarray) -> np.ndarray:
         """Return K_II^-1 right for one right side (num_interior,) of owned rows."""
         self.profile.counts.solves += 1
+        self.factorise()
         return self.substructure.interior.inverse(self.K.matrix, right)
 
     def interior_mass_times(self, vector: np.ndarray) -> np.ndarray:

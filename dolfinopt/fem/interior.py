@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,23 @@ TOLERANCE = 1e-8
 TIGHT = 1e-12  # where a Krylov space is made of solutions
 
 
+@dataclass(frozen=True, eq=False)
+class Guesses:
+    """From what the iterative solves of one design set out: with it they end in the same bits.
+
+    Attributes:
+        fields: (num_interior, k) by purpose, the solutions of the design before.
+        young: (n_cells,) Young's modulus of the design that the hierarchy was made for, Pa.
+        gradual: how it was made, see `Multigrid`.
+        progress: see `BlockConjugateGradients`.
+    """
+
+    fields: Mapping[str, np.ndarray]
+    young: np.ndarray
+    gradual: bool
+    progress: tuple[float, float]
+
+
 class InteriorSystem:
     """K_II with one factorisation, and M_II, of whichever design asked last.
 
@@ -90,6 +108,10 @@ class InteriorSystem:
         self._mass_of: sp.csr_matrix | None = None
         self._solutions: dict[str, np.ndarray] = {}
         self._node_mass_of: sp.csr_matrix | None = None
+        # Young's modulus of the design that is asked for, and of that the hierarchy was made for.
+        self._asked: np.ndarray | None = None
+        self._young: np.ndarray | None = None
+        self._setups = 0  # of the hierarchy, when `_young` was noted
 
     @cached_property
     def _entries(self) -> InteriorEntries:
@@ -164,13 +186,18 @@ class InteriorSystem:
             return "LAPACK's band"
         return str(self._ksp.getPC().getFactorSolverType())
 
-    def factorise(self, K: sp.csr_matrix) -> Factor:
-        """Return the factor of K_II; nothing is done if K was the last one (collective)."""
+    def factorise(self, K: sp.csr_matrix, young: np.ndarray | None = None) -> Factor:
+        """Return the factor of K_II; nothing is done if K was the last one (collective).
+
+        Args:
+            K: assembled for one design.
+            young: (n_cells,) its Young's modulus, which `guesses` are to know; Pa.
+        """
         if self._factor is not None and self._factorised is K:
             return self._factor
         self._factorised = None
         if self.is_iterative:
-            return self._refreshed(K)
+            return self._refreshed(K, young)
         band = self._band
         with self._profile.phase("factorisation"):
             # What rounding has made indefinite PETSc factorises all the same; whether the result
@@ -183,16 +210,22 @@ class InteriorSystem:
         self._factorised = K
         return self._factor
 
-    def _refreshed(self, K: sp.csr_matrix) -> BlockConjugateGradients:
+    def _refreshed(self, K: sp.csr_matrix, young: np.ndarray | None) -> BlockConjugateGradients:
         """Return the iterative solver of K_II (collective)."""
         with self._profile.phase("factorisation"):
             self.stiffness(K)
             if "_iterative" in self.__dict__:
                 self._iterative.update()
-            self._factor = self._iterative
+            self._factor, self._asked = self._iterative, young
+            self._note_hierarchy()
         self._profile.counts.factorisations += 1
         self._factorised = K
         return self._iterative
+
+    def _note_hierarchy(self) -> None:
+        """Remember whose hierarchy it is, if it is a new one."""
+        if self._iterative.grid.setups != self._setups:
+            self._setups, self._young = self._iterative.grid.setups, self._asked
 
     def solve(self, K: sp.csr_matrix, right: np.ndarray, purpose: str) -> tuple[np.ndarray, bool]:
         """Return K_II^-1 right (num_interior, k) and whether that failed (collective).
@@ -206,9 +239,49 @@ class InteriorSystem:
         if right.shape[1] == 0:
             return right.copy(), False
         out = self._iterative.solve(right, self._solutions.get(purpose))
+        self._note_hierarchy()
         if purpose:
             self._solutions[purpose] = out
         return out, self._iterative.failed
+
+    @property
+    def guesses(self) -> Guesses | None:
+        """What the next iterative solves set out from; None where there is nothing."""
+        if self._young is None:
+            return None
+        gradual = self._iterative.grid.gradual
+        return Guesses(dict(self._solutions), self._young, gradual, self._iterative.progress)
+
+    def set_guesses(self, guesses: Guesses | None, K: sp.csr_matrix | None) -> None:
+        """Let the next iterative solves set out from what was `guesses` (collective).
+
+        Args:
+            guesses: None where there was nothing.
+            K: assembled for `guesses.young`, where the hierarchy is another design's; or None.
+        """
+        if guesses is None:
+            self._solutions, self._young, self._setups = {}, None, 0
+            self._factor = self._factorised = None
+            self.__dict__.pop("_iterative", None)
+            return
+        self._solutions = dict(guesses.fields)
+        if K is not None:
+            self._factor = self._factorised = None
+            self.stiffness(K)
+            known = "_iterative" in self.__dict__
+            grid = self._iterative.grid
+            grid.gradual = guesses.gradual
+            if known or grid.gradual:
+                grid.make()
+            self._young, self._setups = guesses.young, grid.setups
+            self._stiffness_of = None  # the matrix is to be given free
+        self._iterative.progress = guesses.progress
+
+    def has_hierarchy_of(self, guesses: Guesses) -> bool:
+        """Return whether the hierarchy at hand is that of these guesses (collective)."""
+        mine = self._young is not None and np.array_equal(self._young, guesses.young)
+        mine = mine and self._iterative.grid.gradual == guesses.gradual
+        return self._T.comm.allreduce(mine, op=MPI.LAND)
 
     def inverse(self, K: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
         """Return K_II^-1 times a vector (num_interior,), to nearly all digits."""

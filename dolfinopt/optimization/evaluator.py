@@ -20,6 +20,7 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm, PhysicalDesign
+    from dolfinopt.fem.interior import Guesses
 
 
 class Evaluator:
@@ -30,8 +31,8 @@ class Evaluator:
         variables, continuation: how x makes designs.
         trajectory: of the design evaluated last; None without a motion and off the root.
         solutions: its motions; the next evaluation sets out from them.
-        initial_solutions, initial_vectors: from where that of the last x set out, so that it can
-            be repeated in the same bits.
+        initial_solutions, initial_vectors, initial_guesses: from where that of the last x set out,
+            so that it can be repeated in the same bits.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Evaluator:
         self.solutions: tuple[Solution, ...] = ()
         self.initial_solutions: tuple[Solution, ...] = ()
         self.initial_vectors: dict[int, list[np.ndarray]] = {}
+        self.initial_guesses: dict[int, Guesses | None] = {}
 
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
         """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
@@ -58,6 +60,7 @@ class Evaluator:
         """Evaluate the designs that x stands for, the nominal one last (collective)."""
         self.initial_solutions = self.solutions
         self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
+        self.initial_guesses = {k: arm.guesses for k, arm in self.arms.items()}
         # Gradients at once, with the design's factorisation at hand.
         return [
             self.differentiated(design, self.evaluate_densities(densities(design)))
@@ -73,6 +76,7 @@ class Evaluator:
         self.solutions = self.initial_solutions
         for k, vectors in self.initial_vectors.items():
             self.arms[k].initial_vectors = vectors
+            self.arms[k].guesses = self.initial_guesses[k]
         return self.evaluate(x)
 
     def with_gradient(self, kind: str) -> Evaluator:

@@ -213,6 +213,7 @@ class Iterate:
             kkt=self.kkt,
             cells=self.variables.split(np.column_stack(columns)),
             modes=self.evaluator.initial_vectors,
+            guesses={k: one for k, one in self.evaluator.initial_guesses.items() if one},
             multipliers=state.multipliers,
             convexity=self.convexity,
             solutions=self.evaluator.initial_solutions,
@@ -229,6 +230,7 @@ class Iterate:
         self.evaluator.solutions = memory.solutions
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
+            arm.guesses = memory.guesses.get(k)
         self.iteration, self.change, self.kkt = memory.iteration, memory.change, memory.kkt
         self.continuation.beta = memory.beta
         self.continuation.thresholds = dict(memory.thresholds)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.solution import Solution
+from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.responses.order_selection import OrderSelection
@@ -25,6 +26,7 @@ class IterateMemory:
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
         multipliers, convexity: MMA's, on all ranks.
+        guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
         thresholds: per arm its eta.
@@ -35,6 +37,7 @@ class IterateMemory:
     kkt: float
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
+    guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
     convexity: np.ndarray
     solutions: tuple[Solution, ...]

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.disk import write_arrays
-from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.memory import FurtherMemory, IterateMemory, Memory
+from dolfinopt.optimization.memory import FurtherMemory, Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
-from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
+from dolfinopt.output.iterate_arrays import arrays_of, fields_from
+from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.contents import DIGEST, program, with_digests
 from dolfinopt.scene.load import Scene
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 NAME = CHECKPOINT
 FURTHER = "further/"  # before the names of what further iterations left
-# A solution's arrays: name in the file, field.
-SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
 # Keys a resumed run may change: they say when to stop, not what design is computed.
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
 
@@ -58,54 +56,13 @@ def save(
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
     number = len(scene.arms) + 1
-    arrays = _gathered(partition, arms, memory, number)
+    arrays = arrays_of(partition, arms, memory, number)
     if memory.further is not None:
-        more = _gathered(partition, arms, memory.further, number)
+        more = arrays_of(partition, arms, memory.further, number)
         arrays |= {FURTHER + key: value for key, value in more.items()}
     with together(partition.world):
         if partition.world.rank == 0:
             _write(folder, scene, memory, arrays)
-
-
-def _gathered(
-    partition: Partition, arms: Mapping[int, Arm], memory: IterateMemory, number: int
-) -> dict[str, Any]:
-    """Return the arrays of one design, of whole arms (collective; complete on the root).
-
-    Args:
-        number: of sets of modes.
-    """
-    with together(partition.world):
-        points = {k: _interior_points(arm) for k, arm in arms.items()}
-        known = [
-            {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()} for j in range(number)
-        ]
-    columns: dict[str, Mapping[int, Any]] = {
-        "centroid": gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()}),
-        "cells": gather_cells(partition, memory.cells),
-        "threshold": gather_arms(partition, memory.thresholds),
-        "points": gather_cells(partition, points),
-    }
-    for j, by_arm in enumerate(known):
-        columns[f"modes{j}"] = gather_cells(partition, {k: rows for k, (rows, _) in by_arm.items()})
-        columns[f"outboard{j}"] = gather_cells(
-            partition, {k: last for k, (_, last) in by_arm.items()}
-        )
-    if partition.world.rank != 0:
-        return {}
-    arrays: dict[str, Any] = {
-        "iteration": memory.iteration,
-        "last": [memory.change, memory.kkt],
-        "multipliers": memory.multipliers,
-        "convexity": memory.convexity,
-        "sharpness": memory.beta,
-    }
-    for k, solution in enumerate(memory.solutions):
-        for name, field in (*SOLUTION.items(), ("error", "error")):
-            arrays[f"solution{k}/{name}"] = getattr(solution, field)
-    for key, by_arm in columns.items():
-        arrays |= {f"arm{k}/{key}": value for k, value in by_arm.items()}
-    return arrays
 
 
 def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -> None:
@@ -169,13 +126,13 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         own = {k.removeprefix(FURTHER): v for k, v in arrays.items() if k.startswith(FURTHER)}
         objectives, feasible = own["designs"].T.tolist()
         further = FurtherMemory(
-            **_of_design(own, arms),
+            **fields_from(own, arms),
             begun=int(own["begun"]),
             objectives=tuple(objectives),
             feasible=tuple(map(bool, feasible)),
         )
     return Memory(
-        **_of_design(arrays, arms),
+        **fields_from(arrays, arms),
         history=history,
         initial_deviation=arrays["initial_deviation"],
         finished=str(arrays["finished"]),
@@ -183,62 +140,6 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         stiffening=stiffening,
         further=further,
     )
-
-
-def _of_design(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
-    """Return the fields of `IterateMemory`."""
-    cells: dict[int, np.ndarray] = {}
-    modes: dict[int, list[np.ndarray]] = {}
-    for k, arm in arms.items():
-        if f"arm{k}/cells" in arrays:  # an arm that repeats another's design has no variables
-            rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
-            cells[k] = arrays[f"arm{k}/cells"][rows]
-        rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
-        rows = (2 * rows[:, None] + [0, 1]).ravel()
-        last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
-        modes[k] = []
-        for j in range(len(arm.initial_vectors)):
-            interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
-            modes[k].append(np.vstack([interior[rows], outboard if last else outboard[:0]]))
-    solutions: list[Solution] = []
-    while f"solution{len(solutions)}/error" in arrays:
-        of = f"solution{len(solutions)}"
-        parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
-        solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
-    change, kkt = arrays["last"].tolist()
-    return {
-        "iteration": int(arrays["iteration"]),
-        "change": change,
-        "kkt": kkt,
-        "cells": cells,
-        "modes": modes,
-        "multipliers": arrays["multipliers"],
-        "convexity": arrays["convexity"],
-        "solutions": tuple(solutions),
-        "beta": float(arrays["sharpness"]),
-        "thresholds": {k: float(arrays[f"arm{k}/threshold"]) for k in cells},
-    }
-
-
-def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
-    inner = arm.substructure.T.num_interior
-    whole = modes[j] if j < len(modes) else np.empty((inner, 0))
-    return whole[:inner], whole[inner:]
-
-
-def _interior_points(arm: Arm) -> np.ndarray:
-    substructure = arm.substructure
-    return substructure.operators.points[substructure.T.interior_nodes]
-
-
-def _match(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return for each wanted point the row of the same point among the known ones."""
-    from scipy.spatial import cKDTree
-
-    if len(wanted) == 0:
-        return np.zeros(0, dtype=int)
-    return cKDTree(known).query(wanted)[1]
 
 
 def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:

@@ -40,6 +40,7 @@ class Operators:
 
 def interior_operators(arm: ElasticArm) -> Operators:
     """Return those of the interior of an arm whose systems are solved iteratively."""
+    arm.factorise()
     stiffness, cycle = arm.substructure.interior.multigrid(arm.K.matrix)
     return Operators(
         arm.num_interior,
