@@ -238,7 +238,7 @@ def test_best_of_what_keeps_the_constraints():
 # -- scenes ------------------------------------------------------------------------------------
 
 QUICK = ["arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9"]
-QUICK += ["simulation.tolerance=1e-3"]
+QUICK += ["simulation.tolerance=1e-2"]
 LIGHT = "payload.mass=0.2"
 
 

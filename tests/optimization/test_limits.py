@@ -25,6 +25,7 @@ WORLD = MPI.COMM_WORLD
 LIGHTEST = TWO_ARM.with_name("lightest_two_arm.toml")
 QUICK = ["arms.cells=[40,4]", "design.filter_radius=0.05", "design.volume_fraction=1.0"]
 QUICK += ["simulation.sample=0.005", "reduction.coordinates=3", "objective.gradient=exact"]
+QUICK += ["simulation.tolerance=1e-3"]
 
 
 def scene(*changes, iterations):

@@ -201,8 +201,9 @@ def test_cross_evaluation(folder):
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
 def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
     vary = ["payload.mass=4:8:3", "motion.flattening=0.8,1"]
-    alone = study.study(scene(), None, vary, [], tmp_path, SELF, shown=False)
-    together = study.study(scene(), None, vary, [], shared_tmp_path / "all", WORLD, shown=False)
+    base = scene("simulation.tolerance=1e-2")
+    alone = study.study(base, None, vary, [], tmp_path, SELF, shown=False)
+    together = study.study(base, None, vary, [], shared_tmp_path / "all", WORLD, shown=False)
     assert len(alone.tables) == len(together.tables)
     for one, other in zip(alone.tables, together.tables, strict=True):
         assert (one.name, one.title) == (other.name, other.title)
@@ -295,7 +296,8 @@ def test_long_names_stay_apart():
 def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
     """Each has its files; a sweep that grows computes what is new; another scene is refused."""
     folder = shared_tmp_path / "o"
-    quick = [*SETTINGS, "--set", "optimizer.max_iterations=1", "--out", folder]
+    rough = overrides("optimizer.max_iterations=1", "simulation.tolerance=1e-2")
+    quick = [*SETTINGS, *rough, "--out", folder]
 
     def computed(*arguments):
         run(TWO_ARM, *arguments, *quick)
