@@ -170,7 +170,13 @@ def test_gradient_of_a_body(cells, stiffening, interfaces):
 
 
 @pytest.mark.parametrize(
-    ("method", "coordinates"), [("craig-bampton", 8), ("modal", 8), ("krylov", 8), ("krylov", 20)]
+    ("method", "coordinates"),
+    [
+        ("craig-bampton", 8),
+        ("modal", 8),
+        ("krylov", 8),
+        pytest.param("krylov", 20, marks=pytest.mark.serial),
+    ],
 )
 def test_gradient_of_a_basis(method, coordinates):
     """With modes, of which the span alone counts; the last of an arm with two interfaces."""
