@@ -25,6 +25,7 @@ from dolfinopt.paths.tables import (
     moves,
     read_table,
 )
+from dolfinopt.paths.time_laws import Limits
 from dolfinopt.scene.duration import (
     POINT,
     SAME_TIME,
@@ -262,7 +263,8 @@ def _stop_to_stop(motion: Motion, table: Table, measured: int | None = None) -> 
                 f"{TIME}, the law's name and the limits"
             )
         length = float(np.linalg.norm((table.rows[j] - table.rows[i])[:measured]))
-        law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
+        limits = limits_of(motion) if length > 0.0 else Limits()  # of turns on the spot none
+        law = known_law(motion.law, length, limits, motion.acceleration_share)
         time = float(table.t[j] - table.t[i])
         if time < law.least * (1.0 - SAME_TIME):
             raise InputError(
