@@ -167,9 +167,9 @@ def _notes(rows: Sequence[Row]) -> list[str]:
         "CPU seconds of the slowest rank; a box beam with a core of nearly void. The first design "
         "makes the factor or hierarchy, a nearby one (densities moved by up to "
         f"{MOVE:g}) starts from its fields. One iteration: filter, K, six interface fields, body, "
-        "energies; of plain DOLFINx: K, one load by conjugate gradients with GAMG, energies.",
-        f"Factors are made of links whose cross-section has up to {interior.WIDEST} dofs, where "
-        "memory allows.",
+        "energies; of plain DOLFINx: K, one load by conjugate gradients with GAMG to the same "
+        "tolerance, energies.",
+        f"Factors are made up to a bandwidth of {interior.WIDEST}, where memory allows.",
     ]
     for name, points in ((line.label, line) for line in curves(here, 0, 2, 3)):
         if len(points.x) > 1:

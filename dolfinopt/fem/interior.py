@@ -45,8 +45,8 @@ MOST_WORK = 1e9
 # takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
 MOST_SOLID_WORK = 1.5e11
 # Conjugate gradients take the same time a row whatever the shape, factors the longer the larger the
-# cross-sections. With those of WIDEST dofs a nearby design takes equally long: slender arms of
-# 250 000 and cubes of 25 000 rows (`dolfinopt bench solid`). Conjugate gradients are used, too,
+# cross-sections. With a bandwidth of WIDEST a nearby design takes equally long: slender arms of
+# 250 000 and cubes of 22 000 rows (`dolfinopt bench solid`). Conjugate gradients are used, too,
 # where factors would take more than a part of the memory that is free: bytes of MUMPS' factor a row
 # at so many rows, growing as a power.
 WIDEST = 1200
