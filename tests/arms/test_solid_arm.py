@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from mpi4py import MPI
-from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_arm, solid_scene
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, YOUNG, solid_arm, solid_scene
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.errors import InputError
@@ -139,6 +139,21 @@ def test_three_interfaces():
     ends = np.abs(arm.mesh.centroid[:, 0] - 0.25) > 0.1
     assert arm.substructure.joins(np.ones(len(ends), dtype=bool))
     assert not arm.substructure.joins(ends)
+
+
+@pytest.mark.serial
+def test_force_between_the_ends():
+    """A beam loaded at a section between its ends: deflections there and, beyond it, of the end."""
+    ring = Interface(name="ring", point=(0.2625, 0.0, 0.0), radius=0.021)  # a layer of cells
+    arm = solid_arm(cells=(20, 4, 2), coordinates=12, interfaces=(ring,))
+    S = arm.state(np.ones(arm.mesh.num_cells)).elastic.constraint_modes().stiffness
+    moved = np.linalg.inv(S)[:, 7]  # by 1 N along y at the ring
+    bending = YOUNG * THICKNESS * HEIGHT**3 / 12.0
+    a = ring.point[0]
+    slope = a**2 / 2.0 / bending
+    expected = a**3 / 3.0 / bending, a**3 / 3.0 / bending + slope * (LENGTH - a), slope, slope
+    assert moved[[7, 1, 11, 5]] == pytest.approx(expected, rel=0.03)
+    assert moved[1] - moved[7] == pytest.approx(moved[11] * (LENGTH - a), rel=1e-3)
 
 
 @pytest.mark.parametrize("radius", [0.001, 0.3])
