@@ -60,6 +60,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.part.check import Check
     from dolfinopt.part.part import Part
+    from dolfinopt.part.solid_part import SolidPart
 
 Densities = Mapping[str, np.ndarray]
 
@@ -401,16 +402,14 @@ class Model:
             InputError: no part can be made of the design.
             ConvergenceError: the motion of the densities or of the parts cannot be simulated.
         """
-        from dolfinopt.part.check import check_parts
-        from dolfinopt.part.mesh import mesh_parts
-        from dolfinopt.part.part import make_parts
+        from dolfinopt.part.of_scene import check_of, parts_of
 
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
-            parts = make_parts(self.scene, place, tool_radius, tolerance, False, self._world)
+            parts = parts_of(self.scene, place, self._world, tool_radius, tolerance, False)
             with together(self._world):
                 if self._world.rank == 0:
-                    return check_parts(self.scene, place, parts, mesh_parts(parts))
+                    return check_of(self.scene, place, parts)
         return None
 
     def make_parts(
@@ -421,13 +420,14 @@ class Model:
         tool_radius: float | None = None,
         tolerance: float | None = None,
         arcs: bool = False,
-    ) -> dict[str, Part]:
+    ) -> dict[str, Part] | dict[str, SolidPart]:
         """Make parts for the workshop of a design, as `dolfinopt part` does.
 
         Args:
             x: a result or its design.
             folder: for the files of `dolfinopt part`, but for the picture; None: none are written.
-            tool_radius: of concave corners, m; None: a fifth of a cell.
+            tool_radius: of concave corners, m; None: a fifth of a cell. Like the next two, of
+                solids for those alone whose design is the same over the thickness.
             tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
             arcs: lines and arcs alone, no splines.
 
@@ -438,21 +438,19 @@ class Model:
             InputError: no part can be made of the design, or the folder holds files already.
         """
         from dolfinopt.output.folders import check_unused, prepare_folder
-        from dolfinopt.part.files import file_names, write_parts
-        from dolfinopt.part.mesh import mesh_parts
-        from dolfinopt.part.part import make_parts
+        from dolfinopt.part.of_scene import names_of, parts_of, write_of
 
         out = None if folder is None else Path(folder)
         if out is not None:
-            on_root(self._world, check_unused, out, file_names(self.scene))
+            on_root(self._world, check_unused, out, names_of(self.scene))
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
-            found = make_parts(self.scene, place, tool_radius, tolerance, arcs, self._world)
+            found = parts_of(self.scene, place, self._world, tool_radius, tolerance, arcs)
         if out is not None:
             with together(self._world):
                 if self._world.rank == 0:
                     prepare_folder(out)
-                    write_parts(out, self.scene, found, mesh_parts(found).fine)
+                    write_of(out, self.scene, found)
         return {self.scene.arms[k].name: part for k, part in found.items()}
 
     def study(

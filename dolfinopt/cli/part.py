@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import click
 
 from dolfinopt.cli.options import out_option, overwrite_option, plots_option
 from dolfinopt.cli.part_solid import make_solids
+from dolfinopt.cli.part_table import tell
 from dolfinopt.cli.shared import claim, elapsed, scene_of, warn
 from dolfinopt.cli.start import start
 from dolfinopt.errors import ConvergenceError, InputError
@@ -72,8 +72,8 @@ def part(
     millimetres; part.toml is the machine with these parts, to be simulated like any scene. A table
     tells what it does beside the densities, and beside these cut to solid and void.
 
-    Solid arms as STL and 3MF, in millimetres, and part.toml, which --no-check leaves out; they are
-    not simulated, and the other options are for arms in the plane.
+    Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
+    STEP and DXF, too, for which --tool-radius, --tolerance and --curves are.
     """
     world = start()
     from dolfinopt.parallel import on_root, together
@@ -86,18 +86,13 @@ def part(
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
     if scene.is_spatial:
-        planar = {
-            "--tool-radius": tool_radius is not None,
-            "--tolerance": tolerance is not None,
-            "--curves": curves != "splines",
-            "--polish": polish > 0,
-        }
-        for name in (name for name, given in planar.items() if given):
+        if polish:
             raise InputError(
-                f"{name}: of arms in the plane alone; the arms of {folder} are solids, whose parts "
-                "have no curves; leave it out"
+                f"--polish: of arms in the plane alone; the arms of {folder} are solids; leave it "
+                "out"
             )
-        make_solids(world, scene, folder, target, overwrite, check, plots)
+        options = tool_radius, tolerance, curves == "arcs"
+        make_solids(world, scene, folder, target, options, check, overwrite, plots)
         return
     claim(world, target, overwrite, file_names(scene))
     parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)
@@ -168,26 +163,5 @@ def _write(
         if owner is None:
             click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
     if check is not None:
-        _tell(check)
+        tell(check)
     click.echo(f"{elapsed():.1f} s; files in {target}, the machine with these parts in part.toml")
-
-
-def _tell(check: Check) -> None:
-    """Print the table of a check and what it says."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("", "density", "crisp", "part", "unit", "part/crisp"):
-        table.add_column(name, justify="left" if name in ("", "unit") else "right")
-    for name, row in check.table().iterrows():
-        values = [f"{row[form]:.4g}" for form in ("density", "crisp", "part")]
-        ratio = f"{100.0 * row['part/crisp']:+.2f} %"
-        cells = [str(name).replace("_", " "), *values, row["unit"], ratio]
-        table.add_row(*("-" if "nan" in cell else cell for cell in cells))
-    Console(highlight=False, width=None if sys.stdout.isatty() else 100).print(table)
-    for line in (check.loss, *check.notes):
-        click.echo(line)
-    for limit in check.part.limits:
-        click.echo(f"limit {'met' if limit.met else 'missed'}: {limit.sentence}")
-    warn(check.warnings)

@@ -9,7 +9,7 @@ Source: Williams (1952), doi:10.1115/1.4010553.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -42,13 +42,13 @@ SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
 
 @dataclass(frozen=True, eq=False)
 class PartStress:
-    """Von Mises stress of one arm of the chain along the motion, at the corners of its triangles.
+    """Von Mises stress of one arm of the chain along the motion, at the corners of its cells.
 
     Attributes:
         peak: the largest further than `APART` cells from every singular point.
         everywhere: the largest of all, singular points included.
-        hot: (n, 2) where stress exceeds `HOT` times the peak, but at singular points, m.
-        cells: for pictures: the largest at any corner of every triangle, and when; at singular
+        hot: (n, d) where stress exceeds `HOT` times the peak, but at singular points, m.
+        cells: for pictures: the largest at any corner of every cell, and when; at singular
             points at most `SHOWN` times `peak`.
     """
 
@@ -97,29 +97,49 @@ def part_stress(
     """
     import shapely
 
+    def away(k: int, places: np.ndarray, margin: float) -> np.ndarray:
+        far = np.ones(len(places), dtype=bool)
+        if len(singular := singular_points(shapes[k])):
+            gaps = np.linalg.norm(places[:, None] - singular, axis=2)
+            far = gaps.min(axis=1) >= apart[k]
+        if margin > 0.0:
+            at = shapely.points(places)
+            far &= shapely.distance(at, interface_lines(shapes[k])) >= margin
+        return far
+
+    return stress_of_parts(arms, trajectory, away, _at_corners)
+
+
+def stress_of_parts(
+    arms: Mapping[int, Arm],
+    trajectory: Trajectory,
+    away: Callable[[int, np.ndarray, float], np.ndarray],
+    at_corners: Callable[[Arm], tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> dict[int, PartStress]:
+    """Return the stress of every part by its place in the chain, on this rank alone.
+
+    Args:
+        arms, trajectory: as for `part_stress`.
+        away: which places (n, d), m, of an arm count, by its index and the scene's margin, m.
+        at_corners: what `_Points` holds of an arm.
+    """
     scene = next(iter(arms.values())).scene
     motions = motions_of(trajectory)
     found: dict[int, PartStress] = {}
     for k, loads in arm_loads(scene, motions).items():
-        points = _Points(*_at_corners(arms[k]))
-        away = np.ones(len(points.places), dtype=bool)
-        if len(singular := singular_points(shapes[k])):
-            gaps = np.linalg.norm(points.places[:, None] - singular, axis=2)
-            away = gaps.min(axis=1) >= apart[k]
-        if (margin := scene.objective.stress_margin) > 0.0:
-            at = shapely.points(points.places)
-            away &= shapely.distance(at, interface_lines(shapes[k])) >= margin
+        points = _Points(*at_corners(arms[k]))
+        counts = away(k, points.places, scene.objective.stress_margin)
         for one in loads:
             a, t = one.coefficients, motions[one.motion].t
-            best = points.peak(a, t, np.flatnonzero(away))
+            best = points.peak(a, t, np.flatnonzero(counts))
             known = found.get(one.place)
             if known is not None and known.peak.value >= best.value:
                 continue
-            whole = points.peak(a, t, np.arange(len(away)))
+            whole = points.peak(a, t, np.arange(len(counts)))
             at, when = maxima(MPI.COMM_SELF, points.A, a)
-            hot = points.places[away & (at > HOT * best.value)]
+            hot = points.places[counts & (at > HOT * best.value)]
             # What has no limit would be all that the colours show.
-            at[~away] = np.minimum(at[~away], SHOWN * best.value)
+            at[~counts] = np.minimum(at[~counts], SHOWN * best.value)
             worst = at[points.corners].argmax(axis=1)
             node = points.corners[np.arange(len(worst)), worst]
             cells = ArmStress(best, whole, at[node], t[when[node]])
@@ -129,12 +149,12 @@ def part_stress(
 
 @dataclass(frozen=True, eq=False)
 class _Points:
-    """Corners of triangles, and their stress by load coefficients.
+    """Corners of triangles or tetrahedra, and their stress by load coefficients.
 
     Attributes:
-        A: (3, n, m) components of `fem.stress.VON_MISES`, Pa.
-        places: (n, 2) m.
-        corners: (n_cells, 3) of the n.
+        A: (3 or 5, n, m) components of `fem.stress.VON_MISES`, Pa.
+        places: (n, d) m.
+        corners: (n_cells, d + 1) of the n.
     """
 
     A: np.ndarray
@@ -144,8 +164,8 @@ class _Points:
     def peak(self, a: np.ndarray, t: np.ndarray, chosen: np.ndarray) -> Peak:
         """Return the largest stress of the chosen points."""
         largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
-        x, y = self.places[chosen][largest.point]
-        return Peak(largest.largest, (float(x), float(y)), float(t[largest.instant]))
+        place = tuple(map(float, self.places[chosen][largest.point]))
+        return Peak(largest.largest, place, float(t[largest.instant]))
 
 
 def _at_corners(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.output.views import ArmView, gather_views
-from dolfinopt.part.body_mesh import BodyMesh
 from dolfinopt.part.boundary_stress import HOT
 from dolfinopt.part.forms import (
     STRESS,
@@ -54,8 +53,10 @@ class Check:
         stress_change: relative, of the largest stress by the last refinement where it is largest.
         meshes: of the parts by their place in the chain, as fine as their stress needs.
         views: the parts' arms with their stress, for pictures.
-        cells: triangles of the parts by the name of the arm.
+        cells: triangles, or tetrahedra, of the parts by the name of the arm.
         singular: where stress has no limit on the parts and is larger than the one reported.
+        singular_arm: which part has it.
+        kind: of the cells.
     """
 
     units: Mapping[str, str]
@@ -64,11 +65,12 @@ class Check:
     part: Column
     coarse: Column
     stress_change: float
-    meshes: Mapping[int, BodyMesh]
+    meshes: Mapping[int, Any]
     views: list[ArmView]
     cells: Mapping[str, int]
     singular: Peak | None
     singular_arm: str
+    kind: str = "triangles"
 
     @property
     def columns(self) -> dict[str, Column]:
@@ -211,7 +213,7 @@ class Check:
             "table": table,
             "check": {
                 "loss": self.loss,
-                "triangles": dict(self.cells),
+                self.kind: dict(self.cells),
                 "refinement": self.refinement,
                 "converged": self.converged,
                 "stress": places,
@@ -231,6 +233,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+def relative_change(value: float, other: float) -> float:
+    """Return value / other - 1, nan where there is nothing to compare with."""
+    return _ratio(value, other) - 1.0
+
+
 def _word(change: Mapping[str, float]) -> str:
     return "stiffer" if change["compliance"] < 0.0 else "softer"
 
@@ -244,8 +251,8 @@ def _percent(value: float) -> str:
 
 
 def _told(peak: Peak, arm: str) -> str:
-    x, y = peak.place
-    return f"{1e-6 * peak.value:.4g} MPa in {arm} at ({x:.4g}, {y:.4g}) m and {peak.instant:.3f} s"
+    place = ", ".join(f"{x:.4g}" for x in peak.place)
+    return f"{1e-6 * peak.value:.4g} MPa in {arm} at ({place}) m and {peak.instant:.3f} s"
 
 
 def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: Meshes) -> Check:
@@ -268,7 +275,7 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
     for round_ in range(ROUNDS + 1):
         fine = simulate_bodies(scene, parts, bodies)
         column, stress = part_column(scene, fine, parts)
-        change = _ratio(column.values[STRESS], before.values[STRESS]) - 1.0
+        change = relative_change(column.values[STRESS], before.values[STRESS])
         if round_ == ROUNDS or not abs(change) > SETTLED_STRESS:
             break
         for place, one in stress.items():

@@ -83,25 +83,19 @@ def simulate_bodies(
         changes: tables of the scene that are other than the run's.
     """
     with tempfile.TemporaryDirectory() as folder:
-        posed = _scene_of_parts(scene, parts, meshes, Path(folder), changes)
-        partition, arms = _built(posed)
+        write_meshes(Path(folder), {scene.arms[k].name: one for k, one in meshes.items()})
+        data = scene_data(scene, parts, Path(folder))
+        for table, keys in changes.items():
+            data[table] = {**data.get(table, {}), **keys}
+        return simulate_scene(data)
+
+
+def simulate_scene(data: Mapping[str, Any]) -> Simulated:
+    """Simulate a machine whose arms are of solid material, by what part.toml holds of it."""
+    scene = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
+    partition, arms = _built(scene)
     x_phys = {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
-    return _simulated(posed, partition, arms, x_phys)
-
-
-def _scene_of_parts(
-    scene: Scene,
-    parts: Mapping[int, Part],
-    meshes: Mapping[int, BodyMesh],
-    folder: Path,
-    changes: Mapping[str, Any],
-) -> Scene:
-    """Return the scene that part.toml holds, with meshes in another folder."""
-    write_meshes(folder, {scene.arms[k].name: one for k, one in meshes.items()})
-    data = scene_data(scene, parts, folder)
-    for table, keys in changes.items():
-        data[table] = {**data.get(table, {}), **keys}
-    return scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
+    return _simulated(scene, partition, arms, x_phys)
 
 
 def _built(scene: Scene) -> tuple[Partition, dict[int, Arm]]:
@@ -154,7 +148,7 @@ def crisp(x_phys: np.ndarray, area: np.ndarray) -> np.ndarray:
 
     Args:
         x_phys: (n,) physical densities.
-        area: (n,) of the cells, m2.
+        area: (n,) of the cells, m2; of solids their volume, m3.
     """
     levels, which = np.unique(x_phys, return_inverse=True)
     held = np.bincount(which.ravel(), area)  # by density; cells of one density stay together
@@ -171,7 +165,7 @@ def _design_column(one: Simulated) -> Column:
         one.partition, one.arms, one.trajectory, Profile()
     )
     peak, arm = largest_of({place: each.peak for place, each in stress.items()}, one.scene)
-    return _column(one, peak, arm)
+    return column_of(one, peak, arm)
 
 
 def part_column(
@@ -183,10 +177,11 @@ def part_column(
     shapes = {k: part.shape for k, part in parts.items()}
     found = part_stress(one.arms, one.trajectory, shapes, apart)
     peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
-    return _column(one, peak, arm), found
+    return column_of(one, peak, arm), found
 
 
-def _column(one: Simulated, peak: Peak | None, arm: str) -> Column:
+def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
+    """Return the figures of a machine whose largest stress is known, with the arm that has it."""
     limits = [
         limit
         for limit in limits_of(one.scene, one.evaluation)

@@ -22,6 +22,7 @@ SAME_VOLUME = 1e-3  # relative, of the surface to the design
 AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 
 MIRRORED = {4: [0, 2, 1, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3]}
+MIRRORED[27] = [*range(18, 27), *range(9, 18), *range(9)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +121,101 @@ def nodal_densities(
     return points, nodes, total / weight
 
 
+def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `nodal_densities` does of hexahedra cut in eight, 27 points in each.
+
+    At a cell's centre its own density counts alone: a member as thick as one cell stays so.
+
+    Args:
+        corners: (n, 8, 3) m, common ones the same to the last bit.
+        density: (n,) of the cells.
+
+    Returns:
+        Points (m, 3); nodes (n, 27) of every cell as a tensor product; densities (m,).
+    """
+    grid = corners.reshape(-1, 2, 2, 2, 3)
+    for axis in (1, 2, 3):
+        first, last = np.split(grid, 2, axis=axis)
+        # Sums of the same two numbers, whichever comes first: halves of common edges are common.
+        grid = np.concatenate([first, 0.5 * (first + last), last], axis=axis)
+    for axis in (1, 2, 3):
+        _centre_faces(grid, corners, axis)
+    points, nodes = _numbers(grid.reshape(-1, 27, 3))
+    nodes = np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[27]], nodes)
+    sizes = cell_volumes(corners)
+    weight, total = (
+        np.bincount(nodes.ravel(), np.repeat(one, 27), len(points))
+        for one in (sizes, sizes * density)
+    )
+    return points, nodes, total / weight
+
+
+def middles(faces: np.ndarray) -> np.ndarray:
+    """Return the nine points (n, 9, 3) of `halved` on faces (n, 4, 3), corners around them, m."""
+    a, b, c, d = faces.swapaxes(0, 1)
+    ends = [0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + d), 0.5 * (d + a)]
+    return np.stack([a, b, c, d, *ends, 0.25 * ((a + c) + (b + d))], axis=1)
+
+
+def eighths(nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (8 n, 8) of the cells that `halved` made of nodes (n, 27)."""
+    grid = nodes.reshape(-1, 3, 3, 3)
+    parts = [
+        grid[:, z : z + 2, y : y + 2, x : x + 2].reshape(-1, 8)
+        for z in (0, 1) for y in (0, 1) for x in (0, 1)
+    ]  # fmt: skip
+    return np.stack(parts, axis=1).reshape(-1, 8)
+
+
+def forty_eighths(nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (48 n, 4) of the tetrahedra that `halved` can be cut in, from (n, 27).
+
+    Each has the centre of the cell, of a face, of an edge, and a corner. Neighbours cut a face they
+    share alike, however they are turned, as VTK's ways to clip hexahedra do not.
+    """
+    return nodes[:, FORTY_EIGHTHS].reshape(-1, 4)
+
+
+def _forty_eighths() -> np.ndarray:
+    """Return the rows (48, 4) of `forty_eighths`, of positive volume."""
+    places = np.array([[x, y, z] for z in (0, 1, 2) for y in (0, 1, 2) for x in (0, 1, 2)])
+    found = []
+    odd = (places != 1).sum(axis=1)  # of a corner 3, of an edge 2, of a face 1, of the centre 0
+    for face in np.flatnonzero(odd == 1):
+        for edge in np.flatnonzero(odd == 2):
+            for corner in np.flatnonzero(odd == 3):
+                steps = places[[face, edge, corner]] - 1
+                if ((steps[0] == 0) | (steps[0] == steps[1])).all() and (
+                    (steps[1] == 0) | (steps[1] == steps[2])
+                ).all():
+                    turned = np.linalg.det(steps) < 0.0
+                    found.append([13, face, *((corner, edge) if turned else (edge, corner))])
+    return np.array(found)
+
+
+FORTY_EIGHTHS = _forty_eighths()
+
+
+def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
+    """Put the centres of the faces across an axis where both of their cells have them."""
+    cube = corners.reshape(-1, 2, 2, 2, 3)
+    for place, side in ((0, 0), (2, 1)):
+        face = np.take(cube, side, axis=axis)
+        middle = 0.25 * ((face[:, 0, 0] + face[:, 1, 1]) + (face[:, 0, 1] + face[:, 1, 0]))
+        at = [slice(None), 1, 1, 1]
+        at[axis] = place
+        grid[tuple(at)] = middle
+
+
 def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the nodes of cells, those of left-handed ones in another order."""
-    count = nodes.shape[1]
-    edges = corners[:, [1, 2, 3 if count == 4 else 4]] - corners[:, :1]
-    left = np.linalg.det(edges) < 0.0
-    return np.where(left[:, None], nodes[:, MIRRORED[count]], nodes)
+    return np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[nodes.shape[1]]], nodes)
+
+
+def _left_handed(corners: np.ndarray) -> np.ndarray:
+    """Tell which cells (n, 4 or 8, 3) are left-handed."""
+    edges = corners[:, [1, 2, 3 if corners.shape[1] == 4 else 4]] - corners[:, :1]
+    return np.asarray(np.linalg.det(edges) < 0.0)
 
 
 def _cut(

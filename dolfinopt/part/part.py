@@ -133,7 +133,7 @@ def make_parts(
     from dolfinopt.parallel import on_root, together
 
     world = MPI.COMM_SELF if world is None else world
-    on_root(world, _check, folder, tool_radius, tolerance)
+    on_root(world, check_options, folder, tool_radius, tolerance)
     domains = read_domains(scene, folder, world)
     with together(world):
         mine = {k: make_part(one, tool_radius, tolerance, arcs) for k, one in domains.items()}
@@ -143,7 +143,7 @@ def make_parts(
     return {k: found[k] for k in sorted(found)}
 
 
-def _check(folder: Path, tool_radius: float | None, tolerance: float | None) -> None:
+def check_options(folder: Path, tool_radius: float | None, tolerance: float | None) -> None:
     """Raise InputError unless the folder has a design and the options are in range."""
     for name, value, least in (
         ("--tool-radius", tool_radius, 0.0),

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.part.part import Part
 from dolfinopt.scene.contents import with_relative_paths
 from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.part.solid_part import SolidPart
 
 
 def scene_text(scene: Scene, parts: Mapping[int, Part], folder: Path) -> str:
@@ -47,26 +50,41 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
     return data
 
 
-def solid_scene_text(scene: Scene, folder: Path) -> str:
+def solid_scene_text(scene: Scene, parts: Mapping[int, SolidPart], folder: Path) -> str:
     """Return the text of a scene in which the arms are parts, meshed with tetrahedra.
 
     Args:
         scene: of the run, in space.
+        parts: by their place among the arms.
         folder: where the scene and the meshes NAME.msh will lie.
     """
-    data = scene.to_tree()
-    data["name"] = f"{scene.name}: part"
-    for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
-        if owner is not None:
-            row.update(_meshed(folder.absolute() / f"{arm.name}.msh"))
-            row["cell_shape"] = "tetrahedron"
-            row["symmetric_z"] = row["extruded"] = False
-    data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
     head = (
         "# The arms as parts, meshed with tetrahedra: simulate and study them like any scene.\n"
         f"# Made of the design of {scene.name}.\n"
     )
-    return head + toml_text(with_relative_paths(data, folder))
+    return head + toml_text(with_relative_paths(solid_scene_data(scene, parts, folder), folder))
+
+
+def solid_scene_data(scene: Scene, parts: Mapping[int, SolidPart], meshes: Path) -> dict[str, Any]:
+    """Return the data of `solid_scene_text` with absolute paths.
+
+    Args:
+        scene, parts: as there.
+        meshes: folder of the meshes, NAME.msh.
+    """
+    data = scene.to_tree()
+    data["name"] = f"{scene.name}: part"
+    for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
+        if owner is None:
+            continue
+        name = scene.arms[owner].name if arm.design else arm.name
+        row.update(_meshed(meshes.absolute() / f"{name}.msh"))
+        size = np.ptp(parts[owner].surface.points, axis=0)
+        row["height"], row["thickness"] = float(size[1]), float(size[2])
+        row["cell_shape"] = "tetrahedron"
+        row["symmetric_z"] = row["extruded"] = False
+    data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
+    return data
 
 
 def _arm(part: Part, mesh: Path) -> dict[str, Any]:

@@ -13,14 +13,20 @@ import numpy as np
 
 from dolfinopt.part.isosurface import Surface
 
-PASSES, PASS_BAND = 40, 0.03  # of the windowed sinc: ripples of a cell or two go
+# Of the windowed sinc: steps from cell to cell go, ripples of a smooth field's isosurface.
+PASSES, STEPS, RIPPLES = 40, 0.03, 0.15
 FURTHEST = 0.4  # of a cell that smoothing moves a point
 ROOM = 0.5  # and of its distance from the arm's own faces
 CORRECTIONS, SAME_VOLUME = 20, 1e-9  # Newton's steps; relative
 
 
 def smooth_surface(
-    surface: Surface, inner: np.ndarray, free: np.ndarray, cell: float, walls: np.ndarray
+    surface: Surface,
+    inner: np.ndarray,
+    free: np.ndarray,
+    cell: float,
+    walls: np.ndarray,
+    crisp: bool = True,
 ) -> Surface:
     """Return a surface whose free points are smoothed.
 
@@ -32,6 +38,7 @@ def smooth_surface(
         free: (n,) True of points that move, all of them on inner triangles alone.
         cell: size of the design's cells, m.
         walls: (k, 3 or 4, 3) corners of the arm's own faces, around them, m.
+        crisp: whether the surface has the steps of cells.
     """
     import pyvista
 
@@ -40,22 +47,34 @@ def smooth_surface(
     patch = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles[inner])
     smooth = patch.smooth_taubin(
         n_iter=PASSES,
-        pass_band=PASS_BAND,
+        pass_band=STEPS if crisp else RIPPLES,
         boundary_smoothing=False,
         feature_smoothing=False,
         non_manifold_smoothing=False,
         normalize_coordinates=True,
     )
     move = np.asarray(smooth.points, dtype=float) - surface.points
-    corners = walls.reshape(-1, 3)
-    around = np.arange(len(corners), dtype=int).reshape(walls.shape[:2])
-    own = pyvista.PolyData.from_regular_faces(corners, around)
-    _, nearest = own.find_closest_cell(surface.points, return_closest_point=True)
-    room = np.linalg.norm(np.asarray(nearest) - surface.points, axis=1)
+    room = distance_to_faces(surface.points, walls)
     most = np.minimum(FURTHEST * cell, ROOM * room)
     length = np.linalg.norm(move, axis=1)
     move *= np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
     return replace(surface, points=surface.points + np.where(free[:, None], move, 0.0))
+
+
+def distance_to_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of points (n, 3) from the nearest of faces (k, 3 or 4, 3), m.
+
+    Args:
+        points: m.
+        faces: corners around flat faces, m.
+    """
+    import pyvista
+
+    corners = faces.reshape(-1, 3)
+    around = np.arange(len(corners), dtype=int).reshape(faces.shape[:2])
+    found = pyvista.PolyData.from_regular_faces(corners, around)
+    _, nearest = found.find_closest_cell(points, return_closest_point=True)
+    return np.asarray(np.linalg.norm(np.asarray(nearest) - points, axis=1))
 
 
 def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:

@@ -18,7 +18,7 @@ def stl_bytes(shape: Shape, thickness: float, tolerance: float, title: str) -> b
         tolerance: of chords in place of curves, m.
         title: for the header.
     """
-    corners = _facets(shape.polygons(tolerance), thickness) * MM
+    corners = extruded_facets(shape.polygons(tolerance), thickness) * MM
     return triangle_bytes(corners, f"{title}, mm")
 
 
@@ -38,7 +38,7 @@ def triangle_bytes(corners: np.ndarray, title: str) -> bytes:
     return head + np.uint32(len(corners)).tobytes() + data.tobytes()
 
 
-def _facets(loops: list[np.ndarray], thickness: float) -> np.ndarray:
+def extruded_facets(loops: list[np.ndarray], thickness: float) -> np.ndarray:
     """Return the corners (n, 3, 3) of the facets, m, counterclockwise from outside."""
     import shapely
 

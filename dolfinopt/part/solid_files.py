@@ -7,30 +7,30 @@ import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from dolfinopt.disk import write_atomically, write_text
-from dolfinopt.errors import InputError
-from dolfinopt.mesh.surface_solid import mesh_of_surface
-from dolfinopt.part.files import FIGURES, SCENE, publish
+from dolfinopt.mesh.surface_solid import Tetrahedra
+from dolfinopt.part.drawings import dxf_text
+from dolfinopt.part.files import FIGURES, PICTURES, SCENE, publish
 from dolfinopt.part.scene_file import solid_scene_text
 from dolfinopt.part.solid import MM, triangle_bytes
+from dolfinopt.part.solid_check import write_solid_meshes
 from dolfinopt.part.solid_part import SolidPart
+from dolfinopt.part.step import solid_text
 from dolfinopt.part.three_mf import three_mf_bytes
 from dolfinopt.scene.load import Scene
 
-FORMATS = (".stl", ".3mf", ".msh")
-PICTURE = "part.png"
+if TYPE_CHECKING:
+    from dolfinopt.part.check import Check
+
+FORMATS = (".stl", ".3mf", ".msh", ".step", ".dxf")
 
 
 def file_names(scene: Scene) -> list[str]:
     """Return the names of all files, the one that says they are complete first."""
-    return [
-        FIGURES,
-        SCENE,
-        PICTURE,
-        *(f"{arm}{kind}" for arm in _owners(scene) for kind in FORMATS),
-    ]
+    arms = [f"{arm}{kind}" for arm in _owners(scene) for kind in FORMATS]
+    return [FIGURES, SCENE, *PICTURES, *arms]
 
 
 def _owners(scene: Scene) -> dict[str, int]:
@@ -39,43 +39,40 @@ def _owners(scene: Scene) -> dict[str, int]:
     return {arm.name: owner for arm, owner in owned if owner is not None}
 
 
-def figures_of(scene: Scene, parts: Mapping[int, SolidPart]) -> dict[str, Any]:
+def figures_of(
+    scene: Scene,
+    parts: Mapping[int, SolidPart],
+    meshes: Mapping[int, Tetrahedra] | None = None,
+    check: Check | None = None,
+) -> dict[str, Any]:
     """Return the content of part.json."""
-    arms = {
-        name: parts[owner].figures(scene.material_of(owner).density)
-        for name, owner in _owners(scene).items()
-    }
-    units = {"volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m"}
-    return {"name": scene.name, "arms": arms, "units": units}
-
-
-def mesh_solid_parts(scene: Scene, parts: Mapping[int, SolidPart]) -> dict[str, bytes]:
-    """Return .msh files of the parts, by the arms' names, in tetrahedra of the design's cell size.
-
-    Raises:
-        InputError: Gmsh cannot mesh a part, or it has no flat ends at the joints.
-    """
-    found = {}
+    arms = {}
     for name, owner in _owners(scene).items():
-        part = parts[owner]
-        points, triangles = part.surface.points, part.surface.triangles
-        try:
-            found[name] = mesh_of_surface(points, triangles, _length(scene, name), part.cell)[0]
-        except InputError as error:
-            raise InputError(f"arm {name!r}: {error}") from None
-    return found
-
-
-def _length(scene: Scene, name: str) -> float:
-    return next(arm.length for arm in scene.arms if arm.name == name)
+        arms[name] = parts[owner].figures(scene.material_of(owner).density)
+        if meshes is not None:
+            mesh = meshes[owner]
+            quality = mesh.quality
+            arms[name]["mesh"] = {
+                "tetrahedra": len(mesh.cells),
+                "volume": float(mesh.volumes.sum()),
+                "least_quality": float(quality.min()),
+                "mean_quality": float(quality.mean()),
+            }
+    units = {
+        "volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m",
+        "thinnest_member": "m", "narrowest_gap": "m", "widths_to": "m", "filter_radius": "m",
+    }  # fmt: skip
+    checked = {} if check is None else check.to_dict()
+    return {"name": scene.name, "arms": arms, "units": units, **checked}
 
 
 def write_solid_parts(
     folder: Path,
     scene: Scene,
     parts: Mapping[int, SolidPart],
-    meshes: Mapping[str, bytes] | None = None,
-    picture: Callable[[Path], None] | None = None,
+    meshes: Mapping[int, Tetrahedra] | None = None,
+    check: Check | None = None,
+    pictures: Callable[[Path], None] | None = None,
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
 
@@ -85,8 +82,9 @@ def write_solid_parts(
         folder: exists.
         scene: of the arms.
         parts: by their place among the arms.
-        meshes: of `mesh_solid_parts`, for part.toml; None: there is none.
-        picture: draws part.png.
+        meshes: for part.toml, likewise; None: there is none.
+        check: what the parts do, if it is known.
+        pictures: draws `files.PICTURES` into a folder.
 
     Raises:
         OutputError: the disk is full, for instance.
@@ -94,21 +92,26 @@ def write_solid_parts(
     with tempfile.TemporaryDirectory(prefix="dolfinopt-part-") as temporary:
         made = Path(temporary)
         for name, owner in _owners(scene).items():
-            surface = parts[owner].surface
-            title = f"{name} of {scene.name}, mm"
-            stl = triangle_bytes(MM * surface.corners, title)
-            write_atomically(made / f"{name}.stl", partial(_put, stl))
-            write_atomically(made / f"{name}.3mf", partial(_put, three_mf_bytes(surface, name)))
-        for name, data in (meshes or {}).items():
-            write_atomically(made / f"{name}.msh", partial(_put, data))
+            _write_part(made, name, parts[owner], f"{name} of {scene.name}")
         if meshes is not None:
-            write_text(made / SCENE, solid_scene_text(scene, folder))
-        if picture is not None:
-            picture(made / PICTURE)
-        figures = figures_of(scene, parts)
+            write_solid_meshes(made, scene, meshes)
+            write_text(made / SCENE, solid_scene_text(scene, parts, folder))
+        if pictures is not None:
+            pictures(made)
+        figures = figures_of(scene, parts, meshes, check)
         write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
         publish(made, folder, file_names(scene))
     return figures
+
+
+def _write_part(folder: Path, name: str, part: SolidPart, title: str) -> None:
+    stl = triangle_bytes(MM * part.surface.corners, f"{title}, mm")
+    write_atomically(folder / f"{name}.stl", partial(_put, stl))
+    write_atomically(folder / f"{name}.3mf", partial(_put, three_mf_bytes(part.surface, name)))
+    if part.flat is not None:
+        shape, t = part.flat.shape, part.flat.domain.thickness
+        write_text(folder / f"{name}.step", solid_text(shape, t, name, -0.5 * t))
+        write_text(folder / f"{name}.dxf", dxf_text(shape))
 
 
 def _put(data: bytes, stream: IO[bytes]) -> None:

@@ -1,67 +1,52 @@
-"""From the density of a solid arm to its part: a closed surface, smooth, of the same volume."""
+"""From the density of a solid arm to its part: a closed surface, smooth, of the same volume.
+
+A design that is the same over the thickness is a plate: its part is that of the plane, extruded.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.cells import cell_volumes, facet_corners
-from dolfinopt.part.isosurface import BELOW, Surface, cut, nodal_densities, outside
+from dolfinopt.part.isosurface import (
+    APART,
+    BELOW,
+    Surface,
+    cut,
+    eighths,
+    forty_eighths,
+    halved,
+    middles,
+    nodal_densities,
+    outside,
+)
+from dolfinopt.part.part import Part, check_options, make_part
+from dolfinopt.part.shape import Shape
 from dolfinopt.part.smooth_surface import smooth_surface, with_volume
+from dolfinopt.part.solid import extruded_facets
+from dolfinopt.part.solid_domain import SolidDomain, read_solid_domains
+from dolfinopt.part.solid_widths import Widths, measured_widths
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.mesh.arm_mesh import ArmMesh
-
 HALVINGS, NEAR = 30, 1e-3  # of the interval of levels; relative difference of volumes that will do
 SAME_VOLUME = 1e-4  # relative, of the part to the design
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
 WHOLE = 1.0 - 1e-9  # of a mark that points between two marked nodes have, but for rounding
+HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
 GRAY = 0.02  # grayness from which on a design is no longer close to any part
-
-
-@dataclass(frozen=True, eq=False)
-class SolidDomain:
-    """A solid arm with a design.
-
-    Attributes:
-        name: of the arm.
-        corners: (n_cells, 4 or 8, 3) of the cells, m.
-        x_phys: (n_cells,) physical densities.
-        own: (n, 3 or 4, 3) corners of the arm's own faces, around them, m.
-        inboard, outboard: those of the interfaces, likewise.
-    """
-
-    name: str
-    corners: np.ndarray
-    x_phys: np.ndarray
-    own: np.ndarray
-    inboard: np.ndarray
-    outboard: np.ndarray
-
-    @property
-    def cell(self) -> float:
-        """Size of a cell: the least of its median edges, m."""
-        ends = (1, 2, 3) if self.corners.shape[1] == 4 else (1, 2, 4)
-        edges = self.corners[:, ends] - self.corners[:, :1]
-        return float(np.median(np.linalg.norm(edges, axis=2), axis=0).min())
-
-    @property
-    def volume(self) -> float:
-        """The material's, m3."""
-        return float(cell_volumes(self.corners) @ self.x_phys)
-
-    @property
-    def grayness(self) -> float:
-        """Mean of 4 x (1 - x) over the volume."""
-        sizes = cell_volumes(self.corners)
-        return float(4.0 * self.x_phys * (1.0 - self.x_phys) @ sizes / sizes.sum())
+NARROW = 0.9  # of the width asked for, below which a member or gap is told
+FEW = (
+    20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
+)
+MARKS = ("own", "inboard", "outboard")
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,26 +54,42 @@ class SolidPart:
     """The part of one solid arm.
 
     Attributes:
-        name: of the arm.
+        domain: the arm and its design.
         surface: of the part, in the arm's frame, m.
-        level: density at which the isosurface lies.
-        design_volume: of the material in the design, m3.
-        distance: furthest that a point was moved from the isosurface, m.
+        level: density at which the isosurface, or the outline, lies.
+        distance: furthest that a point was moved from the isosurface, or curves from the outline,
+            m.
         pieces: number of pieces left out because they do not join both interfaces.
         pieces_volume: their volume, m3.
-        grayness: of the design.
-        cell: size of the design's cells, m.
+        flat: the part in the plane that it is extruded from; None of others.
     """
 
-    name: str
+    domain: SolidDomain
     surface: Surface
     level: float
-    design_volume: float
     distance: float
     pieces: int
     pieces_volume: float
-    grayness: float
-    cell: float
+    flat: Part | None = None
+
+    @property
+    def name(self) -> str:
+        """The arm's name."""
+        return self.domain.name
+
+    @cached_property
+    def widths(self) -> Widths:
+        """Of its thinnest member and its narrowest gap; of plates of the member alone."""
+        if self.flat is None:
+            return measured_widths(self.domain, self.surface)
+        return Widths(self.flat.thinnest, None, self.flat.tolerance)
+
+    @property
+    def volume(self) -> float:
+        """Of the part, m3; of an extruded one that within its curves."""
+        if self.flat is None:
+            return self.surface.volume
+        return self.flat.shape.area * self.flat.domain.thickness
 
     @property
     def watertight(self) -> bool:
@@ -102,23 +103,42 @@ class SolidPart:
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
-        found = []
-        if self.grayness > GRAY:
+        one, found = self.domain, []
+        if one.grayness > GRAY:
             found.append(
-                f"arm {self.name!r}: grayness {self.grayness:.2g}: much of the material is in "
-                "cells that are neither solid nor void; the part is another design than the "
-                'optimised one; optimise with design.projection = "robust"'
+                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
+                "the material is in cells that are neither solid nor void; the part is another "
+                'design than the optimised one; optimise with design.projection = "robust"'
             )
         if self.pieces:
             pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
-            share = 100.0 * self.pieces_volume / self.design_volume
+            share = 100.0 * self.pieces_volume / one.volume
             found.append(
-                f"arm {self.name!r}: {pieces} without a joint to both interfaces "
+                f"arm {one.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
             )
         if not self.watertight:
-            found.append(f"arm {self.name!r}: its surface is not watertight; repair it")
-        return found
+            found.append(f"arm {one.name!r}: its surface is not watertight; repair it")
+        return found + self._narrow()
+
+    def _narrow(self) -> list[str]:
+        """Return what is said of members and gaps narrower than asked for, or than the filter."""
+        one = self.domain
+        found: dict[str, list[str]] = {}
+        for name, width, asked, key in (
+            ("thinnest member", self.widths.member, one.minimum_member, "design.minimum_member"),
+            ("narrowest gap", self.widths.gap, one.minimum_gap, "design.minimum_gap"),
+        ):
+            limit = f"{key}, {1e3 * asked:.3g} mm"
+            if asked == 0.0:
+                asked = one.filter_radius
+                limit = f"the filter's radius, {1e3 * asked:.3g} mm"
+            if width is not None and width < NARROW * asked:
+                found.setdefault(limit, []).append(f"its {name} is {1e3 * width:.2g} mm wide")
+        return [
+            f"arm {one.name!r}: {' and '.join(words)}, below {limit}"
+            for limit, words in found.items()
+        ]
 
     def figures(self, density: float) -> dict[str, Any]:
         """Return the entry of part.json.
@@ -126,30 +146,41 @@ class SolidPart:
         Args:
             density: of the material, kg/m3.
         """
-        volume = self.surface.volume
         return {
-            "volume": volume,
-            "mass": density * volume,
-            "design_volume": self.design_volume,
+            "volume": self.volume,
+            "mass": density * self.volume,
+            "design_volume": self.domain.volume,
             "level": self.level,
             "distance": self.distance,
             "triangles": len(self.surface.triangles),
             "watertight": self.watertight,
+            "extruded": self.flat is not None,
+            "thinnest_member": self.widths.member,
+            "narrowest_gap": self.widths.gap,
+            "widths_to": self.widths.to,
+            "filter_radius": self.domain.filter_radius,
             "pieces_left_out": self.pieces,
-            "grayness": self.grayness,
+            "grayness": self.domain.grayness,
             "warnings": self.warnings,
         }
 
 
-def make_solid_parts(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, SolidPart]:
+def make_solid_parts(
+    scene: Scene,
+    folder: Path,
+    world: MPI.Comm,
+    tool_radius: float | None = None,
+    tolerance: float | None = None,
+    arcs: bool = False,
+) -> dict[int, SolidPart]:
     """Make the parts of the solid arms that have a design of their own (collective).
-
-    Each arm is whole on one rank, so that its part is the same on any number of them.
 
     Args:
         scene: of the run.
         folder: with its design.npz.
         world: the ranks that share the arms.
+        tool_radius, tolerance, arcs: of designs that are the same over the thickness, see
+            `part.make_parts`.
 
     Returns:
         Parts by their place among the arms, on the root; none elsewhere.
@@ -157,62 +188,64 @@ def make_solid_parts(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, S
     Raises:
         InputError: no design in the folder, or no part can be made of it; on all ranks.
     """
-    from dolfinopt.mesh.arm_mesh import arm_mesh
-    from dolfinopt.mesh.budget import check_budget
-    from dolfinopt.output.design import read_smooth_design
-    from dolfinopt.parallel import partition_arms, together
+    from dolfinopt.parallel import on_root, together
 
-    check_budget(world, scene)
-    partition = partition_arms(world, scene.cell_counts, whole=True)
-    patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
+    on_root(world, check_options, folder, tool_radius, tolerance)
+    domains = read_solid_domains(scene, folder, world)
+    curved = arcs or tool_radius is not None or tolerance is not None
     with together(world):
-        meshes = {
-            k: arm_mesh(partition.comm, scene.arms[k], patterns.get(k)) for k in partition.arms
-        }
-    designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
-    with together(world):
-        mine = {k: make_solid_part(solid_domain(mesh, designs[k][0])) for k, mesh in meshes.items()}
+        for one in domains.values():
+            if curved and one.flat is None:
+                raise InputError(
+                    f"arm {one.name!r}: its design varies over the thickness, so that its part "
+                    "has no curves: leave out --tool-radius, --tolerance and --curves, or "
+                    "optimise with arms.extruded = true"
+                )
+        mine = {k: make_solid_part(one, tool_radius, tolerance, arcs) for k, one in domains.items()}
     found: dict[int, SolidPart] = {}
     for pieces in world.gather(mine, root=0) or ():
         found.update(pieces)
     return {k: found[k] for k in sorted(found)}
 
 
-def solid_domain(mesh: ArmMesh, x_phys: np.ndarray) -> SolidDomain:
-    """Return a solid arm with a design.
-
-    Args:
-        mesh: of the arm, whole on this rank.
-        x_phys: (n_cells,) physical densities.
-    """
-    from dolfinopt.mesh import compat
-
-    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
-    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
-    around = np.array(facet_corners(3, corners.shape[1]))
-    once = np.bincount(facets.ravel())[facets] == 1
-    outboard = np.setdiff1d(mesh.interface_facets, mesh.inboard_facets)
-    marks = once, np.isin(facets, mesh.inboard_facets), np.isin(facets, outboard)
-    if around.shape[1] == 4:
-        around = around[:, [0, 1, 3, 2]]
-    faces = corners[:, around]
-    return SolidDomain(mesh.name, corners, x_phys, *(faces[mark] for mark in marks))
-
-
-def make_solid_part(domain: SolidDomain) -> SolidPart:
-    """Return the part of one solid arm.
+def make_solid_part(
+    domain: SolidDomain,
+    tool_radius: float | None = None,
+    tolerance: float | None = None,
+    arcs: bool = False,
+) -> SolidPart:
+    """Return the part of one solid arm, see `make_solid_parts`.
 
     Raises:
         InputError: it does not hang together, or no level of the density keeps its volume.
     """
+    if domain.flat is None:
+        return _freeform_part(domain)
+    part = make_part(domain.flat, tool_radius, tolerance, arcs)
+    outline, t = part.outline, domain.flat.thickness
+    surface = _prism(part.shape, t, 0.5 * part.tolerance)
+    lost = t * outline.islands_area
+    far = part.shape.distance
+    return SolidPart(domain, surface, outline.level, far, outline.islands, lost, part)
+
+
+def _prism(shape: Shape, thickness: float, tolerance: float) -> Surface:
+    """Return the surface of a shape extruded to both sides of z = 0, chords within a tolerance."""
+    corners = extruded_facets(shape.polygons(tolerance), thickness).reshape(-1, 3)
+    points, which = np.unique(corners, axis=0, return_inverse=True)
+    return Surface(points - np.array([0.0, 0.0, 0.5 * thickness]), which.reshape(-1, 3))
+
+
+def _freeform_part(domain: SolidDomain) -> SolidPart:
     level, solid, pieces, lost = _at_volume(domain)
     surface, values = outside(solid)
     # Material ends within the arm where all corners of a triangle lie at the level.
     at_level = np.abs(values["density"] - level) < 1e-9
     inner = at_level[surface.triangles].all(axis=1)
-    free = at_level & (values["own"] < WHOLE)
+    free = at_level & (values["own"] < WHOLE) & (values["stays"] < HELD)
     free[surface.triangles[~inner]] = False
-    smooth = smooth_surface(surface, inner, free, domain.cell, domain.own)
+    walls = [domain.own, domain.kept]
+    smooth = smooth_surface(surface, inner, free, domain.cell, np.concatenate(walls), domain.crisp)
     found = with_volume(smooth, free, domain.volume)
     distance = float(np.linalg.norm(found.points - surface.points, axis=1).max())
     if abs(found.volume - domain.volume) > SAME_VOLUME * domain.volume or (
@@ -224,28 +257,75 @@ def make_solid_part(domain: SolidDomain) -> SolidPart:
             f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
             'longer, or with design.projection = "robust"'
         )
-    gray, cell = domain.grayness, domain.cell
-    return SolidPart(domain.name, found, level, domain.volume, distance, pieces, lost, gray, cell)
+    return SolidPart(domain, found, level, distance, pieces, lost)
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """The density of a solid arm at nodes.
+
+    Attributes:
+        points: (n, 3) m.
+        nodes: (m, 4 or 8) of cells.
+        values: (n,) with the highest one at interfaces: material along them that the design leaves
+            void, since interfaces are rigid.
+        marks: (n,) 1.0 of nodes on `SolidDomain`'s faces and in what stays solid, by name.
+    """
+
+    points: np.ndarray
+    nodes: np.ndarray
+    values: np.ndarray
+    marks: dict[str, np.ndarray]
+
+    def above(self, level: float) -> Any:
+        """Return the grid of what is above a level, see `cut`; what stays solid is."""
+        stays = self.marks["stays"] > 0.0
+        values = np.where(stays, np.maximum(self.values, level + APART), self.values)
+        return cut(self.points, self.nodes, values, level, self.marks)
+
+
+def _field(domain: SolidDomain) -> _Field:
+    corners, density = domain.corners, domain.field
+    faces = {name: getattr(domain, name) for name in MARKS}
+    is_box = domain.is_box
+    if corners.shape[1] == 8 and (len(corners) <= FEW or not is_box):
+        points, nodes, values = halved(corners, density)
+        cells = eighths(nodes) if is_box else forty_eighths(nodes)
+        faces = {name: middles(one) for name, one in faces.items()}
+    else:
+        points, nodes, values = nodal_densities(corners, density)
+        cells = nodes
+    marks = {name: _among(points, one) for name, one in faces.items()}
+    marks["stays"] = np.zeros(len(points))
+    marks["stays"][nodes[domain.passive]] = 1.0
+    values[(marks["inboard"] > 0.0) | (marks["outboard"] > 0.0)] = values.max()
+    return _Field(points, cells, values, marks)
 
 
 def _at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
     """Return the level that keeps the volume, the grid above it that joins both interfaces, the
     number of pieces that do not, and their volume, m3."""
-    points, nodes, values = nodal_densities(domain.corners, domain.x_phys)
-    marks = {name: _among(points, getattr(domain, name)) for name in ("own", "inboard", "outboard")}
-    target = domain.volume
+    field, target = _field(domain), domain.volume
     best: tuple[float, float, Any, Any] | None = None
-    above, below = 0.0, BELOW * float(values.max())  # levels that enclose too much and too little
+    # Levels that enclose too much and too little, and by how much; halves where it stays the same.
+    low, high = 0.0, BELOW * float(field.values.max())
+    more, less, last = float(domain.sizes.sum()) - target, -target, 0.0
     for _ in range(HALVINGS):
-        level = 0.5 * (above + below)
-        whole = cut(points, nodes, values, level, marks)
+        level = high - (high - low) * min(max(less / (less - more), 0.1), 0.9)
+        whole = field.above(level)
         joined = _joined(whole)
-        volume = 0.0 if joined is None else outside(joined)[0].volume
-        if joined is not None and (best is None or abs(volume - target) < best[0]):
-            best = abs(volume - target), level, whole, joined
-        if abs(volume - target) <= NEAR * target:
+        off = (0.0 if joined is None else outside(joined)[0].volume) - target
+        if joined is not None and (best is None or abs(off) < best[0]):
+            best = abs(off), level, whole, joined
+        if abs(off) <= NEAR * target:
             break
-        above, below = (level, below) if volume > target else (above, level)
+        if off > 0.0:
+            low, more = level, off
+            less *= 0.5 if last > 0.0 else 1.0
+        else:
+            high, less = level, off
+            more *= 0.5 if last < 0.0 else 1.0
+        last = off
     if best is None:
         raise InputError(
             f"arm {domain.name!r}: its design does not hang together: no material joins both "

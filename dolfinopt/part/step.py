@@ -33,8 +33,8 @@ def face_text(shape: Shape, name: str) -> str:
     return file.text(name, f"{name}_face.step", "MANIFOLD_SURFACE_SHAPE_REPRESENTATION", model)
 
 
-def solid_text(shape: Shape, thickness: float, name: str) -> str:
-    """Return a STEP file with one solid from z = 0 to a thickness, m, as product `name`.
+def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -> str:
+    """Return a STEP file with one solid from z = `bottom` over a thickness, m, as product `name`.
 
     Splines are cut at their knots: Open CASCADE, and what is built on it, integrates over an edge
     by one rule of Gauss. It is exact for a polynomial, and off by up to some per cent for a spline
@@ -42,14 +42,14 @@ def solid_text(shape: Shape, thickness: float, name: str) -> str:
     """
     file = _File()
     loops = [_Loop(file, _cut(loop)) for loop in shape.loops]
-    height = MM * thickness
-    bottom = [loop.edges(0.0) for loop in loops]
-    top = [loop.edges(height) for loop in loops]
+    z0, z1 = MM * bottom, MM * (bottom + thickness)
+    below = [loop.edges(z0) for loop in loops]
+    above = [loop.edges(z1) for loop in loops]
     faces = [
-        _flat_face(file, bottom, 0.0, upwards=False),
-        _flat_face(file, top, height, upwards=True),
+        _flat_face(file, below, z0, upwards=False),
+        _flat_face(file, above, z1, upwards=True),
     ]
-    for loop, low, high in zip(loops, bottom, top, strict=True):
+    for loop, low, high in zip(loops, below, above, strict=True):
         faces += loop.walls(low, high)
     shell = file.add(f"CLOSED_SHELL('',({','.join(faces)}))")
     solid = file.add(f"MANIFOLD_SOLID_BREP({_string(name)},{shell})")

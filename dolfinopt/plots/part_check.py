@@ -25,7 +25,13 @@ if TYPE_CHECKING:
 def draw_check(folder: Path, check: Check, scene: Scene) -> None:
     """Draw deviation.png and stress.png of parts into a folder."""
     save(deviation_figure(check, scene), folder / "deviation.png")
-    draw_stress(folder / "stress.png", designed(check.views), f"{scene.name}: stress of the parts")
+    title = f"{scene.name}: stress of the parts"
+    if scene.is_spatial:
+        from dolfinopt.plots.solid_stress import solid_stress_figure
+
+        save(solid_stress_figure(designed(check.views), title), folder / "stress.png")
+    else:
+        draw_stress(folder / "stress.png", designed(check.views), title)
 
 
 def deviation_figure(check: Check, scene: Scene) -> Figure:
@@ -63,4 +69,4 @@ def deviation_figure(check: Check, scene: Scene) -> Figure:
 
 
 def _distance(trajectory: Trajectory) -> np.ndarray:
-    return 1e3 * np.hypot(*trajectory.deviation.T)
+    return 1e3 * np.asarray(np.linalg.norm(trajectory.deviation, axis=1))

@@ -32,6 +32,7 @@ WIDTH, HEIGHT = 12.0, 16.0  # inches, the most that the links take
 COLUMN = 6.0  # inches, of the links side by side
 SIDE, HEAD, LABEL, RULER = 0.55, 0.6, 0.4, 0.55  # inches: margins, title, above and below a link
 MILLI = 1e3
+Box = tuple[np.ndarray, np.ndarray]
 
 
 def camera_of_links() -> Camera:
@@ -93,13 +94,20 @@ def draw_link(
     axes: Axes, view: ArmView, scale: float, draw: Callable[[Studio, Surface], None]
 ) -> None:
     """Draw a link's material by `draw`, the box around it and lengths; `scale` in px per m."""
+    draw_boxed(axes, _bounds(view), scale, lambda studio: draw(studio, material(view)))
+
+
+def draw_boxed(
+    axes: Axes, box: Box, scale: float, draw: Callable[[Studio], None], edges: bool = True
+) -> None:
+    """Draw what is in a box by `draw`, its edges if wanted, and lengths; `scale` in px per m."""
     camera = camera_of_links()
-    low, high = _bounds(view)
-    studio = link_studio(view, camera, scale)
-    draw(studio, material(view))
-    studio.line(box_lines(low, high), GREY)
+    studio = _box_studio(box, camera, scale)
+    draw(studio)
+    if edges:
+        studio.line(box_lines(*box), GREY)
     show(axes, studio.close(), studio.low, studio.high)
-    _draw_ruler(axes, camera, low, high, scale)
+    _draw_ruler(axes, camera, *box, scale)
 
 
 def caption(view: ArmView, mass: float | None) -> str:
@@ -128,8 +136,15 @@ def link_panels(
         title: above them.
         foot: room below them, inches.
     """
+    return box_panels([_bounds(view) for view in views], title, foot)
+
+
+def box_panels(
+    boxes: Sequence[Box], title: str, foot: float = 0.0
+) -> tuple[Figure, list[Axes], float]:
+    """Return what `link_panels` does, of boxes: lowest and highest corner (3,), m."""
     camera = camera_of_links()
-    spans = np.array([np.ptp(camera.plane(box_corners(*_bounds(v))), axis=0) for v in views])
+    spans = np.array([np.ptp(camera.plane(box_corners(*box)), axis=0) for box in boxes])
     inches = min((WIDTH - 2 * SIDE) / spans[:, 0].max(), HEIGHT / spans[:, 1].sum())
     width = max(7.0, spans[:, 0].max() * inches + 2 * SIDE)
     height = HEAD + foot + float((spans[:, 1] * inches + LABEL + RULER).sum()) + 0.1
@@ -146,13 +161,17 @@ def link_panels(
     return figure, panels, inches * DPI
 
 
-def _bounds(view: ArmView) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(view: ArmView) -> Box:
     return view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
 
 
 def link_studio(view: ArmView, camera: Camera, scale: float) -> Studio:
     """Return the studio for one link."""
-    seen = camera.plane(box_corners(*_bounds(view)))
+    return _box_studio(_bounds(view), camera, scale)
+
+
+def _box_studio(box: Box, camera: Camera, scale: float) -> Studio:
+    seen = camera.plane(box_corners(*box))
     return Studio(camera, seen.min(axis=0), seen.max(axis=0), scale)
 
 

@@ -1,70 +1,63 @@
-"""Picture of the parts of solid arms, drawn by PyVista off-screen."""
+"""Picture of the parts of solid arms."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.disk import write_atomically
-from dolfinopt.plots.style import PathLike
+from dolfinopt.plots.solid_design import MILLI, box_panels, draw_boxed
+from dolfinopt.plots.solids import STEEL, Studio
+from dolfinopt.plots.style import PathLike, save
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from dolfinopt.part.isosurface import Surface
     from dolfinopt.part.solid_part import SolidPart
 
-WIDTH, LEAST, MOST = 1400, 260, 700  # px, of the page; of an arm's row
-SPARE = 1.08  # of the width, over the longest part
-WORDS = 60  # px, of a row, for the caption
-FACE, CREASE = "#b8c4cc", 35.0  # degrees, between faces that meet at an edge
-VIEW = np.array([-0.45, 0.55, 1.0])  # towards the eye: inboard, above, beside
+
+def draw_solid_parts(
+    path: PathLike, parts: Sequence[SolidPart], title: str, masses: Sequence[float]
+) -> Path:
+    """Draw the figure of `solid_parts_figure` (PNG); return the path."""
+    return save(solid_parts_figure(parts, title, masses), path)
 
 
-def draw_solid_parts(path: PathLike, parts: Sequence[SolidPart], title: str) -> Path:
-    """Draw parts below each other, to one scale (PNG); return the path."""
-    import pyvista
-    from PIL import Image
+def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[float]) -> Figure:
+    """Draw parts below each other, to one scale.
 
-    towards = VIEW / np.linalg.norm(VIEW)
-    across = np.cross([0.0, 1.0, 0.0], towards)
-    across /= np.linalg.norm(across)
-    upwards = np.cross(towards, across)
-    spans = np.array(
-        [np.ptp(one.surface.points @ [*zip(across, upwards)], axis=0) for one in parts]
-    )
-    pixel = SPARE * spans[:, 0].max() / WIDTH  # m
-    row = int(np.clip(SPARE * spans[:, 1].max() / pixel + 2 * WORDS, LEAST, MOST))
-    plotter = cast(
-        Any,
-        pyvista.Plotter(
-            off_screen=True,
-            shape=(len(parts), 1),
-            border=False,
-            window_size=[WIDTH, row * len(parts)],
-        ),
-    )
-    try:
-        plotter.set_background("white")
-        for k, one in enumerate(parts):
-            plotter.subplot(k, 0)
-            mesh = pyvista.PolyData.from_regular_faces(one.surface.points, one.surface.triangles)
-            plotter.add_mesh(
-                mesh, color=FACE, smooth_shading=True, split_sharp_edges=True, feature_angle=CREASE
-            )
-            head = f"{title}: " if k == 0 else ""
-            words = f"{head}{one.name}, {1e6 * one.surface.volume:.4g} cm3"
-            plotter.add_text(words, position="upper_left", font_size=12, color="black")
-            middle = 0.5 * (one.surface.points.min(axis=0) + one.surface.points.max(axis=0))
-            plotter.camera_position = [
-                middle + 10.0 * spans.max() * towards, middle, [0.0, 1.0, 0.0]
-            ]  # fmt: skip
-            plotter.camera.parallel_projection = True
-            plotter.camera.parallel_scale = 0.5 * row * pixel
-            plotter.reset_camera_clipping_range()
-        image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True)))
-    finally:
-        plotter.close()
-    path = Path(path)
-    write_atomically(path, lambda stream: image.save(stream, format="PNG"))
-    return path
+    Args:
+        parts: of solid arms.
+        title: above the picture.
+        masses: of the parts, kg.
+    """
+    boxes = [(one.surface.points.min(axis=0), one.surface.points.max(axis=0)) for one in parts]
+    figure, panels, scale = box_panels(boxes, title)
+    for one, box, axes, mass in zip(parts, boxes, panels, masses, strict=True):
+        draw_boxed(axes, box, scale, partial(_draw, one.surface), edges=False)
+        axes.set_title(caption(one, mass), loc="left", fontsize=11, parse_math=False)
+    return figure
+
+
+def _draw(surface: Surface, studio: Studio) -> None:
+    studio.solid(surface, STEEL)
+
+
+def caption(part: SolidPart, mass: float) -> str:
+    """Return what stands above a part: its size, volume, mass and narrowest places."""
+    size = MILLI * np.ptp(part.surface.points, axis=0)
+    words = [
+        f"{part.name}   {size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} mm",
+        f"volume {1e6 * part.volume:.4g} cm3, mass {mass:.4g} kg",
+    ]
+    for name, width in (
+        ("thinnest member", part.widths.member),
+        ("narrowest gap", part.widths.gap),
+    ):
+        if width is not None:
+            words.append(f"{name} {MILLI * width:.2g} mm")
+    return ", ".join(words)

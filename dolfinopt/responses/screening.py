@@ -53,7 +53,7 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
 
     Args:
         comm: ranks that share the points.
-        A: (3, n_points, m) of this rank's points, there may be none.
+        A: (3, n_points, m) of this rank's points, in space (5, ...); there may be none.
         a: (n, m) the same on all ranks.
         coarse: ascending instants to begin with, the first and the last one among them.
     """
@@ -213,8 +213,8 @@ def _squares(A: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return |A_e a_n|^2 (n_points, n)."""
     parts = A @ a.T
     np.multiply(parts, parts, out=parts)
-    parts[0] += parts[1]
-    parts[0] += parts[2]
+    for part in parts[1:]:
+        parts[0] += part
     return parts[0]
 
 

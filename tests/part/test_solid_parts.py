@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import zipfile
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,11 +16,16 @@ from runs import ROOT, run, shell
 from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
 
 import dolfinopt as do
+from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.part.isosurface import cut, nodal_densities, outside
+from dolfinopt.part.isosurface import cut, eighths, halved, nodal_densities, outside
 from dolfinopt.part.solid import MM, triangle_bytes
-from dolfinopt.part.solid_part import make_solid_part, solid_domain
+from dolfinopt.part.solid_domain import domain_in_scene, solid_domain
+from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
+from dolfinopt.part.solid_part import make_solid_part
+from dolfinopt.part.solid_widths import narrowest, rasterised
+from dolfinopt.part.step import solid_text
 from dolfinopt.part.three_mf import CORE, three_mf_bytes
 
 trimesh = pytest.importorskip("trimesh")
@@ -61,8 +68,14 @@ def read_three_mf(data):
 @pytest.fixture(scope="module")
 def domain_with():
     """A function that returns the domain of a density given by x, y, z, m."""
-    mesh = arm_mesh(MPI.COMM_SELF, solid_scene(cells=CELLS).arms[0])
-    return lambda density: solid_domain(mesh, density(*mesh.centroid.T).astype(float))
+    scene = solid_scene(cells=CELLS)
+    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[0])
+
+    def make(density, mesh=mesh, plate=False):
+        x_phys = mesh.keep(density(*mesh.centroid.T).astype(float))
+        return domain_in_scene(scene, 0, mesh, x_phys) if plate else solid_domain(mesh, x_phys)
+
+    return make
 
 
 @pytest.mark.parametrize("density", [windows, hollow, islands])
@@ -70,7 +83,7 @@ def test_part_of_a_solid(domain_with, density):
     domain = domain_with(density)
     part = make_solid_part(domain)
     assert part.watertight
-    assert part.surface.volume == pytest.approx(domain.volume, rel=1e-4)
+    assert part.volume == pytest.approx(domain.volume, rel=1e-4)
     assert 0.01 * domain.cell < part.distance <= 0.5 * domain.cell
     stl = trimesh.load_mesh(
         io.BytesIO(triangle_bytes(MM * part.surface.corners, "part, mm")), "stl"
@@ -79,25 +92,99 @@ def test_part_of_a_solid(domain_with, density):
         assert found.is_watertight and found.is_winding_consistent
         assert found.volume == pytest.approx(1e9 * domain.volume, rel=1e-4)
         assert found.bounds == pytest.approx(MM * np.array([LOW, HIGH]), abs=MM * size)
-    assert (part.surface.points >= LOW - 1e-12).all() and (
-        part.surface.points <= HIGH + 1e-12
-    ).all()
-    # Points on the arm's own faces are where the isosurface has them: in their planes to 1e-9 m.
-    points, nodes, values = nodal_densities(domain.corners, domain.x_phys)
-    before, _ = outside(cut(points, nodes, values, part.level))
-    off = [
-        np.minimum(np.abs(p - LOW), np.abs(p - HIGH)) for p in (before.points, part.surface.points)
-    ]
-    near = [(one.min(axis=1) < 1e-3 * domain.cell) for one in off]
-    assert off[1][near[1]].min(axis=1).max() < 1e-9
-    if density is not islands:
-        assert part.pieces == 0 and np.array_equal(*near)
-        assert np.array_equal(before.points[near[0]], part.surface.points[near[0]])
-    for side in (0.0, LENGTH):  # all of both interfaces, where the design has them
-        flat = (np.abs(part.surface.corners[..., 0] - side) < 1e-9).all(axis=1)
-        a, b, c = part.surface.corners[flat].swapaxes(0, 1)
+    points = part.surface.points
+    assert (points >= LOW - 1e-12).all() and (points <= HIGH + 1e-12).all()
+    # What lies on the arm's own faces does so to 1e-9 m.
+    off = np.minimum(np.abs(points - LOW), np.abs(points - HIGH)).min(axis=1)
+    assert off[off < 1e-3 * domain.cell].max() < 1e-9
+    for side in (0.0, LENGTH):  # all of both interfaces
+        assert area_in(part.surface, 0, side) == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
+
+
+def area_in(surface, axis, place):
+    """Return the area of the triangles in a plane across an axis, m2."""
+    flat = (np.abs(surface.corners[..., axis] - place) < 1e-9).all(axis=1)
+    a, b, c = surface.corners[flat].swapaxes(0, 1)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
+@pytest.mark.parametrize("plate", [False, True])
+def test_mesh_of_a_part(domain_with, plate):
+    """Tetrahedra of the part's volume, its interfaces all of the arm's."""
+    part = make_solid_part(domain_with(windows, plate=plate))
+    assert (part.flat is not None) == plate
+    mesh = solid_mesh(part, 1.6 * mesh_size(part))
+    assert mesh.volumes.min() > 0.0 and mesh.quality.min() > 0.03 and mesh.quality.mean() > 0.6
+    assert mesh.volumes.sum() == pytest.approx(part.volume, rel=1e-6)
+    for facets, x in ((mesh.inboard, 0.0), (mesh.outboard, LENGTH)):
+        corners = mesh.points[facets]
+        assert np.abs(corners[..., 0] - x).max() < 1e-9
+        a, b, c = corners.swapaxes(0, 1)
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
         assert area == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
+    boundary = trimesh.Trimesh(mesh.points, mesh.boundary, process=False)
+    assert boundary.is_watertight and boundary.volume == pytest.approx(part.volume, rel=1e-6)
+
+
+def test_extruded_design_has_the_curves_of_a_plate(domain_with):
+    """Its surface is flat but for the curves, from one side of the link to the other."""
+    part = make_solid_part(domain_with(windows, plate=True))
+    flat = part.flat
+    assert part.volume == pytest.approx(flat.shape.area * THICKNESS, rel=1e-12)
+    assert len(flat.shape.loops) == 6  # five windows
+    assert part.watertight
+    for z in (-0.5 * THICKNESS, 0.5 * THICKNESS):
+        assert area_in(part.surface, 2, z) == pytest.approx(flat.shape.area, rel=1e-3)
+    bottom = solid_text(flat.shape, THICKNESS, "a", -0.5 * THICKNESS)
+    heights = {float(z) for z in re.findall(r"CARTESIAN_POINT\('',\([^,]+,[^,]+,([^)]+)\)", bottom)}
+    assert heights == {-10.0, 0.0, 10.0}  # mm; the file's origin
+
+
+def test_what_stays_solid_or_void_is_kept(domain_with):
+    """A block that stays, and a hole through it that stays void."""
+    mesh = arm_mesh(MPI.COMM_SELF, solid_scene(cells=CELLS).arms[0])
+    x, y, _ = mesh.centroid.T
+    block = (np.abs(x - 0.25) < 0.0375) & (np.abs(y) < 0.0134)
+    hole = (np.abs(x - 0.25) < 0.0125) & (np.abs(y) < 0.0067)
+    mesh = replace(mesh, passive=mesh.passive | (block & ~hole), void=hole)
+    surface = make_solid_part(domain_with(lambda x, y, z: np.abs(y) > 0.0131, mesh)).surface
+    for axis, place, across in ((0, 0.2375, HEIGHT / 3.0), (1, HEIGHT / 6.0, 0.025)):
+        assert area_in(surface, axis, place) == pytest.approx(across * THICKNESS, rel=1e-9)
+    voxel = 1e-3
+    solid = rasterised(surface, voxel, 0)
+    assert solid.shape == (500, 40, 20)
+    x, y = (0.5 + np.arange(n) - n / 2 for n in (500, 40))  # mm, from the middle
+    wide, high = np.abs(x) < 37.0, np.abs(y) < 13.0
+    inside = wide[:, None] & high & ~((np.abs(x) < 13.0)[:, None] & (np.abs(y) < 7.0))
+    assert solid[inside].all()
+    assert not solid[(np.abs(x) < 12.0)[:, None] & (np.abs(y) < 6.0)].any()
+
+
+def test_narrowest_place_of_voxels():
+    """A plate of 6, a bar of 4 and a window of 10 voxels; edges and corners are no members."""
+    inside = np.zeros((60, 30, 20), dtype=bool)
+    inside[2:-2, 2:-2, 2:-2] = True
+    h = 0.5
+    assert narrowest(inside, h) is None
+    inside[20:40, 8:-2, 2:-2] = False  # a plate of 6
+    assert narrowest(inside, h) == pytest.approx(6 * h, abs=h)
+    inside[20:40, 2:8, 6:-2] = False  # a bar of 6 x 4
+    assert narrowest(inside, h) == pytest.approx(4 * h, abs=h)
+    void = np.ones((70, 40, 30), dtype=bool)
+    void[5:-5, 5:-5, 5:-5] = False
+    void[30:40, :, 10:-10] = True  # a hole of 10 x 10
+    assert narrowest(void, h) == pytest.approx(10 * h, abs=h)
+    assert narrowest(void, h, 6 * h) is None
+
+
+def test_narrow_members_are_told(domain_with):
+    domain = replace(domain_with(windows), filter_radius=0.012)
+    part = make_solid_part(domain)
+    assert part.widths.member == pytest.approx(HEIGHT / 6.0, abs=2.0 * part.widths.to)
+    assert any("thinnest member" in one and "filter's radius, 12 mm" in one
+               for one in part.warnings)  # fmt: skip
+    asked = replace(part, domain=replace(domain, minimum_member=0.004))
+    assert not any("thinnest member" in one for one in asked.warnings)
 
 
 def test_three_mf_is_read_by_others(domain_with):
@@ -122,10 +209,23 @@ def test_smoothing_takes_stairs_away(domain_with):
     """A slanted crisp end of a cavity: less area than the isosurface, at the same volume."""
     domain = domain_with(lambda x, y, z: 1.0 * (hollow(x, y, z) > 0.5))
     part = make_solid_part(domain)
-    before = outside(cut(*nodal_densities(domain.corners, domain.x_phys), part.level))[0]
-    assert trimesh.Trimesh(*(part.surface.points, part.surface.triangles)).area < (
-        0.995 * trimesh.Trimesh(before.points, before.triangles).area
+    points, nodes, values = halved(domain.corners, domain.field)
+    before = outside(cut(points, eighths(nodes), values, part.level))[0]
+    after, stairs = (
+        trimesh.Trimesh(one.points, one.triangles).area for one in (part.surface, before)
     )
+    assert after < 0.995 * stairs
+
+
+def test_member_of_one_cell_keeps_its_size(domain_with):
+    """A strip of one cell along an edge of the box, between its ends: at one half all of it but
+    what is rounded off its inner edge."""
+    strip = domain_with(lambda x, y, z: 1.0 * ((y > 0.0134) & (z > 0.005)))
+    points, nodes, values = halved(strip.corners, strip.field)
+    surface, _ = outside(cut(points, eighths(nodes), values, 0.5))
+    assert surface.volume == pytest.approx(strip.volume, rel=0.03)
+    coarse, _ = outside(cut(*nodal_densities(strip.corners, strip.field), 0.5))
+    assert coarse.volume < 0.9 * strip.volume
 
 
 @pytest.mark.parametrize(
@@ -140,51 +240,103 @@ def test_no_part_can_be_made(domain_with, density, words):
         make_solid_part(domain_with(density))
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """What `dolfinopt part` reads of a run of two solid links."""
-    path = tmp_path_factory.mktemp("solids") / "run"
-    changes = [f"arms.{name}.cells=[20,4,2]" for name in ("link1", "link2")]
-    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes)
+def finished(path, densities, *changes):
+    """Write what `dolfinopt part` reads of a run of the machine in space; return the folder."""
+    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", list(changes))
     arrays = {}
-    for arm in scene.arms[1:]:
+    for arm, density in zip(scene.arms[1:], densities):
         mesh = arm_mesh(MPI.COMM_SELF, arm)
         arrays[f"{arm.name}/centroid"] = mesh.centroid
-        arrays[f"{arm.name}/density"] = windows(*mesh.centroid.T)
+        arrays[f"{arm.name}/density"] = density(*mesh.centroid.T).astype(float)
     path.mkdir()
     np.savez(path / "design.npz", **arrays)
     (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
     return path
 
 
-def test_two_ranks_write_the_same_solids(finished, tmp_path, capfd):
-    run("part", finished, "--out", tmp_path / "one")
+def test_two_ranks_write_the_same_solids(tmp_path, capfd):
+    """A free-form link and a plate."""
+    cells = [f"arms.link{k}.cells=[16,4,4]" for k in (1, 2)]
+    folder = finished(tmp_path / "run", (hollow, windows), *cells)
+    options = "--no-check", "--no-plots"
+    run("part", folder, "--out", tmp_path / "one", *options)
     told = capfd.readouterr().out
-    assert "no STEP of solids" in told and "column: no part" in told
-    done = shell("part", finished, "--out", tmp_path / "two", "--no-plots", ranks=2)
+    assert "no STEP of link1:" in told and "column: no part" in told
+    done = shell("part", folder, "--out", tmp_path / "two", *options, ranks=2)
     assert done.returncode == 0, done.stderr
     here, there = (
         {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
         for name in ("one", "two")
     )
     kinds = [f"link{k}.{kind}" for k in (1, 2) for kind in ("3mf", "msh", "stl")]
-    assert sorted(there) == sorted([*kinds, "part.json", "part.toml"])
-    assert here.keys() - there.keys() == {"part.png"}
+    assert sorted(there) == sorted([*kinds, "link2.step", "link2.dxf", "part.json", "part.toml"])
     assert [name for name in there if here[name] != there[name]] == []
     rows = json.loads(here["part.json"])["arms"]
     for row in rows.values():
         assert row["volume"] == pytest.approx(row["design_volume"], rel=1e-4)
+        assert row["mesh"]["volume"] == pytest.approx(row["volume"], rel=1e-6)
         assert row["watertight"] and row["pieces_left_out"] == 0
-    # The machine with the parts: solid, of their mass but for the facets of its mesh.
-    scene = do.load_scene(tmp_path / "one" / "part.toml")
-    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[1])
-    assert mesh.area.sum() == pytest.approx(rows["link1"]["volume"], rel=0.01)
-    assert len(mesh.inboard_facets) and len(mesh.outboard_facets)
-    assert scene.design.volume_fraction == 1.0
 
 
-@pytest.mark.parametrize("option", ["--polish=2", "--tolerance=1e-4", "--curves=arcs"])
-def test_options_of_outlines_are_refused(finished, option):
-    done = shell("part", finished, option)
-    assert done.returncode == 2 and option.split("=")[0] in done.stderr
-    assert not (finished / "part").exists()
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory):
+    """The folder of a run in which one link has a part and the other is rigid; its part."""
+    folder = finished(
+        tmp_path_factory.mktemp("solids") / "run",
+        (windows,),
+        "arms.link1.cells=[16,4,2]",
+        "arms.link2.rigid=true",
+        "simulation.sample=0.01",
+        "constraints.deviation=0.001",
+    )
+    run("part", folder)
+    return folder, json.loads((folder / "part" / "part.json").read_text())
+
+
+def test_table_of_densities_and_parts(checked):
+    table = checked[1]["table"]
+    assert {"mass", "first_frequency_link1", "compliance", "deviation", "settling", "stress",
+            "drive_peak_yaw", "drive_peak_elbow"} <= table.keys()  # fmt: skip
+    assert "first_frequency_link2" not in table
+    for name in ("mass", "compliance", "deviation", "first_frequency_link1"):
+        row = table[name]
+        assert row["part"] == pytest.approx(row["density"], rel=0.05), name
+    check = checked[1]["check"]
+    assert check["converged"] and check["tetrahedra"]["link1"] > 500
+    assert len(check["stress"]["part"]["place"]) == 3
+    limit = check["limits"]["deviation"]
+    assert not limit["met"] and limit["value"] == table["deviation"]["part"]
+
+
+def test_scene_of_parts_is_the_machine_of_the_table(checked, tmp_path):
+    folder, figures = checked
+    scene = do.load_scene(folder / "part" / "part.toml")
+    found = do.Model(scene, comm=MPI.COMM_SELF).simulate().evaluation
+    for value, name in ((found.compliance, "compliance"), (found.max_deviation, "deviation")):
+        assert value == pytest.approx(figures["table"][name]["part"], rel=1e-6)
+
+
+def test_pictures_of_parts(checked):
+    for name in ("part.png", "deviation.png", "stress.png"):
+        assert (checked[0] / "part" / name).stat().st_size > 5000
+
+
+def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
+    folder, figures = checked
+    model = do.Model(scene_of(folder), comm=MPI.COMM_SELF)
+    design = {"link1": windows(*model.centroids["link1"].T)}
+    parts = model.make_parts(design, tmp_path / "parts")
+    assert parts["link1"].volume == pytest.approx(figures["arms"]["link1"]["volume"], rel=1e-9)
+    assert (tmp_path / "parts" / "link1.step").exists()
+    told = {}
+    monkeypatch.setattr("dolfinopt.part.solid_check.check_solid_parts",
+                        lambda *given: told.update(given=given) or "check")  # fmt: skip
+    assert model.check_parts(design) == "check" and told["given"][2].keys() == {1}
+
+
+def test_options_of_outlines_are_refused(tmp_path):
+    folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
+    for option, words in (("--polish=2", "--polish"), ("--curves=arcs", "varies over the thick")):
+        with pytest.raises(InputError, match=words):
+            run("part", folder, option)
+    assert not (folder / "part").exists()
