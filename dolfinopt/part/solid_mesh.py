@@ -18,7 +18,8 @@ COARSER = 1.6  # sides of the cells of the mesh with which the scene's is compar
 # What is tried until a mesh is valid: angles, degrees, from which on there are edges between faces,
 # and sides, of those wanted.
 TRIES = ((40.0, 1.0), (60.0, 1.0), (80.0, 1.0), (40.0, 0.75), (60.0, 0.75), (40.0, 0.5))
-MOST = 60_000  # cells of a part, about
+MOST = 40_000  # cells of a part, about
+ACROSS = 3.0  # cells over the smaller of a part's height and thickness, at least
 IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
 NEAR = 1e-6  # of a cell: distance of points from the arm's faces up to which they lie on them
 LEAST = 1e-3  # shape of the worst cell, of a valid mesh
@@ -31,7 +32,7 @@ class SolidMeshes:
 
     Attributes:
         coarse: to tell by how much figures depend on the mesh.
-        fine: those of the parts' scene, cells as long as the design's.
+        fine: those of the parts' scene, cells about as large as the design's.
     """
 
     coarse: Mapping[int, Tetrahedra]
@@ -51,10 +52,15 @@ def mesh_solid_parts(parts: Mapping[int, SolidPart], coarse: bool = True) -> Sol
 
 
 def mesh_size(part: SolidPart) -> float:
-    """Return the wanted side of a part's cells, m: a cell of the design, or as many as there may
-    be."""
-    least = (IN_CUBE * part.surface.volume / MOST) ** (1.0 / 3.0)
-    return float(max(part.domain.cell, least))
+    """Return the wanted side of a part's cells, m: that of a cube as large as the design's cells.
+
+    At most a third of the part's height and thickness, for it may twist; at least so much that
+    there are no more than `MOST`.
+    """
+    cube = float(np.median(part.domain.sizes)) ** (1.0 / 3.0)
+    across = float(np.ptp(part.surface.points, axis=0)[1:].min())
+    least = (IN_CUBE * part.volume / MOST) ** (1.0 / 3.0)
+    return float(max(min(cube, across / ACROSS), least))
 
 
 def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
@@ -107,9 +113,9 @@ def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
 
     cell = flat.domain.cell
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        face = body_mesh(gmsh, flat.shape, cell, max(size / cell, 1.0))
+        face = body_mesh(gmsh, flat.shape, cell, size / part.domain.cell)
     thickness = flat.domain.thickness
-    layers = max(1, round(thickness / (1.5 * size)))
+    layers = max(1, round(thickness / size))
     count = len(face.points)
     heights = np.linspace(-0.5 * thickness, 0.5 * thickness, layers + 1)
     points = np.concatenate([np.column_stack([face.points, np.full(count, z)]) for z in heights])
