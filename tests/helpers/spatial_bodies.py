@@ -262,6 +262,7 @@ def posed(body: ShapeIntegrals) -> ShapeIntegrals:
         outboard_point=np.append(body.outboard_point, 0.0),
         K0=K0,
         K0_outboard=K0_outboard,
+        further_points=np.zeros((0, 3)),
     )
 
 
