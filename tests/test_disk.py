@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import overrides, run
 
 from dolfinopt import disk, locks
 from dolfinopt.data import paper_scene
@@ -18,6 +19,7 @@ from dolfinopt.disk import append_text, make_folder, write_arrays, write_atomica
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.locks import has_locks, try_lock
 from dolfinopt.output import checkpoint
+from dolfinopt.parallel import abort_together
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study.cases import Case
 from dolfinopt.study.store import run_cases
@@ -93,38 +95,29 @@ def test_every_step_of_writing(step, tmp_path, monkeypatch):
     assert path.read_text() == "before\n" and len(list(tmp_path.iterdir())) == 1
 
 
-FULL_DISK = """
-import os, sys
-from dolfinopt import disk
-sync, calls = os.fsync, [0]
-def fsync(number):
-    calls[0] += 1
-    if calls[0] > {after}:
-        raise OSError({errno}, os.strerror({errno}))
-    sync(number)
-disk.os.fsync = fsync
-sys.argv = {arguments!r}
-from dolfinopt.cli import main
-main()
-"""
-
-
 @pytest.mark.serial
 @pytest.mark.parametrize("after", [0, 2, 3, 5])
-def test_a_full_disk_ends_a_run_in_one_line(after, tmp_path):
+def test_a_full_disk_ends_a_run_in_one_line(after, tmp_path, monkeypatch, capsys):
     """Whichever file does not fit: status 1, no temporary file, and a checkpoint one can go on."""
-    arguments = ["dolfinopt", "optimize", str(paper_scene()), "--out", str(tmp_path), "--no-plots"]
-    for text in COARSE:
-        arguments += ["--set", text]
-    script = FULL_DISK.format(after=after, errno=errno.ENOSPC, arguments=arguments)
-    run = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120
-    )
-    assert run.returncode == 1
-    lines = [one for one in run.stderr.splitlines() if one.startswith("dolfinopt: ")]
+    sync, calls = os.fsync, []
+
+    def fsync(number):
+        calls.append(number)
+        if len(calls) > after:
+            full()
+        sync(number)
+
+    words = ["optimize", paper_scene(), *overrides(*COARSE), "--out", tmp_path, "--no-plots"]
+    monkeypatch.setattr(os, "fsync", fsync)
+    with pytest.raises(SystemExit) as ending, abort_together(SELF):
+        run(*words, world=SELF)
+    monkeypatch.undo()
+    assert ending.value.code == 1
+    told = capsys.readouterr().err
+    lines = [one for one in told.splitlines() if one.startswith("dolfinopt: ")]
     (line,) = [one for one in lines if not one.startswith("dolfinopt: warning: ")]
     assert "cannot be written (No space left on device); make room" in line
-    assert "Traceback" not in run.stderr
+    assert "Traceback" not in told
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
     assert not (tmp_path / "summary.json").exists()
     if after > 0:
@@ -137,12 +130,12 @@ def test_standard_output_without_room(tmp_path):
     command = [sys.executable, "-m", "dolfinopt", "simulate", str(paper_scene()), "--no-plots"]
     command += ["--out", str(tmp_path), "--set", COARSE[0], "--set", COARSE[1]]
     with open("/dev/full", "w") as nowhere:
-        run = subprocess.run(
+        done = subprocess.run(
             command, stdout=nowhere, stderr=subprocess.PIPE, text=True, timeout=120
         )
-    assert run.returncode == 1
-    assert run.stderr.splitlines()[-1] == "dolfinopt: standard output: No space left on device"
-    assert "Traceback" not in run.stderr
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == "dolfinopt: standard output: No space left on device"
+    assert "Traceback" not in done.stderr
 
 
 # -- locks -----------------------------------------------------------------------------------

@@ -241,7 +241,8 @@ VIEWED = {  # option, what the view shows by default and with the option
 def views(folder, *options):
     """Return what PETSc shows of each solver of a simulation with these options."""
     given = [f"-{p}{one[0]} ascii:{folder}/{p}.txt" for p, one in VIEWED.items()]
-    scene = [TWO_ARM, "--set", "arms.cells=[16,3]", "--out", folder / "out", "--no-plots"]
+    scene = [TWO_ARM, "--set", "arms.cells=[16,3]", "--set", "simulation.tolerance=0.1",
+             "--out", folder / "out", "--no-plots"]  # fmt: skip
     run = subprocess.run(
         [sys.executable, "-m", "dolfinopt", "simulate", *map(str, scene)],
         env=os.environ | {"PETSC_OPTIONS": " ".join([*given, *options])},

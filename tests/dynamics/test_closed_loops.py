@@ -109,6 +109,7 @@ def test_rigid_limit(kind: str) -> None:
     tree = slider_crank(0.012, (20, 3)) if kind == "slider" else four_bar((20, 3))
     tree["material"]["young_modulus"] *= 1e3
     tree["reduction"] = {"coordinates": 3}
+    tree["motion"]["horizon"] = 1.3 * tree["motion"]["duration"]
     trajectory, system = machine(simulated(tree))
     t, step = trajectory.t[10:-1], 1e-6
 
@@ -130,6 +131,7 @@ def test_closure_forces_of_rigid_loops(gravity: float) -> None:
 
     def stiff(tree: Tree) -> Trajectory:
         tree["material"]["young_modulus"] *= 1e3
+        tree["motion"]["horizon"] = 1.3 * tree["motion"]["duration"]  # a turn, and more
         trajectory, _ = machine(simulated(with_keys(tree, changes)))
         return trajectory
 
