@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from dolfinopt.bench.solid_link import MOVE, PHASES
 from dolfinopt.bench.whole import mpirun
 from dolfinopt.fem import interior
 from dolfinopt.fem.interior import ITERATIVE
+from dolfinopt.mesh.budget import free_memory, solid_bytes
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Panel
 
@@ -58,6 +60,10 @@ def _measure(plan: Plan, tell: Tell) -> dict[str, Callable[[], list[Row]]]:
     ]
     compared = QUICKLY_COMPARED if plan.quick else COMPARED
     asked += [(who, cells, 1) for cells in compared for who in ("factor", "iterative")]
+    free = free_memory()
+    if large := [one for one in asked if solid_bytes(math.prod(one[1]), one[2]) > free]:
+        tell(f"{len(large)} measurements need more memory than is free: left out")
+    asked = [one for one in asked if one not in large]
     return {
         f"{WHO[who]}, {' x '.join(map(str, cells))} cells, {_ranks(ranks)}": partial(
             in_process, plan.scene, who, cells, ranks

@@ -26,7 +26,7 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
 
     Diagrams of integrators, meshes, reductions and iterations, beside other programs; or those
     named alone: time, peers, whole, mesh, reduction, tolerance, solvers, and solid, which measures
-    solid links up to a million degrees of freedom (needs 20 GB) and runs only when it is named.
+    solid links up to a million degrees of freedom (needs 14 GB) and runs only when it is named.
 
     What is measured is kept in DIR; a call that was interrupted goes on.
     """

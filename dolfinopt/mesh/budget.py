@@ -138,6 +138,11 @@ def _left(folder: Path, limit: str, usage: str, reclaimable: str) -> float:
         return math.inf
 
 
+def solid_bytes(cells: int, ranks: int) -> float:
+    """Return the memory that a solid arm of hexahedra takes on all of its ranks."""
+    return (SHARED if ranks > 1 else 1.0) * _bytes(SOLID * cells) + ranks * PROCESS
+
+
 def _bytes(cells: float) -> float:
     return cells * (CELL + FILL * max(math.log2(max(cells, 1) / AT), 0.0))
 

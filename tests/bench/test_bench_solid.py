@@ -84,6 +84,15 @@ def test_goes_on(tmp_path, monkeypatch):
     assert said[0].endswith("(1 of 10)") and said[-1].endswith("(6 of 6)")
 
 
+def test_what_does_not_fit_is_left_out(monkeypatch):
+    monkeypatch.setattr(solid, "free_memory", lambda: 4e9)
+    said: list[str] = []
+    steps = solid.diagram().measure(Plan(load_scene(TWO_ARM), False), said.append)
+    assert any("260 x 26 x 17 cells, 1 rank" in name for name in steps)
+    assert not any("260 x 26 x 17 cells, 2 ranks" in n or n.startswith("362") for n in steps)
+    assert said == ["6 measurements need more memory than is free: left out"]
+
+
 def test_names():
     assert [one.name for one in named(["solid", "time"])] == ["solid", "time"]
     assert "solid" not in [one.name for one in named([])]
