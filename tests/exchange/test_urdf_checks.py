@@ -9,6 +9,7 @@ import pytest
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 
 from dolfinopt.errors import InputError
+from dolfinopt.exchange.urdf.bodies import scene_bodies
 from dolfinopt.exchange.urdf.checks import implausible_inertias
 from dolfinopt.exchange.urdf.read import read_robot
 from dolfinopt.scene.load import load_scene
@@ -135,6 +136,15 @@ JOINT = (
             "part of a loop",
         ),
         (["<link/>"], "not a robot that yourdfpy can read"),
+        (
+            [LINK.format("a"), LINK.format("b"),
+             JOINT.format("j", "revolute", "a", "b", '<origin xyz="nan 0 0"/>')],
+            "joint 'j': origin: expected finite numbers, found nan",
+        ),
+        (
+            ['<link name="a"><visual><geometry><box size="-1 1 1"/></geometry></visual></link>'],
+            "link 'a': size of a box: expected positive numbers, found -1, 1, 1",
+        ),
     ],
 )  # fmt: skip
 def test_robots_that_a_scene_cannot_hold(tmp_path, inside, message):
@@ -143,6 +153,23 @@ def test_robots_that_a_scene_cannot_hold(tmp_path, inside, message):
     with pytest.raises(InputError, match=message) as caught:
         read_robot(file)
     assert "\n" not in str(caught.value) and str(caught.value).startswith(str(file))
+
+
+def test_meshes_that_are_none(tmp_path):
+    """Told, and in their place a guess: no name, no volume."""
+    (tmp_path / "flat.stl").write_text(
+        "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 0 1\n"
+        "endloop\nendfacet\nendsolid a\n"
+    )
+    shape = '<geometry><cylinder radius="0.055" length="0.84"/></geometry>'
+    assert shape in DEMO.read_text()
+    for name, message in (("", "mesh without a name"), (' filename="flat.stl"', "kg in 0 m3")):
+        file = tmp_path / "r.urdf"
+        file.write_text(DEMO.read_text().replace(shape, f"<geometry><mesh{name}/></geometry>"))
+        robot = read_robot(file)
+        assert any(message in one for one in implausible_inertias(robot))
+        (forearm,) = (one for one in scene_bodies(robot, ("forearm",), "tool") if one.is_solid)
+        assert not forearm.measured and forearm.size == pytest.approx([0.07287] * 2)
 
 
 def test_files_that_are_no_robots(tmp_path):

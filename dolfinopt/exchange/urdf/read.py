@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 SECTIONS = 64  # flat sides of a cylinder
+SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}  # of shapes
 
 
 def read_robot(file: Path) -> Robot:
@@ -120,6 +121,7 @@ def _joint(file: Path, one: Any) -> RobotJoint:
         raise InputError(
             f"{where}: type {one.type!r}; a scene has joints of type {', '.join(MOVABLE)} and fixed"
         )
+    _check_finite(f"{where}: origin", _pose(one.origin))
     axis = np.asarray(one.axis, dtype=float)
     length = np.linalg.norm(axis) if axis.shape == (3,) else 0.0
     if one.type != "fixed" and not (math.isfinite(length) and length > 0.0):
@@ -131,6 +133,7 @@ def _joint(file: Path, one: Any) -> RobotJoint:
         upper = 0.0 if limit.upper is None else limit.upper
         if limit.lower is None and limit.upper is None:
             lower, upper = -math.inf, math.inf
+        _check_finite(f"{where}: limit", [x for x in (limit.lower, limit.upper) if x is not None])
         if lower > upper:
             raise InputError(f"{where}: limit lower = {lower:g} above upper = {upper:g}")
     velocity = math.inf if limit is None or not limit.velocity else limit.velocity
@@ -210,11 +213,13 @@ def _link(file: Path, one: Any) -> RobotLink:
     shapes, missing = [], []
     for element in one.collisions or one.visuals:
         try:
-            shape = _shape(file, element.geometry)
+            shape = _shape(file, one.name, element.geometry)
         except FileNotFoundError:
-            missing.append(element.geometry.mesh.filename)
+            missing.append(element.geometry.mesh.filename or "without a name")
             continue
-        shape.apply_transform(_pose(element.origin))
+        pose = _pose(element.origin)
+        _check_finite(f"{file}: link {one.name!r}: origin of a shape", pose)
+        shape.apply_transform(pose)
         shapes.append(shape)
     return RobotLink(one.name, _inertia(file, one), tuple(shapes), tuple(missing))
 
@@ -232,14 +237,27 @@ def _inertia(file: Path, link: Any) -> Inertia | None:
     return Inertia(mass, pose[:3, 3], R @ tensor @ R.T)
 
 
-def _shape(file: Path, geometry: Any) -> Trimesh:
-    """Return the surface of a geometry element.
+def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
+    values = np.atleast_1d(np.asarray(numbers, dtype=float))
+    if not np.isfinite(values).all() or (positive and (values <= 0.0).any()):
+        found = ", ".join(f"{value:g}" for value in values.ravel())
+        raise InputError(f"{where}: expected {'positive' if positive else 'finite'} numbers, "
+                         f"found {found}")  # fmt: skip
+
+
+def _shape(file: Path, link: str, geometry: Any) -> Trimesh:
+    """Return the surface of a geometry element of a link.
 
     Raises:
         FileNotFoundError: its mesh is not there, or no mesh.
+        InputError: its size is none.
     """
     from trimesh import creation
 
+    for kind, names in SIZES.items():
+        if (one := getattr(geometry, kind)) is not None:
+            size = np.hstack([getattr(one, name) for name in names])
+            _check_finite(f"{file}: link {link!r}: size of a {kind}", size, positive=True)
     if geometry.box is not None:
         return creation.box(extents=geometry.box.size)
     if geometry.sphere is not None:
@@ -253,7 +271,7 @@ def _shape(file: Path, geometry: Any) -> Trimesh:
 def _mesh(file: Path, mesh: Any) -> Trimesh:
     import trimesh
 
-    path = mesh_path(file, mesh.filename)
+    path = mesh_path(file, mesh.filename) if mesh.filename else None
     if path is None:
         raise FileNotFoundError(mesh.filename)
     load: Callable[..., Any] = trimesh.load_mesh

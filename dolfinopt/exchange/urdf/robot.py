@@ -127,7 +127,7 @@ class RobotLink:
     def volume(self) -> float:
         """Volume in m3 within its surfaces; within their convex hulls if they are open."""
         return sum(
-            abs(one.volume if one.is_watertight else one.convex_hull.volume) for one in self.shapes
+            abs(one.volume if one.is_watertight else _hull_volume(one)) for one in self.shapes
         )
 
     @cached_property
@@ -183,6 +183,16 @@ class Robot:
             own = motion_of(joint.kind, joint.axis, q[joint.name]) if joint.moves else np.eye(4)
             found[joint.child] = found[joint.parent] @ joint.pose @ own
         return found
+
+
+def _hull_volume(surface: Trimesh) -> float:
+    """Return the volume of a surface's convex hull, m3; 0 of a flat one."""
+    from scipy.spatial import QhullError
+
+    try:
+        return float(surface.convex_hull.volume)
+    except QhullError:
+        return 0.0
 
 
 # -- frames ----------------------------------------------------------------------------------

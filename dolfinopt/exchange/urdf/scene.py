@@ -98,7 +98,11 @@ class RobotScene:
         if body.mesh is None:
             sides = height, thickness = (_up(body.size[0]), _up(body.size[1]))
             weight = DENSITY * body.length * height * thickness
-            by = "the extents of its geometry" if body.measured else "a guess: it has no geometry"
+            by = (
+                "the extents of its geometry"
+                if body.measured
+                else "a guess: its geometry does not tell"
+            )
             keys = [f"cells = {list(cells_of(body.length, *sides))}"]
         else:
             sides, weight, by = body.size, DENSITY * body.mesh.volume, "those of its geometry"

@@ -44,14 +44,11 @@ def solid_of(robot: Robot, name: str, tool: str) -> Solid:
     x = along / length
     z = _across(x, inner.axis if inner.moves else None, pose[:3, :3] @ outer.axis)
     frame = pose_of(np.column_stack([x, np.cross(z, x), z]), first)
-    points = robot.links[name].points
-    if not len(points):
+    points = robot.links[name].points @ frame[:3, :3]
+    height, thickness = np.ptp(points[:, 1:], axis=0) if len(points) else (0.0, 0.0)
+    if min(height, thickness) <= 0.0:  # no geometry, or a flat one
         side = length / SLENDERNESS
         return Solid(frame, length, (side, side), False)
-    own = points @ frame[:3, :3]
-    height, thickness = np.ptp(own[:, 1]), np.ptp(own[:, 2])
-    if min(height, thickness) <= 0.0:
-        raise InputError(f"{robot.file}: link {name!r}: its geometry is flat")
     return Solid(frame, length, (float(height), float(thickness)), True)
 
 
