@@ -127,7 +127,8 @@ class RobotLink:
     def volume(self) -> float:
         """Volume in m3 within its surfaces; within their convex hulls if they are open."""
         return sum(
-            abs(one.volume if one.is_watertight else _hull_volume(one)) for one in self.shapes
+            abs(float(one.volume)) if one.is_watertight else _hull_volume(one)
+            for one in self.shapes
         )
 
     @cached_property
