@@ -223,6 +223,8 @@ run_tests() {
   cd "$here" || exit 1
   answer_soon
   export NO_COLOR=1 # mpirun gives the ranks a terminal even when there is none
+  # Tests start a hundred processes, which share compiled modules, in folders that git ignores.
+  unset PYTHONDONTWRITEBYTECODE
   check "ruff check" "$python" -m ruff check .
   check "ruff format" "$python" -m ruff format --check .
   check "imports" "$venv/bin/lint-imports" --no-cache
