@@ -170,6 +170,9 @@ def _last_point(axes: Axes, line: Any) -> tuple[float, float] | None:
     if not len(points):
         return None
     last = points[np.argmax(points[:, 0])]
+    # Asked for its limits, Matplotlib brings them up to date; `transLimits` does not.
+    axes.get_xlim()
+    axes.get_ylim()
     x, y = (axes.transScale + axes.transLimits).transform(last)
     return float(x), float(y)
 
