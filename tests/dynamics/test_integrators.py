@@ -595,6 +595,20 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     assert len(told) >= 2
 
 
+def test_motion_that_finer_steps_let_grow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light coordinates of a stiffened machine: two grids, and a remedy."""
+    on_grid, grids = radau._on_grid, []
+
+    def grown(*details):  # type: ignore[no-untyped-def]
+        grids.append(len(details[1]) - 1)
+        return replace(on_grid(*details), error=(1e-3, 71.0)[len(grids) - 1])
+
+    monkeypatch.setattr(radau, "_on_grid", grown)
+    with pytest.raises(ConvergenceError, match=r"stiffen the arms.*simulation\.stiffening = false"):
+        solve("radau", oscillator(3.0, 0.0, pushed, 1.0), 1e-4)
+    assert len(grids) == 2
+
+
 @BOTH
 def test_no_static_equilibrium_is_a_named_error(integrator: str) -> None:
     """Arms that the first acceleration alone would fold."""
