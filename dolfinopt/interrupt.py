@@ -10,7 +10,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 INTERRUPTED = 130  # exit status, as of a shell's command that Ctrl-C has ended
@@ -58,6 +59,21 @@ def raise_again() -> bool:
     if ended:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return ended
+
+
+@contextmanager
+def ending_at_once() -> Iterator[None]:
+    """Let Ctrl-C end the process within the block, which must not write anything.
+
+    There are libraries that swallow the exception where they import others (trimesh).
+    """
+    before = signal.getsignal(signal.SIGINT)
+    end_at_once()
+    try:
+        yield
+    finally:
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, before)
 
 
 def _end(number: int, frame: Any) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from dolfinopt.cli.shared import claim, design_of, scene_of, warn
 from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
+from dolfinopt.interrupt import ending_at_once
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -75,10 +76,11 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     with together(world):
         if world.rank == 0:
             cells = {k: (corners[k], densities[k]) for k in after.bodies}
-            files, said = _robot_files(scene, origin, folder, after.bodies, cells)
-            if table is not None:
-                files = _pages(table, *sides) | files
-                said.append(table.markdown())
+            with ending_at_once():
+                files, said = _robot_files(scene, origin, folder, after.bodies, cells)
+                if table is not None:
+                    files = _pages(table, *sides) | files
+                    said.append(table.markdown())
             _write(folder, files, origin.file.name)
             click.echo("\n".join(said))
 

@@ -14,6 +14,7 @@ from dolfinopt.cli.options import out_option
 from dolfinopt.cli.shared import warn
 from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
+from dolfinopt.interrupt import ending_at_once
 
 if TYPE_CHECKING:
     import numpy as np
@@ -65,6 +66,15 @@ def import_robot(
 def _import(
     robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool, out: Path | None
 ) -> None:
+    with ending_at_once():
+        found = _read(robot, links, trajectory, tool, boxes)
+    _write(out or Path(robot.stem), *found)
+
+
+def _read(
+    robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool
+) -> tuple[RobotScene, list[str], np.ndarray, np.ndarray]:
+    """Return the scene, names of the joints that move, instants (n,) and rows (n, joints)."""
     from dolfinopt.exchange.urdf.bodies import check_links, default_tool, scene_bodies
     from dolfinopt.exchange.urdf.checks import implausible_inertias
     from dolfinopt.exchange.urdf.read import read_robot
@@ -82,7 +92,7 @@ def _import(
     if not boxes:
         bodies = tuple(_meshed(model, one) if one.is_solid else one for one in bodies)
     scene = RobotScene(model, bodies, float(t[-1]))
-    _write(scene, out or Path(robot.stem), [joints[j.name] for j in model.movable], t, rows)
+    return scene, [joints[joint.name] for joint in model.movable], t, rows
 
 
 def _meshed(model: Robot, body: SceneBody) -> SceneBody:
@@ -129,7 +139,7 @@ def _trajectory(model: Robot, file: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _write(
-    scene: RobotScene, folder: Path, joints: list[str], t: np.ndarray, rows: np.ndarray
+    folder: Path, scene: RobotScene, joints: list[str], t: np.ndarray, rows: np.ndarray
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.exchange.urdf.scene import RECORD, TRAJECTORY

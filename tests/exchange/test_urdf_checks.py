@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 import numpy as np
@@ -80,6 +81,21 @@ def test_a_motion_that_is_too_fast_is_told(tmp_path, capsys):
     assert "joint elbow moves at up to 2.812 rad/s, beyond its limit of 2.618" in (
         capsys.readouterr().err
     )
+
+
+def test_ctrl_c_ends_the_import_before_it_writes(tmp_path, monkeypatch):
+    """Libraries that swallow KeyboardInterrupt never see one; afterwards all is as before."""
+    handlers = [signal.default_int_handler]
+    monkeypatch.setattr(
+        "dolfinopt.exchange.urdf.read.read_robot",
+        lambda file: handlers.append(signal.getsignal(signal.SIGINT)) or read_robot(file),
+    )
+    before = signal.signal(signal.SIGINT, handlers[0])
+    try:
+        run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
+        assert handlers[1] not in handlers[:1] and signal.getsignal(signal.SIGINT) is handlers[0]
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(
