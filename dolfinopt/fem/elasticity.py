@@ -25,7 +25,7 @@ from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity, joins
 from dolfinopt.fem.interface import InterfaceTransformation
-from dolfinopt.fem.interior import Guesses, InteriorSystem
+from dolfinopt.fem.interior import TETRAHEDRA, Guesses, InteriorSystem
 from dolfinopt.fem.stress import element_centres, stress_operator
 from dolfinopt.fem.uniform import single, uniform_cells
 from dolfinopt.fem.uniform_stress import UniformStress
@@ -87,7 +87,10 @@ class Substructure:
                 )
                 self._mass = AffineMatrix(operators.cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        self.interior = InteriorSystem(self.T, self._stiffness, self._mass, profile, tolerance)
+        wider = TETRAHEDRA if operators.cells.shape[1] == 10 else 1.0  # quadratic ones
+        self.interior = InteriorSystem(
+            self.T, self._stiffness, self._mass, profile, tolerance, wider
+        )
         self._last: ElasticArm | None = None
 
     @cached_property

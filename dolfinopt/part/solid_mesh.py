@@ -18,7 +18,7 @@ COARSER = 1.6  # sides of the cells of the mesh with which the scene's is compar
 # What is tried until a mesh is valid: angles, degrees, from which on there are edges between faces,
 # and sides, of those wanted.
 TRIES = ((40.0, 1.0), (60.0, 1.0), (80.0, 1.0), (40.0, 0.75), (60.0, 0.75), (40.0, 0.5))
-MOST = 40_000  # cells of a part, about
+MOST = 10_000  # cells of a part, about
 ACROSS = 3.0  # cells over the smaller of a part's height and thickness, at least
 IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
 NEAR = 1e-6  # of a cell: distance of points from the arm's faces up to which they lie on them
