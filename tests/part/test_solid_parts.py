@@ -20,6 +20,7 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.part.isosurface import cut, eighths, halved, nodal_densities, outside
+from dolfinopt.part.smooth_surface import distance_to_faces
 from dolfinopt.part.solid import MM, triangle_bytes
 from dolfinopt.part.solid_domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
@@ -160,6 +161,41 @@ def test_what_stays_solid_or_void_is_kept(domain_with):
     assert not solid[(np.abs(x) < 12.0)[:, None] & (np.abs(y) < 6.0)].any()
 
 
+BORED = """
+SetFactory("OpenCASCADE");
+Box(1) = {-0.02, -0.02, -0.01, 0.54, 0.04, 0.02};
+Cylinder(2) = {0, 0, -0.02, 0, 0, 0.04, 0.01};
+Cylinder(3) = {0.5, 0, -0.02, 0, 0, 0.04, 0.01};
+BooleanDifference(4) = { Volume{1}; Delete; }{ Volume{2, 3}; Delete; };
+Physical Surface("inboard") = {Surface In BoundingBox {-0.011, -0.011, -1, 0.011, 0.011, 1}};
+Physical Surface("outboard") = {Surface In BoundingBox {0.489, -0.011, -1, 0.511, 0.011, 1}};
+"""
+
+
+def test_bores_are_interfaces_of_parts(tmp_path):
+    """A bar with bores, tetrahedra: the part's bores, and its mesh's, are the design's."""
+    (tmp_path / "bar.geo").write_text(BORED)
+    keys = {"cells": None, "mesh": str(tmp_path / "bar.geo"), "mesh_size": 0.01, "passive": 0.03}
+    arm = solid_scene(**keys, cell_shape="tetrahedron").arms[0]
+    mesh = arm_mesh(MPI.COMM_SELF, arm)
+    x, y, _ = mesh.centroid.T
+    density = 1.0 * ((np.abs(y) > 0.0095) | (np.abs(x - 0.25) < 0.03))
+    domain = solid_domain(mesh, mesh.keep(density))
+    part = make_solid_part(domain)
+    assert part.watertight and part.volume == pytest.approx(domain.volume, rel=1e-6)
+    found = solid_mesh(part, 1.5 * mesh_size(part))
+    assert found.quality.min() > 1e-3
+    for faces, facets in ((domain.inboard, found.inboard), (domain.outboard, found.outboard)):
+        areas = []
+        for corners in (faces, found.points[facets]):
+            a, b, c = corners.swapaxes(0, 1)
+            areas.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+        assert areas[1] == pytest.approx(areas[0], rel=0.02)
+        assert distance_to_faces(found.points[np.unique(facets)], faces).max() < 1e-9
+    with pytest.raises(InputError, match="several outboard interfaces"):
+        solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
+
+
 def test_narrowest_place_of_voxels():
     """A plate of 6, a bar of 4 and a window of 10 voxels; edges and corners are no members."""
     inside = np.zeros((60, 30, 20), dtype=bool)
@@ -256,7 +292,7 @@ def finished(path, densities, *changes):
 
 def test_two_ranks_write_the_same_solids(tmp_path, capfd):
     """A free-form link and a plate."""
-    cells = [f"arms.link{k}.cells=[16,4,4]" for k in (1, 2)]
+    cells = [f"arms.link{k}.cells=[12,4,4]" for k in (1, 2)]
     folder = finished(tmp_path / "run", (hollow, windows), *cells)
     options = "--no-check", "--no-plots"
     run("part", folder, "--out", tmp_path / "one", *options)
