@@ -1,6 +1,5 @@
 """Optimisation in space: it resumes in the same bits, and is the same on any number of ranks."""
 
-
 import numpy as np
 import pytest
 from mpi4py import MPI
