@@ -125,7 +125,7 @@ class DesignState:
             basis = self.basis
             with self.elastic.profile.phase("inertia integrals"):
                 damping = self.scene.damping.stiffness_proportional
-                loads = self.unit_loads if self.stiffened else None
+                loads = self.stiffening_loads if self.stiffened else None
                 self._body = shape_integrals(self.elastic, basis, damping, loads)
         return self._body
 
@@ -133,6 +133,11 @@ class DesignState:
     def unit_loads(self) -> UnitLoads:
         """The static fields of unit accelerations, forces and moment, see there."""
         return unit_loads(self.elastic)
+
+    @cached_property
+    def stiffening_loads(self) -> UnitLoads:
+        """Those, and the fields of the inertia of the modes."""
+        return self.unit_loads.with_modes(self.basis.V, self.basis.MV)
 
     @cached_property
     def load_fields(self) -> LoadFields:

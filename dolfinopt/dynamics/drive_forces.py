@@ -19,8 +19,8 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import PLANE, Equations, MachineInstants, MachineSystem
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.interface_jacobian import interface_place, place_gradient
-from dolfinopt.multibody.inverse_dynamics import Rates
 from dolfinopt.multibody.mechanism import ElasticBodies
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 
 if TYPE_CHECKING:

@@ -22,8 +22,9 @@ import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.inverse_dynamics import Rates, body_loads
+from dolfinopt.multibody.inverse_dynamics import body_loads
 from dolfinopt.multibody.mechanism import ElasticBodies
+from dolfinopt.multibody.modal_displacement import ModalDisplacement, Rates
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import SPACE, ShapeIntegrals, in_basis
 
@@ -77,10 +78,15 @@ def load_coefficients(
     """
     if isinstance(system, ElasticSystem) and motion is not None:
         found = []
-        loads = body_loads(system.mechanism, motion, rates)
-        for (p, w), part in zip(loads, system.mechanism.slices, strict=True):
-            (q, qd, qdd), w, wd = (x[:, part] for x in rates), w[:, None], p[:, 2, None]
-            found.append(-np.hstack([p, qdd - w * w * q, wd * q + 2.0 * w * qd]))
+        mechanism = system.mechanism
+        loads = body_loads(mechanism, motion, rates)
+        constants = mechanism.modal_constants
+        for (p, w), part, own in zip(loads, mechanism.slices, constants, strict=True):
+            q, qd, qdd = rates
+            modal = ModalDisplacement(own.L, (q[:, part], qd[:, part], qdd[:, part]))
+            w, wd = w[:, None], p[:, 2, None]
+            radial, around = modal.zdd - w * w * modal.z, wd * modal.z + 2.0 * w * modal.zd
+            found.append(-np.hstack([p, radial, around]))
         return found
     probe = _Probe(system)
     rows = probe.system.at(t).residual(*(probe.spread(x) for x in rates))

@@ -1,10 +1,12 @@
-"""What the rotation of second order of a rigid interface in space adds to the geometric stiffness.
+"""What the rotation of second order of a rigid interface adds to the geometric stiffness.
 
 A node of the outboard interface, r from its point of reference, moves by u + (exp(theta~) - 1) r,
 theta being the rotation vector. The linear modes hold u + theta x r of it; the reaction R_p of the
 interface's nodes to a unit load does work along the rest, theta x (theta x r) / 2:
 
     K0_p[i, j] gains theta_i' D_p theta_j,   D_p = S_p - tr(S_p) 1,   S_p = sym(sum R_p r').
+
+In the plane theta has one component and D_p is -tr(S_p).
 
 Without it a rotation of the interface would strain the cells beside it, whose stress across the
 arm is large, and a moment M at the interface would act on nodes that keep the directions of their
@@ -25,7 +27,10 @@ if TYPE_CHECKING:
 
 
 class FaceRotation:
-    """The outboard interfaces of one design of an arm in space, six coordinates each; m of them."""
+    """The outboard interfaces of one design of an arm; m of them, c rotations each.
+
+    Of d directions c is 1 in the plane and 3 in space; an interface has d + c coordinates.
+    """
 
     def __init__(self, arm: ElasticArm):
         """Gather the cells beside the interfaces."""
@@ -37,22 +42,22 @@ class FaceRotation:
 
     @cached_property
     def _fit(self) -> np.ndarray:
-        """The field (n_nodes, 3, 6 m) whose products with modes are their coordinates, summed."""
+        """The field (n_nodes, d, (d + c) m) whose products with modes are coordinates, summed."""
         rigid = self.arm.rigid
         rows = rigid[self.arm.outboard].reshape(-1, rigid.shape[2])
         return rigid @ np.linalg.inv(self.arm.comm.allreduce(rows.T @ rows))
 
     def _rotations(self, V: np.ndarray) -> np.ndarray:
-        """Return the rotation vectors (m, 3, q) in modes (n_nodes, 3, q) (collective)."""
+        """Return the rotation vectors (m, c, q) in modes (n_nodes, d, q) (collective)."""
         found = self.arm.comm.allreduce(np.tensordot(self._fit, V, ((0, 1), (0, 1))))
-        return found.reshape(-1, 6, V.shape[2])[:, 3:]
+        return found.reshape(len(self._levers), -1, V.shape[2])[:, V.shape[1] :]
 
     def tensors(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
-        """Return D (m, p, 3, 3) of unit loads, N m each (collective).
+        """Return D (m, p, c, c) of unit loads, N m each (collective).
 
         Args:
-            fields: (n_nodes, 3, p) their static fields u_p.
-            accelerations: (n_nodes, 3, k) of the first k loads, whose inertia loads the nodes.
+            fields: (n_nodes, d, p) their static fields u_p.
+            accelerations: (n_nodes, d, k) of the first k loads, whose inertia loads the nodes.
         """
         arm, nodes = self.arm, self._nodes
         values = fields[nodes] - fields[nodes].mean(axis=1, keepdims=True)
@@ -64,7 +69,7 @@ class FaceRotation:
         return _deviated(0.5 * (S + S.swapaxes(2, 3)))
 
     def stiffness(self, D: np.ndarray, V: np.ndarray) -> np.ndarray:
-        """Return what K0 (p, q, q) gains in modes V (n_nodes, 3, q) (collective)."""
+        """Return what K0 (p, q, q) gains in modes V (n_nodes, d, q) (collective)."""
         theta = self._rotations(V)[:, None]
         return (theta.swapaxes(2, 3) @ D @ theta).sum(axis=0)
 
@@ -76,14 +81,15 @@ class FaceRotation:
         It is sum_p y_p . (K u_p - f_p) with nodal fields y, zero but at the interfaces.
 
         Returns:
-            By the modes (n_nodes, 3, q), all held but these; y (n_nodes, 3, p); and K y, the
+            By the modes (n_nodes, d, q), all held but these; y (n_nodes, d, p); and K y, the
             derivative by the fields; contributions of this rank's cells (collective).
         """
         theta = self._rotations(V)
         symmetric = 0.5 * (by_K0 + by_K0.swapaxes(1, 2))
-        by_theta = np.zeros((len(theta), 6, V.shape[2]))
-        by_theta[:, 3:] = 2.0 * np.einsum("mpab,mbj,pij->mai", D, theta, symmetric)
-        by_S = _deviated(theta[:, None] @ symmetric @ theta[:, None].swapaxes(2, 3))
+        dim, c = V.shape[1], theta.shape[1]
+        by_theta = np.zeros((len(theta), dim + c, V.shape[2]))
+        by_theta[:, dim:] = 2.0 * np.einsum("mpab,mbj,pij->mai", D, theta, symmetric)
+        by_S = _by_moments(theta[:, None] @ symmetric @ theta[:, None].swapaxes(2, 3))
         y = np.einsum("mpab,mnb->nap", by_S, self._levers)
         forces = np.zeros_like(y)
         np.add.at(forces, self._nodes, self._stiffness_times(y[self._nodes]))
@@ -108,14 +114,23 @@ class FaceRotation:
 
 
 def _levers(rigid: np.ndarray) -> np.ndarray:
-    """Return r (m, n_nodes, 3) from every interface's point of reference, zero elsewhere.
+    """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere.
 
-    Rotations about x and y, among the unit motions (n_nodes, 3, 6 m), tell it: theta x r.
+    Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
     """
+    if rigid.shape[1] == 2:
+        about_z = rigid[:, :, 2::3]
+        return np.stack([about_z[:, 1], -about_z[:, 0]], axis=-1).swapaxes(0, 1)
     about_x, about_y = rigid[:, :, 3::6], rigid[:, :, 4::6]
     return np.stack([-about_y[:, 2], about_x[:, 2], -about_x[:, 1]], axis=-1).swapaxes(0, 1)
 
 
 def _deviated(S: np.ndarray) -> np.ndarray:
-    """Return S - tr(S) 1 of symmetric tensors (..., 3, 3)."""
-    return S - np.trace(S, axis1=-2, axis2=-1)[..., None, None] * np.eye(3)
+    """Return S - tr(S) 1 of symmetric tensors (..., 3, 3); -tr(S) (..., 1, 1) in the plane."""
+    trace = np.trace(S, axis1=-2, axis2=-1)[..., None, None]
+    return -trace if S.shape[-1] == 2 else S - trace * np.eye(3)
+
+
+def _by_moments(by_D: np.ndarray) -> np.ndarray:
+    """Return the transpose of `_deviated`: derivatives by S, given those by D (symmetric)."""
+    return -by_D * np.eye(2) if by_D.shape[-1] == 1 else _deviated(by_D)

@@ -8,8 +8,9 @@ K u_p = f_p, whose stress stiffens the body in its modes:
 
     K0_p[i, j] = int t sigma(u_p)_ab (d_a phi_i . d_b phi_j) dA
 
-with p unit loads, d directions and b outboard coordinates. In space the rigid interface's rotation
-of second order adds to it, see `face_rotation`.
+with p unit loads, d directions and b outboard coordinates. The rigid interface's rotation of second
+order adds to it, see `face_rotation`. The inertia of the modes themselves, M phi_k, loads the body,
+too: `UnitLoads.with_modes` has these q loads between the other inertial ones and the interface's.
 
 Source: Wallrapp & Schwertassek, Int. J. Numer. Methods Eng. 32 (1991) 1751-1766,
 doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
@@ -18,7 +19,7 @@ doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -46,20 +47,38 @@ class UnitLoads:
     Attributes:
         arm: the design.
         fields: (n_nodes, d, p) u_p, m per unit load: m/s2, 1/s2, N, N m.
+        modes: (n_nodes, d, k) whose inertia are loads, too; none by default.
     """
 
     arm: ElasticArm
     fields: np.ndarray
+    modes: np.ndarray | None = None
 
     @property
     def num_loads(self) -> int:
-        """Number p of unit loads: 7 in the plane, 18 in space."""
+        """Number p of unit loads: 7 in the plane, 18 in space, and those of the modes."""
         return self.fields.shape[2]
 
     @property
-    def num_inertial(self) -> int:
-        """Number of those by the arm's own inertia."""
+    def num_frame(self) -> int:
+        """Number of those by the arm's own inertia in its frame's acceleration."""
         return NUM_INERTIAL[self.fields.shape[1]]
+
+    @property
+    def num_inertial(self) -> int:
+        """Number of those by the arm's own inertia, that of the modes included."""
+        return self.num_frame + (0 if self.modes is None else self.modes.shape[2])
+
+    def with_modes(self, V: np.ndarray, MV: np.ndarray) -> UnitLoads:
+        """Return these loads and the inertia of modes: q more solves (collective).
+
+        Args:
+            V: (n_nodes, d, q) modes.
+            MV: mass matrix times V, contributions of this rank's cells.
+        """
+        modal = static_response(self.arm, *self.arm.restrict(MV), "modal accelerations")
+        parts = [self.fields[:, :, : self.num_frame], modal, self.fields[:, :, self.num_frame :]]
+        return UnitLoads(self.arm, np.concatenate(parts, axis=2), V)
 
     @cached_property
     def _terms(self) -> Sequence[Sequence[tuple[int, int, int]]]:
@@ -86,20 +105,20 @@ class UnitLoads:
         else:
             own = self._stiffness(V)
         K0 = own if arm.comm.size == 1 else arm.comm.allreduce(own)
-        if self._face is not None:
-            K0 = K0 + self._face.stiffness(self._face_tensors, V)
-        return K0
+        return K0 + self._face.stiffness(self._face_tensors, V)
 
     @cached_property
-    def _face(self) -> FaceRotation | None:
-        return FaceRotation(self.arm) if self.fields.shape[1] == 3 else None
+    def _face(self) -> FaceRotation:
+        return FaceRotation(self.arm)
 
     @cached_property
     def _face_tensors(self) -> np.ndarray:
-        """D (m, p, 3, 3) of `FaceRotation` (collective)."""
-        assert self._face is not None
+        """D (m, p, c, c) of `FaceRotation` (collective)."""
         points = self.arm.points
-        return self._face.tensors(self.fields, _accelerations(np.ones_like(points), points))
+        accelerations = _accelerations(np.ones_like(points), points)
+        if self.modes is not None:
+            accelerations = np.concatenate([accelerations, self.modes], axis=2)
+        return self._face.tensors(self.fields, accelerations)
 
     @cached_property
     def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
@@ -142,7 +161,7 @@ class UnitLoads:
         u_F = Psi S^-1 with S = Psi'K Psi.
 
         Args:
-            V: (n_nodes, d, q) as given to `geometric_stiffness`.
+            V: (n_nodes, d, q) as given to `geometric_stiffness`, and to `with_modes` if that was.
             by_K0: (p, q, q) derivatives.
             static: whether V begins with the constraint modes, by which `by_modes` then
                 differentiates u_F, too, and `by_stiffness` by S.
@@ -164,7 +183,7 @@ class UnitLoads:
         if by_fields is not None:
             forces = forces + by_fields
         by_stiffness, face = np.zeros_like(compliance), None
-        if self._face is not None and len(by_K0):
+        if len(by_K0):
             by_face, face, turned = self._face.gradient(self._face_tensors, V, by_K0)
             by_V, direct = by_V + by_face, direct + self._face.stiffness_products(face, self.fields)
             forces = forces + turned[:, :, : forces.shape[2]]
@@ -176,7 +195,10 @@ class UnitLoads:
                 forces = forces[:, :, :inertial]
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
-        return GeometricGradient(self, by_V, direct, adjoint, by_stiffness, face)
+        found = GeometricGradient(self, by_V, direct, adjoint, by_stiffness, face)
+        if self.modes is None:
+            return found
+        return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
 
     def stiffness_products(
         self, left: np.ndarray, V: np.ndarray, adjoint: np.ndarray
@@ -253,7 +275,7 @@ class GeometricGradient:
         direct: (n_cells,) by Young's modulus, modes and fields held.
         adjoint: (n_nodes, d, k) of the fields of the first k loads.
         by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
-        face: (n_nodes, 3, p) what K u_p - f_p is multiplied by at the interface in space, see
+        face: (n_nodes, d, p) what K u_p - f_p is multiplied by at the interface, see
             `FaceRotation.gradient`.
     """
 
@@ -279,13 +301,21 @@ class GeometricGradient:
         fields = self.loads.fields[:, :, : self.adjoint.shape[2]]
         return self.direct - self.loads.arm.cell_stiffness_products(self.adjoint, fields)
 
+    @cached_property
+    def _by_loads(self) -> np.ndarray:
+        """By the loads f_p that are inertia (n_nodes, d, k)."""
+        adjoint = self.adjoint[:, :, : self.loads.num_inertial]
+        return adjoint if self.face is None else adjoint - self.face[:, :, : adjoint.shape[2]]
+
     @property
     def by_inertia(self) -> np.ndarray:
         """Fields whose products with dM 1_x and dM X are the part by the mass (n_nodes, d, 2)."""
-        adjoint = self.adjoint[:, :, : self.loads.num_inertial]
-        if self.face is not None:
-            adjoint = adjoint - self.face[:, :, : self.loads.num_inertial]
-        return _by_inertia(adjoint)
+        return _by_inertia(self._by_loads[:, :, : self.loads.num_frame])
+
+    @property
+    def by_modal_inertia(self) -> np.ndarray:
+        """Fields whose products with d(M V) are the modal loads' part (n_nodes, d, q)."""
+        return self._by_loads[:, :, self.loads.num_frame :]
 
     @property
     def by_density(self) -> np.ndarray:
@@ -293,7 +323,11 @@ class GeometricGradient:
         arm = self.loads.arm
         unit = np.zeros_like(arm.points)
         unit[:, 0] = 1.0
-        return arm.cell_mass_products(self.by_inertia, np.stack([unit, arm.points], axis=2))
+        left, right = [self.by_inertia], [np.stack([unit, arm.points], axis=2)]
+        if self.loads.modes is not None:
+            left.append(self.by_modal_inertia)
+            right.append(self.loads.modes)
+        return arm.cell_mass_products(np.concatenate(left, axis=2), np.concatenate(right, axis=2))
 
 
 def _fold(

@@ -15,14 +15,15 @@ import numpy as np
 from dolfinopt.multibody.instants import FEW, PerInstant, several
 from dolfinopt.multibody.inverse_dynamics import (
     Frame,
-    Rates,
     along,
     body_force,
     body_moment,
     inertia,
+    modal_inertia,
     outward_pass,
 )
 from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -66,7 +67,7 @@ def body_gradient(
             outer = _with_carried(frames[k], ends[k], carried, outer)
         outboard, outer = _outboard_gradient(frames[k], rates, virtual, outer)
         gradient.insert(0, _integral_gradient(frames[k], rates, virtual, *outboard))
-        outer = _with_body(frames[k], rates, virtual, outer)
+        outer = _with_body(frames[k], virtual, outer)
     return gradient
 
 
@@ -208,26 +209,23 @@ def _integral_gradient(
     """Return the gradient of one body's virtual work by its shape integrals."""
     q, qd, _ = rates
     p, rotation, multipliers = virtual
-    eta, eta_d, eta_dd, virtual_eta = (
-        np.insert(x, 0, first, axis=1)
-        for x, first in zip((*rates, multipliers), (1.0, 0.0, 0.0, 0.0))
-    )
-    w, wd = frame.w[:, None], frame.wd[:, None]
-    radial = eta_dd - w * w * eta  # of a point's acceleration, in N
-    around = wd * eta + 2.0 * w * eta_d  # in S N
-    rotated_eta = rotation[:, None] * eta
+    modal = frame.modal
+    etas = _augmented(rates, multipliers)
+    eta, eta_d, eta_dd, virtual_eta = etas
     kappa = 1j * frame.wd - frame.w * frame.w
     moment = p * np.conj(kappa) - 1j * rotation * frame.a
     by_w = moment @ eta + (p * -2j * frame.w) @ eta_d + p @ eta_dd + frame.a @ virtual_eta
+    W = _by_second_moments(frame, rotation, etas)
+    along_modes = np.zeros_like(frame.constants.body.along_modes)
+    if modal.L is not None:
+        along = _augmented((modal.z, modal.zd, modal.zdd), modal.pushed(multipliers))
+        W[:, 1:, 1:] = _by_second_moments(frame, rotation, along)[:, 1:, 1:]
+        by, forces = _by_modal_displacement(frame, virtual), modal_inertia(frame)
+        along_modes = modal.gradient(by, forces, multipliers)
     return ShapeIntegrals(
         mass=float((np.conj(p) * frame.a).real.sum()),
         w=np.stack([by_w.real, by_w.imag]),
-        W=np.stack(
-            [
-                virtual_eta.T @ radial + rotated_eta.T @ around,
-                virtual_eta.T @ around + (rotation[:, None] * radial).T @ eta,
-            ]
-        ),
+        W=W,
         K=multipliers.T @ q,
         D=multipliers.T @ qd,
         outboard=outboard,
@@ -235,7 +233,45 @@ def _integral_gradient(
         further_points=np.zeros((0, 2)),
         K0=_by_geometric_stiffness(frame, virtual),
         K0_outboard=K0_outboard,
+        along_modes=along_modes,
     )
+
+
+_Etas = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _augmented(rates: Rates, multipliers: np.ndarray) -> _Etas:
+    """Return (1, q), its rates and its variation, (n, 1 + q) each."""
+    pairs = zip((*rates, multipliers), (1.0, 0.0, 0.0, 0.0), strict=True)
+    q, qd, qdd, virtual = (np.insert(x, 0, first, axis=1) for x, first in pairs)
+    return q, qd, qdd, virtual
+
+
+def _by_second_moments(frame: Frame, rotation: np.ndarray, etas: _Etas) -> np.ndarray:
+    """Return the gradient of the virtual work by W (2, 1 + q, 1 + q)."""
+    eta, eta_d, eta_dd, virtual_eta = etas
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    radial = eta_dd - w * w * eta  # of a point's acceleration, in N
+    around = wd * eta + 2.0 * w * eta_d  # in S N
+    rotated_eta = rotation[:, None] * eta
+    return np.stack(
+        [
+            virtual_eta.T @ radial + rotated_eta.T @ around,
+            virtual_eta.T @ around + (rotation[:, None] * radial).T @ eta,
+        ]
+    )
+
+
+def _by_modal_displacement(frame: Frame, virtual: Rates) -> Rates:
+    """Return the gradient of the virtual work by z, zd and zdd (n, q)."""
+    modal, body = frame.modal, frame.constants.body
+    _, rotation, multipliers = virtual
+    w, wd, phi = frame.w[:, None], frame.wd[:, None], rotation[:, None]
+    zeta, M, G = modal.pushed(multipliers), body.M, body.G
+    by_z = phi * (2.0 * (wd * modal.z + w * modal.zd) @ M + modal.zdd @ G)
+    by_z += wd * (zeta @ G) - w * w * (zeta @ M)
+    by_zd = 2.0 * w * (phi * (modal.z @ M) + zeta @ G)
+    return by_z, by_zd, zeta @ M - phi * (modal.z @ G)
 
 
 def _by_geometric_stiffness(frame: Frame, virtual: Rates) -> np.ndarray:
@@ -254,17 +290,16 @@ def _by_geometric_stiffness(frame: Frame, virtual: Rates) -> np.ndarray:
     return _by_K0(frame, weights, multipliers)
 
 
-def _with_body(frame: Frame, rates: Rates, virtual: Rates, outer: _Outer) -> _Outer:
+def _with_body(frame: Frame, virtual: Rates, outer: _Outer) -> _Outer:
     """Add one body's own force and gradient to what lies outboard of it."""
-    body = frame.constants.body
-    _, qd, _ = rates
+    body, modal = frame.constants.body, frame.modal
     p, rotation, multipliers = virtual
     w = frame.w
-    spin = np.einsum("nk,nk->n", frame.jM, qd)
-    gyro = -2.0 * w[:, None] * frame.jM - 2.0 * (qd @ body.G)
+    spin = np.einsum("nk,nk->n", frame.jM, modal.qd)
+    gyro = -2.0 * w[:, None] * frame.jM - 2.0 * modal.pulled(modal.zd @ body.G)
     return _Outer(
         force=outer.force + body_force(frame),
-        moment=outer.moment + body_moment(frame, rates),
+        moment=outer.moment + body_moment(frame),
         a=outer.a + body.mass * p + 1j * frame.s * rotation + along(multipliers, frame.C),
         w=outer.w
         + (np.conj(p) * (2j * frame.sd - 2.0 * w * frame.s)).real

@@ -12,7 +12,9 @@ Schwertassek & Wallrapp (1999).
 A body with geometric stiffness K0_p by the loads p = (a_x, a_y, wd, -w^2, F_x, F_y, T) deforms in
 the second order, too: whatever these loads do work on loses 1/2 q'K0_p q, and its derivative by q
 loses K0_p q. That is c + C q for a, the outboard displacement and rotation for F and T; and
-j + M q loses K0 q of -w^2, r + G q that of wd. The residual gains -p . K0 q by the same rule.
+j + M q loses K0 q of -w^2, r + G q that of wd. The residual gains -p . K0 q by the same rule. In
+the terms with M and G the place of q is taken by z, see `modal_displacement`, and their forces come
+to the rows through dz/dq.
 Source: Wallrapp & Schwertassek (1991), doi:10.1002/nme.1620320818.
 """
 
@@ -25,9 +27,9 @@ import numpy as np
 
 from dolfinopt.multibody.instants import FEW, Scale, as_column, several
 from dolfinopt.multibody.mechanism import INTERFACE, Mechanism, ModalConstants, product
+from dolfinopt.multibody.modal_displacement import ModalDisplacement, Rates
 from dolfinopt.multibody.motion import RigidMotion
 
-Rates = tuple[np.ndarray, np.ndarray, np.ndarray]  # q, qd, qdd
 # Up to so many modes their products two by two are cheaper than a sum for each load.
 FEW_MODES = 8
 
@@ -112,6 +114,7 @@ class Frame:
         joint_rotation: (n,) complex exp(i (theta + joint angle)) from the next frame to this one.
         constants: of the body.
         e: (n, q) its coordinates.
+        modal: its displacement along the modes.
         next_a, next_wd: acceleration of the outboard interface less gravity, in the next frame's
             components, and its angular acceleration.
         bent: its deformation of the second order, None of a linear body.
@@ -129,6 +132,7 @@ class Frame:
     joint_rotation: np.ndarray
     constants: ModalConstants
     e: np.ndarray
+    modal: ModalDisplacement
     next_a: np.ndarray
     next_wd: np.ndarray
     bent: SecondOrder | None = None
@@ -136,13 +140,14 @@ class Frame:
     @cached_property
     def jM(self) -> np.ndarray:
         """Return j + M q (n, q), half the derivative of the inertia."""
-        linear = self.constants.body.j + self.e @ self.constants.body.M
+        modal = self.modal
+        linear = self.constants.body.j + modal.pulled(modal.z @ self.constants.body.M)
         return linear if self.bent is None else linear - self.bent.q[:, 3]
 
     @cached_property
     def rG(self) -> np.ndarray:
         """Return r + G q (n, q); G is skew: (G q)' = -q' G."""
-        linear = self.constants.body.r - self.e @ self.constants.body.G
+        linear = self.constants.body.r - self.modal.pulled(self.modal.z @ self.constants.body.G)
         return linear if self.bent is None else linear - self.bent.q[:, 2]
 
     @cached_property
@@ -220,6 +225,7 @@ def outward_pass(
                 joint_rotation,
                 constants,
                 e,
+                ModalDisplacement(constants.L, (e, qd[:, part], qdd[:, part])),
                 next_a,
                 next_wd,
                 bent,
@@ -305,7 +311,7 @@ def inward_pass(
             loads.insert(0, (load_columns(frame, (force, moment)), frame.w))
         rows[:, part] = _body_residual(frame, own, (force, moment), scale)
         if k > 0 or driven:
-            moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame, own)
+            moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame)
             force = force + scale.mass * body_force(frame)
             drives.insert(0, moment)
     return rows, (force, drives)
@@ -315,14 +321,11 @@ def _body_residual(
     frame: Frame, rates: Rates, load: tuple[np.ndarray, np.ndarray], scale: Scale
 ) -> np.ndarray:
     """Return one body's elastic rows (n, q) under the load (force, moment) on its outboard end."""
-    e, ed, edd = rates
-    body, constants = frame.constants.body, frame.constants
-    w, wd = frame.w, frame.wd
+    e, ed, _ = rates
+    constants = frame.constants
     load_coefficients = load_columns(frame, load)
     load_coefficients[:, :4] *= as_column(scale.mass)
-    w, wd = w[:, None], wd[:, None]
-    inertial = (edd - (w * w) * e) @ body.M
-    inertial -= (wd * e + (2.0 * w) * ed) @ body.G
+    inertial = frame.modal.pulled(modal_inertia(frame))
     if isinstance(scale.mass, np.ndarray) or scale.mass != 1.0:
         inertial *= as_column(scale.mass)
     inertial += load_coefficients @ constants.loads
@@ -334,6 +337,15 @@ def _body_residual(
     return inertial
 
 
+def modal_inertia(frame: Frame) -> np.ndarray:
+    """Return the inertia forces M zdd - w^2 M z + wd G z + 2 w G zd (n, q) of the modes."""
+    body, modal = frame.constants.body, frame.modal
+    w, wd = frame.w[:, None], frame.wd[:, None]
+    forces = (modal.zdd - (w * w) * modal.z) @ body.M
+    forces -= (wd * modal.z + (2.0 * w) * modal.zd) @ body.G
+    return forces
+
+
 def load_columns(frame: Frame, load: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return (a_x, a_y, wd, -w^2, F_x, F_y, T) (n, 7)."""
     columns = np.empty((len(frame.w), 7))
@@ -343,24 +355,29 @@ def load_columns(frame: Frame, load: tuple[np.ndarray, np.ndarray]) -> np.ndarra
     return columns
 
 
-def body_moment(frame: Frame, rates: Rates) -> np.ndarray:
+def body_moment(frame: Frame) -> np.ndarray:
     """Return the moment T (n,) of one body's own inertia about its frame's origin, N m."""
-    _, ed, edd = rates
+    modal = frame.modal
     moment = (
         (np.conj(frame.s) * frame.a).imag
         + inertia(frame) * frame.wd
-        + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, ed)
-        + np.einsum("nk,nk->n", frame.rG, edd)
+        + 2.0 * frame.w * np.einsum("nk,nk->n", frame.jM, modal.qd)
+        + np.einsum("nk,nk->n", frame.rG, modal.qdd)
     )
     if frame.bent is not None:
         moment -= frame.bent.spin
+    if modal.L is not None:
+        moment -= np.einsum("nk,nk->n", modal.z @ frame.constants.body.G, modal.convective)
     return moment
 
 
 def inertia(frame: Frame) -> np.ndarray:
     """Return the deformed body's inertia about its frame's origin (n,), kg m2."""
-    body = frame.constants.body
-    return body.inertia + np.einsum("nk,nk->n", body.j + frame.jM, frame.e)
+    body, bent, z = frame.constants.body, frame.bent, frame.modal.z
+    if bent is None:
+        return body.inertia + np.einsum("nk,nk->n", body.j + frame.jM, frame.e)
+    first = np.einsum("nk,nk->n", 2.0 * body.j - bent.q[:, 3], frame.e)
+    return body.inertia + first + np.einsum("nk,nk->n", z @ body.M, z)
 
 
 def body_force(frame: Frame) -> np.ndarray:

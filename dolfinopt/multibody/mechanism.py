@@ -35,6 +35,7 @@ class ModalConstants:
         loads: (7, q) real: x and y of C; r; j; x and y of B; rotation.
         K, D: (q, q), or their diagonals (q,) where there is nothing else; no D, None.
         K0: (7, q, q) geometric stiffness by each of `loads`, or None of a linear body.
+        L: (q, q, q) of `ModalDisplacement`, or None.
     """
 
     body: ShapeIntegrals
@@ -48,6 +49,7 @@ class ModalConstants:
     K: np.ndarray
     D: np.ndarray | None
     K0: np.ndarray | None
+    L: np.ndarray | None
 
     @cached_property
     def second_order(self) -> np.ndarray:
@@ -77,6 +79,7 @@ def _modal_constants(body: ShapeIntegrals) -> ModalConstants:
         K=_diagonal_or_matrix(body.K),
         D=_diagonal_or_matrix(body.D) if body.D.any() else None,
         K0=np.concatenate([body.K0, body.K0_outboard]) if body.is_stiffened else None,
+        L=body.along_modes if len(body.along_modes) else None,
     )
 
 

@@ -61,7 +61,10 @@ TABLE = (
     Integral("K0", "mass", modes=(1, 2)),
     Integral("K0_outboard", modes=(1, 2)),
     Integral("further_points"),
+    Integral("along_modes", modes=(0, 1, 2)),
 )
+
+STIFFENING = ("K0", "K0_outboard", "along_modes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +89,9 @@ class ShapeIntegrals:
         K0_outboard: (b, q, q) that of unit forces and moments at the outboard interfaces, 1/m and
             1 for modes in m; (0, q, q) likewise.
         further_points: (i, d) reference positions of the others, m; none in the plane.
+        along_modes: (q, q, q) L of the displacement of second order along the modes, M^-1 times
+            the geometric stiffness by the modes' inertia, see `modal_displacement`; (0, q, q) where
+            it is not known, as of bodies from files.
     """
 
     mass: float
@@ -98,6 +104,7 @@ class ShapeIntegrals:
     K0: np.ndarray
     K0_outboard: np.ndarray
     further_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    along_modes: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     @property
     def points(self) -> np.ndarray:
@@ -179,13 +186,14 @@ def plane_body(
     K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
     """
     q = len(K)
+    none = np.zeros((0, q, q))
     W = np.zeros((2, 1 + q, 1 + q))
     W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
     W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
-    w, K0 = np.column_stack([moment, C]), np.zeros((0, q, q)) if K0 is None else K0
+    w, K0 = np.column_stack([moment, C]), none if K0 is None else K0
     further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
     return ShapeIntegrals(
-        float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:], further
+        float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:], further, none
     )
 
 
@@ -234,7 +242,13 @@ def in_basis(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
 
 
 def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.ndarray:
-    """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay."""
+    """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay.
+
+    Of three axes the first one is that of coordinates themselves: T^-1 x.
+    """
+    if rank == 3:
+        value = _transformed(value, T, 2, first)
+        return np.tensordot(np.linalg.pinv(T), value, 1) if len(value) else value
     q = T.shape[1]
     out = np.empty((*value.shape[:-rank], *(first + q,) * rank))
     if rank == 1:
@@ -277,6 +291,28 @@ def generators(dimension: int) -> np.ndarray:
     return PLANE if dimension == 2 else SPACE
 
 
+def _diagonal(E: np.ndarray) -> np.ndarray:
+    """Return which of E_c have a trace: those whose integrals M is the sum of."""
+    return np.trace(E, axis1=1, axis2=2) != 0.0
+
+
+def by_modal_loads(body: ShapeIntegrals, by: ShapeIntegrals) -> tuple[ShapeIntegrals, np.ndarray]:
+    """Return derivatives by integrals without L, and those by the K0 that it is made of.
+
+    Args:
+        body: whose L is M^-1 K0.
+        by: derivatives by its integrals.
+
+    Returns:
+        The derivatives, those by L among those by M, and those by K0 (q, q, q).
+    """
+    L, W = body.along_modes, by.W.copy()
+    by_K0 = np.linalg.solve(body.M, by.along_modes.reshape(len(L), -1)).reshape(L.shape)
+    diagonal = _diagonal(generators(len(by.w)))
+    W[diagonal, 1:, 1:] -= np.tensordot(by_K0, L, ((1, 2), (1, 2)))
+    return replace(by, W=W), by_K0
+
+
 def shape_integrals(
     arm: ElasticArm,
     basis: Basis,
@@ -312,18 +348,26 @@ def shape_integrals(
     mass, moment, C, second, first, modes = (
         piece.reshape(np.shape(part)) for piece, part in zip(pieces, parts, strict=True)
     )
-    K0 = np.zeros((0, q, q)) if loads is None else loads.geometric_stiffness(V)
+    W = _assembled(E, second, first, modes)
+    K0 = by_modes = by_outboard = np.zeros((0, q, q))
+    if loads is not None:
+        ends = [loads.num_frame, loads.num_inertial]
+        K0, by_modes, by_outboard = np.split(loads.geometric_stiffness(V), ends)
+    if len(by_modes):
+        M = W[_diagonal(E), 1:, 1:].sum(axis=0)
+        by_modes = np.linalg.solve(M, by_modes.reshape(q, -1)).reshape(by_modes.shape)
     return ShapeIntegrals(
         mass=float(mass),
         w=np.column_stack([moment, C]),
-        W=_assembled(E, second, first, modes),
+        W=W,
         K=basis.stiffness,
         D=stiffness_proportional * basis.stiffness,
         outboard=basis.outboard,
         outboard_point=arm.mesh.outboard_point,
-        K0=K0[: len(E) + d],
-        K0_outboard=K0[len(E) + d :],
+        K0=K0,
+        K0_outboard=by_outboard,
         further_points=arm.mesh.further_points,
+        along_modes=by_modes,
     )
 
 
@@ -432,14 +476,14 @@ def rigid_bar(
 def padded(by: ShapeIntegrals, like: ShapeIntegrals) -> ShapeIntegrals:
     """Return derivatives by `rigid_part` as those by the whole body `like`: zero by its modes."""
     whole = in_basis(by, np.zeros((0, like.num_modes)))
-    none, outboard = np.zeros_like(like.K0), np.zeros_like(like.K0_outboard)
-    return replace(whole, K0=none, K0_outboard=outboard)
+    zero = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
+    return replace(whole, **zero)
 
 
 def linear_part(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body without geometric stiffness."""
     linear = np.zeros((0, body.num_modes, body.num_modes))
-    return replace(body, K0=linear, K0_outboard=linear)
+    return replace(body, **dict.fromkeys(STIFFENING, linear))
 
 
 def rigid_part(body: ShapeIntegrals) -> ShapeIntegrals:

@@ -84,7 +84,7 @@ def _loads(rigid: Mechanism, motion: RigidMotion, closure: Closure | None) -> li
         inertial = (frame.a.real, frame.a.imag, frame.wd, -frame.w * frame.w)
         loads.insert(0, np.stack([*inertial, force.real, force.imag, moment], axis=1))
         moment = moment + (np.conj(frame.d) * force).imag
-        moment = moment + body_moment(frame, (none, none, none))
+        moment = moment + body_moment(frame)
         force = force + body_force(frame)
     return loads
 

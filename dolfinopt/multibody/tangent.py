@@ -17,15 +17,16 @@ import numpy as np
 from dolfinopt.multibody.instants import FEW, PerInstant, Scale, as_column, several
 from dolfinopt.multibody.inverse_dynamics import (
     Frame,
-    Rates,
     as_complex,
     body_force,
     body_moment,
     inertia,
     load_columns,
+    modal_inertia,
     outward_pass,
 )
 from dolfinopt.multibody.mechanism import Mechanism, ModalConstants
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.motion import RigidMotion
 
 _FrameDerivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # of (a, w, wd), each (n, 3 S)
@@ -41,7 +42,7 @@ class _BodyTangent:
     """Derivative of one body's elastic residual by S coordinates; arrays over n instants.
 
     r' = K q' + D qd' + M (qdd' - w^2 q') + G (wd q' + 2 w qd') + left (right y') with
-    y = [q, qd, qdd] of all S coordinates.
+    y = [q, qd, qdd] of all S coordinates, and what geometric stiffness adds.
 
     Attributes:
         constants: its constants.
@@ -51,7 +52,8 @@ class _BodyTangent:
         scale: of its constants; not of left and right.
         left: (n, q, r).
         right: (n, r, 3 S).
-        geometric: (n, q, q) sum_p p K0_p, which r' loses times q', or None of a linear body.
+        geometric: (n, q, q) each, what stiffening adds by q, and by qd and qdd where the body's
+            own inertia knows it; nothing of a linear body.
     """
 
     constants: ModalConstants
@@ -63,7 +65,7 @@ class _BodyTangent:
     scale: Scale
     left: np.ndarray
     right: np.ndarray
-    geometric: np.ndarray | None = None
+    geometric: tuple[np.ndarray, ...] = ()
 
     @property
     def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -74,7 +76,7 @@ class _BodyTangent:
     def at(self, part: slice) -> _BodyTangent:
         """Return it at some of the instants."""
         names = ("w", "wd", "scale", "left", "right")
-        geometric = None if self.geometric is None else self.geometric[part]
+        geometric = tuple(one[part] for one in self.geometric)
         changed = {name: getattr(self, name)[part] for name in names}
         return replace(self, geometric=geometric, **changed)
 
@@ -153,8 +155,8 @@ class Tangent:
             if part.constants.D is not None:
                 rows[:, :, columns[1]] += d * D
             rows[:, :, columns[2]] += m * M
-            if part.geometric is not None:
-                rows[:, :, columns[0]] -= part.geometric[:, part.kept[:, None], part.kept]
+            for place, one in zip(columns, part.geometric):
+                rows[:, :, place] += one[:, part.kept[:, None], part.kept]
         return jacobian
 
     def times(
@@ -185,8 +187,9 @@ class Tangent:
                 coupled += (k * e) @ K
             if D.any():
                 coupled += (d * ed) @ D
-            if part.geometric is not None:
-                coupled -= _by_instant(e, part.geometric[:, part.kept[:, None], own])
+            for change_of, one in zip((e, ed, edd), part.geometric):
+                rows = one[:, own[:, None], part.kept].swapaxes(1, 2)
+                coupled += _by_instant(change_of, rows)
             out.append(coupled)
         return np.concatenate(out, axis=1)
 
@@ -214,8 +217,8 @@ class Tangent:
             if part.constants.D is not None:
                 by_v[:, part.columns] += d * (y @ body.D[:, part.kept])
             by_a[:, part.columns] += m * M
-            if part.geometric is not None:
-                by_q[:, part.columns] -= _by_instant(y, part.geometric[:, :, part.kept])
+            for by, one in zip((by_q, by_v, by_a), part.geometric):
+                by[:, part.columns] += _by_instant(y, one[:, :, part.kept])
         return by_q, by_v, by_a
 
 
@@ -299,7 +302,6 @@ def linearise(
     for k in reversed(range(len(frames))):
         part, scale = mechanism.slices[k], mechanism.scale(k)
         frame, chosen = frames[k], places.kept[k]
-        rates = (q[:, part], qd[:, part], qdd[:, part])
         if carried := mechanism.carried(k):
             force, moment = force + carried[0] * frame.next_a, moment + carried[1] * frame.next_wd
             next_a_v, next_wd_v = _interface_derivatives(motions[k + 1], places.of_rigid(k + 2))
@@ -311,7 +313,7 @@ def linearise(
             force_v[:, columns[0]] += 1j * force[:, None] * rotation
         moves = k > 0 or len(places.rigid) > 0
         load = (force_v, moment_v)
-        left, right = _coupling(frame, motions[k], rates[1], load, scale.mass, moves)
+        left, right = _coupling(frame, motions[k], load, scale.mass, moves)
         geometric = _geometric(frame, (force, moment), scale.mass)
         rows = slice(len(places.rigid) + part.start, len(places.rigid) + part.stop)
         own = (frame.constants, rows, places.bodies[k], chosen, frame.w, frame.wd, scale)
@@ -321,10 +323,10 @@ def linearise(
         columns = places.of_body(k)
         moment_v = moment_v + (np.conj(frame.d)[:, None] * force_v).imag
         moment_v[:, columns[0]] += (np.conj(frame.B[..., chosen]) * force[:, None]).imag
-        force_b, moment_b = _body_load(frame, motions[k], columns, chosen, rates)
+        force_b, moment_b = _body_load(frame, motions[k], columns, chosen)
         mass = as_column(scale.mass)
         force_v, moment_v = force_v + mass * force_b, moment_v + mass * moment_b
-        moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame, rates)
+        moment = moment + (np.conj(frame.d) * force).imag + scale.mass * body_moment(frame)
         force = force + scale.mass * body_force(frame)
         drives[:, places.rigid == k + 1] = moment_v[:, None]
     if 0 in places.rigid:
@@ -425,22 +427,22 @@ def _next_motion(
 def _coupling(
     frame: Frame,
     motion: _FrameDerivatives,
-    ed: np.ndarray,
     load: tuple[np.ndarray, np.ndarray],
     mass: PerInstant,
     moves: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what a body feels of the others: factors (n, q, r), (n, r, 3 S); r = 3, or 7."""
     force_v, moment_v = load
-    constants = frame.constants
+    modal = frame.modal
     by = [frame.B.real, frame.B.imag, frame.rotation]
     coupled = [force_v.real, force_v.imag, moment_v]
     if moves:
         a_v, w_v, wd_v = motion
-        by_w = -2.0 * (frame.w[:, None] * frame.jM + ed @ constants.body.G)
+        gyroscopic = modal.pulled(modal.zd @ frame.constants.body.G)
+        by_w = -2.0 * (frame.w[:, None] * frame.jM + gyroscopic)
         by += [frame.C.real, frame.C.imag, by_w, frame.rG]
         coupled += [as_column(mass) * x for x in (a_v.real, a_v.imag, w_v, wd_v)]
-    left = np.empty((*ed.shape, len(by)))
+    left = np.empty((*frame.e.shape, len(by)))
     for i, column in enumerate(by):
         left[:, :, i] = column
     return left, np.stack(coupled, axis=1)
@@ -451,11 +453,9 @@ def _body_load(
     motion: _FrameDerivatives,
     columns: _Columns,
     chosen: np.ndarray,
-    rates: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives (n, 3 S) of one body's own force F and moment T."""
-    body, C = frame.constants.body, frame.C[..., chosen]
-    _, ed, edd = rates
+    body, C, modal = frame.constants.body, frame.C[..., chosen], frame.modal
     a_v, w_v, wd_v = motion
     cq, cv, ca = columns
     w, wd = frame.w[:, None], frame.wd[:, None]
@@ -464,16 +464,21 @@ def _body_load(
     force[:, cq] += (1j * wd - w * w) * C
     force[:, cv] += 2j * w * C
     force[:, ca] += C
-    spin = 2.0 * np.einsum("nk,nk->n", frame.jM, ed)[:, None]
+    spin = 2.0 * np.einsum("nk,nk->n", frame.jM, modal.qd)[:, None]
     moment = (np.conj(s) * a_v).imag + inertia(frame)[:, None] * wd_v + spin * w_v
     moment[:, cq] += (
         (np.conj(C) * frame.a[:, None]).imag
         + 2.0 * wd * frame.jM[:, chosen]
-        + 2.0 * w * (ed @ body.M[:, chosen])
-        + edd @ body.G[:, chosen]  # (G q) . qdd = qdd' G q
+        + 2.0 * w * modal.pulled(modal.zd @ body.M)[:, chosen]
+        + modal.pulled(modal.zdd @ body.G)[:, chosen]  # (G z) . zdd = zdd' G z
     )
     moment[:, cv] += 2.0 * w * frame.jM[:, chosen]
     moment[:, ca] += frame.rG[:, chosen]
+    if modal.L is not None:
+        Mz, zG = modal.z @ body.M, modal.z @ body.G
+        by_q = 2.0 * w * modal.rate_by_q(Mz) - modal.second_rate_by_q(zG)
+        moment[:, cq] += by_q[:, chosen]
+        moment[:, cv] -= 2.0 * modal.rate_by_q(zG)[:, chosen]
     if (bent := frame.bent) is not None:
         K0_ed, K0_edd = bent.qd[..., chosen], bent.qdd[..., chosen]
         C_d = as_complex(K0_ed[:, 0], K0_ed[:, 1])
@@ -486,10 +491,23 @@ def _body_load(
 
 def _geometric(
     frame: Frame, load: tuple[np.ndarray, np.ndarray], mass: PerInstant
-) -> np.ndarray | None:
-    """Return sum_p p K0_p (n, q, q) under the load on the outboard end, None of a linear body."""
+) -> tuple[np.ndarray, ...]:
+    """Return what stiffening adds to the rows' derivatives, see `_BodyTangent`.
+
+    -sum_p p K0_p (n, q, q) under the load on the outboard end, and what the modes' inertia makes
+    of the second order.
+    """
     if frame.bent is None:
-        return None
+        return ()
     p, K0 = load_columns(frame, load), frame.bent.K0
     p[:, :4] *= as_column(mass)
-    return (p @ K0.reshape(len(K0), -1)).reshape(-1, *K0.shape[1:])
+    by_q = -(p @ K0.reshape(len(K0), -1)).reshape(-1, *K0.shape[1:])
+    if frame.modal.L is None:
+        return (by_q,)
+    body, w, wd = frame.constants.body, frame.w[:, None, None], frame.wd[:, None, None]
+    by_z, by_zd = wd * body.G - w * w * body.M, 2.0 * w * body.G
+    found = frame.modal.tangent(modal_inertia(frame), body.M, by_z, by_zd)
+    if isinstance(mass, np.ndarray) or mass != 1.0:
+        mass = mass[:, None, None] if isinstance(mass, np.ndarray) else mass
+        found = (mass * found[0], mass * found[1], mass * found[2])
+    return by_q + found[0], found[1], found[2]

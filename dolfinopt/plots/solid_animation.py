@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.disk import write_atomically
+from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.multibody.spatial.frames import Frames, body_frames
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 from dolfinopt.output.views import ArmView
@@ -109,11 +110,7 @@ def make_solid_film(
 
 def _without_stiffening(mechanism: SpatialMechanism) -> SpatialMechanism:
     """Return it with interfaces that move linearly with the coordinates, as surfaces do."""
-    bodies = []
-    for body in mechanism.bodies:
-        none, outboard = np.zeros_like(body.K0), np.zeros_like(body.K0_outboard)
-        bodies.append(replace(body, K0=none, K0_outboard=outboard))
-    return replace(mechanism, bodies=tuple(bodies))
+    return replace(mechanism, bodies=tuple(map(linear_part, mechanism.bodies)))
 
 
 def draw_solid_motion(

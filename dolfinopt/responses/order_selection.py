@@ -191,7 +191,9 @@ class _Comparison:
 
     def _body(self, k: int, basis: Basis, beta: float) -> ShapeIntegrals:
         arm = self.arms[k]
-        loads = arm.current.unit_loads if arm.stiffened else None
+        loads = None
+        if arm.stiffened:
+            loads = arm.current.unit_loads.with_modes(basis.V, basis.MV)
         return shape_integrals(arm.elastic, basis, beta, loads)
 
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:

@@ -9,7 +9,13 @@ import numpy as np
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.fem.cells import combine
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, mass_partners, rigid_body
+from dolfinopt.fem.geometric_stiffness import GeometricGradient
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    by_modal_loads,
+    mass_partners,
+    rigid_body,
+)
 from dolfinopt.reduction import METHODS, frame_fields
 from dolfinopt.responses.statics import StaticResponse
 
@@ -64,6 +70,9 @@ def exact_gradient(
         V = basis.V
         damping = state.scene.damping.stiffness_proportional
         by_K = cotangents.K + damping * cotangents.D
+        by_modes = cotangents.along_modes
+        if len(by_modes):
+            cotangents, by_modes = by_modal_loads(state.body, cotangents)
         partners = mass_partners(elastic.points, V, cotangents)
         by_V = elastic.mass_times(partners.by_modes)
         by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
@@ -73,9 +82,8 @@ def exact_gradient(
             inertial = state.load_fields.gradient(by_elastic)
             by_V += modes + inertial.by_modes
         if cotangents.is_stiffened or by_unit_loads is not None:
-            by_K0 = np.concatenate([cotangents.K0, cotangents.K0_outboard])
             static = state.scene.reduction.method == "craig-bampton"
-            geometric = state.unit_loads.gradient(V, by_K0, static=static, by_fields=by_unit_loads)
+            geometric = _geometric_gradient(state, cotangents, by_modes, by_unit_loads)
             by_V += geometric.by_modes
             if static:  # K's first block is S; the constraint modes' interior is in equilibrium
                 b = len(geometric.by_stiffness)
@@ -92,8 +100,10 @@ def exact_gradient(
             energies = elastic.cell_stiffness_products(left, V)
         else:
             energies = geometric.by_young_beside(left, V)
-            # The partners of X and 1_x stand at the ends.
+            # The partners of X and 1_x stand at the ends, those of the modes between them.
             partners.left[:, :, [-1, 0]] += geometric.by_inertia
+            if cotangents.is_stiffened:
+                partners.left[:, :, 1:-1] += geometric.by_modal_inertia
         masses = elastic.cell_mass_products(partners.left, partners.right)
         if fields.frame is not None:
             masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
@@ -101,6 +111,22 @@ def exact_gradient(
             energies += inertial.by_young
             masses += inertial.by_density
         return state.young_slope * energies + state.density_slope * masses
+
+
+def _geometric_gradient(
+    state: DesignState, by: ShapeIntegrals, by_modes: np.ndarray, by_fields: np.ndarray | None
+) -> GeometricGradient:
+    """Differentiate by geometric stiffness and by the fields of the unit loads, see `UnitLoads`."""
+    static = state.scene.reduction.method == "craig-bampton"
+    loads = state.unit_loads
+    if by.is_stiffened:
+        loads = state.stiffening_loads
+        if by_fields is not None:
+            none = np.zeros((*by_fields.shape[:2], by.num_modes))
+            parts = np.split(by_fields, [loads.num_frame], axis=2)
+            by_fields = np.concatenate([parts[0], none, parts[1]], axis=2)
+    by_K0 = np.concatenate([by.K0, by_modes, by.K0_outboard])
+    return loads.gradient(state.basis.V, by_K0, static=static, by_fields=by_fields)
 
 
 def static_gradient(state: DesignState, response: StaticResponse) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.load_coefficients import load_counts, load_gradient
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.shape_integrals import SPACE, ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
 from dolfinopt.responses.response import by_owner
 from dolfinopt.responses.scenarios import cotangents_of_scene, factors
 from dolfinopt.scene.load import Scene
@@ -146,6 +146,6 @@ def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> Shap
         W[0, 1:, 1:], W[1, 1:, 1:] = by_P[:, 7 : 7 + q], by_P[:, 7 + q :]
     zero = {
         key: np.zeros_like(getattr(body, key))
-        for key in ("D", "outboard_point", "further_points", "K0", "K0_outboard")
+        for key in ("D", "outboard_point", "further_points", *STIFFENING)
     }
     return replace(body, mass=0.0, w=w, W=W, K=by_K, outboard=outboard, **zero)

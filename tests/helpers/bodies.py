@@ -246,11 +246,11 @@ class BentChain(Chain):
     """A chain whose bodies deform in the second order, by Lagrange's equations.
 
     First moment s, inertia J, angular momentum h of the relative motion and the outboard interface
-    lose 1/2 q'K0 q by the load that works on them; the kinetic energy is built of them, the mass
-    matrix of the elastic coordinates held: what geometric stiffness is in the theory.
+    lose 1/2 q'K0 q by the load that works on them; so does the displacement q along the modes. The
+    kinetic energy is built of them: what geometric stiffness is in the theory.
 
     Attributes:
-        K0: of every cloud, (7, q, q).
+        K0: of every cloud, (7 + q, q, q): by the seven loads, and L of its modes.
     """
 
     K0: tuple[np.ndarray, ...] = ()
@@ -259,7 +259,7 @@ class BentChain(Chain):
         """Return the chain of bodies with geometric stiffness."""
         linear = super().mechanism()
         bodies = [
-            replace(body, K0=K0[:4], K0_outboard=K0[4:])
+            replace(body, K0=K0[:4], K0_outboard=K0[4:7], along_modes=K0[7:])
             for body, K0 in zip(linear.bodies, self.K0, strict=True)
         ]
         return replace(linear, bodies=tuple(bodies))
@@ -300,8 +300,10 @@ class BentChain(Chain):
         for k, (cloud, K0) in enumerate(zip(self.clouds, self.K0, strict=True)):
             body, e = cloud.body(), self.parts(y)[k]
             s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
-            J = body.inertia + 2.0 * body.j @ e + e @ (body.M - K0[3]) @ e
-            by_s, by_h = body.C - e @ K0[:2], body.r + body.G @ e - K0[2] @ e
+            along = e @ K0[7:]
+            z, turn = e - 0.5 * along @ e, np.eye(len(e)) - along
+            J = body.inertia + 2.0 * body.j @ e - e @ K0[3] @ e + z @ body.M @ z
+            by_s, by_h = body.C - e @ K0[:2], body.r + turn.T @ body.G @ z - K0[2] @ e
             rates = []
             for (origins, turned), x in zip(moved, (u, v), strict=True):
                 velocity = _rotation(angles[k]).T @ origins[k].imag * 1e30
@@ -310,7 +312,8 @@ class BentChain(Chain):
             (v1, w1, s1, h1, e1), (v2, w2, s2, h2, e2) = rates
             around = np.array([-s[1], s[0]])
             total += body.mass * v1 @ v2 + v1 @ (s2 + w2 * around) + v2 @ (s1 + w1 * around)
-            total += J * w1 * w2 + w1 * h2 + w2 * h1 + e1 @ body.M @ e2
+            total += J * w1 * w2 + w1 * h2 + w2 * h1
+            total += (turn @ e1) @ body.M @ (turn @ e2)
         (tip1, angle1), (tip2, angle2) = (
             (origins[-1].imag * 1e30, turned[-1].imag * 1e30) for origins, turned in moved
         )

@@ -209,9 +209,11 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
 
 def stiffened(rng: np.random.Generator, body: ShapeIntegrals) -> ShapeIntegrals:
     """Return a body with some geometric stiffness."""
-    K0 = rng.normal(scale=0.2, size=(12 + len(body.outboard), *(body.num_modes,) * 2))
+    q, b = body.num_modes, len(body.outboard)
+    K0 = rng.normal(scale=0.2, size=(12 + b + q, q, q))
     K0 = K0 + K0.swapaxes(1, 2)
-    return replace(body, K0=K0[:12], K0_outboard=K0[12:])
+    # The modes of light clouds move little mass.
+    return replace(body, K0=K0[:12], K0_outboard=K0[12 : 12 + b], along_modes=0.1 * K0[12 + b :])
 
 
 def changes(rng: np.random.Generator, body: ShapeIntegrals) -> dict[str, np.ndarray]:
@@ -220,7 +222,7 @@ def changes(rng: np.random.Generator, body: ShapeIntegrals) -> dict[str, np.ndar
     for one in TABLE:
         value = np.asarray(getattr(body, one.name))
         change = rng.normal(size=value.shape)
-        if one.name[0] in "KD":
+        if one.name[0] in "KD" or one.name == "along_modes":
             change = change + change.swapaxes(-1, -2)
         if one.name == "W":  # W_ba = W_ab'
             blocks = change.reshape(3, 3, *change.shape[1:])

@@ -125,10 +125,12 @@ def test_plane_machine_in_space(stiff):
         (JointHardware(0.4, 0.1, 0.2), JointHardware(rotor=0.3)), 1.5,
     ).mechanism()  # fmt: skip
     if stiff:
-        K0 = [rng.normal(scale=0.2, size=(7, b.num_modes, b.num_modes)) for b in chain.bodies]
+        K0 = [rng.normal(scale=0.1, size=(7 + b.num_modes, *b.M.shape)) for b in chain.bodies]
         K0 = [x + x.swapaxes(1, 2) for x in K0]
         pairs = zip(chain.bodies, K0)
-        bodies = tuple(replace(b, K0=x[:4], K0_outboard=x[4:]) for b, x in pairs)
+        bodies = tuple(
+            replace(b, K0=x[:4], K0_outboard=x[4:7], along_modes=x[7:]) for b, x in pairs
+        )
         chain = replace(chain, bodies=bodies)
     motion = RigidMotion(*rng.normal(size=(3, 5, 3)))
     rates = tuple(0.4 * rng.normal(size=(3, 5, 5)))

@@ -71,9 +71,10 @@ def random_chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Mec
         return model
     bodies = []
     for body in model.bodies:
-        K0 = rng.normal(scale=0.1, size=(7, body.num_modes, body.num_modes))
+        K0 = rng.normal(scale=0.1, size=(7 + body.num_modes, body.num_modes, body.num_modes))
         K0 = K0 + K0.swapaxes(1, 2)
-        bodies.append(replace(body, K0=K0[:4], K0_outboard=K0[4:]))
+        parts = {"K0": K0[:4], "K0_outboard": K0[4:7], "along_modes": 0.1 * K0[7:]}
+        bodies.append(replace(body, **parts))
     return replace(model, bodies=tuple(bodies))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.spatial.inverse_dynamics import Link, inward_pass, outward_pass
 from dolfinopt.multibody.spatial.kinematics import Load
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism

@@ -7,7 +7,8 @@ the body's frame is a + A p + 2 Omega p' + p'' with A = wd~ + w~ w~, Omega = w~.
     f = a . C + A_ab W_ab eta + 2 Omega_ab W_ab eta' + W_aa eta'' + K e + D e'
 with s = w eta, G_ab = int p_a p_b, H_ab = int p_a p'_b, I_ab = int p_a p''_b. Geometric stiffness
 K0 of the accelerations a and A_ab takes 1/2 e'K0 e from s and from int p_a X_b, and K0 e from
-their derivatives C and W_ab eta by e. Loads are stacked (F, T), motions (a, w, wd).
+their derivatives C and W_ab eta by e. In products of the modes with each other the place of e is
+taken by z, see `modal_displacement`. Loads are stacked (F, T), motions (a, w, wd).
 Source: Schwertassek & Wallrapp (1999); Wallrapp & Schwertassek (1991),
 doi:10.1002/nme.1620320818.
 """
@@ -18,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.modal_displacement import ModalDisplacement, Rates
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import TRANSPOSED, Constants
 from dolfinopt.multibody.spatial.rotations import ONE, axial, cross, skew, times
@@ -47,6 +48,7 @@ class BodyMotion:
         """Take the motion (a, w, wd)."""
         self.constants, self.rates = constants, rates
         self.a, self.w, self.wd = motion
+        self.modal = ModalDisplacement(constants.L, rates)
 
     @property
     def is_flexible(self) -> bool:
@@ -79,12 +81,22 @@ class BodyMotion:
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """W_ab times eta, eta', eta'' (n, 9, 1 + q)."""
-        constants = self.constants
+        """W_ab of all fields times eta, eta', eta'' (n, 9, 1 + q), of the modes times (1, z)."""
+        constants, modal = self.constants, self.modal
         shape = (len(self.a), 9, 1 + constants.num_modes)
-        found = [(x @ constants.W_modes).reshape(shape) for x in self.rates]
+        along = (modal.z, modal.zd, modal.zdd)
+        found = [(x @ constants.W_modes).reshape(shape) for x in along]
+        if modal.L is not None:
+            first = constants.W_modes[:, :: shape[2]]
+            for product, x in zip(found, self.rates, strict=True):
+                product[:, :, 0] = x @ first
         found[0] = found[0] + constants.W_rest.reshape(shape[1:])
         return found[0], found[1], found[2]
+
+    @cached_property
+    def _along(self) -> np.ndarray:
+        """W_ab of the modes times z (n, 9, q)."""
+        return self._products[0][:, :, 1:] - self.constants.body.W[:, 1:, 0]
 
     @cached_property
     def C(self) -> np.ndarray:
@@ -96,6 +108,8 @@ class BodyMotion:
     def Y(self) -> np.ndarray:
         """W_ab eta (n, 9, q) of the modes' rows, less K0_ab e."""
         Y, bent = self._products[0][:, :, 1:], self._stiffening
+        if self.modal.L is not None:
+            Y = self.constants.body.W[:, 1:, 0] + self.modal.pulled(self._along)
         return Y if bent is None else Y - bent[0][:, 3:]
 
     @cached_property
@@ -116,8 +130,10 @@ class BodyMotion:
     @cached_property
     def second_moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """G, H, I (n, 3, 3) = int p p', int p p'' of rates, see the module."""
-        e = self.rates[0]
-        found = [x[:, :, 0] + np.einsum("nck,nk->nc", x[:, :, 1:], e) for x in self._products]
+        e, z = self.rates[0], self.modal.z
+        found = [x[:, :, 0] + np.einsum("nck,nk->nc", x[:, :, 1:], z) for x in self._products]
+        if self.modal.L is not None:
+            found[0] = found[0] + (e - z) @ self.constants.body.W[:, 1:, 0].T
         if (bent := self._stiffening) is not None:
             x, xd = bent[0][:, 3:], bent[1][:, 3:]
             own, rate, second = (np.einsum("nck,nk->nc", x, one) for one in self.rates)
@@ -154,11 +170,11 @@ class BodyMotion:
     @cached_property
     def rows(self) -> np.ndarray:
         """The body's own elastic rows (n, q), nothing loading its outboard interface."""
-        body, (e, ed, edd) = self.constants.body, self.rates
+        body, modal, (e, ed, _) = self.constants.body, self.modal, self.rates
         A, Omega = self.A.reshape(-1, 1, 9), self.Omega.reshape(-1, 1, 9)
-        f = (A @ self.Y + 2.0 * (Omega @ self._products[1][:, :, 1:]))[:, 0]
+        f = (A @ self.Y + 2.0 * (Omega @ modal.pulled(self._products[1][:, :, 1:])))[:, 0]
         f = f + (self.a @ self.C if self.C.ndim == 2 else (self.a[:, None] @ self.C)[:, 0])
-        return f + edd @ self.constants.M + e @ body.K + ed @ body.D
+        return f + modal.pulled(modal.zdd @ self.constants.M) + e @ body.K + ed @ body.D
 
     # -- derivatives -------------------------------------------------------------------------
 
@@ -190,7 +206,7 @@ class BodyMotion:
         by_w = self.w[:, None] @ (Y + Y[:, TRANSPOSED]).reshape(count, 3, -1)
         out[:, 3:6] = by_w.reshape(count, 3, q)
         out[:, 3:6] -= 2.0 * self.w[:, :, None] * Y[:, DIAGONAL].sum(axis=1)[:, None]
-        out[:, 3:6] -= 2.0 * (AXIAL @ self._products[1][:, :, 1:])
+        out[:, 3:6] -= 2.0 * (AXIAL @ self.modal.pulled(self._products[1][:, :, 1:]))
         out[:, 6:] = -(AXIAL @ Y)
         return out.swapaxes(1, 2)
 
@@ -203,7 +219,13 @@ class BodyMotion:
         Omega = self.Omega
         by_e[:, :3], by_ed[:, :3], by_edd[:, :3] = self.A @ C, 2.0 * (Omega @ C), C
         of_A, of_Omega = self._moment_by_second_moments
-        turned, first, second = Y[:, TRANSPOSED], *(x[:, :, 1:] for x in self._products[1:])
+        modal = self.modal
+        first, second = (modal.pulled(x[:, :, 1:]) for x in self._products[1:])
+        turned, bending = Y[:, TRANSPOSED], None
+        if modal.L is not None:
+            across = self._along[:, TRANSPOSED]
+            bending = modal.rate_by_q(across)
+            first, second = first + bending, second + modal.second_rate_by_q(across)
         if bent is not None:
             xd, xdd = bent[1], bent[2]
             by_e[:, :3] -= 2.0 * (Omega @ xd[:, :3]) + xdd[:, :3]
@@ -215,6 +237,8 @@ class BodyMotion:
         by_ed[:, 3:] = of_Omega @ turned
         if bent is not None:
             by_ed[:, 3:] -= 2.0 * (AXIAL @ bent[1][:, 3:][:, TRANSPOSED])
+        if bending is not None:
+            by_ed[:, 3:] += 2.0 * (AXIAL @ bending)
         by_edd[:, 3:] = AXIAL @ turned
         return by_e, by_ed, by_edd
 
@@ -227,16 +251,27 @@ class BodyMotion:
         return of_A, of_Omega
 
     @cached_property
-    def rows_by_rates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the rows by e and e' (n, q, q); by e'' it is the constant mass M."""
+    def rows_by_rates(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of the rows by e, e' and e'' (n, q, q); the mass M (q, q) if z is e."""
         constants, body = self.constants, self.constants.body
         count, q = self.rates[0].shape
         A, Omega = self.A.reshape(count, 9), self.Omega.reshape(count, 9)
-        by_e = (A @ constants.modes).reshape(count, q, q) + body.K
-        by_ed = (2.0 * Omega @ constants.modes).reshape(count, q, q) + body.D
+        by_z = (A @ constants.modes).reshape(count, q, q)
+        by_zd = (2.0 * Omega @ constants.modes).reshape(count, q, q)
+        by_e, by_ed, by_edd = by_z + body.K, by_zd + body.D, constants.M
+        if self.modal.L is not None:
+            more = self.modal.tangent(self._modal_inertia, constants.M, by_z, by_zd)
+            by_e, by_ed, by_edd = by_e + more[0], by_ed + more[1], by_edd + more[2]
         if constants.K0 is not None:
             by_e -= np.tensordot(np.hstack([self.a, A]), constants.K0, 1)
-        return by_e, by_ed
+        return by_e, by_ed, by_edd
+
+    @cached_property
+    def _modal_inertia(self) -> np.ndarray:
+        """A_ab W_ab z + 2 Omega_ab W_ab z' + M z'' (n, q)."""
+        A, Omega = self.A.reshape(-1, 1, 9), self.Omega.reshape(-1, 1, 9)
+        forces = (A @ self._along + 2.0 * (Omega @ self._products[1][:, :, 1:]))[:, 0]
+        return np.asarray(forces + self.modal.zdd @ self.constants.M)
 
     # -- gradient ----------------------------------------------------------------------------
 
@@ -250,13 +285,36 @@ class BodyMotion:
             multipliers: (n, q) of the rows.
 
         Returns:
-            mass, w, W, K, D and K0 under their names.
+            mass, w, W, K, D, K0 and along_modes under their names.
         """
-        q, (e, ed, edd) = self.constants.num_modes, self.rates
+        (e, ed, _), modal = self.rates, self.modal
         p, phi = virtual[:, :3], virtual[:, 3:]
+        w, W = self._by_moments(p, phi, self.rates, multipliers)
+        along_modes = np.zeros_like(self.constants.body.along_modes)
+        if modal.L is not None:
+            along = (modal.z, modal.zd, modal.zdd)
+            by_modes = self._by_moments(p, phi, along, modal.pushed(multipliers))[1]
+            W[:, 1:, 1:] = by_modes[:, 1:, 1:]
+            by = self._by_modal_displacement(phi, multipliers)
+            along_modes = modal.gradient(by, self._modal_inertia, multipliers)
+        return {
+            "mass": float((p * self.a).sum()),
+            "w": w,
+            "W": W,
+            "K": multipliers.T @ e,
+            "D": multipliers.T @ ed,
+            "K0": self._by_stiffening(p, phi, multipliers),
+            "along_modes": along_modes,
+        }
+
+    def _by_moments(
+        self, p: np.ndarray, phi: np.ndarray, rates: Rates, multipliers: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivative of the virtual work by w (3, 1 + q) and W (9, 1 + q, 1 + q)."""
+        q = self.constants.num_modes
         eta, eta_d, eta_dd, zeta = (
             np.insert(x, 0, first, axis=1)[:, None, None]
-            for x, first in zip((e, ed, edd, multipliers), (1.0, 0.0, 0.0, 0.0), strict=True)
+            for x, first in zip((*rates, multipliers), (1.0, 0.0, 0.0, 0.0), strict=True)
         )
         one = ONE[:, :, None]
         # Of a point N_a,k: its virtual displacement, and its acceleration less a (n, 3, 3, 1 + q).
@@ -265,14 +323,22 @@ class BodyMotion:
         left, right = (x.reshape(-1, 3 * (1 + q)) for x in (moved, driven))
         W = (left.T @ right).reshape(3, 1 + q, 3, 1 + q).transpose(0, 2, 1, 3)
         w = (p.reshape(-1) @ right + self.a.reshape(-1) @ left).reshape(3, 1 + q)
-        return {
-            "mass": float((p * self.a).sum()),
-            "w": w,
-            "W": W.reshape(9, 1 + q, 1 + q),
-            "K": multipliers.T @ e,
-            "D": multipliers.T @ ed,
-            "K0": self._by_stiffening(p, phi, multipliers),
-        }
+        return w, W.reshape(9, 1 + q, 1 + q)
+
+    def _by_modal_displacement(self, phi: np.ndarray, multipliers: np.ndarray) -> Rates:
+        """Return the derivative of the virtual work by z, z' and z'' (n, q)."""
+        count, q = multipliers.shape
+        A, Omega = self.A.reshape(count, 1, 9), self.Omega.reshape(count, 1, 9)
+        zeta, constants = self.modal.pushed(multipliers), self.constants
+        of_rows = (zeta @ constants.modes.reshape(9, q, q)).swapaxes(0, 1)  # W_ab' zeta
+        of_G, of_H = (phi[:, None] @ x for x in self._moment_by_second_moments)
+        of_I = (phi @ AXIAL)[:, None]
+        z, zd, zdd = self._along, self._products[1][:, :, 1:], self._products[2][:, :, 1:]
+        across = z[:, TRANSPOSED]
+        by_z = of_G @ (z + across) + of_H @ zd + of_I @ zdd + A @ of_rows
+        by_zd = of_H @ across + 2.0 * (Omega @ of_rows)
+        by_zdd = (of_I @ across)[:, 0] + zeta @ constants.M
+        return by_z[:, 0], by_zd[:, 0], by_zdd
 
     def _by_stiffening(self, p: np.ndarray, phi: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
         """Return the derivative by K0 (12, q, q); (0, q, q) of a linear body."""

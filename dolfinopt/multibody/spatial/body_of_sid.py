@@ -114,6 +114,7 @@ def from_sid(
         outboard=np.concatenate([matrix.M0 for tip in tips for matrix in (tip.phi, tip.psi)]),
         outboard_point=points[0],
         K0=0.5 * (K0 + K0.swapaxes(1, 2)),
+        along_modes=np.zeros((0, q, q)),
         K0_outboard=0.5 * (K0_outboard + K0_outboard.swapaxes(1, 2)),
         further_points=points[1:],
     )

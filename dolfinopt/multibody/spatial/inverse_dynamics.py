@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.spatial.body_motion import BodyMotion
 from dolfinopt.multibody.spatial.kinematics import Interface, Load, Motion, MovingJoint
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.spatial.body_motion import BodyMotion
 from dolfinopt.multibody.spatial.mechanism import Joint
 from dolfinopt.multibody.spatial.rotations import (

@@ -66,6 +66,7 @@ class Constants:
         K0: (12, q, q) of the frame's accelerations a and A_ab, or None of a linear body.
         K0_outboard: (6 i, q, q), or None.
         points: (i, 3) reference positions of the interfaces.
+        L: (q, q, q) of `ModalDisplacement`, or None.
     """
 
     body: ShapeIntegrals
@@ -79,6 +80,7 @@ class Constants:
     K0: np.ndarray | None
     K0_outboard: np.ndarray | None
     points: np.ndarray
+    L: np.ndarray | None
 
     @property
     def num_modes(self) -> int:
@@ -104,6 +106,7 @@ def constants_of(body: ShapeIntegrals) -> Constants:
         K0=body.K0 if stiffened else None,
         K0_outboard=body.K0_outboard if stiffened else None,
         points=body.points,
+        L=body.along_modes if len(body.along_modes) else None,
     )
 
 

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dolfinopt.multibody.inverse_dynamics import Rates
+from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.spatial.inverse_dynamics import (
     Link,
     Loads,
@@ -34,7 +34,7 @@ class BodyTangent:
         rows, columns: its place among all rows and among the S columns.
         kept: those of its coordinates that have a column.
         K, D: (n, q, q).
-        M: (q, q).
+        M: (n, q, q), or (q, q) of a body whose mass is the same in every shape.
         left: (n, q, r).
         right: (n, r, 3 S).
     """
@@ -51,7 +51,7 @@ class BodyTangent:
     def at(self, part: slice) -> BodyTangent:
         """Return it at some of the instants."""
         changed = {name: getattr(self, name)[part] for name in ("K", "D", "left", "right")}
-        return replace(self, **changed)
+        return replace(self, M=self.M if self.M.ndim == 2 else self.M[part], **changed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,9 @@ class SpatialTangent:
         jacobian = np.empty((len(self.drives), size, 3 * size))
         jacobian[:, : self.drives.shape[1]] = self.drives
         for part in self.bodies:
-            rows, own = jacobian[:, part.columns], np.ix_(part.kept, part.kept)
+            rows, own = jacobian[:, part.columns], (..., part.kept[:, None], part.kept)
             np.matmul(part.left[:, part.kept], part.right, out=rows)
-            blocks = (part.K[:, own[0], own[1]], part.D[:, own[0], own[1]], part.M[own])
+            blocks = (part.K[own], part.D[own], part.M[own])
             for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
                 rows[:, :, columns] += block
         return jacobian
@@ -108,7 +108,7 @@ class SpatialTangent:
             rows = part.left[:, own] @ (part.right @ change)
             rows += part.K[:, own[:, None], part.kept] @ e
             rows += part.D[:, own[:, None], part.kept] @ ed
-            rows += part.M[own[:, None], part.kept] @ edd
+            rows += part.M[..., own[:, None], part.kept] @ edd
             out.append(rows)
         found: np.ndarray = np.concatenate(out, axis=1).swapaxes(1, 2)
         return found.reshape(len(q), len(wanted))
@@ -120,7 +120,7 @@ class SpatialTangent:
         for part in self.bodies:
             y = rows[:, None, part.rows]
             gradient += ((y @ part.left) @ part.right)[:, 0]
-            blocks = (part.K[:, :, part.kept], part.D[:, :, part.kept], part.M[:, part.kept])
+            blocks = (part.K[:, :, part.kept], part.D[:, :, part.kept], part.M[..., part.kept])
             for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
                 gradient[:, columns] += (y @ block)[:, 0]
         by_q, by_v, by_a = np.split(gradient, 3, axis=1)
@@ -327,7 +327,7 @@ def _body_tangent(
 ) -> BodyTangent:
     """Return the derivative of body i's rows."""
     part, body = mechanism.slices[i], link.body
-    K, D = body.rows_by_rates
+    K, D, M = body.rows_by_rates
     count, q = body.rates[0].shape
     left, right = [np.zeros((count, q, 0))], [np.zeros((count, 0, 3 * places.size))]
     for s, interface in link.interfaces.items():
@@ -344,7 +344,7 @@ def _body_tangent(
         kept=places.kept[i],
         K=K,
         D=D,
-        M=body.constants.M,
+        M=M,
         left=np.concatenate(left, axis=2),
         right=np.concatenate(right, axis=1),
     )
