@@ -256,10 +256,13 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         click.echo(_chosen(found["coordinates"], found["error_estimate"]))
     loads, asked = summary["stiffening"], summary["scene"]["simulation"]["stiffening"]
     if asked == "auto" and loads is not None and loads["on"]:
-        click.echo(
-            'simulation.stiffening = "auto": on, the loads of the motion change the stiffness of '
-            f"an arm by {100.0 * loads['estimate']:.2g} %"
+        reason = (
+            "the loads of the motion change the stiffness of an arm by "
+            f"{100.0 * loads['estimate']:.2g} %"
+            if loads["neglected"] is None
+            else f"the deviation would be {100.0 * loads['neglected']:.2g} % off without it"
         )
+        click.echo(f'simulation.stiffening = "auto": on, {reason}')
     ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
     optimised = summary["kkt"] is not None
     if optimised:

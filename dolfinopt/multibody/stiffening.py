@@ -19,23 +19,21 @@ from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_part
 
-# Change of stiffness from which "auto" takes it into account. Two arms of half density with 0.5 kg
-# reach 0.014 in 0.9 s, which is 2 % of the deviation, and 0.022 in 0.7 s, which is 6 %.
-SWITCH_ON = 0.02
-WARN = 0.05  # from which a motion without it is not to be trusted
-
 
 @dataclass(frozen=True)
 class Stiffening:
     """Whether bodies have geometric stiffness, and why.
 
     Attributes:
-        estimate: largest relative change of an arm's stiffness along the motion.
+        estimate: largest relative change of an arm's stiffness along the motion; None where the
+            scene itself says whether it counts.
         on: whether it is taken into account.
+        neglected: what the deviation would miss without it, over its largest; None if not compared.
     """
 
-    estimate: float
+    estimate: float | None
     on: bool
+    neglected: float | None = None
 
 
 def largest_change(

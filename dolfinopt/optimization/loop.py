@@ -26,6 +26,8 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
+from dolfinopt.responses.scenarios import pose_scenarios
+from dolfinopt.responses.stiffening import reconsider_stiffening
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -115,7 +117,7 @@ class _Run:
         self._evaluate()
         if memory is None:
             self._record()
-        while not self._finished():
+        while not self._finished() or self._stiffens():
             self.iterate.step(self.iterate.problem)
             self._record()
             self._checkpoint()
@@ -144,6 +146,23 @@ class _Run:
         """Decide whether to stop; the same on all ranks."""
         self.finished = self.iterate.ending()
         return bool(self.finished)
+
+    def _stiffens(self) -> bool:
+        """Look again whether geometric stiffening counts, and say whether to go on (collective).
+
+        "auto" decided for the initial design. Where the final one calls for it, it is evaluated
+        anew, and the iterations that are left go on with it.
+        """
+        if not needs(self.scene, "motion"):
+            return False
+        with together(self.partition.world):
+            for k, arm in self.arms.items():
+                arm.set_design(self.iterate.nominal.x_phys[k])
+        group = [self.scene, *pose_scenarios(self.scene)]
+        if not reconsider_stiffening(group, self.partition, self.arms):
+            return False
+        self.iterate.evaluate()
+        return self.iterate.iteration < self.scene.optimizer.max_iterations
 
     def _land(self) -> None:
         """Take short steps where the iterations ended just beyond a limit (collective).

@@ -79,7 +79,10 @@ def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -
         arrays["coordinates"] = memory.choice.coordinates
         arrays["tried"] = np.array(memory.choice.tried)
     if memory.stiffening is not None:
-        arrays["stiffening"] = [memory.stiffening.estimate, float(memory.stiffening.on)]
+        known = memory.stiffening
+        arrays["stiffening"] = [
+            np.nan if x is None else float(x) for x in (known.estimate, known.on, known.neglected)
+        ]
     if (further := memory.further) is not None:
         arrays[f"{FURTHER}begun"] = further.begun
         arrays[f"{FURTHER}designs"] = np.column_stack([further.objectives, further.feasible])
@@ -119,8 +122,10 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         choice = OrderSelection(count, dict(tried)[count], tried)
     stiffening = None
     if "stiffening" in arrays:
-        estimate, on = arrays["stiffening"].tolist()
-        stiffening = Stiffening(estimate, bool(on))
+        estimate, on, neglected = (
+            None if np.isnan(x) else x for x in arrays["stiffening"].tolist()
+        )
+        stiffening = Stiffening(estimate, bool(on), neglected)
     further = None
     if f"{FURTHER}begun" in arrays:
         own = {k.removeprefix(FURTHER): v for k, v in arrays.items() if k.startswith(FURTHER)}

@@ -31,7 +31,7 @@ from dolfinopt.responses.response import (
     objective_of,
 )
 from dolfinopt.responses.scenarios import bodies_in
-from dolfinopt.responses.stiffening import decide_stiffening
+from dolfinopt.responses.stiffening import decide_stiffening, stiffening_of_each
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
@@ -166,7 +166,30 @@ def evaluate_batch(
         with together(partition.world):
             for k, arm in arms.items():
                 arm.set_design(x_phys[k])
-        decide_stiffening(scenes, partition, arms)
+        decided = stiffening_of_each(
+            [(one, *pose_scenarios(one)) for one in scenes], partition, arms
+        )
+    except ConvergenceError as error:
+        return [error] * len(scenes)
+    found: dict[int, tuple[Evaluation, Trajectory | None] | ConvergenceError] = {}
+    for on in (False, True):  # bodies differ
+        if chosen := [i for i, one in enumerate(decided) if one.on == on]:
+            for arm in arms.values():
+                arm.set_stiffening(decided[chosen[0]])
+            some = _evaluate_alike([scenes[i] for i in chosen], partition, arms, x_phys, profile)
+            found.update(zip(chosen, some, strict=True))
+    return [found[i] for i in range(len(scenes))]
+
+
+def _evaluate_alike(
+    scenes: Sequence[Scene],
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x_phys: Cells,
+    profile: Profile,
+) -> list[tuple[Evaluation, Trajectory | None] | ConvergenceError]:
+    """Return `evaluate_batch` of scenes whose bodies all have geometric stiffness, or none."""
+    try:
         owned = _reduced(partition, arms, x_phys)
     except ConvergenceError as error:
         return [error] * len(scenes)
