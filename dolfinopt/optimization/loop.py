@@ -26,9 +26,8 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
-from dolfinopt.responses.scenarios import pose_scenarios
 from dolfinopt.responses.stiffening import reconsider_stiffening
-from dolfinopt.scene.load import Scene
+from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
