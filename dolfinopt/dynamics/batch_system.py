@@ -156,6 +156,8 @@ def _joined(motions: Sequence[RigidMotion]) -> RigidMotion:
 def related(systems: Sequence[ElasticSystem]) -> list[np.ndarray | None]:
     """Return every system's `BatchSystem.scales` (bodies, 3) of the first one's bodies, or None.
 
+    None of those with other masses and inertias at their joints, too.
+
     The damping's shape is the stiffness where it is proportional to it.
     """
     reference = systems[0].mechanism.bodies
@@ -164,11 +166,22 @@ def related(systems: Sequence[ElasticSystem]) -> list[np.ndarray | None]:
     for system in systems:
         bodies = system.mechanism.bodies
         scales = None
-        if len(bodies) == len(reference) and len(system.breakpoints) == len(systems[0].breakpoints):
+        if _same_hardware(system, systems[0]) and len(bodies) == len(reference):
             rows = [_scale(a, b, c) for a, b, c in zip(reference, bodies, dampers, strict=True)]
             scales = None if any(row is None for row in rows) else np.array(rows)
         found.append(scales)
     return found
+
+
+def _same_hardware(system: ElasticSystem, other: ElasticSystem) -> bool:
+    """Return whether all is equal that a `BatchSystem` takes from its first system alone."""
+    one, two = system.mechanism, other.mechanism
+    return (
+        one.joints == two.joints
+        and one.cart_mass == two.cart_mass
+        and one.joint_height == two.joint_height
+        and len(system.breakpoints) == len(other.breakpoints)
+    )
 
 
 def _shape_of_damping(body: ShapeIntegrals) -> np.ndarray:

@@ -301,10 +301,18 @@ def _flexibility(system: System, free: bool) -> np.ndarray:
 
 
 def _first_acceleration(system: System, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Return qdd (1, N) at t = 0, at which free coordinates set out."""
+    """Return qdd (1, N) at t = 0, at which free coordinates set out.
+
+    Zero of those without inertia, as of a motor without rotor inertia behind a spring: their
+    equations hold no acceleration.
+    """
     instants, rest = system.at(np.zeros(1)), np.zeros_like(q)
     mass = instants.linearise(q, qd, rest).dense()[0, :, 2 * q.shape[1] :]
-    return np.linalg.solve(mass, -instants.residual(q, qd, rest)[0])[None]
+    heavy = np.flatnonzero(mass.any(axis=1))
+    found = np.zeros_like(q)
+    residual = instants.residual(q, qd, rest)[0, heavy]
+    found[0, heavy] = np.linalg.solve(mass[np.ix_(heavy, heavy)], -residual)
+    return found
 
 
 def _every(h: np.ndarray) -> int:

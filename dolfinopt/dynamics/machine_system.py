@@ -364,17 +364,13 @@ class MachineSystem:
     def initial_state(self) -> State:
         """Return y, yd (1, S): the equilibrium of the controlled machine at t = 0.
 
-        Where a free coordinate has no stiffness it begins on the desired motion instead, the
-        elastic coordinates at rest, and so does a loop's, but for what keeps it closed.
+        A drive without stiffness begins on the desired motion and is held there for it: what else
+        is free, in a closed loop the joints that follow, finds its equilibrium about it.
 
         Raises:
             ConvergenceError: there is no equilibrium near the undeformed state.
         """
         y = np.zeros((1, self.num_coordinates))
-        R, moving, _ = self.ends
-        if self.is_held.any():
-            y[:, R:moving] = self.elastic.initial_state()[0]
-            return y, np.zeros_like(y)
         return self._rest(y)[0], np.zeros_like(y)
 
     @property
@@ -382,17 +378,23 @@ class MachineSystem:
         """Where nothing but the start holds a free coordinate (R,): no gain and no loop."""
         return self.drives.driven & (self.drives.stiffness == 0.0)
 
+    @cached_property
+    def _at_start(self) -> np.ndarray:
+        """Places of the unknowns that the equilibrium at t = 0 determines: all but held drives."""
+        return np.setdiff1d(np.arange(self.num_coordinates), self.drive_columns[self.is_held])
+
     def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
         instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
-        rest, ydd = np.zeros_like(y), np.zeros_like(y)
+        rest, ydd, step = (np.zeros_like(y) for _ in range(3))
+        step, some = step[0], self._at_start
         for _ in range(MAX_NEWTON):
-            residual = instants.residual(y, rest, ydd)[0]
+            residual = instants.residual(y, rest, ydd)[0, some]
             if not residual.any():
                 return y, ydd[0, ground]
             matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])
             try:
-                step = np.linalg.solve(matrix, -residual)
+                step[some] = np.linalg.solve(matrix[np.ix_(some, some)], -residual)
             except np.linalg.LinAlgError:
                 break
             ydd[0, ground] += step[ground]
@@ -400,10 +402,14 @@ class MachineSystem:
             y = y + step
             if np.abs(step).max() <= ROUNDING * max(1.0, np.abs(y).max()):
                 return y, ydd[0, ground]
+        limited = bool(self.drives.limited.any())
         raise ConvergenceError(
-            "the machine finds no equilibrium at t = 0: the drives are too soft for gravity, or "
-            "the loop cannot be closed; raise control.stiffness or material.young_modulus, or "
-            'leave feed-forward on, control.feed_forward = "rigid"'
+            "the machine finds no equilibrium at t = 0: the drives are too "
+            + ("weak or soft" if limited else "soft")
+            + " for gravity, or the loop cannot be closed; raise "
+            + ("control.limits, " if limited else "")
+            + "control.stiffness or material.young_modulus, or leave feed-forward on, "
+            'control.feed_forward = "rigid"'
         )
 
     def body_gradient(
@@ -461,16 +467,15 @@ class MachineSystem:
 
     def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:
         """Return the derivative by every body of J through the state y (S,) at t = 0."""
-        R, moving, _ = self.ends
-        if self.is_held.any():
-            return self.elastic.start_gradient(y[R:moving], by_y[R:moving])
         rest, ydd = np.zeros((1, len(y))), np.zeros((1, len(y)))
         ground = slice(*self.ends[1:])
         _, ydd[0, ground] = self._rest(y[None])
         tangent = self.at(np.zeros(1)).linearise(y[None], rest, ydd).dense()[0]
         right = by_y.copy()
         right[ground] = 0.0
-        multipliers = np.linalg.solve(self._at_rest(tangent).T, -right)
+        multipliers, some = np.zeros_like(right), self._at_start
+        matrix = self._at_rest(tangent)[np.ix_(some, some)]
+        multipliers[some] = np.linalg.solve(matrix.T, -right[some])
         return self.body_gradient(np.zeros(1), y[None], rest, ydd, multipliers[None])
 
     def _at_rest(self, tangent: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.fem.multigrid import Multigrid
+from dolfinopt.parallel import on_root
 
 COLUMNS = 12  # right sides at a time: memory of their vectors on all levels
 MAX_STEPS = 500
@@ -130,7 +131,7 @@ class BlockConjugateGradients:
             Z = grid.cycle(R)
         P = self._orthonormal(Z)
         self.steps = 0
-        while (self._lengths(R, Z) > goal).any():
+        while not (self._lengths(R, Z) <= goal).all():  # not a number included
             if self.steps == MAX_STEPS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
                 self.failed = True
                 break
@@ -149,7 +150,9 @@ class BlockConjugateGradients:
     def _orthonormal(self, P: np.ndarray) -> np.ndarray:
         """Return an orthonormal basis of the columns, dependent ones left out."""
         gram = self._dot(P, P)
+        if not np.isfinite(gram).all():
+            return P[:, :0]
         scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+        values, vectors = on_root(self._comm, np.linalg.eigh, gram / np.outer(scale, scale))
         kept = values > INDEPENDENT * values[-1]
         return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))

@@ -8,6 +8,27 @@ from functools import cached_property
 
 import numpy as np
 
+LINEAR = 0.95  # share of its limit up to which a drive gives what is wanted of it
+
+
+def saturated(wanted: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a drive gives of a wanted force, and the derivative by it, 1 to 0.
+
+    u = w for |w| <= 0.95 L, u = L sign(w) for |w| >= 1.05 L; between them the derivative falls by
+    the quintic law, 1 - 10 x^3 + 15 x^4 - 6 x^5 with x = (|w| / L - 0.95) / 0.1, hence
+    |u| = L (0.95 + 0.1 (x - 2.5 x^4 + 3 x^5 - x^6)). Three times continuously differentiable:
+    Newton's method, gradients and the integrator see no corner.
+
+    Args:
+        wanted: w (..., R), N, N m.
+        limit: L > 0 (R,), finite.
+    """
+    width = 2.0 * (1.0 - LINEAR)
+    x = np.clip((np.abs(wanted) / limit - LINEAR) / width, 0.0, 1.0)
+    bent = LINEAR + width * (x - x**4 * (2.5 - 3.0 * x + x * x))
+    u = np.where(x > 0.0, np.sign(wanted) * limit * bent, wanted)
+    return u, 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+
 
 @dataclass(frozen=True, eq=False)
 class Springs:
@@ -32,9 +53,9 @@ NO_SPRINGS = Springs(np.zeros(0, dtype=int), *np.zeros((3, 0)))
 class Drives:
     """Feed-forward plus proportional and derivative feedback of the free rigid coordinates.
 
-    u = limit( u_ff(t) + Kp (q_d - q) + Kd (qd_d - qd) ), coordinate by coordinate. A limit u_max
-    saturates smoothly, u_max tanh(u / u_max); of infinite limits nothing is cut off. A spring and
-    damper between a drive on its desired motion and the arm is the same without feed-forward.
+    u = limit( u_ff(t) + Kp (q_d - q) + Kd (qd_d - qd) ), coordinate by coordinate, see `saturated`;
+    of infinite limits nothing is cut off. A spring and damper between a drive on its desired motion
+    and the arm is the same without feed-forward.
 
     Attributes:
         free: (R,) ascending rigid coordinates, 0 the cart, k + 1 the joint of body k.
@@ -65,16 +86,16 @@ class Drives:
             return wanted
         u = wanted.copy()
         limits = self.limits[self.limited]
-        u[:, self.limited] = limits * np.tanh(wanted[:, self.limited] / limits)
+        u[:, self.limited] = saturated(wanted[:, self.limited], limits)[0]
         return u
 
     def passing(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Return du / d(wanted force) (n, R): 1 within the limits, 0 far beyond."""
+        """Return du / d(wanted force) (n, R): 1 within the limits, 0 beyond."""
         wanted = ahead - self.stiffness * error - self.damping * rate
         out = np.ones_like(wanted)
         limits = self.limits[self.limited]
-        out[:, self.limited] = np.cosh(np.minimum(np.abs(wanted[:, self.limited]) / limits, 300.0))
-        return out**-2.0
+        out[:, self.limited] = saturated(wanted[:, self.limited], limits)[1]
+        return out
 
     @cached_property
     def limited(self) -> np.ndarray:

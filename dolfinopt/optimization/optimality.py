@@ -58,8 +58,10 @@ def kkt_residual(
     size = {k: np.array([g0[part] @ g0[part], free[part].sum()]) for k, part in parts.items()}
     square, count = total(size)
     multipliers = np.zeros(f.size)
-    if not square > 0.0:
+    if square == 0.0:
         return 0.0, multipliers
+    if not np.isfinite(square):
+        return np.inf, multipliers
     g0 = g0 / np.sqrt(square / count)
     least, kept = np.inf, np.zeros(active.size)
     inside = (down > 0.0) & (up > 0.0)

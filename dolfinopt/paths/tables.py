@@ -42,7 +42,9 @@ class Curve:
         derivatives: functions of the parameter (n,) that return the curve (n, k) and its first
             and second derivative.
         kinks: parameters inside where the second or third derivative jumps.
-        rests: whether the derivatives are to be zero at both ends; else they are the functions'.
+        rests: whether the derivatives are zero at and behind both ends, as of a curve in its own
+            time; else they are the functions'. Along a curve without times the law brings rest, and
+            where it brakes until the last instant its acceleration there belongs to the motion.
     """
 
     end: float
@@ -206,7 +208,7 @@ def curve_by_chord(table: Table, measured: int | None = None) -> Curve:
     length = np.append(0.0, np.cumsum(chords))
     spline = CubicSpline(length / length[-1], table.rows, bc_type="natural")
     derivatives = (spline, spline.derivative(1), spline.derivative(2))
-    return Curve(1.0, derivatives, tuple(spline.x[1:-1].tolist()))
+    return Curve(1.0, derivatives, tuple(spline.x[1:-1].tolist()), rests=False)
 
 
 def _text(file: str) -> str:

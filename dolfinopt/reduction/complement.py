@@ -58,6 +58,8 @@ def complement_solve(
         for _ in range(MAX_ADJOINT):
             if energy <= goal:
                 break
+            if not np.isfinite(energy):
+                raise _too_close(pencil, k)
             length = energy / float(pencil.total(step @ image))
             out[:, k] += length * step
             residual -= length * image
@@ -94,6 +96,8 @@ def _without_factor(
     P, energy = Z, lengths(R, Z)
     goal = ADJOINT_TOLERANCE**2 * energy
     for _ in range(MAX_ADJOINT):
+        if not np.isfinite(energy).all():
+            break
         more = energy > goal[here]
         if not more.any():
             return out
@@ -107,7 +111,7 @@ def _without_factor(
         Z = conditioned(R)
         before, energy = energy, lengths(R, Z)
         P = Z + P * (energy / before)
-    raise _too_close(pencil, int(here[0]))
+    raise _too_close(pencil, int(here[np.argmin(np.isfinite(energy))]))
 
 
 def _too_close(pencil: Pencil, k: int) -> ConvergenceError:

@@ -11,6 +11,7 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.parallel import on_root
 from dolfinopt.reduction.lobpcg import Operators, interior_operators, lowest_without_factor
 from dolfinopt.solver import has_options, obeying_options
 
@@ -132,7 +133,7 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
         if left < LOST * whole:
             continue
         inverse = float(pencil.total(Mr @ pencil.inverse(Mr)))
-        if inverse * values[-1] > (1.0 + REPEATED) * left:
+        if not inverse * values[-1] <= (1.0 + REPEATED) * left:  # not a number included
             return True
     return False
 
@@ -172,7 +173,8 @@ def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
         length = np.sqrt(max(float(pencil.total(w @ Mw)), 0.0))
         if m + 1 < count:
             continue
-        theta, y = np.linalg.eigh(T[: m + 1, : m + 1], UPLO="U")
+        # One rank decides when the search ends: another's LAPACK may round differently.
+        theta, y = on_root(pencil.arm.comm, np.linalg.eigh, T[: m + 1, : m + 1], "U")
         theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
         if (length * np.abs(y[-1]) <= EIGEN_TOLERANCE * theta).all():
             return 1.0 / theta, (y.T @ Q[: m + 1]).T

@@ -98,6 +98,7 @@ class FreeOperators:
             lambda V: by_column(self.mass_times, V),
             precondition,
             inner.total,
+            inner.comm,
         )
 
     def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,12 +7,14 @@ Fehr & Eberhard, Multibody Syst. Dyn. 25 (2011) 313-334, doi:10.1007/s11044-010-
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.cells import combine
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.parallel import on_root
 from dolfinopt.reduction.basis import Basis, Options
 from dolfinopt.reduction.free_arm import (
     FreeArm,
@@ -75,7 +77,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     V = space.V[:, :, : len(factor)]
     upper = np.linalg.cholesky(arm.energy_matrix(V)).T
     _, triangle = np.linalg.qr((upper @ reduced.vectors @ factor).T)
-    U, sigma, _ = np.linalg.svd(triangle.T, full_matrices=False)
+    U, sigma, _ = on_root(arm.comm, partial(np.linalg.svd, triangle.T, full_matrices=False))
     found = int((sigma > RANK_TOLERANCE * sigma[0]).sum())
     if found < options.coordinates:
         raise ConvergenceError(
@@ -128,7 +130,7 @@ class _Reduced:
         """Diagonalise the part of the space that K^-1 M was applied to."""
         r = space.H.shape[1]
         T = space.H[:r]
-        theta, vectors = np.linalg.eigh(0.5 * (T + T.T))
+        theta, vectors = on_root(space.free.arm.comm, np.linalg.eigh, 0.5 * (T + T.T))
         theta = np.maximum(theta, np.finfo(float).eps * theta[-1])  # positive but for rounding
         inputs = vectors[: len(space.start)].T @ space.start
         beyond = space.H[r:] @ vectors

@@ -11,8 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.parallel import on_root
 
 Columns = Callable[[np.ndarray], np.ndarray]
 GUARDS = 3  # vectors beyond those that are wanted: the last ones converge slowly
@@ -29,6 +31,7 @@ class Operators:
         rows: of this rank.
         stiffness, mass, precondition: K, M, and an approximation of K^-1.
         total: sum over the ranks.
+        comm: the ranks that share the rows.
     """
 
     rows: int
@@ -36,6 +39,7 @@ class Operators:
     mass: Columns
     precondition: Columns
     total: Columns
+    comm: MPI.Comm
 
 
 def interior_operators(arm: ElasticArm) -> Operators:
@@ -48,6 +52,7 @@ def interior_operators(arm: ElasticArm) -> Operators:
         lambda V: by_column(arm.interior_mass_times, V),
         cycle,
         lambda part: part if arm.comm.size == 1 else arm.comm.allreduce(part),
+        arm.comm,
     )
 
 
@@ -129,8 +134,14 @@ def _ritz(operators: Operators, space: list[np.ndarray]) -> tuple[np.ndarray, np
     both = operators.total(S.T @ np.concatenate([KS, MS], axis=1))
     K, M = 0.5 * (both[:, :k] + both[:, :k].T), 0.5 * (both[:, k:] + both[:, k:].T)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
-    lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
-    kept = lengths > INDEPENDENT * lengths[-1]
-    T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
-    values, vectors = np.linalg.eigh(T.T @ K @ T)
-    return T @ vectors, values
+
+    def solved() -> tuple[np.ndarray, np.ndarray]:
+        lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
+        kept = lengths > INDEPENDENT * lengths[-1]
+        T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
+        values, vectors = np.linalg.eigh(T.T @ K @ T)
+        return T @ vectors, values
+
+    # One rank decides how many vectors are independent, and when the search ends.
+    found: tuple[np.ndarray, np.ndarray] = on_root(operators.comm, solved)
+    return found

@@ -10,6 +10,7 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.cells import combine
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.parallel import on_root
 from dolfinopt.reduction.basis import Basis, orient
 from dolfinopt.reduction.free_arm import FreeArm, Rows
 
@@ -169,14 +170,19 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         f"arm {arm.mesh.name!r}: the vectors of the reduction are dependent; ask for fewer "
         "reduction.coordinates or raise interpolation.floor"
     )
-    try:
-        inverse = np.linalg.inv(np.linalg.cholesky(energy))
-    except np.linalg.LinAlgError:
-        raise dependent from None
-    # The lowest frequencies are the largest of these, which keep all their digits.
-    mu, y = np.linalg.eigh(inverse @ (0.5 * (mass + mass.T)) @ inverse.T)
-    if mu[0] <= 0.0:
-        raise dependent
+
+    def solved() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        try:
+            inverse = np.linalg.inv(np.linalg.cholesky(energy))
+        except np.linalg.LinAlgError:
+            raise dependent from None
+        # The lowest frequencies are the largest of these, which keep all their digits.
+        mu, y = np.linalg.eigh(inverse @ (0.5 * (mass + mass.T)) @ inverse.T)
+        if not mu[0] > 0.0:  # not a number included
+            raise dependent
+        return inverse, mu, y
+
+    inverse, mu, y = on_root(arm.comm, solved)
     y = (inverse.T @ y[:, ::-1]) / np.sqrt(mu[::-1])
     # Stiffnesses differ by up to ten powers of ten, and y are as far from orthonormal as that.
     none = np.empty((*V.shape[:2], 0))

@@ -85,7 +85,7 @@ def choose_coordinates(
     most = min(max(MOST, least), comparison.limit)
     tried: dict[int, float] = {}
     low, high = least - 1, least
-    while (error := comparison.error(high)) > goal:
+    while not (error := comparison.error(high)) <= goal:  # not a number included
         tried[high] = error
         if high >= most:
             raise _none_found(scene, tried, goal)

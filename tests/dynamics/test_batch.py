@@ -27,7 +27,7 @@ from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.instants import Scale
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.multibody.tangent import linearise
@@ -289,12 +289,20 @@ def test_one_problem_is_solved_as_ever(alone):
     assert np.array_equal(one.a, single.a) and len(alone) == 1
 
 
-def test_other_bodies_are_solved_alone(alone):
-    """A stiffer arm is no scaled one: it does not spoil the batch of the others."""
-    stiffer = two_arms(bending=40.0)
-    problems = [two_arms(), stiffer, two_arms(payload=1.2)]
+def with_elbow(system: ElasticSystem) -> ElasticSystem:
+    """Return the system with a motor on its elbow, 2 kg."""
+    joints = (JointHardware(mass=2.0, inertia=0.01), JointHardware())
+    return replace(system, mechanism=replace(system.mechanism, joints=joints))
+
+
+@pytest.mark.parametrize(
+    "other", [two_arms(bending=40.0), with_elbow(two_arms())], ids=["stiffer", "joint mass"]
+)
+def test_other_machines_are_solved_alone(alone, other):
+    """A stiffer arm, or another motor, is no scaled one: it does not spoil the others' batch."""
+    problems = [two_arms(), other, two_arms(payload=1.2)]
     found, _ = solve(problems)
-    assert alone == [stiffer]
+    assert alone == [other]
     for problem, one in zip(problems, found, strict=True):
         single = radau.integrate(problem, TOLERANCE, 3, Profile())
         assert distance(problem, one, single) <= 2.0 * TOLERANCE

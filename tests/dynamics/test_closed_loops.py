@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from reference_machines import (
@@ -168,3 +170,23 @@ def test_closure_forces_of_rigid_loops(gravity: float) -> None:
     assert pin.closure_force is not None
     assert apart(pin.closure_force[10:-1] @ [1.0, 1.0j], force) < 1e-4
     assert apart(pin.joint_forces[10:-1, 1], torque) < 1e-4
+
+
+@pytest.mark.parametrize("arms_of", [slider_crank, four_bar], ids=["slider-crank", "four-bar"])
+def test_crank_without_stiffness_starts_closed_and_at_rest(arms_of: Callable[..., Tree]) -> None:
+    """Gravity bends the arms: the crank is held for the start, the joints that follow give way."""
+    height = (0.008,) if arms_of is slider_crank else ()
+    drive = {"stiffness": [0.0], "damping": [20.0]}
+    motion = {"speed": 60.0, "gravity": [0.0, -9.81]}
+    tree = arms_of(*height, cells=(24, 3), control=drive, motion=motion)
+    result = simulated(with_keys(tree, {"simulation": {"tolerance": 1e-4}}))
+    trajectory, system = machine(result)
+    y, yd = system.initial_state()
+    assert y[0, 0] == 0.0  # of the crank
+    assert np.abs(y[0, 1:]).max() > 0.0
+    ydd = np.zeros_like(y)
+    ydd[:, slice(*system.ends[1:])] = system._rest(y)[1]
+    left = system.at(np.zeros(1)).residual(y, yd, ydd)[0]
+    size = np.abs(system.feed_forward(trajectory.desired[:1])).max()  # N m; the crank's of gravity
+    assert np.abs(left[1:]).max() < 1e-10 * size
+    assert np.abs(gaps(result)).max() < 1e-9  # m

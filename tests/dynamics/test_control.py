@@ -18,7 +18,9 @@ from reference_machines import (
     with_keys,
 )
 
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.model import SimulationResult
+from dolfinopt.multibody.drives import LINEAR, saturated
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
@@ -89,6 +91,55 @@ def test_generalised_alpha() -> None:
     trajectory, _ = machine(simulated(tree))
     assert apart(other.deviation, trajectory.deviation) < 1e-3  # measured 1.1e-4
     assert apart(other.joint_forces, trajectory.joint_forces) < 2e-3  # 3.3e-4
+
+
+def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
+    """As wanted within the limit, the limit beyond; derivative right, continuous to the second."""
+    limit = np.array([40.0])
+    within = limit * np.array([[-LINEAR], [0.0], [0.3], [LINEAR]])
+    u, slope = saturated(within, limit)
+    np.testing.assert_array_equal(u, within)
+    np.testing.assert_array_equal(slope, 1.0)
+    u, slope = saturated(limit * np.array([[-1e9], [-1.06], [1.06], [1e9]]), limit)
+    assert u.ravel() == pytest.approx([-40.0, -40.0, 40.0, 40.0], rel=1e-15)
+    assert not slope.any()
+    wanted, h = 40.0 * np.linspace(0.9, 1.1, 2001)[:, None], 40.0 * 1e-4
+    u, slope = saturated(wanted, limit)
+    assert (np.diff(u, axis=0) >= -1e-14 * 40.0).all()
+    # Central differences: a sixth of h^2 times the third derivative, 60 / (0.1 L)^2 at most.
+    assert np.abs((u[2:] - u[:-2]) / (2.0 * h) - slope[1:-1]).max() < 60.0 * 1e-4**2 / 0.1**2 / 6.0
+    bend = np.diff(slope, axis=0) / h  # changes by 60 h / (0.1 L)^2 at most where it is continuous
+    assert np.abs(np.diff(bend, axis=0)).max() < 60.0 * h / 4.0**2
+
+
+def lifting(mass: float, limits: list[float] | None) -> Tree:
+    """Return a robot of two links that lifts its payload, its drives as its data sheet has them."""
+    bar = {"height": 0.1, "thickness": 0.02, "cells": [16, 3], "passive": 0.0}
+    robot = two_arm("motion.horizon=1.2", "motion.duration=0.8", control={
+        "stiffness": [2e4, 1e4], "damping": [600.0, 200.0], **({"limits": limits} if limits else {})
+    })  # fmt: skip
+    robot["arms"] = [
+        {"name": "upper", "length": 0.612, "joint_mass": 4.0, **bar},
+        {"name": "fore", "length": 0.572, "joint_mass": 0.0, **bar},
+    ]
+    motion = {"path": "line", "base": "fixed", "joint_height": 0.0, "gravity": [0.0, -9.81]}
+    motion |= {"start": [1.05, 0.2], "end": [0.7, 0.6], "duration": 1.0, "horizon": 1.5}
+    return with_keys(robot, {"motion": motion, "payload": {"mass": mass}})
+
+
+def test_robot_within_its_data_sheet() -> None:
+    """Drives that need less than 95 % of their limits do as drives without; others are cut off."""
+    limits = [330.0, 150.0]  # N m
+    free, held = (machine(simulated(lifting(18.0, one)))[0] for one in (None, limits))
+    peak = np.abs(free.joint_forces[:, 1:]).max(axis=0) / limits
+    assert 0.8 < peak.max() < LINEAR
+    np.testing.assert_array_equal(held.deviation, free.deviation)
+    weak = [260.0, 150.0]
+    forces = np.abs(machine(simulated(lifting(17.0, weak)))[0].joint_forces[:, 1:])
+    assert forces[:, 0].max() == pytest.approx(260.0, rel=1e-12)
+    assert (forces <= np.array(weak) * (1.0 + 1e-12)).all()
+    with pytest.raises(ConvergenceError, match=r"too weak or soft for gravity.*control\.limits"):
+        simulated(lifting(40.0, limits))
 
 
 @pytest.mark.parametrize(("stiffening", "least", "most"), [(True, 0.0, 4e-3), (False, 1e-2, 3e-2)])

@@ -39,6 +39,16 @@ def test_stiff_springs_are_rigid_drives() -> None:
     assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
 
 
+@pytest.mark.parametrize("rotor", [0.0, 2e-5])
+def test_generalised_alpha(rotor: float) -> None:
+    """The conventional method finds the same motion, with motors of no inertia, too."""
+    soft = ("arms.joint_stiffness=1e5", "arms.joint_damping=100.0", f"arms.rotor_inertia={rotor}")
+    options = ("simulation.integrator=generalized-alpha", "simulation.tolerance=1e-3")
+    expected, found = simulated(*soft), simulated(*soft, *options)
+    off = np.abs(found.deviation - expected.deviation).max()
+    assert off < 1e-3 * np.abs(expected.deviation).max()  # measured 2.8e-4
+
+
 def test_tangent() -> None:
     """The derivative of the residual by coordinates and rates, by central differences."""
     options = ("arms.joint_stiffness=1e5", "arms.joint_damping=100.0", "simulation.stiffening=true")

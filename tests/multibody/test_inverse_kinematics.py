@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import breakpoints, check_motion
 from dolfinopt.multibody.spatial.end_path import end_path, relative_vectors
+from dolfinopt.multibody.spatial.inverse_kinematics import Follower
 from dolfinopt.multibody.spatial.links import end_chain
 from dolfinopt.multibody.spatial.motion import joint_motion
 from dolfinopt.multibody.spatial.rotations import exponential
@@ -176,9 +178,19 @@ def test_joints_of_the_table(tmp_path):
 
 def test_rotation_vectors_go_on():
     """Beyond half a turn and past a whole one."""
-    angles = np.linspace(0.0, 9.0, 13)
+    angles = np.linspace(0.0, 60.0, 61)
     R = exponential(np.array([0.3, -0.2, 0.5])) @ exponential(angles[:, None] * [0.0, 0.6, 0.8])
     assert np.abs(relative_vectors(R) - angles[:, None] * [0.0, 0.6, 0.8]).max() < 1e-12
+
+
+def test_a_slide_is_no_angle_where_the_reach_is_one_metre():
+    """Its unit is the reach then as that of an angle is 1 rad, and whole turns mean nothing."""
+    kinds = ("revolute", "prismatic")
+    joints = tuple(SimpleNamespace(coordinate=k, kind=kind) for k, kind in enumerate(kinds))
+    chain = SimpleNamespace(reach=1.0, joints=joints, coordinates=(0, 1))
+    follower = Follower(None, chain, np.arange(2), np.zeros(0, dtype=int))
+    assert follower._units.tolist() == [1.0, 1.0]
+    assert follower._slides.tolist() == [False, True]
 
 
 REFUSED = [

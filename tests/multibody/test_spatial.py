@@ -47,7 +47,9 @@ pytestmark = pytest.mark.serial
 ROUNDING = 1e-12
 
 
-@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5, 0.9999, 2.5, 6.0])
+# rad: on both sides of where the series takes more terms (1) and where sine and cosine take over
+# (3.16); 31 and 60 are five and nearly ten turns.
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5, 0.9999, 2.5, 3.15, 3.17, 6.0, 31.0, 60.0, 100.0])
 def test_rotation_vector(size):
     """Against the matrix exponential, and derivatives of it by complex steps, to rounding."""
     rng = np.random.default_rng(0)

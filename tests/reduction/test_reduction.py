@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,8 +34,10 @@ from dolfinopt.reduction import (
     mac,
     modal,
 )
-from dolfinopt.reduction.eigenproblem import interior_pencil, lowest_eigenpairs
+from dolfinopt.reduction.complement import complement_solve
+from dolfinopt.reduction.eigenproblem import Pencil, interior_pencil, lowest_eigenpairs
 from dolfinopt.reduction.gramian import quadrature
+from dolfinopt.reduction.lobpcg import Operators
 from dolfinopt.reduction.subspace import ritz
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
@@ -579,6 +582,35 @@ def test_what_subspaces_cannot_do():
         balanced(arm, Options(12, band=(0.0, 1e-3)))
     with pytest.raises(ConvergenceError, match=r"the vectors .* ask for fewer"):
         ritz(arm, krylov(arm, Options(3)).V[:, :, [0, 1, 1]])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("iterative", [False, True], ids=["factor", "cycles"])
+def test_adjoint_of_modes_is_no_answer_where_a_product_is_no_number(iterative):
+    """Right where all products are; an error, and not what was found so far, where one is not."""
+    K, broken = np.diag([1.0, 4.0, 9.0, 25.0, 36.0]), [np.inf]
+    arm = SimpleNamespace(comm=MPI.COMM_SELF, mesh=SimpleNamespace(name="arm"))
+
+    def inverse(v):
+        broken[0] -= 1
+        return np.full_like(v, np.nan) if broken[0] < 0 else (v.T / np.diag(K)).T
+
+    def copied(v):
+        return v.copy()
+
+    operators = Operators(5, lambda V: K @ V, copied, inverse, copied, arm.comm)
+    pencil = Pencil(arm, inverse, copied, lambda: (None, None), operators if iterative else None)
+    modes, values = np.eye(5)[:, :2], np.array([1.0, 4.0])
+    right = np.random.default_rng(0).normal(size=(5, 2))
+    expected = right / (np.diag(K)[:, None] - values + np.eye(5, 2) + np.eye(5, 2, 1))
+    expected[:2] = 0.0
+    found = complement_solve(pencil, modes, values, right)
+    assert found[2:] == pytest.approx(expected[2:], rel=1e-7)
+    assert np.abs(found[:2]).max() < 1e-12
+    for after in range(3):  # the first product, or a later one
+        broken[0] = after
+        with pytest.raises(ConvergenceError, match="derivatives of mode 1 do not converge"):
+            complement_solve(pencil, modes, values, right)
 
 
 # -- in motion ------------------------------------------------------------------------------------

@@ -62,9 +62,9 @@ def scenes(folder: Path) -> dict[str, Tree]:
     """Return a small scene of every kind."""
     table = folder / "drive.csv"
     table.write_text("t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n")
-    limited = {**GAINS, "limits": [150.0, 200.0, 150.0]}
     rod = slider_crank(0.008, (24, 3))
     drive = {"stiffness": [2e3], "damping": [20.0]}
+    weak = {**drive, "limits": [36.0]}  # of 43 N m that the crank asks for
     joints = {"joint_mass": 0.5, "joint_inertia": 0.01}
     return {
         "stiffened": arms(COMPLIANCE, True),
@@ -72,7 +72,7 @@ def scenes(folder: Path) -> dict[str, Tree]:
         **{f"stiffened-{name}": of_element(name, True) for name in ELEMENTS},
         "stiffened-deviation": arms(DEVIATION, True),
         "control": arms(DEVIATION, False, control=GAINS),
-        "control-limits-gravity": arms(DEVIATION, True, control=limited, motion=GRAVITY),
+        "control-gravity": arms(DEVIATION, True, control=GAINS, motion=GRAVITY),
         "control-alone": arms(
             COMPLIANCE, False, control={**GAINS, "feed_forward": "none"}, motion=GRAVITY
         ),
@@ -91,9 +91,11 @@ def scenes(folder: Path) -> dict[str, Tree]:
         "slider": loop(rod),
         "slider-deviation": loop(rod, objective=DEVIATION, motion=GRAVITY),
         "slider-control": loop(rod, control=drive, motion=GRAVITY),
+        "slider-limits": loop(rod, control=weak, motion=GRAVITY),
+        "slider-torque": loop(rod, control={**drive, "stiffness": [0.0]}, motion=GRAVITY),
         "pin": loop(four_bar((24, 3))),
         "effort": arms(EFFORT, True, motion=GRAVITY, constraints=KEPT),
-        "effort-control": arms(EFFORT, False, control=limited, motion=GRAVITY, constraints=KEPT),
+        "effort-control": arms(EFFORT, False, control=GAINS, motion=GRAVITY, constraints=KEPT),
         "effort-soft-joint": with_hardware(
             arms(EFFORT, False, constraints=KEPT),
             **joints,
@@ -101,6 +103,7 @@ def scenes(folder: Path) -> dict[str, Tree]:
             joint_damping=50.0,
         ),
         "effort-slider": loop(rod, objective=EFFORT, motion=GRAVITY, constraints=KEPT),
+        "effort-slider-limits": loop(rod, objective=EFFORT, control=weak, constraints=KEPT),
         "effort-slider-control": loop(rod, objective=EFFORT, control=drive, constraints=KEPT),
         "effort-pin": loop(four_bar((24, 3)), objective=EFFORT, constraints=KEPT),
         "peak_force-control": arms(PEAK, True, control=GAINS, constraints=KEPT),
@@ -111,14 +114,22 @@ def scenes(folder: Path) -> dict[str, Tree]:
 # Cosine between the gradient by ESL and the exact one, at least. ESL hold the elastic coordinates
 # and the loop's joints: of where a slider ends up nothing is left that would tell.
 COSINE = {"slider-deviation": -1.0}
-SLOW = ("control-limits-gravity", "hardware", "pin", "effort-soft-joint", "effort-pin")
+SLOW = (
+    "control-gravity",
+    "hardware",
+    "slider-limits",
+    "effort-slider-limits",
+    "pin",
+    "effort-soft-joint",
+    "effort-pin",
+)
 KINDS = (
     *ELEMENTS,
     *(f"stiffened-{name}" for name in ELEMENTS),
     "stiffened",
     "stiffened-deviation",
     "control",
-    "control-limits-gravity",
+    "control-gravity",
     "control-alone",
     "control-table",
     "hardware",
@@ -126,11 +137,14 @@ KINDS = (
     "slider",
     "slider-deviation",
     "slider-control",
+    "slider-limits",
+    "slider-torque",
     "pin",
     "effort",
     "effort-control",
     "effort-soft-joint",
     "effort-slider",
+    "effort-slider-limits",
     "effort-slider-control",
     "effort-pin",
     "peak_force-control",

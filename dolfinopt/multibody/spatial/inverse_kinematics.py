@@ -65,11 +65,15 @@ class Follower:
         return np.array([1.0, 1.0, 1.0, *(self.chain.reach,) * 3])
 
     @cached_property
+    def _slides(self) -> np.ndarray:
+        """Which of the unknowns (k,) are displacements."""
+        kinds = {joint.coordinate: joint.kind for joint in self.chain.joints}
+        return np.array([kinds[k] == "prismatic" for k in self.unknown.tolist()], dtype=bool)
+
+    @cached_property
     def _units(self) -> np.ndarray:
         """Unit (k,) of every unknown: 1 rad, or the reach."""
-        kinds = {joint.coordinate: joint.kind for joint in self.chain.joints}
-        slides = [kinds[k] == "prismatic" for k in self.unknown.tolist()]
-        return np.where(slides, self.chain.reach, 1.0)
+        return np.where(self._slides, self.chain.reach, 1.0)
 
     # -- equations ---------------------------------------------------------------------------
 
@@ -170,7 +174,7 @@ class Follower:
                 break
         else:
             raise self._unreachable(0.0, best, path)
-        turned = self.unknown[self._units == 1.0]
+        turned = self.unknown[~self._slides]
         best[0, turned] -= 2.0 * np.pi * np.round((best[0, turned] - guess[turned]) / (2.0 * np.pi))
         self._check_singular(0.0, best, path)
         return best
@@ -194,7 +198,7 @@ class Follower:
             guess = q + (ahead - t) * qd
             guess[:, self.given] = path.joints[0]
             other, distance = self._corrected(guess, path)
-            if distance > FOLLOWED * self.chain.reach:
+            if not distance <= FOLLOWED * self.chain.reach:  # not a number included
                 if step < LEAST_STEP * end:
                     raise self._lost(min(t + longest, end), q, ahead)
                 step *= 0.25

@@ -5,6 +5,7 @@ A rotation vector theta, x = theta . theta, turns by
 and with J = 1 + c_2 theta~ + c_3 theta~^2 the rate theta' is the angular velocity J theta', in the
 components of the frame that theta turns away from. c_k(x) = sum_j (-x)^j / (2 j + k)! have the
 derivatives c_k' = (k c_(k+2) - c_(k+1)) / 2 without a division: nothing is lost at small angles.
+At large ones, where the series cancels, they follow from sine and cosine.
 All functions take complex numbers, whose imaginary part is then a derivative.
 Source: Stumpff (1959); Simo & Vu-Quoc (1988), doi:10.1016/0045-7825(88)90073-4; Sola, Deray &
 Atchuthan (2018), arXiv:1812.01537.
@@ -18,9 +19,9 @@ from math import factorial
 
 import numpy as np
 
-# Terms of the series: 1e-24 at x = 1. Beyond, up to x = 100, rounding grows to 1e-13.
+# Terms of the series: 1e-24 at x = 1, and 1e-40 up to x = FAR, where rounding has grown to 1e-15.
 TERMS, NEAR = 10, 1.0
-MANY_TERMS = 40
+MANY_TERMS, FAR = 40, 10.0
 
 ONE = np.eye(3)
 _NEXT, _OTHER = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -60,7 +61,25 @@ def transposed_times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
-    """Return c_0 ... c_(orders-1) at x (n,)."""
+    """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of many turns closed."""
+    far = np.abs(x) > FAR
+    if not far.any():
+        return _series(x, orders)
+    near = _series(np.where(far, 0.0, x), orders)
+    large = _closed(np.where(far, x, FAR), orders)
+    return [np.where(far, b, a) for a, b in zip(near, large, strict=True)]
+
+
+def _closed(x: np.ndarray, orders: int) -> list[np.ndarray]:
+    """Return c_0 = cos(angle), c_1 = sin(angle) / angle, c_(k+2) = (1 / k! - c_k) / x."""
+    angle = np.sqrt(x)
+    found = [np.cos(angle), np.sin(angle) / angle]
+    for k in range(orders - 2):
+        found.append((1.0 / factorial(k) - found[k]) / x)
+    return found
+
+
+def _series(x: np.ndarray, orders: int) -> list[np.ndarray]:
     terms = TERMS if np.abs(x).max(initial=0.0) <= NEAR else MANY_TERMS
     last = [_horner(x, k, terms) for k in (orders - 1, orders - 2)]
     found = last

@@ -38,7 +38,9 @@ class Control(Table):
     damping_factor: Factor = Field(default=1.0, description="factor on all of control.damping [-]")
     limits: tuple[Force, ...] | None = Field(
         default=None,
-        description="largest force of every drive, approached smoothly; default: none [N, N m]",
+        description="largest force of every drive: up to 95 % of its limit a drive gives what the "
+        "control asks for, from 105 % on the limit, with a smooth transition between them "
+        "(three times continuously differentiable); default: none [N, N m]",
     )
     forces: FileName | None = Field(
         default=None,
