@@ -698,7 +698,7 @@ def drawn(rng: np.random.Generator, folder: Path) -> tuple[dict, list[str]]:
         table.write_text(JOINTS.format(arms=names, **rows))
         motion |= {"path": "joints", "file": str(table)}
     else:
-        motion |= {"radius": one([0.5, 0.9]), "joint_height": one([-0.4, -0.1])}
+        motion |= {"path": "arc", "radius": one([0.5, 0.9]), "joint_height": one([-0.4, -0.1])}
         motion |= {"flattening": one([0.2, 1.0]), "law": one(["quintic", "septic"])}
     method, kind = one(METHODS), one(KINDS)
     objective_keys = {"kind": kind, "load_cases": 5, "gradient": one(["esl", "exact"])}
