@@ -29,8 +29,6 @@ QUADRATIC = 1.3  # bytes a node of a quadratic element over those of others
 # of a solid arm on several ranks over one on one: 12.7 GB.
 SOLID = 3.6
 SHARED = 1.5
-CELLS_ACROSS = 12  # of a STEP file without mesh_size, see `geometry.py`
-SOLID_CELLS_ACROSS = 4  # of a solid's, see `solid_model.py`
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -41,7 +39,7 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     A mesh file without mesh_size says too little to be judged; cases that other processes compute
     at the same time are not seen.
     """
-    cells = {index: estimated_cells(scene.arms[index]) for index in scene.cell_counts}
+    cells = scene.cell_counts
     size = {k: count * _cells_for_one(scene.arms[k]) for k, count in cells.items()}
     if sum(size.values()) <= FEW:
         return
@@ -68,16 +66,6 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
         f"{_spoken(max(row[-1] for row in ranks))} for every iteration; take fewer arms.cells or "
         "a larger arms.mesh_size"
     )
-
-
-def estimated_cells(arm: Arm) -> int:
-    """Return how many cells an arm has or may get, 0 where nothing tells."""
-    if arm.n_cells or arm.mesh is None or Path(arm.mesh).suffix.lower() not in (".step", ".stp"):
-        return arm.n_cells
-    size = arm.height / CELLS_ACROSS
-    if arm.is_solid:
-        size = min(arm.height, arm.thickness) / SOLID_CELLS_ACROSS
-    return arm.model_copy(update={"mesh_size": size}).n_cells
 
 
 def _cells_for_one(arm: Arm) -> float:

@@ -302,17 +302,10 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
     return _Traits(
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
-        _cell_size(scene, index, arm),
+        scene.arms[index].cell_size or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
     )
-
-
-def _cell_size(scene: Scene, index: int, arm: Arm) -> float:
-    """Return the longest side of a cell, of a mesh file the root of the mean area, m."""
-    known = scene.arms[index].cell_size
-    area, count = arm.mesh.comm.allreduce(np.array([arm.mesh.area.sum(), arm.mesh.num_cells]))
-    return float(np.sqrt(area / count)) if known is None else known
 
 
 def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:

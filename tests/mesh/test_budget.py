@@ -15,7 +15,7 @@ from solids import solid_scene
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import budget
-from dolfinopt.mesh.budget import check_budget, estimated_cells, free_memory
+from dolfinopt.mesh.budget import check_budget, free_memory
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm, load_scene
@@ -81,12 +81,12 @@ def test_solids_with_conjugate_gradients(monkeypatch, free, fits):
 
 def test_cells_of_files_are_estimated():
     keys = {"name": "a", "length": 1.0, "height": 0.06, "thickness": 0.01}
-    assert estimated_cells(Arm(**keys, mesh="a.step")) == 2400  # a twelfth of the height
-    assert estimated_cells(Arm(**keys, mesh="a.step", mesh_size=1e-3)) == 60_000
+    assert Arm(**keys, mesh="a.step").n_cells == 2400  # a twelfth of the height
+    assert Arm(**keys, mesh="a.step", mesh_size=1e-3).n_cells == 60_000
     triangles = Arm(**keys, mesh="a.geo", mesh_size=1e-3, cell_shape="triangle")
-    assert estimated_cells(triangles) == 120_000
-    assert estimated_cells(Arm(**keys, mesh="a.geo")) == 0
-    assert estimated_cells(Arm(**keys, cells=(7, 3))) == 21
+    assert triangles.n_cells == 120_000
+    assert Arm(**keys, mesh="a.geo").n_cells == 0
+    assert Arm(**keys, cells=(7, 3)).n_cells == 21
 
 
 def write(path, text):

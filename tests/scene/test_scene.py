@@ -720,6 +720,35 @@ def test_a_mesh_excludes_cells():
     assert back.arms == (Arm(**ARM, cells=(20, 2)), Arm(**ARM | {"name": "arm2"}, cells=(20, 2)))
 
 
+SIZED = 'DefineConstant[ h = {1, Name "Parameters/1 mesh size (m)"} ];'
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "size", "shape"),
+    [
+        ("own.step", "", 0.004, "triangle"),
+        ("own.geo", SIZED, 0.004, "triangle"),
+        ("own.geo", "", None, "triangle"),  # it has no such parameter
+        ("own.msh", "", None, None),  # it has its cells
+    ],
+)
+def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, text, size, shape):
+    """All keys an arm leaves out are those of the arm before, but those its file cannot have."""
+    path = tmp_path / file
+    path.write_text(text)
+    data = minimal()
+    before = {"mesh": "meshes/arm_bores.geo", "mesh_size": 0.004, "cell_shape": "triangle"}
+    data["arms"][0] |= before
+    data["arms"][1] |= {"mesh": str(path)}
+    arm = scene_from_dict(data).arms[1]
+    assert (arm.mesh_size, arm.cell_shape, arm.cells) == (size, shape, None)
+    stated = scene_from_dict(data, overrides=["arms.arm1.mesh_size=0.003"]).arms
+    assert [one.mesh_size for one in stated] == [0.003, size]
+    own = data["arms"][1] | {"cells": [20, 2]}  # in place of the mesh
+    data["arms"][1] = {key: value for key, value in own.items() if key != "mesh"}
+    assert scene_from_dict(data).arms[1] == Arm(**ARM | {"name": "arm2"}, cells=(20, 2))
+
+
 @pytest.mark.parametrize(
     ("suffix", "keys", "reason"),
     [
