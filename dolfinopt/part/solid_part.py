@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.crossings import crossings
 from dolfinopt.part.isosurface import Surface, outside
 from dolfinopt.part.part import Part, check_options, make_part
 from dolfinopt.part.shape import Shape
-from dolfinopt.part.smooth_surface import smooth_surface, with_volume
+from dolfinopt.part.smooth_surface import crossings, smooth_surface, with_volume
 from dolfinopt.part.solid import extruded_facets
 from dolfinopt.part.solid_domain import SolidDomain, read_solid_domains
 from dolfinopt.part.solid_level import WHOLE, at_volume

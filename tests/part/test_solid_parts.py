@@ -22,9 +22,8 @@ import dolfinopt.part.solid_part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.part.crossings import crossings
 from dolfinopt.part.isosurface import Surface, cut, eighths, halved, nodal_densities, outside
-from dolfinopt.part.smooth_surface import distance_to_faces
+from dolfinopt.part.smooth_surface import crossings, distance_to_faces
 from dolfinopt.part.solid import MM, triangle_bytes
 from dolfinopt.part.solid_domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
