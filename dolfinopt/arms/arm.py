@@ -356,6 +356,17 @@ class Arm:
             )
         return other
 
+    def fresh(self) -> Arm:
+        """Return this arm as it was built, without a design (collective on the arm).
+
+        Mesh, operators, filter and solver are shared.
+        """
+        other = copy(self)
+        other.coordinates = self.scene.reduction.count or None
+        other.stiffening, other.initial, other._state = None, InitialVectors(), None
+        other.guesses = None
+        return other
+
     # -- initial vectors of searches for modes -----------------------------------------------
 
     @property

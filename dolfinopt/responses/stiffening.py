@@ -28,20 +28,23 @@ def decide_stiffening(
     """Let the arms' bodies have geometric stiffness from now on, or not (collective).
 
     Decided once, by the design that the arms have, and estimated with rigid arms on the desired
-    motion: `Stiffening.estimate` says by how much the loads change an arm's stiffness.
+    motion: `Stiffening.estimate` says by how much the loads change an arm's stiffness. With
+    `simulation.stiffening = false` machines in space have no estimate.
 
     Args:
         scenes: of the same arms; the first one says true, false or "auto".
         partition: which ranks do which arm.
         arms: this rank's, with a design.
     """
+    asked = scenes[0].simulation.stiffening
+    if asked is False and scenes[0].is_spatial:
+        return  # the estimate takes more memory than all the rest of a solid arm
     if partition.world.allreduce(all(arm.stiffening is not None for arm in arms.values()), min):
         return
     with together(partition.world):
         mine = {k: _static_body(arm) for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
     estimate: float = on_root(partition.world, _estimate, scenes, owned)
-    asked = scenes[0].simulation.stiffening
     on = estimate >= SWITCH_ON if asked == "auto" else asked is True
     for arm in arms.values():
         arm.set_stiffening(Stiffening(estimate, on))
