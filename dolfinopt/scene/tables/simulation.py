@@ -32,7 +32,7 @@ class Simulation(Table):
     stiffening: bool | Literal["auto"] = Field(
         default="auto",
         description="geometric stiffening by the arms' own stress: true, false, or where an "
-        "estimate says that it matters [-]",
+        "estimate says that it matters; with false machines in space have no estimate [-]",
     )
     sample: float = Field(
         default=1e-3, ge=1e-9, le=1e5, description="sampling interval of the output [s]"
