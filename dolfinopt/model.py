@@ -364,8 +364,11 @@ class Model:
             ConvergenceError: a simulation failed.
         """
         place = None if folder is None else Path(folder)
-        found = optimize(self.scene, place, resume=resume, world=self._world, report=report)
-        self._arms()  # the order of the cells
+        partition, arms = self._arms()
+        built = partition, {k: arm.fresh() for k, arm in arms.items()}
+        found = optimize(
+            self.scene, place, resume=resume, world=self._world, report=report, built=built
+        )
         stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
             self.scene,

@@ -76,6 +76,33 @@ def test_gradient_predicts_the_change(model: Model) -> None:
     assert abs(other - slope) > 0.1 * abs(slope)
 
 
+def test_arms_are_meshed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Optimisation and simulation share mesh, operators and solver, and nothing of a design."""
+    from dolfinopt.arms import arm as arms
+
+    meshed: list[str] = []
+
+    def counted(comm, arm, pattern=None):
+        meshed.append(arm.name)
+        return arm_mesh(comm, arm, pattern)
+
+    arm_mesh = arms.arm_mesh
+    monkeypatch.setattr(arms, "arm_mesh", counted)
+    quick = (*SMALL, "simulation.stiffening=auto", "reduction.coordinates=auto")
+    plain, used = Model(TWO_ARM, *quick), Model(TWO_ARM, *quick)
+    first = plain.optimize()
+    mine = WORLD.allgather(len(meshed))
+    assert sum(mine) == max(2, WORLD.size)  # two arms; ranks beyond them share one
+    before = used.simulate(used.uniform(0.9)).evaluation  # which decides for another design
+    again = used.optimize()
+    assert sum(WORLD.allgather(len(meshed))) == 2 * sum(mine)
+    assert again.evaluation == first.evaluation and again.iterations == first.iterations
+    for name, values in first.design.items():
+        np.testing.assert_array_equal(again.design[name], values)
+    assert used.simulate(used.uniform(0.9)).evaluation == before
+    assert sum(WORLD.allgather(len(meshed))) == 2 * sum(mine)
+
+
 def test_optimize_has_history_design_and_pictures(result: OptimizationResult) -> None:
     assert result.iterations == 2
     assert not result.converged

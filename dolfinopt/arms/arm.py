@@ -96,6 +96,7 @@ class Arm:
         with profile.phase("mesh"):
             self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
             self.averages = _averages(self.mesh, arm)
+        self._check_widths(arm)
         with profile.phase("element operators"):
             try:
                 element = element_of(self.mesh, arm.element)
@@ -119,6 +120,15 @@ class Arm:
         self.profile = profile
         self.initial = InitialVectors()
         self._state: DesignState | None = None
+
+    def _check_widths(self, arm: scenes.Arm) -> None:
+        """Refuse widths of too few cells of a mesh file, whose cells are known only now."""
+        design = self.scene.design
+        if arm.cell_size is not None or not (arm.designed and design.controls_widths):
+            return
+        for key, reason in design.too_narrow(f'arm "{arm.name}"', self.mesh.cell_size):
+            value = getattr(design, key)
+            raise InputError(f"{self.scene.source}: design.{key} = {value:g}: {reason}")
 
     # -- from design variables to physical densities, and back -------------------------------
 
@@ -344,6 +354,17 @@ class Arm:
             other._state = self._state.under(
                 scene, other.coordinates, other.initial, other.stiffened
             )
+        return other
+
+    def fresh(self) -> Arm:
+        """Return this arm as it was built, without a design (collective on the arm).
+
+        Mesh, operators, filter and solver are shared.
+        """
+        other = copy(self)
+        other.coordinates = self.scene.reduction.count or None
+        other.stiffening, other.initial, other._state = None, InitialVectors(), None
+        other.guesses = None
         return other
 
     # -- initial vectors of searches for modes -----------------------------------------------

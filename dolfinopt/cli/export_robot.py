@@ -237,9 +237,16 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
 
 
 def _surface(title: str, frame: np.ndarray, corners: np.ndarray, density: np.ndarray) -> bytes:
-    """Return an arm's design as STL in its link's frame, in metres."""
+    """Return an arm's design as STL in its link's frame, in metres.
+
+    Raises:
+        InputError: the design is too grey for a surface.
+    """
     from dolfinopt.part.isosurface import design_surface
     from dolfinopt.part.solid import triangle_bytes
 
-    found = design_surface(corners, density).corners
+    try:
+        found = design_surface(corners, density).corners
+    except InputError as error:
+        raise InputError(f"arm {title!r}: {error}") from None
     return triangle_bytes(found @ frame[:3, :3].T + frame[:3, 3], f"{title}, m")

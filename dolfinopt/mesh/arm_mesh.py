@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.cells import cell_areas, cell_volumes, facet_areas, facet_corners
+from dolfinopt.mesh.cells import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import gmsh_on_root, mesh_geo
 from dolfinopt.mesh.groups import FURTHER, INBOARD, OUTBOARD, PASSIVE
@@ -92,6 +92,12 @@ class ArmMesh:
     def num_cells(self) -> int:
         """Number of cells this rank owns."""
         return len(self.area)
+
+    @property
+    def cell_size(self) -> float:
+        """Median length of the cells' edges, m (collective)."""
+        lengths = edge_lengths(self.dim, compat.cell_coordinates(self.mesh, self.num_cells))
+        return float(np.median(np.concatenate(self.comm.allgather(lengths))))
 
     @property
     def fixed(self) -> np.ndarray:

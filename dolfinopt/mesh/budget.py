@@ -11,7 +11,7 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.parallel import partition_arms
 from dolfinopt.scene.schema import Scene
-from dolfinopt.scene.tables.arms import Arm
+from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT, Arm
 
 # Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
 # quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm (`_bytes`, `_seconds`):
@@ -29,8 +29,15 @@ QUADRATIC = 1.3  # bytes a node of a quadratic element over those of others
 # of a solid arm on several ranks over one on one: 12.7 GB.
 SOLID = 3.6
 SHARED = 1.5
-CELLS_ACROSS = 12  # of a STEP file without mesh_size, see `geometry.py`
-SOLID_CELLS_ACROSS = 4  # of a solid's, see `solid_model.py`
+# Bytes a cell of a solid from a file, whose cells are all different: without and with geometric
+# stiffness, which takes the stress of 18 loads in all cells. A bar of 16 755 tetrahedra of second
+# order takes 1.04 and 3.25 GB, of first order 0.23 and 0.46 GB, one of 4468 hexahedra 0.28 and
+# 0.42 GB. Of other elements by their nodes.
+FROM_FILE = {
+    ("tetrahedron", "quadratic"): (62e3, 194e3),
+    ("tetrahedron", "linear"): (14e3, 28e3),
+    ("hexahedron", "incompatible"): (62e3, 95e3),
+}
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -41,15 +48,19 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     A mesh file without mesh_size says too little to be judged; cases that other processes compute
     at the same time are not seen.
     """
-    cells = {index: estimated_cells(scene.arms[index]) for index in scene.cell_counts}
+    cells = scene.cell_counts
     size = {k: count * _cells_for_one(scene.arms[k]) for k, count in cells.items()}
-    if sum(size.values()) <= FEW:
+    least = {k: count * _least_bytes(scene, k) for k, count in cells.items()}
+    if sum(size.values()) <= FEW and sum(least.values()) <= FEW * CELL:
         return
     partition = partition_arms(world, scene.cell_counts)
     shared = {k: SHARED if scene.arms[k].is_solid else 1.0 for k in partition.arms}
     if partition.comm.size == 1:
         shared = dict.fromkeys(shared, 1.0)
-    mine = sum(shared[k] * _bytes(size[k]) for k in shared) / partition.comm.size + PROCESS
+    mine = (
+        sum(shared[k] * max(_bytes(size[k]), least[k]) for k in shared) / partition.comm.size
+        + PROCESS
+    )
     seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
     partition.comm.Free()
     ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
@@ -70,22 +81,26 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     )
 
 
-def estimated_cells(arm: Arm) -> int:
-    """Return how many cells an arm has or may get, 0 where nothing tells."""
-    if arm.n_cells or arm.mesh is None or Path(arm.mesh).suffix.lower() not in (".step", ".stp"):
-        return arm.n_cells
-    size = arm.height / CELLS_ACROSS
-    if arm.is_solid:
-        size = min(arm.height, arm.thickness) / SOLID_CELLS_ACROSS
-    return arm.model_copy(update={"mesh_size": size}).n_cells
-
-
 def _cells_for_one(arm: Arm) -> float:
     """Return how many bilinear quadrilaterals cost as much memory as a cell of the arm."""
     nodes = arm.nodes_per_cell
     if arm.is_solid:
         return SOLID * nodes
     return QUADRATIC * nodes if nodes > 1.0 else 1.0
+
+
+def _least_bytes(scene: Scene, index: int) -> float:
+    """Return the bytes a cell of a solid arm takes if its cells are not all alike; else 0."""
+    arm = scene.arms[index]
+    if arm.mesh is None or not arm.is_solid:
+        return 0.0
+    stiffened = scene.simulation.stiffening is not False
+    element = arm.element or DEFAULT_ELEMENT[arm.shape]
+    if known := FROM_FILE.get((arm.shape, element)):
+        return known[stiffened]
+    usual = arm.model_copy(update={"element": None})
+    nodes = arm.nodes_per_cell / usual.nodes_per_cell
+    return nodes * FROM_FILE[arm.shape, DEFAULT_ELEMENT[arm.shape]][stiffened]
 
 
 def free_memory(proc: Path = Path("/proc"), cgroup: Path = _CGROUP) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 GAUSS = 0.5 + 0.5 / np.sqrt(3.0) * np.array([-1.0, 1.0])  # of two points on [0, 1], weights 1/2
@@ -19,6 +21,21 @@ def facet_corners(dim: int, corners: int) -> tuple[tuple[int, ...], ...]:
     return (
         (0, 1, 2, 3), (0, 1, 4, 5), (0, 2, 4, 6), (1, 3, 5, 7), (2, 3, 6, 7), (4, 5, 6, 7),
     )  # fmt: skip
+
+
+def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
+    """Return the lengths (m,) of all edges of cells of dimension `dim`, in DOLFINx's corner order.
+
+    Args:
+        dim: 2 or 3.
+        corners: (n, corners, d) m.
+    """
+    count = corners.shape[1]
+    pairs = list(combinations(range(count), 2))
+    if count != dim + 1:  # corners of a tensor product differ in one bit along an edge
+        pairs = [(i, j) for i, j in pairs if (i ^ j).bit_count() == 1]
+    first, second = np.array(pairs).T
+    return np.linalg.norm(corners[:, first] - corners[:, second], axis=2).ravel()
 
 
 def cell_areas(corners: np.ndarray) -> np.ndarray:

@@ -17,11 +17,11 @@ from dolfinopt.mesh.checks import check_mesh, flatten
 from dolfinopt.mesh.gmsh_session import mesh_surfaces, silent_terminal
 from dolfinopt.mesh.groups import find_groups, rename_groups, unknown_names
 from dolfinopt.mesh.step_model import read_step
-from dolfinopt.scene.tables.arms import Arm
+from dolfinopt.scene.tables.arms import SIZE_PARAMETER, Arm
 
 # ONELAB parameters of meshes/*.geo, without the number that orders them.
 LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (m)"
-SIZE, SHAPE = "mesh size (m)", "cell shape"
+SIZE, SHAPE = SIZE_PARAMETER, "cell shape"
 
 
 def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -30,7 +30,6 @@ from dolfinopt.mesh.step_names import StepShapes, read_shapes
 from dolfinopt.scene.tables.arms import Arm
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
-CELLS_ACROSS = 4  # of the smaller of height and thickness, of a file without mesh_size
 NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.
 TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
@@ -69,12 +68,12 @@ def _is_step(arm: Arm) -> bool:
 
 def _mesh(gmsh: Any, arm: Arm) -> None:
     """Mesh the volumes: tetrahedra, or hexahedra by cutting each into four."""
-    size = arm.mesh_size or min(arm.height, arm.thickness) / CELLS_ACROSS
-    if arm.cell_shape == "hexahedron":
+    size = arm.cell_size
+    halves = arm.cell_shape == "hexahedron"
+    if halves:
         gmsh.option.setNumber("Mesh.SubdivisionAlgorithm", 2)
-        size *= 2.0
-    if _is_step(arm) or arm.mesh_size is not None:
-        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    if size is not None:
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 2.0 * size if halves else size)
     gmsh.model.mesh.generate(3)
 
 

@@ -14,7 +14,6 @@ from dolfinopt.mesh.groups import DESIGN, INBOARD, NAMES, OUTBOARD, PASSIVE, gro
 from dolfinopt.mesh.step_names import read_shapes
 from dolfinopt.scene.tables.arms import Arm
 
-CELLS_ACROSS = 12  # of a STEP file without mesh_size
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
 NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
 NORMAL = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
@@ -71,7 +70,7 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
     passive = [f[1] for found, group in zip(labels, children) for f in group if PASSIVE in found]
     model.addPhysicalGroup(2, passive, PASSIVE)
     model.setPhysicalName(2, PASSIVE, NAMES[PASSIVE])
-    gmsh.option.setNumber("Mesh.MeshSizeMax", arm.mesh_size or arm.height / CELLS_ACROSS)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", arm.cell_size)
     mesh_surfaces(gmsh, arm.cell_shape or "quadrilateral")
     return False
 

@@ -20,13 +20,16 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_part
 
 
+WARN = 0.05  # change of an arm's stiffness from which a motion without it is not to be trusted
+
+
 @dataclass(frozen=True)
 class Stiffening:
     """Whether bodies have geometric stiffness, and why.
 
     Attributes:
-        estimate: largest relative change of an arm's stiffness along the motion; None where the
-            scene itself says whether it counts.
+        estimate: largest relative change of an arm's stiffness along the motion; None in space
+            where the scene itself says whether it counts.
         on: whether it is taken into account.
         neglected: what the deviation would miss without it, over its largest; None if not compared.
     """

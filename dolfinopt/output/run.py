@@ -54,6 +54,7 @@ def optimize(
     resume: bool = False,
     world: MPI.Comm | None = None,
     report: Report | None = None,
+    built: tuple[Partition, dict[int, Arm]] | None = None,
 ) -> Result:
     """Optimise the scene's arms (collective on `world`).
 
@@ -66,6 +67,8 @@ def optimize(
         resume: go on from the folder's checkpoint.
         world: all ranks; default MPI.COMM_WORLD.
         report: called on the root with every row of the history.
+        built: which ranks do which arm, and this rank's, without a design yet; None: they are
+            meshed.
 
     Raises:
         InputError: `resume` without a matching checkpoint.
@@ -78,8 +81,10 @@ def optimize(
     from dolfinopt.arms.arm import build_arms
 
     profile = Profile()
-    partition = partition_arms(world, scene.cell_counts)
-    arms = build_arms(scene, partition, profile)
+    if built is None:
+        partition = partition_arms(world, scene.cell_counts)
+        built = partition, build_arms(scene, partition, profile)
+    partition, arms = built
     memory, recorder = None, None
     if resume:
         assert folder is not None

@@ -19,7 +19,7 @@ from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.mesh import compat
-from dolfinopt.multibody.stiffening import Stiffening
+from dolfinopt.multibody.stiffening import WARN, Stiffening
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -179,6 +179,7 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *(note for one in traits.values() for note in one.notes),
         *_warnings(run.scene, run.evaluation),
         *_too_few(run.scene, run.choice),
+        *_unstiffened(stiffening_of(run.arms)),
         *(filter_warnings(run.scene, sizes) if run.iterations else ()),
         *(
             [FALLS_APART]
@@ -301,17 +302,10 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
     return _Traits(
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
-        _cell_size(scene, index, arm),
+        scene.arms[index].cell_size or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
     )
-
-
-def _cell_size(scene: Scene, index: int, arm: Arm) -> float:
-    """Return the longest side of a cell, of a mesh file the root of the mean area, m."""
-    known = scene.arms[index].cell_size
-    area, count = arm.mesh.comm.allreduce(np.array([arm.mesh.area.sum(), arm.mesh.num_cells]))
-    return float(np.sqrt(area / count)) if known is None else known
 
 
 def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
@@ -381,6 +375,16 @@ def _too_few(scene: Scene, choice: OrderSelection | None) -> list[str]:
 def _stiffening(stiffening: Stiffening | None) -> dict[str, Any] | None:
     """Return whether the loads' geometric stiffness was taken into account, and how large it is."""
     return None if stiffening is None else asdict(stiffening)
+
+
+def _unstiffened(stiffening: Stiffening | None) -> list[str]:
+    """Return a sentence where geometric stiffening is left out and matters."""
+    if stiffening is None or stiffening.on or (stiffening.estimate or 0.0) < WARN:
+        return []
+    return [
+        f"the loads of the motion change the stiffness of an arm by {stiffening.estimate:.2g} of "
+        "it, which simulation.stiffening = false leaves out; set it to true"
+    ]
 
 
 def _volume(scene: Scene, index: int, arm: Arm) -> float:

@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from dolfinopt.errors import InputError
 from dolfinopt.mesh.cells import cell_volumes
 
 HALVINGS = 40  # of the interval in which the level lies
 BELOW = 0.98  # the highest level, over the highest density
 APART = 0.005  # least difference of a node's density from the level
 SAME_VOLUME = 1e-3  # relative, of the surface to the design
+CLOSE = 0.01  # likewise, beyond which there is no surface: volumes leap at plateaus of the density
 # Corners of a hexahedron, from a tensor product's order to VTK's.
 AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 
@@ -60,6 +62,9 @@ def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
         corners: (n, 4 or 8, 3) of the tetrahedra or hexahedra in any order, m; common ones are
             the same to the last bit.
         density: (n,) of the same cells.
+
+    Raises:
+        InputError: no level of the density encloses the design's volume: it is too grey.
     """
     points, nodes, values = nodal_densities(corners, density)
     volume = float(cell_volumes(corners) @ density)
@@ -70,6 +75,12 @@ def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
         if abs(surface.volume - volume) <= SAME_VOLUME * volume:
             break
         above, below = (level, below) if surface.volume > volume else (above, level)
+    if abs(surface.volume - volume) > CLOSE * volume:
+        raise InputError(
+            f"no level of its density encloses its volume, {1e9 * volume:.4g} mm3: the nearest, "
+            f"{level:.3g}, encloses {1e9 * surface.volume:.4g} mm3; the design is too grey for a "
+            'surface; optimise longer, or with design.projection = "robust"'
+        )
     return surface
 
 

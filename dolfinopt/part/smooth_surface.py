@@ -1,4 +1,4 @@
-"""Smoothing of a solid's surface without shrinkage, then a correction of its volume.
+"""Smoothing of a solid's surface without shrinkage, a correction of its volume, crossings.
 
 Smoothed is where material ends within the arm, by VTK's windowed sinc: Taubin, Zhang & Golub,
 Optimal surface smoothing as filter design, ECCV 1996, doi:10.1007/BFb0015544. Points on the arm's
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dolfinopt.part.isosurface import Surface
 
@@ -18,6 +19,9 @@ PASSES, STEPS, RIPPLES = 40, 0.03, 0.15
 FURTHEST = 0.4  # of a cell that smoothing moves a point
 ROOM = 0.5  # and of its distance from the arm's own faces
 CORRECTIONS, SAME_VOLUME = 20, 1e-9  # Newton's steps; relative
+MANY = 200_000  # pairs of an edge and a triangle that are looked at together
+CANDIDATES = 60  # triangles near an edge, about
+TOUCHES = 1e-9  # of an edge and of a triangle: what only touches does not cross
 
 
 def smooth_surface(
@@ -111,3 +115,65 @@ def _area_vectors(surface: Surface) -> np.ndarray:
     ):
         np.add.at(found, corner, across / 6.0)
     return found
+
+
+def crossings(surface: Surface) -> np.ndarray:
+    """Return pairs (n, 2) of triangles of which an edge of the first passes through the second.
+
+    Edges that have a corner in common with a triangle do not count, and neither does what only
+    touches, as pieces of material that meet in a point.
+    """
+    corners, triangles = surface.corners, surface.triangles
+    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    _, first = np.unique(np.sort(edges, axis=1), axis=0, return_index=True)
+    edges, owners = edges[first], first % len(triangles)
+    start, end = surface.points[edges].swapaxes(0, 1)
+    centres = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+    found = []
+    # Triangles in classes of their size, so that a large one does not make all neighbourhoods wide.
+    for low, group in _by_size(radii):
+        tree = cKDTree(centres[group])
+        reach = 0.5 * np.linalg.norm(end - start, axis=1) + 2.0 * low
+        for part in np.array_split(np.arange(len(edges)), max(1, len(edges) * CANDIDATES // MANY)):
+            near = tree.query_ball_point(0.5 * (start + end)[part], reach[part])
+            edge = np.repeat(part, [len(one) for one in near])
+            triangle = group[np.concatenate([*near, []]).astype(int)]
+            apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
+            edge, triangle = edge[apart], triangle[apart]
+            through = _passes(start[edge], end[edge], corners[triangle])
+            found.append(np.column_stack([owners[edge[through]], triangle[through]]))
+    return np.concatenate(found) if found else np.empty((0, 2), dtype=int)
+
+
+def _by_size(radii: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Return groups of triangles with radii between r and 2 r, and r."""
+    classes = np.floor(np.log2(np.maximum(radii, 1e-6 * radii.max())))
+    return [(2.0**one, np.flatnonzero(classes == one)) for one in np.unique(classes)]
+
+
+def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Tell which segments pass through their triangles (n, 3, 3), off all edges and ends.
+
+    Möller & Trumbore (1997), doi:10.1080/10867651.1997.10487468.
+    """
+    along = end - start
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    to = start - corners[:, 0]
+    normal = np.cross(along, second)
+    det = np.einsum("na,na->n", first, normal)
+    size = np.linalg.norm(along, axis=1) * np.linalg.norm(np.cross(first, second), axis=1)
+    flat = np.abs(det) <= TOUCHES * size  # parallel
+    det = np.where(flat, 1.0, det)
+    across = np.cross(to, first)
+    u = np.einsum("na,na->n", to, normal) / det
+    v = np.einsum("na,na->n", along, across) / det
+    t = np.einsum("na,na->n", second, across) / det
+    inside = (
+        (u > TOUCHES)
+        & (v > TOUCHES)
+        & (u + v < 1.0 - TOUCHES)
+        & (t > TOUCHES)
+        & (t < 1.0 - TOUCHES)
+    )
+    return np.asarray(inside & ~flat)

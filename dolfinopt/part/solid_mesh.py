@@ -23,6 +23,8 @@ ACROSS = 3.0  # cells over the smaller of a part's height and thickness, at leas
 IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
 NEAR = 1e-6  # of a cell: distance of points from the arm's faces up to which they lie on them
 LEAST = 1e-3  # shape of the worst cell, of a valid mesh
+SAME_VOLUME = 1e-4  # relative, of a mesh that is taken to the part
+ROUNDS = 10  # of holding points whose cells a correction of the volume would spoil
 APART = 1e-6  # relative, of a mesh's volume to the part's
 
 
@@ -74,8 +76,8 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
             f"arm {part.name!r}: parts with several outboard interfaces (arms.interfaces) are not "
             "meshed"
         )
-    if not part.watertight:  # Gmsh would end the process
-        raise InputError(f"arm {part.name!r}: its surface is not watertight")
+    if not part.closed:  # Gmsh would end the process
+        raise InputError(f"arm {part.name!r}: its surface is not closed")
     for angle, share in TRIES:
         try:
             if part.flat is None:
@@ -86,9 +88,13 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
             reason = str(error)
             continue
         mesh = _of_volume(part, mesh)
-        if mesh.quality.min() > LEAST:
+        off = mesh.volumes.sum() / part.volume - 1.0
+        if mesh.quality.min() <= LEAST:
+            reason = "its cells are flat"
+        elif abs(off) > SAME_VOLUME:
+            reason = f"its mesh has {100.0 * off:+.2g} % of its volume more"
+        else:
             return mesh
-        reason = "its cells are flat"
     raise InputError(f"arm {part.name!r}: {reason}")
 
 
@@ -113,7 +119,7 @@ def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
 
     cell = flat.domain.cell
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        face = body_mesh(gmsh, flat.shape, cell, size / part.domain.cell)
+        face = body_mesh(gmsh, flat.shape, cell, size / cell)
     thickness = flat.domain.thickness
     layers = max(1, round(thickness / size))
     count = len(face.points)
@@ -147,7 +153,8 @@ def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
 def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
     """Return a mesh whose points within the arm are moved a little, so that it has the volume.
 
-    Flat facets cut off what is round. Where the move would spoil cells the mesh stays as it is.
+    Flat facets cut off what is round. Points of cells that the move would spoil stay where they
+    are, and the others make up for them.
     """
     wanted = part.volume
     if abs(mesh.volumes.sum() - wanted) <= APART * wanted:
@@ -158,6 +165,11 @@ def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
     faces = np.concatenate([domain.own, domain.kept])
     rim = np.flatnonzero(free)
     free[rim] = distance_to_faces(mesh.points[rim], faces) > NEAR * domain.cell
-    moved = with_volume(Surface(mesh.points, facets), free, wanted)
-    found = replace(mesh, points=moved.points)
-    return found if found.quality.min() > LEAST else mesh
+    for _ in range(ROUNDS):
+        moved = with_volume(Surface(mesh.points, facets), free, wanted)
+        found = replace(mesh, points=moved.points)
+        spoilt = (found.quality <= LEAST) & (found.quality < mesh.quality)
+        if not spoilt.any():
+            return found
+        free[mesh.cells[spoilt]] = False
+    return mesh

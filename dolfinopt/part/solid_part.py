@@ -5,7 +5,7 @@ A design that is the same over the thickness is a plate: its part is that of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.isosurface import Surface, outside
 from dolfinopt.part.part import Part, check_options, make_part
 from dolfinopt.part.shape import Shape
-from dolfinopt.part.smooth_surface import smooth_surface, with_volume
+from dolfinopt.part.smooth_surface import crossings, smooth_surface, with_volume
 from dolfinopt.part.solid import extruded_facets
 from dolfinopt.part.solid_domain import SolidDomain, read_solid_domains
 from dolfinopt.part.solid_level import WHOLE, at_volume
@@ -30,6 +30,8 @@ SAME_VOLUME = 1e-4  # relative, of the part to the design
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
 HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
 GRAY = 0.02  # grayness from which on a design is no longer close to any part
+ROUNDS = 8  # of taking smoothing back where the surface would cross itself
+LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
 NARROW = 0.9  # of the width asked for, below which a member or gap is told
 
 
@@ -77,6 +79,16 @@ class SolidPart:
 
     @property
     def watertight(self) -> bool:
+        """Whether the surface is closed and does not cross itself."""
+        return self.closed and self.crossings == 0
+
+    @cached_property
+    def crossings(self) -> int:
+        """Number of pairs of triangles that cross; none of plates, whose outline is checked."""
+        return len(crossings(self.surface)) if self.flat is None else 0
+
+    @property
+    def closed(self) -> bool:
         """Whether every edge has two triangles, which run along it in opposite directions."""
         corners = self.surface.triangles
         edges = np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
@@ -101,8 +113,13 @@ class SolidPart:
                 f"arm {one.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
             )
-        if not self.watertight:
-            found.append(f"arm {one.name!r}: its surface is not watertight; repair it")
+        if not self.closed:
+            found.append(f"arm {one.name!r}: its surface is not closed; repair it")
+        if self.crossings:
+            found.append(
+                f"arm {one.name!r}: its surface crosses itself in {self.crossings} pairs of "
+                "triangles; repair it"
+            )
         return found + self._narrow()
 
     def _narrow(self) -> list[str]:
@@ -230,7 +247,7 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
     free[surface.triangles[~inner]] = False
     walls = [domain.own, domain.kept]
     smooth = smooth_surface(surface, inner, free, domain.cell, np.concatenate(walls), domain.crisp)
-    found = with_volume(smooth, free, domain.volume)
+    found = _uncrossed(surface, smooth, free, domain.volume)
     distance = float(np.linalg.norm(found.points - surface.points, axis=1).max())
     if abs(found.volume - domain.volume) > SAME_VOLUME * domain.volume or (
         distance > FURTHEST * domain.cell
@@ -242,3 +259,30 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
             'longer, or with design.projection = "robust"'
         )
     return SolidPart(domain, found, level, distance, pieces, lost)
+
+
+def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
+    """Return the smoothed surface with a volume, less smooth where it would cross itself.
+
+    The isosurface does not cross itself. Points of triangles that do go back towards it by halves,
+    those beside them with them, and all the way at last; the others make up for the volume.
+
+    Args:
+        surface: the isosurface.
+        smooth: the same, smoothed.
+        free: (n,) True of points that move.
+        volume: that is wanted, m3.
+    """
+    share = np.ones(len(surface.points))
+    move = smooth.points - surface.points
+    for _ in range(ROUNDS):
+        now = replace(surface, points=surface.points + share[:, None] * move)
+        found = with_volume(now, free & (share > 0.0), volume)
+        crossed = crossings(found)
+        if not len(crossed):
+            break
+        near = np.zeros(len(share), dtype=bool)
+        near[surface.triangles[crossed]] = True
+        near[surface.triangles[near[surface.triangles].any(axis=1)]] = True
+        share = np.where(near, np.where(share > LEAST_SHARE, 0.5 * share, 0.0), share)
+    return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.output.trajectory import free_drives
+from dolfinopt.output.trajectory import drive_units, free_drives, rigid_units
 from dolfinopt.plots.style import BLUE, LINE_WIDTH, ORANGE, PathLike, new_figure, save
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
     scene, rows = trajectory.scene, []
     places = range(*scene.driven_columns.indices(trajectory.q_r.shape[1]))
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
+    lengths, loads = rigid_units(scene), drive_units(scene)
     for name, k in zip(scene.driven, places, strict=True):
-        length, force = ("m", "N") if k == 0 else ("rad", "N m")
-        word = "force" if k == 0 else "moment"
-        row: list[Panel] = [(f"{name}: {word}", force, {"": trajectory.joint_forces[:, k]})]
+        word = "force" if loads[name] == "N" else "moment"
+        row: list[Panel] = [(f"{name}: {word}", loads[name], {"": trajectory.joint_forces[:, k]})]
         if name in free:
-            row.insert(0, (f"{name}: error", length, {"": error[:, k]}))
+            row.insert(0, (f"{name}: error", lengths[name], {"": error[:, k]}))
         rows.append(row)
     forces = trajectory.closure_force
     if forces is not None:

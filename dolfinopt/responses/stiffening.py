@@ -87,17 +87,14 @@ def stiffening_of_each(
         partition: which ranks do which arm.
         arms: this rank's, with a design.
     """
-    if not any(group[0].simulation.stiffening == "auto" for group in groups):
-        return [_stated(group) for group in groups]
+    stated = not any(group[0].simulation.stiffening == "auto" for group in groups)
+    if stated and groups[0][0].is_spatial:  # where it takes most of the memory of a solid arm
+        return [Stiffening(None, group[0].simulation.stiffening is True) for group in groups]
     with together(partition.world):
         mine = {k: _static_body(arm) for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
     found: list[Stiffening] = on_root(partition.world, _decided, groups, owned)
     return found
-
-
-def _stated(group: Sequence[Scene]) -> Stiffening:
-    return Stiffening(None, group[0].simulation.stiffening is True)
 
 
 def _static_body(arm: Arm) -> ShapeIntegrals:
@@ -118,10 +115,11 @@ def _decided(
     """Return what is decided for each group."""
     first, found = groups[0][0], []
     for group in groups:
-        if group[0].simulation.stiffening != "auto":
-            found.append(_stated(group))
-            continue
+        asked = group[0].simulation.stiffening
         estimate = max(_change(one, bodies_in(first, one, owned)) for one in group)
+        if asked != "auto":
+            found.append(Stiffening(estimate, asked))
+            continue
         if not SURELY_OFF < estimate < SURELY_ON:
             found.append(Stiffening(estimate, estimate >= SURELY_ON))
             continue

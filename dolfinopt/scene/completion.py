@@ -14,13 +14,15 @@ from dolfinopt.scene.messages import Override, blamed
 from dolfinopt.scene.spelling import input_error, shown
 from dolfinopt.scene.tables.arms import SOLID_SHAPES
 from dolfinopt.scene.tables.motion import Motion
+from dolfinopt.scene.tables.objective import Objective
 from dolfinopt.scene.tables.reduction import Reduction
+from dolfinopt.scene.tables.responses import NEEDS
 
 Keys = tuple[tuple[str, str], ...]
 
 
 def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
-    """Complete duration and horizon of the motion, number of coordinates, limit of the volume.
+    """Complete times of the motion, number of coordinates, limit of the volume and gradient.
 
     Returns:
         The keys that follow from others, as (table, key).
@@ -29,7 +31,7 @@ def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys
         InputError: a stated duration is too short for the limits.
     """
     timed = _time_motion(tree, source, changes)
-    return *timed, *_count_coordinates(tree), *_limit_volume(tree)
+    return *timed, *_count_coordinates(tree), *_limit_volume(tree), *_freeze_loads(tree)
 
 
 def _count_coordinates(tree: dict[str, Any]) -> Keys:
@@ -124,3 +126,21 @@ def _limit_volume(tree: dict[str, Any]) -> Keys:
             tree["design"] = design
         design["volume_fraction"] = None
     return (("design", "volume_fraction"),)
+
+
+def _freeze_loads(tree: dict[str, Any]) -> Keys:
+    """Hold the loads in the gradient of `kind = "esl"`, unless a limit follows the motion.
+
+    Returns:
+        Its key, as (table, key), where it is not stated.
+    """
+    objective, limits = tree.get("objective", {}), tree.get("constraints", {})
+    if not (isinstance(objective, dict) and isinstance(limits, dict)) or "gradient" in objective:
+        return ()
+    limited = [key for key, limit in limits.items() if limit is not None]
+    if objective.get("kind", Objective.model_fields["kind"].default) != "esl" or any(
+        "motion" in NEEDS.get(key, ()) for key in limited
+    ):
+        return ()
+    tree["objective"] = {**objective, "gradient": "esl"}
+    return (("objective", "gradient"),)

@@ -36,7 +36,16 @@ from dolfinopt.scene.messages import (
 )
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.spelling import cut, input_error, shown
-from dolfinopt.scene.tables.arms import MAX_CELLS, MESH_KEYS, OWN_KEYS, PATTERN_KEYS, Arm
+from dolfinopt.scene.tables.arms import (
+    MAX_CELLS,
+    MESH_KEYS,
+    OWN_KEYS,
+    PATTERN_KEYS,
+    SIZE_KEYS,
+    SIZE_PARAMETER,
+    SOLID_SHAPES,
+    Arm,
+)
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, without_none
 from dolfinopt.scene.tables.interpolation import Law
 from dolfinopt.scene.tables.joints import Joint
@@ -116,8 +125,10 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     tree.setdefault("material", {})  # so that the message names the first key missing in it
     _name_material(tree)
     inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
+    sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
     changes = [_override(tree, text, source) for text in overrides]
     for change in changes:
+        sizes.difference_update(change.locs)
         inherited.difference_update(change.locs[:1])
         inherited.update(change.locs[1:])
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
@@ -127,6 +138,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _share_interfaces(tree)
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
+    _drop_sizes(tree, sizes)
     _measure_bodies(tree, inherited)
     derived = complete(tree, source, changes)
     try:
@@ -192,6 +204,27 @@ def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -
             loc = (table, i, key) if isinstance(node, list) else (table, key)
             where = blamed(source, changes, (loc,))
             row[key] = resolve_file(source, value, dotted(loc, tree), where)
+
+
+def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
+    """Leave out sizes and shapes of cells of the arm before that an arm's own file cannot have.
+
+    A .msh file has its cells; a .geo file in the plane a size only where it has the parameter.
+
+    Args:
+        tree: with absolute paths.
+        sizes: paths of the keys that arms have from the arm before.
+    """
+    for table, i, key in sizes:
+        arm = tree[table][i]
+        if not isinstance(arm, dict) or not isinstance(mesh := arm.get("mesh"), str):
+            continue
+        kind, solid = Path(mesh).suffix.lower(), arm.get("cell_shape") in SOLID_SHAPES
+        meshed = kind == ".msh" and not (solid and key == "cell_shape")
+        if kind == ".geo" and key == "mesh_size" and not solid:
+            meshed = f'{SIZE_PARAMETER}"' not in Path(mesh).read_text("utf-8", errors="replace")
+        if meshed:
+            arm.pop(key, None)
 
 
 def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
@@ -354,8 +387,10 @@ def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
 
 def _replaced(arm: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yield the keys that what an arm states takes the place of."""
-    if any(key in arm for key in MESH_KEYS[:2]):
+    if "cells" in arm:
         yield MESH_KEYS
+    if "mesh" in arm:
+        yield ("cells",)
     if "material" in arm:
         yield MATERIAL_VALUES
     if "pattern" in arm:

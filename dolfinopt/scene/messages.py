@@ -95,8 +95,11 @@ def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
         fields = model.model_fields if model else {}
         return _Problem(unknown_key(loc[:-1], loc[-1], fields, tree), (loc,), "unknown")
     if item["type"] == "missing" and len(raw) == len(loc):
-        what = _meaning(field_at(loc))
-        return _Problem(f"missing key {dotted(loc, tree)} ({what})", (loc,), "missing")
+        field = field_at(loc)
+        text = f"missing key {dotted(loc, tree)} ({_meaning(field)})"
+        if field.examples:
+            text = f"missing table [{loc[-1]}] ({_meaning(field)}); write {field.examples[0]}"
+        return _Problem(text, (loc,), "missing")
     reason = item.get("ctx", {}).get("error")
     if isinstance(reason, Refusal):
         locs = tuple((*loc, *key) for key in reason.keys) or (loc,)

@@ -52,7 +52,10 @@ class Scene(Table):
         description="joints of a machine in space, a tree on the ground; without this table the "
         "arms are a chain in the plane",
     )
-    motion: Motion = Field(default=Motion(), description="prescribed motion")
+    motion: Motion = Field(
+        description="prescribed motion",
+        examples=['[motion] with path = "arc", radius, duration and horizon'],
+    )
     control: Control | None = Field(
         default=None,
         description="feedback control; without this table the rigid coordinates follow the desired "
@@ -61,7 +64,10 @@ class Scene(Table):
     closure: Closure | None = Field(
         default=None, description="closed loop; without this table the last arm's end is free"
     )
-    payload: Payload = Field(default=Payload(), description="load of the end-effector")
+    payload: Payload = Field(
+        description="load of the end-effector",
+        examples=["[payload] with mass = 2.0 [kg], or mass = 0.0 without a load"],
+    )
     damping: Damping = Field(default=Damping(), description="structural damping")
     reduction: Reduction = Field(default=Reduction(), description="model reduction")
     simulation: Simulation = Field(default=Simulation(), description="time integration")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM, overrides, run
+from runs import STATED, TWO_ARM, overrides, run
 
 import dolfinopt as do
 from dolfinopt.arms.patterns import Patterns, uniform_design
@@ -246,10 +246,10 @@ def test_a_pattern_of_a_pattern_is_refused():
     three += [{"name": "arm2", "pattern": "arm1"}, {"name": "arm3", "pattern": "arm2"}]
     data = {"material": "POM", "arms": three}
     with pytest.raises(InputError, match="arm2 itself has that of arm1"):
-        do.scene_from_dict(data)
+        do.scene_from_dict(STATED | data)
     # Identical arms may share the mesh of one that repeats another's design.
     three[2] = {"name": "arm3", "design": "arm2"}
-    scene = do.scene_from_dict(data)
+    scene = do.scene_from_dict(STATED | data)
     assert scene.owners == (0, 1, 1) and scene.patterns == {1: 0} and scene.designed == (0,)
 
 
@@ -259,5 +259,5 @@ def test_an_arm_takes_from_its_pattern_not_from_the_arm_before():
     one |= {"symmetric": True, "regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
     other = {"name": "arm2", "passive": 0.1, "symmetric": False, "regions": []}
     data = {"material": "POM", "arms": [one, other, {"name": "arm3", "pattern": "arm1"}]}
-    third = do.scene_from_dict(data).arms[2]
+    third = do.scene_from_dict(STATED | data).arms[2]
     assert third.passive is None and not third.symmetric and third.regions == ()

@@ -8,6 +8,7 @@ import dolfinx
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import STATED
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -306,7 +307,7 @@ def test_chain_through_what_is_clipped(shared_tmp_path):
         "arms": [{"name": "a", "length": 1.0, "height": 0.2, "thickness": 0.01, "mesh": str(path)}],
         "design": {"filter_radius": 0.02},
     }
-    arm = Arm(do.scene_from_dict(data), 0, COMM, do.Profile())
+    arm = Arm(do.scene_from_dict(STATED | data), 0, COMM, do.Profile())
     x = (np.sin(arm.mesh.centroid @ [25.0, 40.0]) > 0.0).astype(float)
     d = (1.0 - 2.0 * x) * (0.5 + rough(np.round(arm.mesh.centroid, 9)))  # into the bounds
     w = 1.0 + arm.mesh.centroid[:, 0]

@@ -287,3 +287,27 @@ def test_a_filter_of_less_than_two_cells_warns(radius, count):
     found = filter_warnings(scene, {0: 0.005, 1: 0.005})
     assert len(found) == count
     assert all("set design.filter_radius = 0.01 or more" in text for text in found)
+
+
+BORES = ("arms.mesh=meshes/arm_bores.geo", "arms.arm2.design=arm1", "design.projection=robust")
+
+
+@pytest.mark.parametrize("shape", ["quadrilateral", "triangle"])
+def test_widths_need_three_cells_of_a_file_that_has_its_own(shape):
+    """The file's own size is 5 mm; that of most edges differs from it by a few per cent."""
+    told = (*BORES, f"arms.cell_shape={shape}", "design.minimum_member=0.014")
+    scene = do.load_scene(TWO_ARM, told)  # which says nothing of the size
+    with pytest.raises(do.InputError, match=r"design.minimum_member = 0\.014: .* at least 3 cells"):
+        do.Arm(scene, 0, WORLD, do.Profile())
+    wide = do.load_scene(TWO_ARM, (*told, "design.minimum_member=0.017"))
+    assert do.Arm(wide, 0, WORLD, do.Profile()).mesh.cell_size == pytest.approx(CELL, rel=0.05)
+
+
+@pytest.mark.serial  # ranks have no part in it
+def test_widths_need_three_cells_of_a_step_file_without_a_size(tmp_path):
+    path = tmp_path / "arm.step"
+    path.write_text("")
+    told = (*BORES[1:], f"arms.mesh={path}")
+    with pytest.raises(do.InputError, match=r"at least 3 cells of arm .arm1., 0\.015 \[m\]"):
+        do.load_scene(TWO_ARM, (*told, "design.minimum_member=0.014"))
+    do.load_scene(TWO_ARM, (*told, "design.minimum_member=0.015"))

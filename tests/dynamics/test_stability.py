@@ -659,8 +659,9 @@ def test_large_deflections_are_warned_of(
     tip = trajectory.q_e[:, trajectory.mechanism.slices[0]] @ body.outboard.T
     ratio = np.linalg.norm(tip[:, :2], axis=1).max() / 1.0
     assert ratio > 0.1 > trajectory.deflections[1]
-    [deflection] = warnings
+    deflection, stiffening = warnings
     assert f"'arm1' deflects by {100.0 * ratio:.3g} %" in deflection
+    assert "simulation.stiffening = false leaves out" in stiffening
 
 
 # -- everything at once ----------------------------------------------------------------------
@@ -697,7 +698,7 @@ def drawn(rng: np.random.Generator, folder: Path) -> tuple[dict, list[str]]:
         table.write_text(JOINTS.format(arms=names, **rows))
         motion |= {"path": "joints", "file": str(table)}
     else:
-        motion |= {"radius": one([0.5, 0.9]), "joint_height": one([-0.4, -0.1])}
+        motion |= {"path": "arc", "radius": one([0.5, 0.9]), "joint_height": one([-0.4, -0.1])}
         motion |= {"flattening": one([0.2, 1.0]), "law": one(["quintic", "septic"])}
     method, kind = one(METHODS), one(KINDS)
     objective_keys = {"kind": kind, "load_cases": 5, "gradient": one(["esl", "exact"])}

@@ -15,6 +15,8 @@ from dolfinopt.scene.load import Scene
 
 ROOT = Path(__file__).parents[2]
 TWO_ARM = ROOT / "demos" / "two_arm.toml"
+# The tables that every scene states, for tests of one arm's mesh, filter or keys.
+STATED = {"motion": {"path": "arc"}, "payload": {"mass": 6.0}}  # kg
 
 
 def scene(*changes: str) -> Scene:

@@ -11,6 +11,7 @@ import dolfinx
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import STATED
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm as ScenesArm
@@ -261,7 +262,7 @@ def solid(size, shape, comm=COMM):
     }
     material = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
     data = {"material": material, "arms": [entry], "design": {"filter_radius": 0.0}}
-    arm = ScenesArm(do.scene_from_dict(data), 0, comm, do.Profile())
+    arm = ScenesArm(do.scene_from_dict(STATED | data), 0, comm, do.Profile())
     body = arm.reduce(np.ones(arm.mesh.num_cells))
     squares = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real
     flexibility = body.outboard @ np.linalg.solve(body.K, body.outboard.T)

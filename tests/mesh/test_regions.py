@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, overrides, run
+from runs import ROOT, STATED, TWO_ARM, overrides, run
 
 import dolfinopt as do
 from dolfinopt.errors import InputError
@@ -227,7 +227,7 @@ def test_an_arm_takes_the_regions_of_the_arm_before():
     one = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}
     one |= {"regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
     data = {"material": "POM", "arms": [one, {"name": "arm2"}, {"name": "arm3", "regions": []}]}
-    scene = do.scene_from_dict(data, overrides=["arms.arm2.length=0.9"])
+    scene = do.scene_from_dict(STATED | data, overrides=["arms.arm2.length=0.9"])
     assert scene.arms[0].regions == scene.arms[1].regions != ()
     assert scene.arms[2].regions == ()
     assert do.scene_from_dict(json.loads(json.dumps(scene.to_dict()))) == scene

@@ -72,7 +72,8 @@ def scene(
             "arms": [
                 {"name": f"arm{k}", "length": length, **section} for k, length in enumerate(lengths)
             ],
-            "motion": {"duration": DURATION, "horizon": 3.0, **motion},
+            "motion": {"path": "arc", "duration": DURATION, "horizon": 3.0, **motion},
+            "payload": {"mass": 6.0},
             **(tables or {}),
         },
         source="test.toml",

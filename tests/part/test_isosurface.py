@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.box import box_arm
 from dolfinopt.part.isosurface import design_surface
@@ -26,7 +27,6 @@ DESIGNS = {
     "cavity": lambda x, y, z: (
         1.0 - ((x > 0.1) & (x < 0.4) & (np.abs(y) < 0.01) & (np.abs(z) < 5e-3))
     ),
-    "gray": lambda x, y, z: np.full_like(x, 0.5),
 }
 
 
@@ -41,7 +41,7 @@ def hexahedra():
 @pytest.mark.parametrize("shape", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("name", DESIGNS)
 def test_a_surface_is_closed_and_keeps_the_volume(hexahedra, name, shape):
-    """And ends at the box's faces; a design of one density has no other surface."""
+    """And ends at the box's faces."""
     density = DESIGNS[name](*hexahedra.mean(axis=1).T)
     corners = hexahedra
     if shape == "tetrahedron":
@@ -51,11 +51,22 @@ def test_a_surface_is_closed_and_keeps_the_volume(hexahedra, name, shape):
     found = trimesh.load_mesh(io.BytesIO(triangle_bytes(surface.corners, "test, m")), "stl")
     assert found.is_watertight and found.is_winding_consistent
     assert found.volume == pytest.approx(surface.volume, rel=1e-5)
-    share = 1.0 if name == "gray" else density.mean()
-    assert surface.volume == pytest.approx(share * np.prod(SIZE), rel=1e-3)
+    assert surface.volume == pytest.approx(density.mean() * np.prod(SIZE), rel=1e-3)
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     assert (surface.points > low - 1e-8).all() and (surface.points < high + 1e-8).all()
     assert found.bounds[:, 0] == pytest.approx([0.0, 0.5], abs=1e-7)
+
+
+@pytest.mark.parametrize("density", [0.4, 0.999])
+def test_a_design_of_one_density_has_no_surface_of_its_volume(hexahedra, density):
+    """But the whole box, which is 1 / 0.4 times the material: told, and taken where it is close."""
+    uniform = np.full(len(hexahedra), density)
+    if density == 0.4:
+        volumes = "encloses its volume, 1.6e.05 mm3: .* encloses 4e.05 mm3; the design is too grey"
+        with pytest.raises(InputError, match=volumes):
+            design_surface(hexahedra, uniform)
+    else:
+        assert design_surface(hexahedra, uniform).volume == pytest.approx(np.prod(SIZE), rel=1e-9)
 
 
 def test_triangles_of_grey_designs_turn_alike():

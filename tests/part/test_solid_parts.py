@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import ROOT, run, shell
+from scipy.ndimage import gaussian_filter
 from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
 
 import dolfinopt as do
+import dolfinopt.part.solid_mesh as solid_mesh_module
+import dolfinopt.part.solid_part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.part.isosurface import cut, eighths, halved, nodal_densities, outside
-from dolfinopt.part.smooth_surface import distance_to_faces
+from dolfinopt.part.isosurface import Surface, cut, eighths, halved, nodal_densities, outside
+from dolfinopt.part.smooth_surface import crossings, distance_to_faces
 from dolfinopt.part.solid import MM, triangle_bytes
 from dolfinopt.part.solid_domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
@@ -125,6 +128,90 @@ def test_mesh_of_a_part(domain_with, plate):
         assert area == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
     boundary = trimesh.Trimesh(mesh.points, mesh.boundary, process=False)
     assert boundary.is_watertight and boundary.volume == pytest.approx(part.volume, rel=1e-6)
+
+
+def test_thin_plates_are_meshed_as_finely_as_their_cells():
+    """Cells 8.3 x 4.4 x 1 mm: the size wanted is 3.66 mm, whatever the cells' thickness."""
+    scene = solid_scene(cells=(60, 9, 4), thickness=0.004)
+    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[0])
+    x_phys = mesh.keep(windows(*mesh.centroid.T))
+    part = make_solid_part(domain_in_scene(scene, 0, mesh, x_phys))
+    size = mesh_size(part)
+    assert size == pytest.approx(3.66e-3, rel=0.01)
+    found = solid_mesh(part, size)
+    assert found.volumes.sum() == pytest.approx(part.volume, rel=1e-6)
+    a, b, c = found.points[np.concatenate([found.inboard, found.boundary])].swapaxes(0, 1)
+    flat = (np.ptp([a[:, 2], b[:, 2], c[:, 2]], axis=0) < 1e-9) & (a[:, 2] > 0.0)  # on top
+    sides = np.linalg.norm(np.concatenate([b - a, c - b, a - c])[np.tile(flat, 3)], axis=1)
+    # Half of the cells' in members; in wide places up to `LARGEST` of them.
+    assert 0.6 * size < np.median(sides) < 1.5 * size
+
+
+def test_points_that_a_correction_of_the_volume_would_spoil_are_held(domain_with, monkeypatch):
+    """The others make up for them: the check's mesh weighs what the part does."""
+    part = make_solid_part(domain_with(hollow))
+    size = 1.5 * mesh_size(part)
+    uncorrected: list[solid_mesh_module.Tetrahedra] = []
+
+    def watched(one, mesh):
+        uncorrected.append(mesh)
+        return correct(one, mesh)
+
+    correct = solid_mesh_module._of_volume
+    monkeypatch.setattr(solid_mesh_module, "_of_volume", watched)
+    worst = solid_mesh(part, size)
+    [before] = uncorrected
+    assert abs(before.volumes.sum() / part.volume - 1.0) > 1e-3
+    # A bound between both qualities of a cell that the correction makes worse.
+    worse = np.flatnonzero(worst.quality < 0.98 * before.quality)
+    cell = worse[np.argmin(worst.quality[worse])]
+    bound = np.sqrt(worst.quality[cell] * before.quality[cell])
+    monkeypatch.setattr(solid_mesh_module, "LEAST", bound)
+    held = correct(part, before)
+    assert held.volumes.sum() == pytest.approx(part.volume, rel=1e-6)
+    np.testing.assert_array_equal(held.points[held.cells[cell]], before.points[before.cells[cell]])
+
+
+def random_crisp(cells, seed):
+    """Return the densities of cells along x, y, z: blobs of about one cell, 40 % void."""
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal(cells), 0.8, mode="nearest")
+    return 1.0 * (noise > np.quantile(noise, 0.4))
+
+
+def test_surfaces_do_not_cross_themselves(monkeypatch):
+    """Smoothing and the correction of the volume made this one do so in 11 places."""
+    cells = (20, 6, 4)
+    scene = solid_scene(cells=cells)
+    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[0])
+    place = (mesh.centroid - LOW) / (HIGH - LOW) * cells
+    density = random_crisp(cells, 0)[tuple(place.astype(int).T)]
+    ends = np.abs(mesh.centroid[:, 0] - 0.25) > 0.2
+    domain = solid_domain(mesh, mesh.keep(np.where(ends, 1.0, density)))
+    part = make_solid_part(domain)
+    assert part.watertight and part.crossings == 0
+    assert part.volume == pytest.approx(domain.volume, rel=1e-4)
+    monkeypatch.setattr(solid_part_module, "ROUNDS", 1)  # as if nothing were taken back
+    crossed = make_solid_part(domain)
+    assert crossed.closed and crossed.crossings > 0 and not crossed.watertight
+    assert any(f"crosses itself in {crossed.crossings} pairs" in one for one in crossed.warnings)
+
+
+def test_crossings_of_known_bodies():
+    """Two tetrahedra with a common corner, edge, or apart do not cross; pushed into each other,
+    they do."""
+    one = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+    def count(move, size=1.0):
+        points = np.concatenate([one, size * one + move])
+        _, first, which = np.unique(points.round(9), axis=0, return_index=True, return_inverse=True)
+        both = which.reshape(-1)[np.concatenate([faces, faces + 4])]
+        return len(crossings(Surface(points[first], both)))
+
+    assert count([3.0, 0.0, 0.0]) == count([1.0, 0.0, 0.0]) == 0  # apart; a corner
+    assert count([0.1, 0.1, 0.1], 0.1) == 0  # within the other one
+    assert count([0.2, 0.2, 0.2]) > 0
+    assert count([-0.01, 0.2, 0.2], 0.02) == 3  # a small one through a large face: edges along x
 
 
 def test_extruded_design_has_the_curves_of_a_plate(domain_with):

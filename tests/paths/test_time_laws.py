@@ -170,7 +170,7 @@ def test_fastest_s_curve(limits: dict[str, float], expected: float) -> None:
 def posed(**motion: Any) -> Scene:
     """Return the example with another motion."""
     data = load_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
-    return scene_from_dict(data | {"motion": motion}, "test.toml")
+    return scene_from_dict(data | {"motion": {"path": "arc"} | motion}, "test.toml")
 
 
 @EVERY

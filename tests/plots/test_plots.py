@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
 from PIL import Image
-from runs import TWO_ARM
+from runs import ROOT, TWO_ARM
 
+import dolfinopt as do
 from dolfinopt.multibody.drives import Closure, pin, slider
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.mechanism import Mechanism
@@ -765,6 +766,34 @@ def test_drives_have_a_row_each_and_the_ground_one():
     assert shown["pin"] == ["crank: moment [N m]", "force of the pin on the arm [N]"]
     # A cart that follows the desired motion exactly has no error to be shown.
     assert shown["soft"][0] == "cart: force [N]" and len(shown["soft"]) == 5
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("slides", [(), (0,), (1,), (0, 2)])
+def test_units_of_drives_in_space(slides):
+    """They follow the joints' kinds; the first joint of a tree is no cart."""
+    from types import SimpleNamespace
+
+    from dolfinopt.plots import drives
+
+    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml")
+    joints = tuple(
+        joint.model_copy(update={"type": "prismatic" if k in slides else joint.type})
+        for k, joint in enumerate(scene.movable)
+    )
+    count = len(joints)
+    assert count == 3
+    control = {"stiffness": (1.0,) * count, "damping": (1.0,) * count}
+    scene = scene.model_copy(update={"joints": joints, "control": SimpleNamespace(**control)})
+    zero = np.zeros((4, count))
+    trajectory = SimpleNamespace(
+        scene=scene, q_r=zero, desired=SimpleNamespace(q=zero), joint_forces=zero,
+        closure_force=None,
+    )  # fmt: skip
+    shown = [(label.split(": ")[1], unit) for row in drives.drive_panels(trajectory)
+             for label, unit, _ in row]  # fmt: skip
+    of = {True: [("error", "m"), ("force", "N")], False: [("error", "rad"), ("moment", "N m")]}
+    assert shown == [quantity for k in range(count) for quantity in of[k in slides]]
 
 
 def load_soft(tree, changes):

@@ -68,6 +68,30 @@ def test_files_in_space(folder):
     assert grid.cell_centers().points[worst] == pytest.approx(told["place"], abs=1e-6)
 
 
+@pytest.mark.parametrize("stiffening", ["false", "auto"])
+def test_no_geometric_stiffness_is_built_where_none_is_asked_for(monkeypatch, stiffening):
+    """It takes two thirds of the memory of tetrahedra; the estimate of "auto" needs it."""
+    from dolfinopt.arms import design_state
+    from dolfinopt.arms.arm import stiffening_of
+
+    built = []
+
+    def counted(arm):
+        built.append(arm)
+        return unit_loads(arm)
+
+    unit_loads = design_state.unit_loads
+    monkeypatch.setattr(design_state, "unit_loads", counted)
+    scene = do.load_scene(DEMO, (*COARSE, f"simulation.stiffening={stiffening}"))
+    partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), do.Profile()
+    arms = do.build_arms(scene, partition, profile)
+    x_phys = uniform_design(scene, partition, arms, 0.5)
+    _, trajectory = do.evaluate(scene, partition, arms, x_phys, profile)
+    do.gradient(scene, partition, arms, trajectory, profile)
+    assert bool(built) == (stiffening == "auto")
+    assert (stiffening_of(arms) is None) == (stiffening == "false")
+
+
 SCENARIOS = (
     "scenarios=[{changes=['payload.mass=2']}, {changes=['material.young_modulus=60e9', "
     "'material.density=2500.0'], weight=2.0}]",

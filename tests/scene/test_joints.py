@@ -171,7 +171,7 @@ def test_interfaces_of_a_scene(source):
     machine = build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
     assert (machine.end, machine.end_interface) == (1, 1) and set(machine.loads) == {(1, 1)}
     data["arms"][2]["interfaces"] = [{**SIDE, "name": "a", "radius": 0.01}]
-    data["payload"] = {"arm": "tool", "interface": "a"}
+    data["payload"] = {"mass": 2.0, "arm": "tool", "interface": "a"}
     data["reduction"]["coordinates"] = 12
     assert scene_from_dict(data, source).arms[2].num_outboard == 12
 
@@ -209,7 +209,7 @@ def test_coordinates_of_several_interfaces(source):
     """Six of each; an arm that shares the design has the interfaces, too."""
     data = with_fork()
     data["arms"][2]["interfaces"] = [{**SIDE, "radius": 0.01}]
-    data["payload"] = {"arm": "tool", "interface": "side"}
+    data["payload"] = {"mass": 2.0, "arm": "tool", "interface": "side"}
     twin = copy.deepcopy(data)
     twin["arms"].append({"name": "twin", "design": "tool"})
     twin["joints"].append({**WRIST, "name": "second", "parent": "tool", "child": "twin"})
@@ -258,7 +258,7 @@ def test_plane_scenes_have_no_keys_of_space():
             load_scene("demos/two_arm.toml", [change])
     data = copy.deepcopy(ROBOT)
     del data["joints"]
-    data["motion"], data["payload"] = {}, {}
+    data["motion"], data["payload"] = {"path": "arc"}, {"mass": 2.0}
     for key, value in (("centre", [0, 0, 0]), ("inertia", [1, 1, 1, 0, 0, 0]), ("length", 0.0)):
         data["arms"][0] = {"name": "a", "rigid": True, "length": 0.3, "height": 0.01,
                            "thickness": 0.01, key: value}  # fmt: skip

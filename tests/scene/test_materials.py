@@ -24,7 +24,8 @@ ARM = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}
 
 
 def tree(solid, **arm2):
-    return {"material": solid, "arms": [dict(ARM), {"name": "arm2"} | arm2]}
+    arms = [dict(ARM), {"name": "arm2"} | arm2]
+    return {"material": solid, "arms": arms, "motion": {"path": "arc"}, "payload": {"mass": 6.0}}
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
@@ -133,6 +134,7 @@ def test_keys_lists_the_catalogue(capsys):
 def test_editors_know_the_names():
     validate = pytest.importorskip("jsonschema").Draft7Validator(scene_schema())
     good = 'material = "PEEK"\n[[arms]]\nname = "a"\nmaterial = "POM"'
+    good += '\n[motion]\npath = "arc"\n[payload]\nmass = 1.0'
     assert validate.is_valid(tomllib.loads(good))
     assert validate.is_valid(tomllib.loads(good.replace('= "PEEK"', '= {name = "PEEK"}')))
     assert not validate.is_valid(tomllib.loads(good.replace("PEEK", "PEAK")))

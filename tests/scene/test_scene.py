@@ -16,7 +16,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from runs import TWO_ARM
+from runs import STATED, TWO_ARM
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -44,7 +44,11 @@ FILE = "some/where.toml"
 def minimal(n_arms=2, **tables):
     """Return the data of a scene with the required keys only, and `tables`."""
     arms = [dict(ARM), *({"name": f"arm{i}"} for i in range(2, n_arms + 1))]
-    return {"material": dict(MATERIAL), "arms": arms} | tables
+    required = {"material": dict(MATERIAL), "arms": arms, **copy.deepcopy(STATED)} | tables
+    for key in STATED:  # a table that is given has its required key, too
+        if isinstance(required[key], dict):
+            required[key] = STATED[key] | required[key]
+    return required
 
 
 def put(data, path, value):
@@ -252,7 +256,7 @@ def test_integer_stands_for_a_number():
         ("motion.horizon", 1.9),  # no rest behind the motion
         ("motion.elbow", 1),
         ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
-        ("motion", {"base": "fixed", "base_position": -1.0}),
+        ("motion", {"path": "arc", "base": "fixed", "base_position": -1.0}),
         ("payload.mass", 0),
         ("damping.stiffness_proportional", 0.0),
         ("simulation.tolerance", 0.1),
@@ -359,7 +363,7 @@ def test_override(override, read, value):
     plain = scene_from_dict(minimal(3))
     scene = scene_from_dict(minimal(3), overrides=[override])
     assert read(scene) == value
-    assert scene_from_dict(plain.to_dict(), overrides=[override]) == scene
+    assert scene_from_dict(plain.to_tree(), overrides=[override]) == scene
     assert scene != plain or override == "design.projection=false"
 
 
@@ -370,7 +374,8 @@ def test_later_override_wins():
 
 
 def test_override_supplies_missing_keys():
-    data = {"arms": [{"name": "arm1", "height": 0.1, "thickness": 0.01}, {"name": "arm2"}]}
+    arms = [{"name": "arm1", "height": 0.1, "thickness": 0.01}, {"name": "arm2"}]
+    data = {"arms": arms, **STATED}
     overrides = [f"material.{key}={value}" for key, value in MATERIAL.items()]
     scene = scene_from_dict(data, overrides=[*overrides, "arms.0.length=0.9"])
     assert [arm.length for arm in scene.arms] == [0.9, 0.9]
@@ -715,6 +720,35 @@ def test_a_mesh_excludes_cells():
     assert back.arms == (Arm(**ARM, cells=(20, 2)), Arm(**ARM | {"name": "arm2"}, cells=(20, 2)))
 
 
+SIZED = 'DefineConstant[ h = {1, Name "Parameters/1 mesh size (m)"} ];'
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "size", "shape"),
+    [
+        ("own.step", "", 0.004, "triangle"),
+        ("own.geo", SIZED, 0.004, "triangle"),
+        ("own.geo", "", None, "triangle"),  # it has no such parameter
+        ("own.msh", "", None, None),  # it has its cells
+    ],
+)
+def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, text, size, shape):
+    """All keys an arm leaves out are those of the arm before, but those its file cannot have."""
+    path = tmp_path / file
+    path.write_text(text)
+    data = minimal()
+    before = {"mesh": "meshes/arm_bores.geo", "mesh_size": 0.004, "cell_shape": "triangle"}
+    data["arms"][0] |= before
+    data["arms"][1] |= {"mesh": str(path)}
+    arm = scene_from_dict(data).arms[1]
+    assert (arm.mesh_size, arm.cell_shape, arm.cells) == (size, shape, None)
+    stated = scene_from_dict(data, overrides=["arms.arm1.mesh_size=0.003"]).arms
+    assert [one.mesh_size for one in stated] == [0.003, size]
+    own = data["arms"][1] | {"cells": [20, 2]}  # in place of the mesh
+    data["arms"][1] = {key: value for key, value in own.items() if key != "mesh"}
+    assert scene_from_dict(data).arms[1] == Arm(**ARM | {"name": "arm2"}, cells=(20, 2))
+
+
 @pytest.mark.parametrize(
     ("suffix", "keys", "reason"),
     [
@@ -753,7 +787,8 @@ def test_every_key_refuses_something():
 @pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov", "balanced"])
 @pytest.mark.parametrize("kind", ["esl", "compliance"])
 def test_all_choices_are_accepted(integrator, method, kind):
-    tables = {"simulation": {"integrator": integrator}, "objective": {"kind": kind}}
+    objective = {"kind": kind, "gradient": "esl"}  # not all have an adjoint
+    tables = {"simulation": {"integrator": integrator}, "objective": objective}
     scene = scene_from_dict(minimal(reduction={"method": method}, **tables))
     assert (scene.simulation.integrator, scene.reduction.method) == (integrator, method)
     assert scene.objective.kind == kind
@@ -956,6 +991,8 @@ def test_exact_gradient_needs_radau():
     data["objective"] = {"gradient": "exact"}
     data["simulation"] = {"integrator": "generalized-alpha"}
     assert 'simulation.integrator = "generalized-alpha": expected "radau"' in message_of(data)
+    data["objective"] = {"kind": "compliance"}  # exact by default: the way out is told
+    assert message_of(data).endswith('; or state objective.gradient = "esl"')
 
 
 def test_misspelt_key_comes_before_the_missing_one():
@@ -982,6 +1019,8 @@ def test_key_that_is_no_string():
         ("arms.0", "height", "[m]"),
         ("arms.0", "thickness", "[m]"),
         ("arms.1", "name", "unique name"),
+        ("motion", "path", "path of the end-effector"),
+        ("payload", "mass", "[kg]"),
     ],
 )
 def test_missing_key(table, key, described):
@@ -993,6 +1032,59 @@ def test_missing_key(table, key, described):
     assert message.startswith(f"{FILE}: missing key {named} (")
     assert described in message and message.endswith(")")
     assert "more)" not in message  # the arms that would take it over do not count
+
+
+@pytest.mark.parametrize(
+    ("table", "remedy"),
+    [
+        ("motion", 'write [motion] with path = "arc", radius, duration and horizon'),
+        ("payload", "write [payload] with mass = 2.0 [kg], or mass = 0.0 without a load"),
+    ],
+)
+def test_motion_and_payload_are_stated(table, remedy):
+    """Not even a scene without dynamic responses has them by default: every run simulates."""
+    data = minimal(objective={"kind": "static"})
+    stated = data.pop(table)
+    message = message_of(data)
+    assert message.startswith(f"{FILE}: missing table [{table}] (") and message.endswith(remedy)
+    [[key, value]] = stated.items()
+    assert scene_from_dict(data, overrides=[f"{table}.{key}={value}"]) == scene_from_dict(
+        minimal(objective={"kind": "static"})
+    )
+
+
+@pytest.mark.parametrize(
+    ("tables", "gradient"),
+    [
+        ({}, "esl"),
+        (
+            {"objective": {"kind": "esl"}, "constraints": {"mass": 2.0, "tip_deflection": 1.0}},
+            "esl",
+        ),
+        ({"constraints": {"first_frequency": 1.0}}, "esl"),
+        ({"constraints": {"deviation": 0.01}}, "exact"),
+        ({"constraints": {"compliance": 9.0}}, "exact"),
+        ({"constraints": {"effort": 9.0}}, "exact"),
+        ({"constraints": {"deviation": None}}, "esl"),  # as a summary has it
+        ({"constraints": {"deviation": 0.01}, "objective": {"gradient": "esl"}}, "esl"),
+        ({"objective": {"gradient": "exact"}}, "exact"),
+        *(({"objective": {"kind": kind}}, "exact") for kind in ("compliance", "settling")),
+        ({"objective": {"kind": "mass"}, "constraints": {"stress": 6e7}}, "exact"),
+    ],
+)
+def test_gradient_is_exact_but_of_the_esl_objective_alone(tables, gradient):
+    scene = scene_from_dict(minimal(**tables))
+    assert scene.objective.gradient == gradient
+    assert scene_from_dict(scene.to_dict()) == scene
+    # What is not stated follows a limit or an objective that is added later; what is stated stays.
+    later = "esl" if tables.get("objective", {}).get("gradient") == "esl" else "exact"
+    for change in ("constraints.settling=1e-3", "objective.kind=deviation"):
+        assert scene_from_dict(scene.to_tree(), overrides=[change]).objective.gradient == later
+
+
+def test_scenarios_have_the_gradient_of_their_scene():
+    scene = scene_from_dict(minimal(scenarios=[{"changes": ["payload.mass=4"]}]))
+    assert [one.objective.gradient for one in pose_scenarios(scene)] == ["esl"]
 
 
 def test_missing_tables():
@@ -1024,6 +1116,12 @@ name = "arm1"
 length = 1.0
 height = 0.06
 thickness = 0.01
+[motion]
+path = "arc"
+"""
+PAYLOAD = """
+[payload]
+mass = 6.0
 """
 
 
@@ -1055,7 +1153,7 @@ def test_bad_file_content(tmp_path, text, parts):
 
 def test_required_tables_are_enough(tmp_path):
     path = tmp_path / "one.toml"
-    path.write_text(REQUIRED)
+    path.write_text(REQUIRED + PAYLOAD)
     assert load_scene(path) == scene_from_dict(minimal(1, name="one"))
 
 
@@ -1186,6 +1284,7 @@ def test_described_defaults():
         "name",  # of the file
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
+        *("motion.path", "payload.mass"),
         *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
         *("arms.interfaces.name", "arms.interfaces.point"),
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent

@@ -39,16 +39,20 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
-MESH_FILES = (".geo", ".msh", ".step", ".stp")
+STEP_FILES = (".step", ".stp")
+MESH_FILES = (".geo", ".msh", *STEP_FILES)
 
-# What an arm is meshed from: an arm that states one of the first two takes none of the others from
-# the arm before.
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = (
     "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
     "joint_damping",
 )  # fmt: skip
-MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
+SIZE_KEYS = ("mesh_size", "cell_shape")
+# What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
+MESH_KEYS = ("cells", "mesh", *SIZE_KEYS)
+SIZE_PARAMETER = "mesh size (m)"  # its name in a .geo file
+CELLS_ACROSS = 12  # the height of an arm from a STEP file without mesh_size
+SOLID_CELLS_ACROSS = 4  # the smaller of height and thickness of a solid one
 # never taken from the arm before
 OWN_KEYS = (
     "name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
@@ -90,7 +94,9 @@ class Arm(Table):
         default=None, description="geometry or mesh file (.geo, .msh, .step) in place of cells [-]"
     )
     mesh_size: Length | None = Field(
-        default=None, description="cell size for a .geo or .step file [m]"
+        default=None,
+        description="cell size for a .geo or .step file; default: a .geo file's own; with .step a "
+        "twelfth of the height, of solids a quarter of the smaller of height and thickness [m]",
     )
     cell_shape: CellShape | None = Field(
         default=None,
@@ -303,7 +309,7 @@ class Arm(Table):
     @model_validator(mode="after")
     def _check_mesh(self) -> Arm:
         if self.mesh is None:
-            for key in ("mesh_size", "cell_shape"):
+            for key in SIZE_KEYS:
                 if getattr(self, key) is not None:
                     raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
             return self
@@ -322,7 +328,7 @@ class Arm(Table):
         kind = Path(self.mesh).suffix.lower()
         if kind not in MESH_FILES:
             raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
-        for key in ("mesh_size", "cell_shape"):
+        for key in SIZE_KEYS:
             told = key == "cell_shape" and self.cell_shape in SOLID_SHAPES
             if kind == ".msh" and getattr(self, key) is not None and not told:
                 raise Refusal(
@@ -359,12 +365,12 @@ class Arm(Table):
         """Number of cells; of a mesh file an estimate, 0 where there is nothing to go by."""
         if self.cells is not None:
             return math.prod(self.cells)
-        if self.mesh_size is None:
+        if (size := self.cell_size) is None:
             return 0
         if self.is_solid:
-            cubes = self.length * self.height * self.thickness / self.mesh_size**3
+            cubes = self.length * self.height * self.thickness / size**3
             return round(6.0 * cubes if self.cell_shape == "tetrahedron" else cubes)
-        squares = self.length * self.height / self.mesh_size**2
+        squares = self.length * self.height / size**2
         return round(2.0 * squares if self.cell_shape == "triangle" else squares)
 
     @property
@@ -420,8 +426,12 @@ class Arm(Table):
 
     @property
     def cell_size(self) -> float | None:
-        """Longest side of a cell, m; None for a mesh file that does not depend on it."""
+        """Longest side of a cell, m; None for a mesh file that says it itself."""
         if self.cells is None:
+            if self.mesh_size is None and Path(str(self.mesh)).suffix.lower() in STEP_FILES:
+                if self.is_solid:
+                    return min(self.height, self.thickness) / SOLID_CELLS_ACROSS
+                return self.height / CELLS_ACROSS
             return self.mesh_size
         sizes = self.length, self.height, self.thickness
         return max(size / count for size, count in zip(sizes, self.cells, strict=False))

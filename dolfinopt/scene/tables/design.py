@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
@@ -128,6 +129,18 @@ class Design(Table):
         keys = ("minimum_member", "minimum_gap")
         return {key: getattr(self, key) for key in keys if getattr(self, key)}
 
+    def too_narrow(self, where: str, size: float) -> Iterator[tuple[str, str]]:
+        """Yield every stated width with too few cells of `size`, m, and what is expected."""
+        least = MEMBER_CELLS * size
+        for key, width in self.stated_widths.items():
+            if width < least * (1.0 - 1e-9):
+                what = key.removeprefix("minimum_")
+                yield (
+                    key,
+                    f"expected at least {MEMBER_CELLS} cells of {where}, {least:.4g} [m]; choose a "
+                    f"wider {what} or finer cells",
+                )
+
     @model_validator(mode="after")
     def _check_widths(self) -> Design:
         if not (stated := self.stated_widths):
@@ -207,17 +220,11 @@ class Design(Table):
     def _check_member_width(self, scene: Scene) -> None:
         for i in scene.designed if self.controls_widths else ():
             arm, scale = scene.arms[i], scene.smallest_scale(i)
-            size, height = arm.cell_size, scale * arm.height
+            height = scale * arm.height
             smallest = f'arm "{arm.name}"' if scale == 1.0 else f'what repeats arm "{arm.name}"'
-            for key, width in self.stated_widths.items():
-                if size is not None and width < MEMBER_CELLS * scale * size * (1.0 - 1e-9):
-                    raise Refusal(
-                        f"expected at least {MEMBER_CELLS} cells of {smallest}, "
-                        f"{MEMBER_CELLS * scale * size:.4g} [m]; choose a wider "
-                        f"{key.removeprefix('minimum_')} or finer cells",
-                        ("design", key),
-                        ("arms", i, "height"),
-                    )
+            if arm.cell_size is not None:  # else known with the mesh, see `Arm`
+                for key, reason in self.too_narrow(smallest, scale * arm.cell_size):
+                    raise Refusal(reason, ("design", key), ("arms", i, "height"))
             member, gap = self.least_widths
             if 2.0 * member + gap > height * (1.0 + 1e-9):
                 reason = (

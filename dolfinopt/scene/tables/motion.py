@@ -27,7 +27,6 @@ class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
     path: PathKind = Field(
-        default="arc",
         description="path of the end-effector (arc, line, table of points), a table of joint "
         "coordinates, or a first joint that runs up to constant speed [-]",
     )

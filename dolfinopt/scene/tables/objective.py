@@ -76,9 +76,10 @@ class Objective(Table):
         description="quantity that decides which instant of an interval is the worst [-]",
     )
     gradient: GradientKind = Field(
-        default="esl",
-        description='"esl": equivalent static loads held constant; "exact": of the whole '
-        "simulation, as it always is of drive forces [-]",
+        default="exact",
+        description='"exact": of the whole simulation, as it always is of drive forces; "esl": '
+        'equivalent static loads held constant, the default with kind = "esl" if no limit under '
+        "[constraints] follows the motion [-]",
     )
     exponent: float = Field(
         default=20.0,
@@ -188,16 +189,17 @@ class Objective(Table):
     def _check_exact(self, scene: Scene) -> None:
         """Refuse reductions and integrators without adjoint where the gradient is exact."""
         because, key = self._why_exact(scene)
+        remedy = '; or state objective.gradient = "esl"' if key[-1] == "gradient" else ""
         if because and scene.reduction.method == "balanced":
             raise Refusal(
                 f'expected "craig-bampton", "modal" or "krylov" with {because}: '
-                "the Gramian's basis has no adjoint",
+                f"the Gramian's basis has no adjoint{remedy}",
                 ("reduction", "method"),
                 key,
             )
         if because and scene.simulation.integrator != "radau":
             raise Refusal(
-                f'expected "radau" with {because}: only its trajectory has an adjoint',
+                f'expected "radau" with {because}: only its trajectory has an adjoint{remedy}',
                 ("simulation", "integrator"),
                 key,
             )

@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 class Payload(Table):
     """What the end-effector carries."""
 
-    mass: float = Field(
-        default=6.0, ge=0, le=1e9, description="point mass at the end-effector [kg]"
-    )
+    mass: float = Field(ge=0, le=1e9, description="point mass at the end-effector [kg]")
     inertia: Moment | Tensor = Field(
         default=0.0,
         description="moment of inertia about its centre; in space about every axis, or the tensor "
