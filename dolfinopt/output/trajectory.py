@@ -25,8 +25,10 @@ def write_trajectory(
     Args:
         folder: where.
         trajectory: what.
-        initial: (n, d) deviation of the initial design, m, kept for the picture.
+        initial: (n, d) deviation of the initial design evenly over the horizon, m, kept for the
+            picture.
     """
+    trajectory = trajectory.sampled
     arrays = {
         "t": trajectory.t,
         "q_r": trajectory.q_r,
@@ -50,7 +52,7 @@ def write_trajectory(
         "joint_forces": ", ".join(FORCE_OF[unit] for unit in rigid_units(scene).values()),
         "closure_force": "N, " + _directions(scene),
         "slider_position": "m, from closure.point along closure.direction",
-        "initial_deviation": "m",
+        "initial_deviation": "m, evenly from 0 to the horizon",
     }
     arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])
     write_arrays(folder / "trajectory.npz", arrays)
