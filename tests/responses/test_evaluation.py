@@ -91,7 +91,6 @@ def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
 
     rigid = build("arms.arm1.rigid=true", *quick)
     limit, trajectory = rigid.evaluate(rigid.fields(same))
-    assert limit.first_frequencies[0] == np.inf
     gaps = []
     for factor in (30.0, 300.0):
         stiff = build(f"arms.arm1.young_modulus={factor * 70e9}", *quick)
@@ -102,7 +101,8 @@ def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
         ]
         if WORLD.rank == 0:
             force = np.abs(trajectory.joint_forces).max(axis=0)
-            gap += list(np.abs(moved.joint_forces - trajectory.joint_forces).max(axis=0) / force)
+            apart = moved.at(trajectory.t).joint_forces - trajectory.joint_forces
+            gap += list(np.abs(apart).max(axis=0) / force)
         gaps.append(np.abs(gap))
     assert (gaps[1] < 2e-2).all()
     np.testing.assert_allclose(np.log10(gaps[0] / gaps[1]), 1.0, atol=0.15)
