@@ -143,9 +143,7 @@ SETTLED = 1e-5  # relative change of the first eigenvalue after which no more it
 MAX_ITERATIONS = 50  # two to four are enough unless the arm has many modes of one frequency
 
 
-def full_first_frequency(
-    arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: np.ndarray
-) -> float:
+def full_first_frequency(arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: np.ndarray) -> float:
     """Return the first natural frequency of the full clamped-free arm, Hz (collective).
 
     Subspace iteration, Z <- K^-1 M Z with Rayleigh's and Ritz' values of Z, from the lowest modes

@@ -133,7 +133,7 @@ def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
 def _arm_stress(
     partition: Partition, cells: CellStress, loads: ArmLoads
 ) -> tuple[_Peaks, np.ndarray]:
-    """Return the peaks of one arm, and largest value and its instant's number of every cell (n_cells, 2).
+    """Return the peaks of one arm; of every cell largest value and instant's number (n_cells, 2).
 
     Collective on the arm's ranks.
     """

@@ -92,9 +92,7 @@ def test_carried(arms: int, kind: str) -> None:
     """Against point masses placed at the chain's random angles, to rounding."""
     rng = np.random.default_rng(arms)
     chain, clouds = chain_of_points(rng, arms)
-    carried = Chain(
-        chain.bodies, chain.outboard_points, chain.angles, chain.loads, kind
-    ).carried()
+    carried = Chain(chain.bodies, chain.outboard_points, chain.angles, chain.loads, kind).carried()
     assert len(carried) == arms
     for k, load in enumerate(carried):
         expected = direct_inertia(chain, clouds, k)

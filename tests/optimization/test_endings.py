@@ -10,7 +10,6 @@ from runs import TWO_ARM, overrides, run, shell
 from scipy.integrate import trapezoid
 
 import dolfinopt as do
-from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.output.fields import write_fields
 from dolfinopt.output.history import read_history

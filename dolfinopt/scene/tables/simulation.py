@@ -35,7 +35,10 @@ class Simulation(Table):
         "estimate says that it matters [-]",
     )
     sample: float = Field(
-        default=1e-3, ge=1e-9, le=1e5, description="interval of the instants in trajectory.npz and trajectory.csv; no result "
+        default=1e-3,
+        ge=1e-9,
+        le=1e5,
+        description="interval of the instants in trajectory.npz and trajectory.csv; no result "
         "depends on it [s]",
     )
 
