@@ -10,7 +10,8 @@ from dolfinopt.dynamics.system import System
 STEPS_PER_PERIOD = 8.0  # of the slowest vibration
 MOST_STEPS = 20_000  # of a first grid: more are asked for by estimated errors alone
 LONGEST = 1e-3  # s from one instant to the next
-MOST_INSTANTS = 1_000_000  # of `LONGEST` alone; they take 1 GB and 3 s
+MOST_INSTANTS = 1_000_000  # `LONGEST` apart; they take 1 GB and 3 s
+OF_LONG_MOTIONS = 100_000  # instants of a longer motion, unless it bends faster
 # Share of the largest elastic deflection by which an extreme may exceed its neighbouring instants:
 # the default simulation.tolerance.
 EXCEEDED = 1e-4
@@ -51,10 +52,11 @@ def response_instants(
 ) -> np.ndarray:
     """Return the instants (n,) of all extremes and integrals over time, s.
 
-    They lie evenly from 0 to the horizon, both included, at most 1 ms apart, and closer where the
-    elastic deflection is so fast that it could exceed two neighbouring instants by more than
-    `EXCEEDED` of its largest value: between instants d apart by max |qdd| d^2 / 8 at most. More
-    than two for each stage of a step say nothing new of a polynomial.
+    They lie evenly from 0 to the horizon, both included, at most 1 ms apart (of a horizon above
+    1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
+    that it could exceed two neighbouring instants by more than `EXCEEDED` of its largest value:
+    between instants d apart by max |qdd| d^2 / 8 at most. More than two for each stage of a step
+    say nothing new of a polynomial.
 
     Args:
         solution: the integrator's.
@@ -63,7 +65,9 @@ def response_instants(
         horizon: s.
         least: number of intervals that are wanted at least.
     """
-    count = max(1, int(np.ceil(min(horizon / LONGEST * (1.0 - 1e-9), MOST_INSTANTS))))
+    count = max(1, int(np.ceil(horizon / LONGEST * (1.0 - 1e-9))))
+    if count > MOST_INSTANTS:
+        count = OF_LONG_MOTIONS
     largest = _largest(solution.q[:, elastic], stiffness)
     wanted = float(least)
     if largest > 0.0:
