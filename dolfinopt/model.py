@@ -115,15 +115,15 @@ class SimulationResult:
         return max((float(v.stress.max()) for v in self.views if v.stress is not None), default=nan)
 
     def to_frame(self) -> DataFrame | None:
-        """Return deviation (m) and compliance of every arm (N m) over time (s, the index).
+        """Return deviation (m) and compliance of every arm (N m) every `simulation.sample`.
 
-        Rank 0; None elsewhere.
+        The index is the time, s. Rank 0; None elsewhere.
         """
         if self.trajectory is None:
             return None
         from pandas import DataFrame, Index
 
-        motion = self.trajectory
+        motion = self.trajectory.sampled
         columns = {f"deviation_{axis}": d for axis, d in zip("xyz", motion.deviation.T)}
         columns["deviation"] = motion.distance
         arms = zip(self.scene.arms, motion.compliance.T, strict=True)
@@ -207,7 +207,7 @@ class OptimizationResult(SimulationResult):
         stop_reason: in words.
         violated: the constraints that are not met, "" if all are.
         rows: one a design, the initial one first; rank 0.
-        initial_deviation: (n, 2) of the initial design, m; rank 0.
+        initial_deviation: (n, 2) of the initial design, evenly over the horizon, m; rank 0.
         certificate: what the exact gradient says of the design.
     """
 

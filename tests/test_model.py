@@ -39,7 +39,8 @@ def test_simulate_is_evaluate(model: Model) -> None:
     assert found.compliance == pytest.approx(found.objective, rel=1e-14)  # summed otherwise
     frame = found.to_frame()
     if ROOT:
-        assert frame["deviation"].max() == found.max_deviation
+        # Every 10 ms; the evaluation looks every millisecond.
+        assert 0.999 * found.max_deviation < frame["deviation"].max() <= found.max_deviation
         assert frame.index[-1] == pytest.approx(scene.motion.horizon)
         assert list(found.design) == ["arm1", "arm2"]
     else:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.arms.vibration import Carried, LoadedModes, loaded_modes
+from dolfinopt.arms.vibration import Carried, LoadedModes, full_first_frequency, loaded_modes
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm
@@ -144,6 +144,12 @@ class DesignState:
         """The static fields of all loads, those of the elastic motion's inertia included."""
         with self.elastic.profile.phase("stress"):
             return load_fields(self.unit_loads, self.basis.V, self.basis.MV)
+
+    @cached_property
+    def first_frequency(self) -> float:
+        """First natural frequency of the arm by itself, clamped-free, Hz; not the reduced one's."""
+        with self.elastic.profile.phase("vibration"):
+            return full_first_frequency(self.elastic, self.basis.V, self.body.K, self.body.M)
 
     def loaded_modes(self, place: int, carried: Carried) -> LoadedModes:
         """Return the natural modes with what is carried; once for the same load.

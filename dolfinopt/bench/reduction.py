@@ -55,7 +55,7 @@ class Response:
 
 
 def _response(scene: Scene, arms: dict[int, Arm], x_phys: dict[int, np.ndarray]) -> Response:
-    trajectory = simulate(scene, bodies_of(scene, arms, x_phys), Profile())
+    trajectory = simulate(scene, bodies_of(scene, arms, x_phys), Profile()).sampled
     return Response(trajectory.compliance.sum(axis=1), trajectory.deviation)
 
 

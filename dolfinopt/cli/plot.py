@@ -38,6 +38,6 @@ def plot(folder: Path, animation: bool) -> None:
     if trajectory is None:
         return
     history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
-    initial = read_initial_deviation(folder / "trajectory.npz")
+    initial = read_initial_deviation(folder / "trajectory.npz", trajectory.t)
     draw(folder, loaded, views, trajectory, history, initial, animation=animation)
     click.echo(f"pictures in {folder}")

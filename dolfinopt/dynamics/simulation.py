@@ -1,9 +1,9 @@
-"""Scene + floating bodies -> the simulated motion, sampled evenly."""
+"""Scene + floating bodies -> the simulated motion, looked at evenly over the horizon."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.load_coefficients import load_coefficients
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.time_grid import response_instants
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.drives import Closure
 from dolfinopt.multibody.end_effector import (
@@ -34,6 +35,8 @@ from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from dolfinopt.dynamics.spatial_system import SpatialSystem
 
     Problem = ElasticSystem | MachineSystem | SpatialSystem
@@ -41,13 +44,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A simulated motion; samples are taken from the integrator's own interpolant.
+    """A simulated motion; values at instants are those of the integrator's own interpolant.
 
     Attributes:
         problem: what moved, and how.
         scene: its scene.
         solution: the integrator's.
-        t: (n,) sample instants, s.
+        t: (n,) instants at which responses look at the motion, see `response_instants`, s. Files
+            have those of `sampled`.
         scenarios: the same design under the scene's scenarios.
     """
 
@@ -56,6 +60,18 @@ class Trajectory:
     solution: Solution
     t: np.ndarray
     scenarios: tuple[Trajectory, ...] = ()
+
+    def at(self, t: np.ndarray) -> Self:
+        """Return the same motion, without scenarios, seen at other instants (n,), s."""
+        return replace(self, t=t, scenarios=())
+
+    @cached_property
+    def sampled(self) -> Self:
+        """The same motion every `simulation.sample`, as files have it."""
+        horizon, sample = self.scene.motion.horizon, self.scene.simulation.sample
+        t = np.arange(round(horizon / sample) + 1) * sample
+        t = t[t <= horizon * (1 + 1e-12)]
+        return self if np.array_equal(t, self.t) else self.at(t)
 
     @property
     def solutions(self) -> tuple[Solution, ...]:
@@ -74,7 +90,7 @@ class Trajectory:
 
     @cached_property
     def drive_forces(self) -> DriveForces:
-        """The forces of all drives at the samples, for the gradient of any function of them."""
+        """The forces of all drives at the instants, for the gradient of any function of them."""
         return DriveForces(self.problem, self.t, self.unknowns)
 
     @cached_property
@@ -200,14 +216,14 @@ class Trajectory:
 
     @cached_property
     def motion(self) -> RigidMotion:
-        """Rigid coordinates at the samples, as they move."""
+        """Rigid coordinates at the instants, as they move."""
         if isinstance(self.problem, ElasticSystem):
             return self.desired
         return self.problem.at(self.t).motion(*self.unknowns)
 
     @cached_property
     def desired(self) -> RigidMotion:
-        """Rigid coordinates at the samples as the scene asks for them."""
+        """Rigid coordinates at the instants as the scene asks for them."""
         return self.problem.motion(self.t)
 
     def by_unknowns(self, by_q: np.ndarray) -> np.ndarray:
@@ -219,10 +235,10 @@ class Trajectory:
     def by_end_effector(
         self, indices: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return the gradient of sum_n weights_n . end_effector_n at some samples.
+        """Return the gradient of sum_n weights_n . end_effector_n at some instants.
 
         Args:
-            indices: (n,) of the samples.
+            indices: (n,) of the instants.
             weights: (n, 2).
 
         Returns:
@@ -248,7 +264,7 @@ class Trajectory:
 
     @property
     def after_motion(self) -> np.ndarray:
-        """Which samples are not before the motion's end (n,); the last one is in any case."""
+        """Which instants are not before the motion's end (n,); the last one is in any case."""
         motion = self.scene.motion
         after: np.ndarray = self.t >= motion.duration - 1e-9 * motion.horizon
         after[-1] = True
@@ -377,10 +393,14 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
 
 
 def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajectory:
-    """Return a solution with its sample instants."""
-    horizon, sample = scene.motion.horizon, scene.simulation.sample
-    t = np.arange(round(horizon / sample) + 1) * sample
-    t = t[t <= horizon * (1 + 1e-12)]
+    """Return a solution with the instants at which responses look at it."""
+    t = response_instants(
+        solution,
+        problem.mechanism.stiffness(),
+        problem.elastic_columns,
+        scene.motion.horizon,
+        scene.objective.load_cases,
+    )
     if not scene.is_spatial:
         assert isinstance(problem, (ElasticSystem, MachineSystem))
         return Trajectory(problem, scene, solution, t)

@@ -34,7 +34,7 @@ class SpatialTrajectory(Trajectory):
 
     @cached_property
     def motion(self) -> JointMotion:  # type: ignore[override]
-        """Joints at the samples, as they move."""
+        """Joints at the instants, as they move."""
         if isinstance(self.problem, SpatialSystem):
             return self.desired
         found: JointMotion = self.problem.at(self.t).motion(*self.unknowns)  # type: ignore
@@ -42,7 +42,7 @@ class SpatialTrajectory(Trajectory):
 
     @cached_property
     def desired(self) -> JointMotion:  # type: ignore[override]
-        """Joints at the samples as the scene asks for them."""
+        """Joints at the instants as the scene asks for them."""
         return self.problem.motion(self.t)
 
     @cached_property
@@ -90,10 +90,10 @@ class SpatialTrajectory(Trajectory):
     def by_end_effector(
         self, indices: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return the gradient of sum_n weights_n . end_effector_n at some samples.
+        """Return the gradient of sum_n weights_n . end_effector_n at some instants.
 
         Args:
-            indices: (n,) of the samples.
+            indices: (n,) of the instants.
             weights: (n, 3).
 
         Returns:

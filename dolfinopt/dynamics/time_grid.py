@@ -1,13 +1,20 @@
-"""Time grids: even steps between the breakpoints, the first guess of their number, refinement."""
+"""Time grids: steps of an integrator, and the instants at which responses look at its solution."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import System
 
 STEPS_PER_PERIOD = 8.0  # of the slowest vibration
 MOST_STEPS = 20_000  # of a first grid: more are asked for by estimated errors alone
+LONGEST = 1e-3  # s from one instant to the next
+MOST_INSTANTS = 1_000_000  # `LONGEST` apart; they take 1 GB and 3 s
+OF_LONG_MOTIONS = 100_000  # instants of a longer motion, unless it bends faster
+# Share of the largest elastic deflection by which an extreme may exceed its neighbouring instants:
+# the default simulation.tolerance.
+EXCEEDED = 1e-4
 
 
 def even_steps(system: System, count: int) -> np.ndarray:
@@ -34,3 +41,43 @@ def first_num_steps(system: System) -> int:
 def steps_between_breakpoints(system: System, time_grid: np.ndarray) -> np.ndarray:
     """Return how many steps of a grid (n + 1,) lie between the breakpoints."""
     return np.diff(np.searchsorted(time_grid, system.breakpoints))
+
+
+def response_instants(
+    solution: Solution,
+    stiffness: np.ndarray,
+    elastic: np.ndarray | slice,
+    horizon: float,
+    least: int,
+) -> np.ndarray:
+    """Return the instants (n,) of all extremes and integrals over time, s.
+
+    They lie evenly from 0 to the horizon, both included, at most 1 ms apart (of a horizon above
+    1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
+    that it could exceed two neighbouring instants by more than `EXCEEDED` of its largest value:
+    between instants d apart by max |qdd| d^2 / 8 at most. More than two for each stage of a step
+    say nothing new of a polynomial.
+
+    Args:
+        solution: the integrator's.
+        stiffness: (N, N) of the elastic coordinates; its energy is the norm.
+        elastic: their columns in the solution.
+        horizon: s.
+        least: number of intervals that are wanted at least.
+    """
+    count = max(1, int(np.ceil(horizon / LONGEST * (1.0 - 1e-9))))
+    if count > MOST_INSTANTS:
+        count = OF_LONG_MOTIONS
+    largest = _largest(solution.q[:, elastic], stiffness)
+    wanted = float(least)
+    if largest > 0.0:
+        bend = _largest(solution.a[..., elastic], stiffness)
+        known = 2.0 * solution.a.shape[0] * solution.a.shape[1]
+        wanted = max(wanted, min(horizon * np.sqrt(bend / (8.0 * EXCEEDED * largest)), known))
+    return np.linspace(0.0, horizon, count * max(1, int(np.ceil(wanted / count))) + 1)
+
+
+def _largest(q: np.ndarray, stiffness: np.ndarray) -> float:
+    """Return max sqrt(q' K q) of coordinates (..., N)."""
+    squares = np.sum((q @ stiffness) * q, axis=-1)
+    return float(np.sqrt(max(squares.max(initial=0.0), 0.0)))

@@ -203,9 +203,9 @@ def _fixed_objective(
 def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float:
     """Return one value of a motion at the instants that `base` chooses."""
     if not trajectory.scenarios:
-        return part.value(trajectory, part.load_cases(base))
+        return part.value(trajectory.at(base.t), part.load_cases(base))
     pairs = zip(trajectory.scenarios, base.scenarios, strict=True)
-    values = [part.value(one, part.load_cases(at)) for one, at in pairs]
+    values = [part.value(one.at(own.t), part.load_cases(own)) for one, own in pairs]
     return part.combine(trajectory.scene, values)[0]
 
 

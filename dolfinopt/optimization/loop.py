@@ -87,7 +87,8 @@ class _Run:
         history: rows so far (root only).
         finished: why the iterations have ended, "" while they go on.
         selection: of the coordinates, where the scene leaves it to "auto".
-        initial_deviation: (n_times, 2) of the initial design, m (root only).
+        initial_deviation: (n_times, 2) of the initial design, evenly over the horizon, m (root
+            only).
         memory: what was saved last.
         further: what is known of further iterations with the exact gradient.
     """

@@ -66,7 +66,7 @@ class Memory(IterateMemory):
 
     Attributes:
         history: rows so far.
-        initial_deviation: (n, 2) m of the initial design.
+        initial_deviation: (n, 2) m of the initial design, evenly over the horizon.
         finished: reason, or "" while running.
         choice: of the coordinates, where the scene leaves it to "auto".
         stiffening: decided for the initial design; None where nothing was simulated.

@@ -33,7 +33,8 @@ class Result:
         evaluation: of the final design.
         trajectory: of the final design; on the root only.
         crisp: evaluation of the final design cut at x_phys = 1/2; None without a projection.
-        initial_deviation: (n, 2) of the initial design, m; on the root only.
+        initial_deviation: (n, 2) of the initial design, evenly over the horizon, m; on the root
+            only.
         history: one row a design, the initial one first; on the root only.
         iterations: design updates made.
         converged: True when the change of the design and the Karush-Kuhn-Tucker residual are

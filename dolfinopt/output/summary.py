@@ -14,11 +14,11 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, stiffening_of
-from dolfinopt.arms.vibration import frequency_excess
 from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.mesh import compat
+from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.multibody.stiffening import WARN, Stiffening
 from dolfinopt.output.trajectory import (
     drive_units,
@@ -76,7 +76,7 @@ def summarise(
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
             "stress": _stress(scene, stress or {}),
-            **_of_designs(scene, run.evaluation, traits),
+            **_of_designs(run, traits),
             **_of_responses(run),
             "simulation_error_estimate": run.evaluation.error,
             "reduction": _reduction(scene, run.choice),
@@ -103,7 +103,8 @@ class _Traits:
         cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3.
         notes: of the mesh.
         widths: of member and gap of the design cut at one half, m.
-        error: `frequency_excess`, None where it is not reduced.
+        frequency: first one of the arm by itself, Hz; None where it is not reduced.
+        error: by how much that of the reduced model exceeds it, relative.
     """
 
     volume_fraction: float
@@ -112,6 +113,7 @@ class _Traits:
     volume: float
     notes: tuple[str, ...]
     widths: tuple[float | None, float | None] = (None, None)
+    frequency: float | None = None
     error: float | None = None
 
 
@@ -122,18 +124,22 @@ def _gather_traits(run: Simulated) -> dict[int, _Traits]:
         mine = {k: _traits(run.scene, k, arm, x_phys[k]) for k, arm in arms.items()}
     every = gather_arms(partition, mine)
     widths = _widths(partition, arms, x_phys)
-    errors = _frequency_errors(partition, arms, x_phys, run.profile)
+    frequencies = _frequencies(partition, arms, x_phys, run.profile)
     with together(partition.world):
         return {
-            k: replace(one, widths=widths.get(k, (None, None)), error=errors.get(k))
+            k: replace(
+                one,
+                widths=widths.get(k, (None, None)),
+                frequency=frequencies.get(k, (None, None))[0],
+                error=frequencies.get(k, (None, None))[1],
+            )
             for k, one in every.items()
         }
 
 
-def _of_designs(
-    scene: Scene, evaluation: Evaluation, traits: Mapping[int, _Traits]
-) -> dict[str, Any]:
+def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]:
     """Return what the designs are like, and the frequencies of the arms, by the arm's name."""
+    scene = run.scene
     volumes = [one.volume for one in traits.values()]
     grays = [one.grayness for one in traits.values()]
     by_arm = {
@@ -141,20 +147,31 @@ def _of_designs(
         for arm, owner in zip(scene.arms, scene.owners, strict=True)
         if owner is not None
     }
-    first = zip(scene.arms, evaluation.first_frequencies, strict=True)
     flexible = [arm.name for arm in scene.arms if arm.flexible]
-    loaded = zip(flexible, evaluation.loaded_frequencies, strict=False)
+    loaded = zip(flexible, run.evaluation.loaded_frequencies, strict=False)
     return {
         "grayness": float(np.average(grays, weights=volumes)),
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
         "minimum_member_measured": {name: one.widths[0] for name, one in by_arm.items()},
         "minimum_gap_measured": {name: one.widths[1] for name, one in by_arm.items()},
-        "first_frequency": {arm.name: value for arm, value in first if np.isfinite(value)},
+        "first_frequency": _first_frequencies(run, by_arm),
         "first_frequency_error": {
             name: one.error for name, one in by_arm.items() if one.error is not None
         },
         "loaded_frequency": dict(loaded),
     }
+
+
+def _first_frequencies(run: Simulated, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
+    """Return those of flexible arms by name, Hz; of a body from a file, what its modes tell."""
+    found = {}
+    bodies = () if run.trajectory is None else run.trajectory.mechanism.bodies
+    for arm, body in zip(run.scene.arms, bodies, strict=False):
+        own = by_arm[arm.name].frequency if arm.name in by_arm else None
+        value = first_frequency(body) if own is None else own
+        if np.isfinite(value):
+            found[arm.name] = value
+    return found
 
 
 def _of_responses(run: Simulated) -> dict[str, Any]:
@@ -257,24 +274,25 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     return units
 
 
-def _frequency_errors(
+def _frequencies(
     partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Mapping[int, np.ndarray],
     profile: Profile,
-) -> dict[int, float]:
-    """Return `frequency_excess` of every design that is reduced, on the root (collective).
+) -> dict[int, tuple[float, float]]:
+    """Return the first frequency of every design that is reduced, Hz, and the reduced one's excess.
 
-    It is not counted: nothing depends on it.
+    On the root (collective). It is not counted: nothing depends on it.
     """
-    counts, errors = replace(profile.counts), {}
-    with profile.phase("frequency error"), together(partition.world):
+    counts, found = replace(profile.counts), {}
+    with together(partition.world):
         for index, arm in arms.items():
             if arm.basis is not None:
-                body = arm.reduce(x_phys[index])
-                errors[index] = frequency_excess(arm.elastic, arm.basis.V, body.K, body.M)
+                state = arm.state(x_phys[index])
+                own = state.first_frequency
+                found[index] = own, max(0.0, first_frequency(state.body) / own - 1.0)
     profile.counts = counts
-    return gather_arms(partition, errors)
+    return gather_arms(partition, found)
 
 
 def _widths(

@@ -25,8 +25,10 @@ def write_trajectory(
     Args:
         folder: where.
         trajectory: what.
-        initial: (n, d) deviation of the initial design, m, kept for the picture.
+        initial: (n, d) deviation of the initial design evenly over the horizon, m, kept for the
+            picture.
     """
+    trajectory = trajectory.sampled
     arrays = {
         "t": trajectory.t,
         "q_r": trajectory.q_r,
@@ -35,9 +37,10 @@ def write_trajectory(
         "compliance": trajectory.compliance,
         "joint_forces": trajectory.joint_forces,
     } | _of_machine(trajectory)
-    if initial is not None:
-        arrays["initial_deviation"] = initial
     scene = trajectory.scene
+    if initial is not None and len(initial):
+        even = np.linspace(0.0, scene.motion.horizon, len(initial))
+        arrays["initial_deviation"] = _between(even, initial, trajectory.t)
     rigid = ", ".join(rigid_units(scene).values())
     units = {
         "t": "s",
@@ -142,9 +145,21 @@ def _directions(scene: Scene) -> str:
     return "along closure.direction turned by +90 degrees"
 
 
-def read_initial_deviation(path: Path) -> np.ndarray | None:
-    """Return the initial design's deviation (n, 2), m, if trajectory.npz holds it."""
+def read_initial_deviation(path: Path, even: np.ndarray) -> np.ndarray | None:
+    """Return the initial design's deviation (n, d), m, if trajectory.npz holds it.
+
+    Args:
+        path: of the file.
+        even: (n,) instants at which it is wanted, s.
+    """
     if not path.is_file():
         return None
     with np.load(path, allow_pickle=False) as data:
-        return data["initial_deviation"] if "initial_deviation" in data.files else None
+        if "initial_deviation" not in data.files:
+            return None
+        return _between(data["t"], data["initial_deviation"], even)
+
+
+def _between(t: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return values (n, d) at other instants, straight between those at t."""
+    return np.stack([np.interp(wanted, t, column) for column in values.T], axis=1)

@@ -206,7 +206,10 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         if len(own) > 1:
             yield f"mass_{scene.arms[k].name}", bodies[k].mass
     for k in own:
-        yield f"first_frequency_{scene.arms[k].name}", found.first_frequencies[k]
+        owner = scene.owners[k]
+        assert owner is not None
+        frequency = one.arms[owner].state(one.x_phys[owner]).first_frequency
+        yield f"first_frequency_{scene.arms[k].name}", frequency
     if objective_of(scene).name not in (
         "esl",
         "compliance",

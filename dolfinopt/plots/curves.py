@@ -183,7 +183,7 @@ def draw_deviation(
         path: of the picture.
         t: (n,) s.
         deviation: (n, 2) m.
-        initial_deviation: (n, 2) m, of the initial design, or None.
+        initial_deviation: (m, 2) m, of the initial design, evenly over the same time, or None.
         title: above the picture, of what from what.
         limits: m, and the instant from which each holds, s.
 
@@ -210,25 +210,27 @@ def deviation_figure(
     """Return the figure of `draw_deviation`; what a curve is stands at its peak."""
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
     axes = figure.add_axes((0.07, 0.11, 0.91, 0.81))
-    curves = [("", deviation)]
+    curves = [("", t, deviation)]
     if initial_deviation is not None:
-        curves = [(INITIAL, initial_deviation), (OPTIMISED, deviation)]
-    distances = [1e3 * lengths(vectors) for _, vectors in curves]
+        times = np.linspace(t[0], t[-1], len(initial_deviation))
+        curves = [(INITIAL, times, initial_deviation), (OPTIMISED, t, deviation)]
+    distances = [1e3 * lengths(vectors) for _, _, vectors in curves]
     largest = [float(d.max()) for d in distances] + [1e3 * limit for limit, _ in limits]
     top = 1.1 * max(largest) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)
     # A curve alone looks like the optimised design's.
-    numbers = look_numbers([[label for label, _ in curves]]) if len(curves) > 1 else {"": 0}
-    for (label, _), distance, height in zip(curves, distances, heights, strict=True):
+    numbers = look_numbers([[label for label, _, _ in curves]]) if len(curves) > 1 else {"": 0}
+    for (label, times, _), distance, height in zip(curves, distances, heights, strict=True):
         worst = int(np.argmax(distance))
         style = look(numbers[label]) | {"marker": "o", "markevery": [worst], "clip_on": False}
-        axes.plot(t, distance, label=label, **style)
-        late = t[worst] > 0.5 * (t[0] + t[-1])
+        axes.plot(times, distance, label=label, **style)
+        when = float(times[worst])
+        late = when > 0.5 * (t[0] + t[-1])
         note = f"{label}: largest" if label else "largest"
         axes.annotate(
-            f"{note} {distance[worst]:.3g} mm at {t[worst]:.3f} s",
-            xy=(t[worst], distance[worst]),
-            xytext=((t[worst] - t[0]) / (t[-1] - t[0]) + (-0.02 if late else 0.02), height + 0.02),
+            f"{note} {distance[worst]:.3g} mm at {when:.3f} s",
+            xy=(when, distance[worst]),
+            xytext=((when - t[0]) / (t[-1] - t[0]) + (-0.02 if late else 0.02), height + 0.02),
             textcoords="axes fraction",
             ha="right" if late else "left",
             fontsize=10,

@@ -43,16 +43,18 @@ def deviation_figure(check: Check, scene: Scene) -> Figure:
     upper = figure.add_axes((0.1, 0.42, 0.88, 0.51))
     lower = figure.add_axes((0.1, 0.09, 0.88, 0.24))
     first = check.density.trajectory
-    t, base = first.t, _distance(first)
+    t = first.t
     styles = looks([list(check.columns)])
     for name, column in check.columns.items():
         style = styles[name] | {"marker": ""}
-        distance = _distance(column.trajectory)
+        own = column.trajectory
+        distance = _distance(own)
         worst = int(np.argmax(distance))
-        note = f"{name}: largest {distance[worst]:.4g} mm at {t[worst]:.3f} s"
-        upper.plot(t, distance, label=note, **style)
+        note = f"{name}: largest {distance[worst]:.4g} mm at {own.t[worst]:.3f} s"
+        upper.plot(own.t, distance, label=note, **style)
         if name != DENSITY:
-            lower.plot(t, distance - base, label=f"{name} less density", **style)
+            base = first if np.array_equal(first.t, own.t) else first.at(own.t)
+            lower.plot(own.t, distance - _distance(base), label=f"{name} less density", **style)
     for limit, since in deviation_limits(scene):
         upper.hlines(1e3 * limit, since, t[-1], color=LIMIT, ls="--", lw=1.0)
     upper.set_title(deviation_title(first), loc="left", fontsize=12)

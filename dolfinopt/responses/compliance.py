@@ -8,6 +8,6 @@ from dolfinopt.responses.response import register
 
 @register
 class IntegralCompliance(ComplianceResponse):
-    """Integral of q' K q over the horizon, trapezoidal rule on the samples, N m s."""
+    """Integral of q' K q over the horizon, trapezoidal rule, N m s."""
 
     name, label, unit = "compliance", "integral of the compliance", "N m s"

@@ -20,7 +20,7 @@ class Deviation(MotionResponse):
     name, label, unit = "deviation", "p-mean of the deviation", "m"
 
     def extreme(self, trajectory: Trajectory) -> float:
-        """Return the largest deviation of the samples, m."""
+        """Return the largest deviation of all instants, m."""
         return trajectory.max_deviation[0]
 
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:

@@ -149,8 +149,9 @@ def _chain(analysis: Analysis) -> Chain | FrozenTree:
             angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
         else:
             angles = [angle] * len(bodies)
-        load = RigidIntegrals(scene.payload.mass, 0j, scene.payload.moment)
-        return Chain(bodies, outboard_points, angles, load, scene.objective.attached)
+        loads = [RigidIntegrals(arm.joint_mass, 0j, arm.joint_inertia) for arm in scene.arms]
+        loads[-1] = loads[-1] + RigidIntegrals(scene.payload.mass, 0j, scene.payload.moment)
+        return Chain(bodies, outboard_points, angles, loads, scene.objective.attached)
 
     return on_root(partition.world, freeze)
 

@@ -16,7 +16,7 @@ from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.motion import motion_objective, worst_instants
@@ -48,7 +48,6 @@ class Motion:
         objective: of the motion, nan where it is another; N m, N m s or m.
         compliance: sum of the load cases' compliance, N m.
         max_deviation, max_deviation_time: m, s.
-        first_frequencies: of every arm, clamped-free, Hz; inf of a rigid one.
         error: estimated relative error of the elastic coordinates.
         deflections, turns: largest outboard deflection of every arm over its length, and rotation
             in rad.
@@ -59,7 +58,6 @@ class Motion:
     compliance: float = np.nan
     max_deviation: float = np.nan
     max_deviation_time: float = np.nan
-    first_frequencies: tuple[float, ...] = ()
     error: float = np.nan
     deflections: tuple[float, ...] = ()
     turns: tuple[float, ...] = ()
@@ -410,7 +408,6 @@ def _figures(trajectory: Trajectory) -> Motion:
         compliance=float(trajectory.compliance[worst].sum()),
         max_deviation=distance,
         max_deviation_time=when,
-        first_frequencies=tuple(map(first_frequency, trajectory.mechanism.bodies)),
         error=trajectory.solution.error,
         deflections=tuple(map(float, trajectory.deflections)),
         turns=tuple(map(float, trajectory.interface_rotations)),

@@ -31,7 +31,7 @@ class LoadCases:
     """Instants that make up a response, and how much each counts.
 
     Attributes:
-        indices: (n,) samples.
+        indices: (n,) of the trajectory's instants.
         weights: (n,) 1 for equivalent static loads, s for an integral over the horizon.
     """
 
@@ -40,10 +40,10 @@ class LoadCases:
 
 
 def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "compliance") -> np.ndarray:
-    """Return the worst sample of each of `count` intervals.
+    """Return the worst instant of each of `count` intervals.
 
     The worst has the largest compliance, arms together, or the largest deviation. (0, horizon] is
-    cut into equal intervals, open below, closed above; intervals that hold no sample give none.
+    cut into equal intervals, open below, closed above; intervals that hold no instant give none.
     Source: Seifried, Moghadasi & Held (2015), text below eq. (9).
     """
     if worst == "compliance":
@@ -51,7 +51,7 @@ def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "complia
     else:
         badness = trajectory.distance
     horizon = trajectory.scene.motion.horizon
-    # The tolerance keeps a sample on an interval's end in that interval, whatever the rounding.
+    # The tolerance keeps an instant on an interval's end in that interval, whatever the rounding.
     interval = np.ceil(trajectory.t / horizon * count - 1e-9).astype(int) - 1
     order = np.lexsort((-badness, interval))
     order = order[interval[order] >= 0]
@@ -59,8 +59,8 @@ def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "complia
     return np.sort(order[first])
 
 
-def all_samples(trajectory: Trajectory) -> LoadCases:
-    """Return all samples with the weights of the trapezoidal rule, s."""
+def all_instants(trajectory: Trajectory) -> LoadCases:
+    """Return all instants with the weights of the trapezoidal rule, s."""
     steps = np.diff(trajectory.t)
     weights = 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
     return LoadCases(np.arange(len(weights)), weights)
@@ -84,8 +84,8 @@ class MotionResponse(Response):
         return [("", self)]
 
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
-        """Return the instants that make it up; by default all samples."""
-        return all_samples(trajectory)
+        """Return the instants that make it up; by default all."""
+        return all_instants(trajectory)
 
     @abstractmethod
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:

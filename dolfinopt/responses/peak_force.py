@@ -53,7 +53,7 @@ class PeakForce(DriveResponse):
         return "N" if value == CART else "N m"
 
     def extreme(self, trajectory: Trajectory) -> float:
-        """Return the largest force of the samples."""
+        """Return the largest force of all instants."""
         return float(np.abs(self._force(trajectory)).max())
 
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:

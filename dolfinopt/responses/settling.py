@@ -6,7 +6,7 @@ import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.responses.deviation import Deviation
-from dolfinopt.responses.motion import LoadCases, all_samples
+from dolfinopt.responses.motion import LoadCases, all_instants
 from dolfinopt.responses.response import register
 
 
@@ -22,9 +22,9 @@ class Settling(Deviation):
         return self.options.gradient == "exact"
 
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
-        """Return the samples of the vibration that is left."""
+        """Return the instants of the vibration that is left."""
         indices = np.flatnonzero(trajectory.after_motion)
-        weights = all_samples(trajectory).weights[indices]
+        weights = all_instants(trajectory).weights[indices]
         return LoadCases(indices, weights)
 
     def extreme(self, trajectory: Trajectory) -> float:

@@ -43,7 +43,7 @@ class Stress(Response):
 
     (sum_en A_e s_en^p / sum_en A_e)^(1/p) with the areas A_e of the cells of all arms, at up to
     100 evenly spaced instants of every scenario, with `objective.stress_exponent`. The true value
-    is the largest s_en of all samples. Displacements are those of mode acceleration, see
+    is the largest s_en of all instants. Displacements are those of mode acceleration, see
     `fem.stress`.
     """
 
@@ -130,7 +130,7 @@ class Stress(Response):
 def _screened(
     partition: Partition, cells: CellStress, loads: Sequence[ArmLoads]
 ) -> tuple[list[_Chosen], float]:
-    """Return the evenly spaced instants of every motion, and the largest stress of all samples.
+    """Return the evenly spaced instants of every motion, and the largest stress of all instants.
 
     Collective on the arm's ranks.
     """
@@ -148,8 +148,8 @@ class _Chosen:
     """Instants of one arm along one motion.
 
     Attributes:
-        loads: of all samples.
-        instants: (k,) samples.
+        loads: of all instants.
+        instants: (k,) of them.
         values: (k,) largest stress of the arm there, Pa.
     """
 

@@ -115,7 +115,7 @@ def stress_report(
 
 @dataclass(frozen=True, eq=False)
 class _Peaks:
-    """Of one arm: place in the chain; value, place (d,) and sample of both peaks."""
+    """Of one arm: place in the chain; value, place (d,) and number of the instant of both peaks."""
 
     place: int
     centre: tuple[float, np.ndarray, int]
@@ -123,8 +123,8 @@ class _Peaks:
 
 
 def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
-    def peak(value: float, place: np.ndarray, sample: int) -> Peak:
-        return Peak(value, tuple(map(float, place)), float(t[sample]))
+    def peak(value: float, place: np.ndarray, number: int) -> Peak:
+        return Peak(value, tuple(map(float, place)), float(t[number]))
 
     when = t[cells[:, 1].astype(int)]
     return ArmStress(peak(*peaks.centre), peak(*peaks.points), cells[:, 0], when)
@@ -133,7 +133,7 @@ def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
 def _arm_stress(
     partition: Partition, cells: CellStress, loads: ArmLoads
 ) -> tuple[_Peaks, np.ndarray]:
-    """Return the peaks of one arm, and largest value and its sample of every cell (n_cells, 2).
+    """Return the peaks of one arm; of every cell largest value and instant's number (n_cells, 2).
 
     Collective on the arm's ranks.
     """

@@ -102,10 +102,10 @@ def simulated(tree: Tree) -> SimulationResult:
 
 
 def machine(result: SimulationResult) -> tuple[Trajectory, MachineSystem]:
-    """Return trajectory and system of a simulated machine."""
+    """Return the trajectory of a simulated machine every `simulation.sample`, and its system."""
     assert result.trajectory is not None
     assert isinstance(result.trajectory.problem, MachineSystem)
-    return result.trajectory, result.trajectory.problem
+    return result.trajectory.sampled, result.trajectory.problem
 
 
 def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:

@@ -10,8 +10,6 @@ from runs import TWO_ARM, overrides, run, shell
 from scipy.integrate import trapezoid
 
 import dolfinopt as do
-from dolfinopt.arms.vibration import frequency_excess
-from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.output.fields import write_fields
 from dolfinopt.output.history import read_history
@@ -262,26 +260,6 @@ def test_settling_of_a_horizon_that_ends_with_the_motion():
     _, trajectory = do.evaluate(one, partition, arms, x, profile)
     if trajectory is not None:
         assert trajectory.settling == pytest.approx(np.hypot(*trajectory.deviation[-1]))
-
-
-def test_first_frequency_error_is_that_to_the_full_model():
-    """Against a basis of thirty coordinates, whose first frequency is the full model's to 1e-8."""
-
-    def first(coordinates):
-        one = scene(f"reduction.coordinates={coordinates}", iterations=1)
-        partition = do.partition_arms(MPI.COMM_SELF, one.cell_counts)
-        arms = do.build_arms(one, partition, do.Profile())
-        x = arms[0].uniform(0.5)
-        body = arms[0].reduce(x)
-        found = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real.min()
-        return arms[0], body, np.sqrt(found)
-
-    arm, body, reduced = first(3)
-    assert isinstance(arm.elastic, ElasticArm) and arm.basis is not None
-    full = first(30)[2]
-    error = frequency_excess(arm.elastic, arm.basis.V, body.K, body.M)
-    assert reduced / full - 1.0 > 1e-3
-    assert error == pytest.approx(reduced / full - 1.0, rel=0.02)
 
 
 SQUARES = np.array(

@@ -112,6 +112,8 @@ CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.
 def test_exact_gradient_in_space(kind, control, monkeypatch):
     """Taylor's remainders fall by the order 2.00 along directions without any symmetry."""
     monkeypatch.setattr("dolfinopt.optimization.gradient_check.STEPS", (2.5e-3, 6.25e-4))
+    # Instants that come and go beneath the cut would make small steps of the p-mean.
+    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE", 0.0)
     limited = ("constraints.deviation=0.1",) if kind == "effort" else ()
     scene = do.load_scene(DEMO, (*COARSE, *control, f"objective.kind={kind}", *limited))
     profile = do.Profile()

@@ -41,6 +41,7 @@ Attached = Literal["rigid-body", "point-mass", "none"]
 Combination = Literal["sum", "worst"]
 WorstBy = Literal["compliance", "deviation"]
 LARGEST_LOAD = 1e9  # N, N m
+MANY_CASES = 1000  # load cases that a motion may have however short it is
 Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
 SpatialLoad = tuple[float, float, float, float, float, float]  # force N, moment N m
 # Of solid arms, if none is stated: forces across, and torsion.
@@ -261,14 +262,13 @@ class Objective(Table):
             raise Refusal(f"expected arrays of {what} [[joints]]", ("objective", "loads"))
 
     def _check_load_cases(self, scene: Scene) -> None:
-        num_samples = scene.simulation.num_samples(scene.motion.horizon)
-        if self.load_cases > num_samples:
+        horizon = scene.motion.horizon
+        most = max(MANY_CASES, int(1e3 * horizon * (1.0 + 1e-9)))
+        if self.load_cases > most:
             raise Refusal(
-                f"expected at most {int(num_samples)}, so that each of the equal intervals of "
-                f"motion.horizon = {scene.motion.horizon} [s] holds a sample (simulation.sample = "
-                f"{scene.simulation.sample} [s])",
+                f"expected at most {most}: one for each millisecond of motion.horizon = {horizon} "
+                f"[s], {MANY_CASES} of a shorter motion",
                 ("objective", "load_cases"),
-                ("simulation", "sample"),
                 ("motion", "horizon"),
             )
 

@@ -35,7 +35,11 @@ class Simulation(Table):
         "deviation would be off by 0.5 % without it [-]",
     )
     sample: float = Field(
-        default=1e-3, ge=1e-9, le=1e5, description="sampling interval of the output [s]"
+        default=1e-3,
+        ge=1e-9,
+        le=1e5,
+        description="interval of the instants in trajectory.npz and trajectory.csv; no result "
+        "depends on it [s]",
     )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
