@@ -127,7 +127,7 @@ SHORTER = 0.5  # steps after a failure: each attempt costs a window, too short o
 LONGER = 2.0  # largest growth of the steps from one window to the next
 LEAST_STEP = 1e-7  # of the horizon: where shorter ones fail the motion has no continuation
 MAX_STEPS = 20_000
-MAX_ITERATIONS = 5_000  # of Newton's method, of all windows: about 2 ms each
+MAX_ITERATIONS = 4_000  # of Newton's method, of all windows: about 2 ms each
 # A step's angle is w h, if w is the frequency of a vibration as large as the whole motion that has
 # the accelerations' highest derivative. Errors of even steps of 2 pi / 8 stand in `radau`.
 ANGLES = (0.05, 1.0)  # bounds of it
@@ -229,9 +229,7 @@ class _Graded:
         if left <= 1.001 * self.count * self.h:
             grid[-1] = end
         stages = stages_of(self.preconditioner, self.method, grid)
-        first = np.broadcast_to(
-            self.held, (self.count, len(self.method.c), self.held.shape[2])
-        )
+        first = np.broadcast_to(self.held, (self.count, len(self.method.c), self.held.shape[2]))
         tuning = replace(ONE_RUN, limits=limits_for(stages), matrices=MATRICES)
         found = newton(stages, self.state, first, self.tolerance, tuning, simplified=False)
         spent = int(found.iterations[0])
@@ -270,9 +268,7 @@ class _Graded:
                 f"{BEYOND}; {REMEDY.replace('them', 'the arms', 1)}"
             )
 
-    def _angles(
-        self, stages: Stages, begin: State, a: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _angles(self, stages: Stages, begin: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the angles (n,) of the steps, and the size of the motion, by group."""
         s, system = len(self.method.c), self.system
         powers = np.linalg.inv(self.method.c[:, None] ** np.arange(s))
@@ -290,5 +286,3 @@ class _Graded:
             f"{self.system.describe(self.state[0])}, beyond small-deflection theory; "
             f"{REMEDY.replace('them', 'the arms', 1)}"
         )
-
-

@@ -119,7 +119,7 @@ class Trajectory:
 
     @cached_property
     def deflections(self) -> np.ndarray:
-        """Largest deflection of every arm's interfaces in its own frame, over its length (arms,)."""
+        """Largest deflection of every arm's end in its own frame, over its length (arms,)."""
         return self.mechanism.deflections(self.q_e)
 
     @cached_property

@@ -525,7 +525,7 @@ def test_arms_too_soft_are_a_named_error(integrator: str) -> None:
     problem, _ = two_arms(
         lambda t: reach(t, (0.0, 300.0, 0.0)), (0.0, 0.6), bending=1e-2, axial=1.0
     )
-    why = {"radau": "deflects by 5. % of its length", "generalized-alpha": "in a time step"}
+    why = {"radau": r"deflects by \d+ % of its length", "generalized-alpha": "in a time step"}
     with pytest.raises(ConvergenceError, match=rf"{why[integrator]}.*material\.young_modulus"):
         solve(integrator, problem, 1e-2)
 
@@ -579,7 +579,7 @@ def test_marches_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("error", "message", "most"),
     [
-        (1.0, r"error of 1 with \d+ time steps and would need \d+, more than 30000", 4),
+        (1.0, r"reaches an error of 1 with \d+ steps, not the simulation\.tolerance", 4),
         (2e-4, r"reaches an error of 0\.0002 with \d+ steps, not the simulation\.tolerance", 6),
         (np.inf, r"finds no estimate of its error with \d+ time steps.*simulation\.stages", 1),
     ],
@@ -597,9 +597,7 @@ def test_error_that_no_steps_lower(
         n = len(time_grid) - 1
         shape = (n, *plain.a.shape[1:])
         none = np.zeros((n, shape[2]))
-        return replace(
-            plain, time_grid=time_grid, q=none, qd=none, a=np.zeros(shape), error=error
-        )
+        return replace(plain, time_grid=time_grid, q=none, qd=none, a=np.zeros(shape), error=error)
 
     monkeypatch.setattr(radau, "_on_grid", constant)
     estimate = radau.estimated_errors
@@ -609,6 +607,17 @@ def test_error_that_no_steps_lower(
     assert "\n" not in str(raised.value)
     assert len(grids) <= most
     assert max(grids) <= radau.MAX_STEPS
+
+
+def test_more_steps_than_there_is_room_for_are_refused() -> None:
+    """Not tried: they would take the memory."""
+    problem, _ = two_arms()
+    grid = even_steps(problem, 5000)
+    found = Solution(grid, np.ones(1), *np.zeros((2, 5000, 6)), np.zeros((5000, 1, 6)), 1.0, 1)
+    with pytest.raises(
+        ConvergenceError, match=r"would need \d+, more than 30000.*simulation\.stages"
+    ):
+        radau.next_time_grid(problem, found, 1e-4, 3)
 
 
 def test_patience_that_ends_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
