@@ -41,6 +41,9 @@ OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
 # has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
 MOST_WORK = 1e9
+# Rows from which MUMPS takes less time than PETSc's Cholesky, on one rank in the plane: with 121 878
+# rows (1000 x 60 cells) a factorisation and 18 solves take 0.23 + 1.00 and 0.78 + 0.42 s.
+MUMPS_ROWS = 125_000
 # Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
 # takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
 MOST_SOLID_WORK = 1.5e11
@@ -155,7 +158,8 @@ class InteriorSystem:
     @cached_property
     def _ksp(self) -> PETSc.KSP:
         # Natural: the interior dofs are numbered for it.
-        return direct_solver(self._stiffness.mat, "natural", OPTIONS, own=self._T.dim == 2)
+        own = self._T.dim == 2 and self._T.num_interior < MUMPS_ROWS
+        return direct_solver(self._stiffness.mat, "natural", OPTIONS, own=own)
 
     @cached_property
     def is_iterative(self) -> bool:
