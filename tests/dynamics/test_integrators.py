@@ -683,6 +683,42 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     assert len(told) >= 2
 
 
+FAST = ("arms.cells=[20,2]", "simulation.stiffening=false", "motion.horizon=1.0")
+
+
+def fast_two_arms(*changes: str) -> Any:
+    """Return the trajectory of two soft arms, or the error."""
+    scene = do.load_scene(Path(__file__).parents[2] / "demos" / "two_arm.toml", [*FAST, *changes])
+    partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile()
+    arms = do.build_arms(scene, partition, profile)
+    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
+    return do.evaluate(scene, partition, arms, x, profile)[1]
+
+
+def test_steps_follow_a_motion_with_a_short_event() -> None:
+    """A third of the length: for some milliseconds steps are 50 times shorter than elsewhere.
+
+    Even steps over 3 s, 100 x 6 cells, were 10 969.
+    """
+    trajectory = fast_two_arms("motion.duration=0.7")
+    steps = np.diff(trajectory.solution.time_grid)
+    assert len(steps) < 600
+    assert steps.max() > 20.0 * steps.min()
+    assert trajectory.deflections.max() == pytest.approx(0.330, abs=1e-3)
+    fine = radau.integrate(trajectory.problem, 1e-6, 5, Profile(), trajectory.solution)
+    assert distance(trajectory.problem, trajectory.solution, fine) < 1e-4
+
+
+def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of an arm's length, by the march, and by what Newton's method finds at once."""
+    remedy = r"deflects by [0-9.]+ % of its length: beyond 50 %.*linear elasticity.*young_modulus"
+    with pytest.raises(ConvergenceError, match="at t = .* an arm " + remedy):
+        fast_two_arms("motion.duration=0.45")
+    monkeypatch.setattr("dolfinopt.dynamics.simulation.VALID", 0.01)
+    with pytest.raises(ConvergenceError, match="^arm 'arm1' " + remedy):
+        fast_two_arms("motion.duration=1.0", "payload.mass=1")
+
+
 def test_motion_that_finer_steps_let_grow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light coordinates of a stiffened machine: two grids, then one after the march, a remedy."""
     on_grid, grids, marched = radau._on_grid, [], radau._marched
