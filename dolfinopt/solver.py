@@ -13,7 +13,7 @@ from scipy.linalg import lapack
 from dolfinopt.errors import InputError
 
 # From so many rows on nested dissection beats the narrow band in PETSc's Cholesky on one rank; and
-# from there on both beat MUMPS and CHOLMOD up to 150 000 rows (`dolfinopt bench`, solvers).
+# from there on both beat MUMPS and CHOLMOD up to 120 000 rows (`dolfinopt bench`, solvers).
 NESTED_ROWS = 30_000
 # LAPACK factorises wider bands block by block, which is faster in the lower triangle; narrower ones
 # entry by entry, faster in the upper triangle. Solutions with the upper one take 60 to 80 %.
@@ -141,8 +141,8 @@ def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str, own: bool = True) 
         ordering: PETSc's name of the elimination order of a small matrix on one rank; large ones
             take nested dissection, MUMPS chooses its own.
         prefix: of the options, e.g. "dolfinopt_stiffness_".
-        own: False for MUMPS on one rank, too, as for solids, whose factors are dense: PETSc's own
-            takes 60 times as long at 50 000 rows.
+        own: False for MUMPS on one rank, too, as for large matrices, and for solids, whose factors
+            are dense: PETSc's own takes 60 times as long at 50 000 rows.
 
     Raises:
         InputError: PETSc refuses the user's options.

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+from runs import TWO_ARM
 
+import dolfinopt as do
+from dolfinopt.fem import interior
 from dolfinopt.solver import BandCholesky, direct_solver
 
 COMM = MPI.COMM_WORLD
@@ -65,3 +68,19 @@ def test_an_empty_band():
     band = BandCholesky(none, none, 0)
     assert band.factorise(np.empty(0))
     assert band.solve(np.empty((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.serial
+def test_large_plane_arms_take_mumps(monkeypatch):
+    """By their rows, on one rank; the objective stays the same to rounding of the factors."""
+    monkeypatch.setattr(interior, "MOST_WORK", 0.0)  # no band
+    found = {}
+    for name, rows in (("petsc", np.inf), ("mumps", 100)):
+        monkeypatch.setattr(interior, "MUMPS_ROWS", rows)
+        scene = do.load_scene(TWO_ARM, ["arms.cells=[24,4]", "design.filter_radius=0"])
+        partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+        arms = do.build_arms(scene, partition, do.Profile())
+        x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
+        found[name] = do.evaluate(scene, partition, arms, x, do.Profile())[0].objective
+        assert arms[0].substructure.interior.solver_name == name
+    assert found["mumps"] == pytest.approx(found["petsc"], rel=3e-10)

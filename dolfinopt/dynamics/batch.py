@@ -19,6 +19,7 @@ from dolfinopt.dynamics.batch_system import BatchModes, BatchSystem, batch_of, r
 from dolfinopt.dynamics.collocation import Stages
 from dolfinopt.dynamics.elastic_system import ElasticSystem, static_equilibrium
 from dolfinopt.dynamics.newton import Iterate, Tuning, newton
+from dolfinopt.dynamics.patience import GivenUp
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import State
 from dolfinopt.dynamics.time_grid import (
@@ -192,9 +193,12 @@ def _groups(
     for i in left:
         system, guess = batch.members[i], guesses[i]
         assert guess is not None
+        try:
+            grid = radau.next_time_grid(system, guess, tolerance, stages)
+        except GivenUp:  # more steps than there is room for: left to whoever solves it by itself
+            continue
         steps = tuple(steps_between_breakpoints(system, guess.time_grid)) if own[i] else ()
         alike.setdefault(steps, []).append(int(i))
-        grid = radau.next_time_grid(system, guess, tolerance, stages)
         wanted[int(i)] = steps_between_breakpoints(system, grid)
     groups: dict[tuple[int, ...], list[int]] = {}
     for group in alike.values():

@@ -102,6 +102,10 @@ class BatchSystem:
         """Say how far the first system's arms' ends turn in a motion q (n, N) of it."""
         return self.members[0].describe(q)
 
+    def deflection(self, q: np.ndarray) -> float:
+        """Return the largest deflection of an arm in a motion q (n, N) of the first system."""
+        return self.members[0].deflection(q)
+
     def preconditioner(self) -> BatchModes:
         """Return its own coordinates: they are vibrations."""
         size = self.num_coordinates

@@ -145,6 +145,10 @@ class PrescribedSystem:
         """Say how far the bodies' ends turn in a motion q (n, N)."""
         raise NotImplementedError
 
+    def deflection(self, q: np.ndarray) -> float:
+        """Return the largest deflection of a body in a motion q (n, N), over its length."""
+        return float(self.mechanism.deflections(q).max(initial=0.0))
+
     def body_gradient(
         self,
         t: np.ndarray,

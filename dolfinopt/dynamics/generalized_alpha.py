@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from dolfinopt.dynamics.patience import GivenUp, spend
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import Instants, System, relative_error
 from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
@@ -83,6 +84,8 @@ def integrate(system: System, tolerance: float, rho_inf: float, profile: Profile
     while True:
         try:
             fine = on_grid(system, time_grid, tolerance, rho_inf)
+        except GivenUp:
+            raise
         except ConvergenceError:
             failures += 1
             if failures == MAX_FAILURES:
@@ -137,8 +140,9 @@ def on_grid(system: System, time_grid: np.ndarray, tolerance: float, rho_inf: fl
     q[0], qd_0 = q_0[0], qd[0]
     a = before = older = _first_acceleration(system, q_0, qd) if free else np.zeros_like(q_0)
     for n in range(len(h)):
-        state = (q[n : n + 1], qd, a)
+        state, spent = (q[n : n + 1], qd, a), newton.iterations
         new = newton.step(instants[n : n + 1], h[n], state, 3.0 * (a - before) + older)
+        spend(newton.iterations - spent)
         if new is None:
             raise ConvergenceError(
                 f"Newton's method fails at t = {time_grid[n]:.4g} s in a time step of "

@@ -510,6 +510,11 @@ class MachineSystem:
         R, moving, _ = self.ends
         return self.elastic.describe(y[:, R:moving])
 
+    def deflection(self, y: np.ndarray) -> float:
+        """Return the largest deflection of an arm in a motion y (n, S), over its length."""
+        R, moving, _ = self.ends
+        return self.elastic.deflection(y[:, R:moving])
+
     def preconditioner(self) -> MachineModes | Unchanged:
         """Return the arms' vibrations beside the free coordinates.
 

@@ -12,6 +12,10 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 
 
+class GivenUp(ConvergenceError):
+    """A simulation that no other steps would save: whoever can try others does not."""
+
+
 @dataclass
 class Work:
     """Newton iterations times time steps.
@@ -28,11 +32,11 @@ class Work:
         """Count some work.
 
         Raises:
-            ConvergenceError: it is more than may be done.
+            GivenUp: it is more than may be done.
         """
         self.done += amount
         if self.done > self.most:
-            raise ConvergenceError(
+            raise GivenUp(
                 f"the simulation takes more than {self.most:.3g} Newton iterations times time "
                 "steps: the arms deform beyond small-deflection theory"
             )

@@ -26,29 +26,36 @@ from dolfinopt.dynamics.collocation import (
     step_beginnings,
 )
 from dolfinopt.dynamics.error_estimate import estimated_errors
-from dolfinopt.dynamics.march import REMEDY, March
+from dolfinopt.dynamics.march import REMEDY, March, graded
 from dolfinopt.dynamics.newton import ONE_RUN, ROUNDING, Iterate
+from dolfinopt.dynamics.newton_matrix import MOST
+from dolfinopt.dynamics.patience import GivenUp
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import Preconditioner, State, System
-from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
+from dolfinopt.dynamics.time_grid import divided, even_steps, first_num_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import SlowWork
 
 GOAL = ONE_RUN.goal  # what Newton may leave, as a share of the tolerance
 MAX_GRIDS = 12  # each at least 1.1 times finer
-# Newton may fail for too long a step: so many times four times more steps are tried, up to a number
-# of them whose attempt still ends in a minute.
-MAX_FAILURES, MAX_RETRY = 3, 80_000
-# Grids that fail, or are solved window by window with an error above `LOST`, until the motion is
-# given up; one with a larger error than a coarser grid counts twice: large vibrations feed on
-# themselves, and every grid finds another motion. Of steps merely too long errors are below 1. So
-# does one, whatever solved it, with GREW times the error of the coarser grid: steps that resolve
-# light coordinates, whose mass geometric stiffness has made negative, find them grow without end.
-MAX_LOST, LOST, GREW = 2, 0.5, 1e3
-# Least growth of the steps at one refinement after the other: as long as vibrations are not
-# resolved the error falls more slowly than the order says.
-REFINED = (1.1, 1.4, 2.0)
+# Steps of a grid; fewer where they take more than so many bytes.
+MAX_STEPS, MAX_BYTES = 30_000, 3e9
+# An error above `LOST` is no estimate: of a grid that Newton's method has solved in windows, or
+# `GREW` times that of a coarser one, it tells that the steps find another motion than finer ones
+# would. Then, and where Newton's method fails, the steps follow from a march along the motion; of a
+# motion that comes of that, it is given up. Of steps merely too long errors are below 1.
+LOST, GREW = 0.5, 1e3
+# Errors in turn that are not below this share of the one before until a motion is given up: as long
+# as a vibration is not resolved its error does not fall.
+STALLED, FELL = 4, 0.9
+# Least growth of the steps at the first refinement, and at most at later ones, where the order that
+# is seen decides: as long as vibrations are not resolved the error falls more slowly.
+REFINED, DOUBLED = 1.1, 2.0
+# Newton iterations times time steps, of all grids: 50 to 130 microseconds each with 8 to 20
+# coordinates; and of long motions so many iterations of their first grid.
+MAX_WORK, MAX_SWEEPS = 120_000, 100
+USUAL = 8  # iterations of a finer grid
 # Share of the tolerance that the estimate may take: it is 0.55 to 1 times the error.
 ACCEPT = 0.6
 # Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent between
@@ -56,6 +63,7 @@ ACCEPT = 0.6
 AIM = 0.4
 # Error with eight steps a period of the slowest vibration, by stages: paper's example, initial
 # design. The first grid is chosen by it where so many more steps are needed; else coarse.
+FIRST_ANGLE = 2.0 * np.pi / 8.0
 FIRST_ERROR = {1: np.inf, 2: 0.083, 3: 4.6e-3, 4: 1.1e-4, 5: 7e-6}
 FIRST_GROWTH = 1.6
 
@@ -82,43 +90,83 @@ def integrate(
     """
     preconditioner = system.preconditioner()
     time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages)
-    iterations = failures = refined = lost = 0
-    before = np.inf
     progress = SlowWork("simulation")
-    for grid in range(1, MAX_GRIDS + 1):
+    most = _most_steps(preconditioner, stages)
+    work = max(MAX_WORK, MAX_SWEEPS * (len(time_grid) - 1))
+    iterations = stalled = coarse = 0
+    before, marched = np.inf, False
+    for _ in range(MAX_GRIDS):
         progress.tell(f"{len(time_grid) - 1} time steps")
         try:
-            guess = _on_grid(preconditioner, time_grid, tolerance, stages, guess, progress)
+            found = _on_grid(preconditioner, time_grid, tolerance, stages, guess, progress)
+        except GivenUp:
+            raise
         except ConvergenceError:
-            failures, lost = failures + 1, lost + 1
-            count = 4 * (len(time_grid) - 1)
-            if grid == MAX_GRIDS or failures == MAX_FAILURES or count > MAX_RETRY:
+            if marched:
                 raise
-            guess, time_grid = None, even_steps(system, count)
-            continue
-        iterations += guess.iterations
+            found = None
+        if found is None or (_is_lost(found, before) and not marched):
+            found = _marched(preconditioner, len(time_grid) - 1, tolerance, stages, progress)
+            before, marched = np.inf, True
+        guess, iterations = found, iterations + found.iterations
         if guess.error <= ACCEPT * tolerance:
             profile.counts.newton_iterations += iterations
             return replace(guess, iterations=iterations)
-        if guess.error > LOST and (guess.windows > 1 or guess.error > GREW * before):
-            lost += 2 if guess.error > before else 1
-            if lost >= MAX_LOST:
-                raise ConvergenceError(_lost_motion(system, guess))
-        if 0.9 * before < guess.error < ROUNDING:
+        if _is_lost(guess, before):
+            raise ConvergenceError(_lost_motion(system, guess))
+        stalled = stalled + 1 if guess.error > FELL * before else 0
+        work -= guess.iterations * len(guess.a)
+        least = _least_growth(guess, before, coarse, tolerance)
+        before, coarse = guess.error, len(guess.a)
+        time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages, least, most)
+        expected = USUAL * (len(time_grid) - 1)
+        if stalled == STALLED or (stalled and guess.error < ROUNDING) or expected > work:
             break
-        before, refined = guess.error, refined + 1
-        least = REFINED[min(refined, len(REFINED)) - 1]
-        time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages, least)
-    assert guess is not None  # a failure on the last grid has been raised
-    raise ConvergenceError(
+    assert guess is not None
+    raise GivenUp(
         f"the simulation reaches an error of {guess.error:.2g} with {len(guess.a)} steps, not the "
         f"simulation.tolerance of {tolerance:g}; raise it, or simulation.stages"
     )
 
 
+def _least_growth(found: Solution, before: float, coarse: int, tolerance: float) -> float:
+    """Return the least growth of the steps by the order that the last refinement has shown."""
+    if not before < np.inf:
+        return REFINED
+    growth = np.log(len(found.a) / coarse)
+    order = np.log(before / found.error) / growth if growth > 0.0 else 0.0
+    if order <= 0.0:
+        return DOUBLED
+    wanted = np.log(found.error / (AIM * tolerance)) / order
+    return float(np.exp(np.clip(wanted, np.log(REFINED), np.log(DOUBLED))))
+
+
+def _most_steps(preconditioner: Preconditioner, stages: int) -> int:
+    """Return how many steps have room: of machines every coordinate has dense blocks.
+
+    Measured: 19 to 75 kB a step with 8 coordinates, 104 with 64, of a four-bar with 18 200.
+    """
+    definite, size = preconditioner.definite, preconditioner.system.num_coordinates
+    dense, copies = (min(size, MOST), 1) if definite else (size, 4)
+    values = copies * (stages * stages + 2 * stages + 8) * dense * dense + 2500
+    return min(MAX_STEPS, int(MAX_BYTES / (8 * values)))
+
+
+def _is_lost(found: Solution, before: float) -> bool:
+    """Return whether finer steps would find another motion, see `LOST`."""
+    if not np.isfinite(found.error):
+        return True
+    return found.error > LOST and (found.windows > 1 or found.error > GREW * before)
+
+
 def _lost_motion(system: System, found: Solution) -> str:
     """Return the message about a motion that is another one on every grid."""
     remedy = REMEDY.replace("them", "the arms", 1)
+    if not np.isfinite(found.error):
+        return (
+            f"the simulation finds no estimate of its error with {len(found.a)} time steps, in "
+            f"which {system.describe(found.q)}; {remedy}, or choose another simulation.stages"
+        )
     if found.windows == 1:  # Newton's method is at ease: light coordinates grow
         remedy += ", or leave geometric stiffness off (simulation.stiffening = false)"
     return (
@@ -126,6 +174,29 @@ def _lost_motion(system: System, found: Solution) -> str:
         f"steps, at last {len(found.a)}, in which {system.describe(found.q)}, beyond "
         f"small-deflection theory; {remedy}"
     )
+
+
+def _marched(
+    preconditioner: Preconditioner,
+    count: int,
+    tolerance: float,
+    stages: int,
+    progress: SlowWork,
+) -> Solution:
+    """Return the solution on steps that follow the motion, see `march.graded`."""
+    system = preconditioner.system
+    known = FIRST_ERROR[min(stages, 5)]
+    angle = 0.8 * FIRST_ANGLE * (AIM * tolerance / known) ** (1.0 / (2 * stages - 1))
+    step = system.breakpoints[-1] / count
+    found = graded(preconditioner, step, angle, tolerance, stages, progress)
+
+    def known_already(steps: Stages, state: State, first: np.ndarray) -> Iterate:
+        return Iterate(found.a, np.ones(1, dtype=bool), np.zeros(1), np.array([found.iterations]))
+
+    grid, state = found.time_grid[None], system.initial_state()
+    (solution,) = on_grids(preconditioner, grid, state, [None], stages, known_already)
+    assert solution is not None  # it has converged
+    return replace(solution, windows=found.windows)
 
 
 def on_grid(
@@ -237,12 +308,16 @@ def next_time_grid(
     guess: Solution | None,
     tolerance: float,
     stages: int,
-    least: float = 1.1,
+    least: float = REFINED,
+    most: int = MAX_STEPS,
 ) -> np.ndarray:
     """Return steps that should meet the tolerance, from the estimated error of `guess`.
 
     Steps that are good enough stay, unless a fifth of them can be saved; others grow in number
     at least by the factor `least`.
+
+    Raises:
+        GivenUp: they are more than `most`.
     """
     if guess is None:
         return _first_time_grid(system, tolerance, stages)
@@ -250,10 +325,18 @@ def next_time_grid(
     order = 2 * stages - 1  # at the steps' ends
     growth = (guess.error / (AIM * tolerance)) ** (1.0 / order)
     if guess.error > ACCEPT * tolerance:
-        return even_steps(system, int(np.ceil(count * min(max(growth, least), 8.0))))
+        wanted = int(np.ceil(count * min(max(growth, least), 8.0)))
+        if wanted > most:
+            raise GivenUp(
+                f"the simulation reaches an error of {guess.error:.2g} with {count} time steps and "
+                f"would need {wanted}, more than {most}, for the simulation.tolerance of "
+                f"{tolerance:g}; raise it, or simulation.stages, or "
+                "damping.stiffness_proportional, or shorten motion.horizon"
+            )
+        return divided(system, guess.time_grid, wanted)
     if growth > 0.8 and np.isin(system.breakpoints, guess.time_grid).all():
         return guess.time_grid
-    return even_steps(system, int(np.ceil(count * min(max(growth, 0.5), 1.0))))
+    return divided(system, guess.time_grid, int(np.ceil(count * min(max(growth, 0.5), 1.0))))
 
 
 def _first_time_grid(system: System, tolerance: float, stages: int) -> np.ndarray:

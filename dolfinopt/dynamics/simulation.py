@@ -16,6 +16,8 @@ from dolfinopt.dynamics.drive_forces import DriveForces
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.load_coefficients import load_coefficients
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.march import BEYOND, REMEDY, VALID
+from dolfinopt.dynamics.patience import GivenUp
 from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.time_grid import response_instants
 from dolfinopt.errors import ConvergenceError
@@ -133,12 +135,8 @@ class Trajectory:
 
     @cached_property
     def deflections(self) -> np.ndarray:
-        """Largest outboard deflection of every arm in its own frame, over its length (arms,)."""
-        largest = []
-        for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
-            u = self.q_e[:, part] @ body.outboard[:2].T
-            largest.append(np.hypot(u[:, 0], u[:, 1]).max() / np.hypot(*body.outboard_point))
-        return np.array(largest)
+        """Largest deflection of every arm's end in its own frame, over its length (arms,)."""
+        return self.mechanism.deflections(self.q_e)
 
     @cached_property
     def interface_rotations(self) -> np.ndarray:
@@ -331,7 +329,8 @@ def simulate_batch(
             1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
-        In the scenes' order; of one that fails its error, see `simulate`.
+        In the scenes' order; of one that fails, or bends by more than `march.VALID` of an arm's
+        length, its error, see `simulate`.
     """
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
     problems = _problems(scenes, bodies)
@@ -354,7 +353,8 @@ def simulate_batch(
             if isinstance(one, ConvergenceError):
                 found[i] = one
                 continue
-            found[i] = _trajectory(problems[i], scenes[i], one)
+            trajectory = _trajectory(problems[i], scenes[i], one)
+            found[i] = _refused(trajectory) or trajectory
             profile.counts.simulations += 1
     return [one for one in found if one is not None]
 
@@ -390,6 +390,19 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
         motion = motions.setdefault(key, desired_motion(scene))
         problems.append(build_system(scene, own, motion))
     return problems
+
+
+def _refused(trajectory: Trajectory) -> ConvergenceError | None:
+    """Return why a motion is none of flexible arms any more, or None."""
+    arms, deflections = trajectory.scene.arms, trajectory.deflections
+    worst = int(np.argmax(deflections)) if len(deflections) else 0
+    if not len(deflections) or deflections[worst] <= VALID:
+        return None
+    name = f"arm {arms[worst].name!r}" if worst < len(arms) else "a link"
+    return GivenUp(
+        f"{name} deflects by {100.0 * deflections[worst]:.3g} % of its length: {BEYOND}; "
+        f"{REMEDY.replace('them', 'the arm', 1)}"
+    )
 
 
 def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajectory:

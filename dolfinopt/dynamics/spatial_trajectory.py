@@ -58,17 +58,6 @@ class SpatialTrajectory(Trajectory):
         return end_effector(self.mechanism, self.motion, self.q_e)
 
     @cached_property
-    def deflections(self) -> np.ndarray:
-        """Largest deflection of every body's interfaces in its frame, over its length (bodies,)."""
-        found = []
-        for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
-            moved = (self.q_e[:, part] @ body.outboard.T).reshape(-1, 6)[:, :3]
-            u = np.linalg.norm(moved, axis=1)
-            length = float(np.linalg.norm(body.points, axis=1).max())
-            found.append(u.max() / length if body.num_modes and length else 0.0)
-        return np.array(found)
-
-    @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every body's outboard interface (bodies,), rad."""
         return interface_rotations(self.mechanism, self.q_e)

@@ -138,6 +138,9 @@ class System(Protocol):
     def describe(self, q: np.ndarray) -> str:
         """Say how far a motion q (n, N) goes, for a message: "the arms' ends turn by 2 rad"."""
 
+    def deflection(self, q: np.ndarray) -> float:
+        """Return the largest deflection of a body in a motion q (n, N), over its length."""
+
     def preconditioner(self) -> Preconditioner:
         """Return coordinates for Newton's method; `Unchanged` where there are no better ones."""
 

@@ -21,7 +21,7 @@ from dolfinopt.fem.assembly import (
     interior_entries,
 )
 from dolfinopt.fem.interface import InterfaceTransformation
-from dolfinopt.mesh.budget import free_memory
+from dolfinopt.mesh.budget import free_memory, ranks_here
 from dolfinopt.profiling import Profile
 from dolfinopt.solver import (
     BandCholesky,
@@ -41,6 +41,10 @@ OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
 # has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
 MOST_WORK = 1e9
+# Rows from which MUMPS takes less time than PETSc's Cholesky, in the plane on one rank, if a design
+# takes 10 solves. Factorisation and 18 solves: 121 878 rows (1000 x 60 cells) 0.23 and 1.00 s by
+# MUMPS, 0.78 and 0.42 s by PETSc; 205 242 rows 0.55 and 1.67 s, 1.48 and 0.69 s.
+MUMPS_ROWS = 150_000
 # Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
 # takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
 MOST_SOLID_WORK = 1.5e11
@@ -155,7 +159,8 @@ class InteriorSystem:
     @cached_property
     def _ksp(self) -> PETSc.KSP:
         # Natural: the interior dofs are numbered for it.
-        return direct_solver(self._stiffness.mat, "natural", OPTIONS, own=self._T.dim == 2)
+        own = self._T.dim == 2 and self._T.num_interior < MUMPS_ROWS
+        return direct_solver(self._stiffness.mat, "natural", OPTIONS, own=own)
 
     @cached_property
     def is_iterative(self) -> bool:
@@ -171,7 +176,9 @@ class InteriorSystem:
         here = MPI.Get_processor_name()
         share = T.comm.allgather(here).count(here) / T.comm.size
         factor = share * FACTOR_BYTES * T.num_dofs * (T.num_dofs / FACTOR_AT) ** FACTOR_GROWTH
-        short = T.num_dofs > FACTOR_AT and factor > FREE_SHARE * free_memory()
+        # Other arms' ranks on this machine take theirs at the same time.
+        free = free_memory() * T.comm.allgather(here).count(here) / ranks_here()
+        short = T.num_dofs > FACTOR_AT and factor > FREE_SHARE * free
         return bool(T.comm.allreduce(short, op=MPI.LOR))
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import defaultdict
 from pathlib import Path
 
@@ -136,6 +137,11 @@ def free_memory(proc: Path = Path("/proc"), cgroup: Path = _CGROUP) -> float:
         for folder in (inner, *inner.parents):
             least = min(least, _left(names[0] / folder, *names[1:]))
     return least
+
+
+def ranks_here() -> int:
+    """Return how many ranks run on this machine: all where the launcher does not say."""
+    return max(1, int(os.environ.get("OMPI_COMM_WORLD_LOCAL_SIZE", MPI.COMM_WORLD.size)))
 
 
 def _left(folder: Path, limit: str, usage: str, reclaimable: str) -> float:

@@ -149,6 +149,23 @@ class ElasticBodies:
             norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
         return np.stack(norms, axis=-1)
 
+    def deflections(self, q: np.ndarray) -> np.ndarray:
+        """Return the largest deflection of every body in q (n, N), over its length (bodies,).
+
+        That of its outboard interfaces in its own frame.
+        """
+        found = []
+        for part, body in zip(self.slices, self.bodies, strict=True):
+            d, largest = len(body.outboard_point), 0.0
+            points = body.outboard_point[None] if d == 2 else body.points
+            length = float(np.linalg.norm(points, axis=1).max())
+            if body.num_modes and length > 0.0:
+                # Of each interface: displacements, then rotations, of which the plane has one.
+                moved = (q[:, part] @ body.outboard.T).reshape(-1, 3 if d == 2 else 6)[:, :d]
+                largest = float(np.linalg.norm(moved, axis=1).max(initial=0.0)) / length
+            found.append(largest)
+        return np.array(found)
+
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
         K = np.zeros((self.num_coordinates, self.num_coordinates))

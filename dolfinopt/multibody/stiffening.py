@@ -19,7 +19,6 @@ from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_part
 
-
 WARN = 0.05  # change of an arm's stiffness from which a motion without it is not to be trusted
 
 

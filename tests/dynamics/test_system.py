@@ -74,6 +74,9 @@ class TestSystem:
     def describe(self, q: np.ndarray) -> str:
         return "it moves"
 
+    def deflection(self, q: np.ndarray) -> float:
+        return 0.0
+
     def preconditioner(self) -> Unchanged:
         return Unchanged(self)
 
