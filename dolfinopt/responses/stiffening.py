@@ -157,7 +157,7 @@ def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> fl
     for stiffened, without in pairs:
         if isinstance(stiffened, ConvergenceError) or isinstance(without, ConvergenceError):
             return None
-        moved, other = _displacements(stiffened), _displacements(without)
+        moved, other = _displacements(stiffened), _displacements(without.at(stiffened.t))
         size = np.linalg.norm(moved, axis=-1).max(initial=0.0)
         if size > 0.0:
             apart = np.linalg.norm(moved - other, axis=-1).max()
