@@ -350,21 +350,31 @@ class Model:
         folder: str | Path | None = None,
         *,
         resume: bool = False,
+        overwrite: bool = False,
         report: Callable[[HistoryRow], None] | None = None,
     ) -> OptimizationResult:
         """Optimise the scene's arms from its initial design.
 
         Args:
-            folder: existing one for history.csv and the checkpoint; None: nothing is written.
+            folder: for history.csv and the checkpoint; None: nothing is written.
             resume: go on from the folder's checkpoint.
+            overwrite: replace the results that the folder holds.
             report: called on rank 0 with every row of the history.
 
         Raises:
-            InputError: there is no fitting checkpoint to go on from.
+            InputError: there is no fitting checkpoint to go on from; the folder holds results, and
+                neither `resume` nor `overwrite` is set; another run works there.
             ConvergenceError: a simulation failed.
         """
         place = None if folder is None else Path(folder)
-        found = optimize(self.scene, place, resume=resume, world=self._world, report=report)
+        found = optimize(
+            self.scene,
+            place,
+            resume=resume,
+            overwrite=overwrite,
+            world=self._world,
+            report=report,
+        )
         self._arms()  # the order of the cells
         stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
@@ -437,11 +447,12 @@ class Model:
         Raises:
             InputError: no part can be made of the design, or the folder holds files already.
         """
-        from dolfinopt.output.folders import check_unused, prepare_folder
+        from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
         from dolfinopt.part.of_scene import names_of, parts_of, write_of
 
         out = None if folder is None else Path(folder)
         if out is not None:
+            on_root(self._world, check_sources, out, names_of(self.scene), self.scene)
             on_root(self._world, check_unused, out, names_of(self.scene))
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")

@@ -82,7 +82,7 @@ def export(
     from dolfinopt.scene.load import pose_scenarios
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
-    claim(world, folder, overwrite, names)
+    claim(world, folder, overwrite, names, scene=loaded)
     partition, arms, x_phys = design_of(world, loaded, design, Profile())
     prepare(world, folder)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))

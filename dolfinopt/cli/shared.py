@@ -16,7 +16,14 @@ import click
 
 from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
-from dolfinopt.output.folders import CHECKPOINT, RUN_FILES, check_unused, prepare_folder
+from dolfinopt.output.folders import (
+    CHECKPOINT,
+    RUN_FILES,
+    check_sources,
+    check_unused,
+    prepare_folder,
+    stale_parts,
+)
 from dolfinopt.units import NOT_MET, with_unit
 
 if TYPE_CHECKING:
@@ -54,6 +61,8 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
         check_forces(scene)
         warn(doubts_of_files(scene))
         warn(implausible(scene))
+        if path.name == "part.toml" and (stale := stale_parts(path.parent)):
+            warn([stale])
         return scene
 
     from dolfinopt.mesh.budget import check_budget
@@ -96,10 +105,16 @@ def claim(
     names: Collection[str] = RUN_FILES,
     *,
     resume: bool = False,
+    scene: Scene | None = None,
 ) -> None:
-    """Raise InputError if the folder holds results that --overwrite does not give up."""
+    """Raise InputError if the folder holds results that --overwrite does not give up.
+
+    Or files that `scene` reads: these are not replaced even so.
+    """
     from dolfinopt.parallel import on_root
 
+    if scene is not None:
+        on_root(world, check_sources, folder, names, scene)
     if not overwrite:
         on_root(world, partial(check_unused, resume=resume), folder, names)
 

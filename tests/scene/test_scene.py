@@ -492,6 +492,8 @@ BAD_VALUES = [
     ("arms.0.name", "12", '"12"', "not a digit"),
     ("arms.0.name", 65 * "a", 65 * "a", "1 to 64"),
     ("arms.0.name", "ARM2", '"arm2"', "no other arm has"),
+    ("arms.0.name", "arm2_face", '"arm2"', "files of both parts would have one name"),
+    ("arms.1.name", "Arm1_R12", '"Arm1_R12"', "files of both parts would have one name"),
     ("arms.0.length", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
     ("arms.0.design", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
     ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
@@ -672,6 +674,7 @@ SHOWN_KEY = {
     ("design.volume_fraction", 5e-4): "design.minimum",
     ("design.initial", 1e-3): "design.minimum",
     ("arms.0.name", "ARM2"): "arms.1.name",
+    ("arms.0.name", "arm2_face"): "arms.1.name",
     ("motion.path", "joints"): "motion.file",
     ("material.name", "stone"): "material",
 }
