@@ -39,7 +39,7 @@ from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.motion import check_motion
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.output.design import read_design
+from dolfinopt.output.design import physical, read_design
 from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
@@ -544,12 +544,13 @@ class Model:
             raise InputError(f"design: expected densities of {', '.join(names)}, found {found}")
         whole = {}
         for (k, order), name in zip(self._order.items(), names, strict=True):
-            values = np.asarray(x[name], dtype=float)
+            values = np.asarray(x[name])
             if values.shape != order.shape:
                 raise InputError(
                     f"design: arm {name!r}: expected densities of shape {order.shape}, "
                     f"found {values.shape}"
                 )
+            values = physical(f"design: density of arm {name!r}", values)
             whole[k] = np.empty_like(values)
             whole[k][order] = values
         return whole

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt.cli.options import (
+    PATH,
     design_option,
     out_option,
     overwrite_option,
@@ -39,7 +40,7 @@ KINDS = (".sid", ".sid.npz", ".fem")
 )
 @click.option(
     "--before",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DIR",
     help="with --urdf: an earlier run of the robot, for a table and a page of both",
 )

@@ -56,10 +56,14 @@ def optimize(
     else:
         claim(world, folder, overwrite, resume=True, scene=loaded)
     with working_alone(world, folder):  # until all files of the run are written
-        with progress(world, loaded) as report:
-            result = run(
-                loaded, folder, resume=resume, overwrite=overwrite, world=world, report=report
-            )
+        try:
+            with progress(world, loaded) as report:
+                result = run(
+                    loaded, folder, resume=resume, overwrite=overwrite, world=world, report=report
+                )
+        except KeyboardInterrupt:
+            instead = " in place of --overwrite" if overwrite else ""
+            raise KeyboardInterrupt(f"to go on, add --resume{instead}") from None
         _write_result(loaded, folder, result, plots, animation)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.options import out_option, overwrite_option, plots_option
+from dolfinopt.cli.options import PATH, out_option, overwrite_option, plots_option
 from dolfinopt.cli.part_solid import make_solids
 from dolfinopt.cli.part_table import tell
 from dolfinopt.cli.shared import claim, elapsed, scene_of, warn
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="DIR", type=PATH)
 @out_option("the files; default: DIR/part")
 @click.option(
     "--tool-radius", type=float, metavar="M", help="of concave corners; default: a fifth of a cell"

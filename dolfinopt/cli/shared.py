@@ -278,7 +278,7 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
     optimised = summary["kkt"] is not None
     if optimised:
-        ending = f"{summary['iterations']} iterations ({ending}), {_sought(summary)}"
+        ending = f"{_counted(summary)} ({ending}), {_sought(summary)}"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
         f"{_largest(summary)}, {_stress(summary)}"
@@ -287,6 +287,12 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     )
     if summary["certificate"] is not None:
         click.echo(f"certificate: {summary['certificate']['sentence']}")
+
+
+def _counted(summary: Mapping[str, Any]) -> str:
+    """Return the number of iterations; those beyond the limit, back within constraints, apart."""
+    made, most = summary["iterations"], summary["scene"]["optimizer"]["max_iterations"]
+    return f"{made} iterations" if made <= most else f"{most} iterations and {made - most} further"
 
 
 def _sought(summary: Mapping[str, Any]) -> str:
@@ -370,10 +376,14 @@ def elapsed() -> float:
 
 
 def _age() -> float:
-    """Return how long ago this process was started, s; 0 where the system does not tell."""
+    """Return how long ago this process was started, s; 0 where the system does not tell.
+
+    The launcher's process becomes this one after its set-up, which does not count.
+    """
     try:
         words = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(words[19]) / os.sysconf("SC_CLK_TCK")
+        age = min(age, time.time() - float(os.environ.get("DOLFINOPT_STARTED", "-inf")))
     except (OSError, ValueError, IndexError, AttributeError):
         return 0.0
     return age if 0.0 <= age < 600.0 else 0.0  # imports do not take longer: another clock

@@ -15,6 +15,7 @@ from dolfinopt.mesh.groups import DESIGN, INBOARD, NAMES, OUTBOARD, PASSIVE, gro
 from dolfinopt.mesh.step_names import read_shapes
 from dolfinopt.scene.tables.arms import Arm
 
+UNNAMED = "Open CASCADE STEP translator"  # and numbers: what Open CASCADE calls nameless products
 CELLS_ACROSS = 12  # of a STEP file without mesh_size
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
 NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
@@ -44,7 +45,8 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
     labels, products = [], []
     for face, owner in zip(faces, owners, strict=True):
         outline = model.getBoundary([face], combined=False, oriented=False)
-        products.append(model.getEntityName(*owner).rpartition("/")[2].strip())
+        product = model.getEntityName(*owner).rpartition("/")[2].strip()
+        products.append("" if product.startswith(UNNAMED) else product)
         names = {products[-1]} | named_faces.names_at(_ends(model, outline), everywhere)
         labels.append({group_named(name, PASSIVE, DESIGN) for name in names})
     if len(set(products)) > 1:  # a single one bears the name of the part

@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import FULL, unwritten
+from dolfinopt.disk import FULL, unwritten, write_text
 from dolfinopt.errors import InputError
 from dolfinopt.locks import working_in
 from dolfinopt.scene.contents import file_digest, named_files
@@ -253,7 +253,7 @@ def write_question(
 ) -> None:
     """Write what a study asked, and its files, as FOLDER/NAME.json."""
     text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
-    (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    write_text(folder / f"{name}.json", text + "\n")
 
 
 def _record(folder: Path, name: str) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.disk import write_arrays, write_text
+from dolfinopt.disk import read_arrays, write_arrays, write_text
 from dolfinopt.multibody.motion import CART
 from dolfinopt.scene.load import Scene
 
@@ -146,5 +146,5 @@ def read_initial_deviation(path: Path) -> np.ndarray | None:
     """Return the initial design's deviation (n, 2), m, if trajectory.npz holds it."""
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as data:
-        return data["initial_deviation"] if "initial_deviation" in data.files else None
+    arrays = read_arrays(path, "name the folder of a finished run")
+    return arrays.get("initial_deviation")

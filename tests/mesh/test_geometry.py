@@ -206,6 +206,21 @@ def test_unknown_groups_of_surfaces_are_listed(write):
 
 
 @pytest.mark.serial  # Gmsh runs on one rank
+def test_products_that_open_cascade_has_numbered_have_no_names(shared_tmp_path):
+    """Every file that it writes has them: "Open CASCADE STEP translator 7.6 1.1"."""
+    path = shared_tmp_path / "two.step"
+
+    def halves(gmsh):
+        for x in (0.0, 500.0 * LENGTH):
+            gmsh.model.occ.addRectangle(x, -500.0 * HEIGHT, 0.0, 500.0 * LENGTH, 1e3 * HEIGHT)
+        gmsh.model.occ.synchronize()
+
+    gmsh_writes(path, halves)
+    assert path.read_text().count("PRODUCT('Open CASCADE STEP translator") == 3
+    assert arm_mesh(COMM, entry(path)).notes == ()
+
+
+@pytest.mark.serial  # Gmsh runs on one rank
 def test_unknown_products_are_listed(shared_tmp_path):
     path = step_file(shared_tmp_path / "arm.step", arm=plate, bush=ring)
     mesh = arm_mesh(COMM, entry(path, mesh_size=0.004))

@@ -669,7 +669,15 @@ BAD_VALUES = [
     ("arms", [], "[]", "an array of tables [[arms]], at least one"),
     ("arms.1", "arm2", '"arm2"', "a table with the keys name, length"),
 ]
+
+
 # Where two keys contradict each other the message may show the other one.
+def test_more_arms_than_any_machine_has():
+    """They were read for half a minute without a word."""
+    with pytest.raises(InputError, match="arms: 1001 of them, expected at most 1000"):
+        scene_from_dict(minimal(1001))
+
+
 SHOWN_KEY = {
     ("design.volume_fraction", 5e-4): "design.minimum",
     ("design.initial", 1e-3): "design.minimum",
@@ -1268,6 +1276,10 @@ def test_who_owns_which_design():
     ("arm", "reason"),
     [
         ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
+        (
+            {"design": "arm1", "density": 2700.0},
+            "arms.1.density (arm2) = 2700.0: expected no value, as in arm1, whose design it shares",
+        ),
         ({"design": "arm1", "density": 1.0}, "arms.1.density (arm2) = 1.0: expected None as arm1"),
         (
             {"design": "arm1", "rigid": True},

@@ -39,6 +39,7 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
+MAX_ARMS = 1000  # every arm is checked beside all others
 PART_FILES = ("_face", "_r12")  # behind an arm's name in files of its part
 MESH_FILES = (".geo", ".msh", ".step", ".stp")
 
@@ -512,8 +513,11 @@ class Arm(Table):
                 key not in ("name", "design", "pattern", *JOINT_KEYS)
                 and getattr(self, key) != value
             ):
+                expected = f"{shown(value)} as {self.design} has"
+                if value is None:
+                    expected = f"no value, as in {self.design}"
                 raise Refusal(
-                    f"expected {shown(value)} as {self.design} has, whose design it shares",
+                    f"expected {expected}, whose design it shares",
                     (*at, key),
                     (*at, "design"),
                 )
