@@ -152,7 +152,7 @@ ensure() {
 }
 
 # The seconds that a run tells begin here: what came before was the set-up.
-begin_clock() { export DOLFINOPT_STARTED="${EPOCHREALTIME/,/.}"; }
+begin_clock() { DOLFINOPT_STARTED=$(date +%s.%N) && export DOLFINOPT_STARTED; }
 
 # --- running --------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mpi4py import MPI
 from runs import ROOT, TWO_ARM, overrides, run, shell
 
 import dolfinopt as do
+from dolfinopt.cli import shared
 from dolfinopt.errors import InputError
 from dolfinopt.locks import RUN
 from dolfinopt.output.folders import RUN_FILES
@@ -244,6 +246,18 @@ def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
 
 
 # -- used folders ----------------------------------------------------------------------------
+
+
+@pytest.mark.serial
+def test_the_launchers_set_up_does_not_count(monkeypatch):
+    """The launcher's process, which may have installed everything, becomes the command's."""
+    monkeypatch.setenv("DOLFINOPT_STARTED", str(time.time() + 1e3))
+    assert shared._age() == 0.0
+    monkeypatch.setenv("DOLFINOPT_STARTED", "0")
+    with_all = shared._age()
+    monkeypatch.delenv("DOLFINOPT_STARTED")
+    assert shared._age() >= with_all  # of a later moment
+
 
 USED = {
     "optimize": ["optimize", TWO_ARM, "--set", "optimizer.max_iterations=1", "--no-plots"],

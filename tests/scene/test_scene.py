@@ -1276,7 +1276,10 @@ def test_who_owns_which_design():
     ("arm", "reason"),
     [
         ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
-        ({"design": "arm1", "density": 1.0}, "arms.1.density (arm2) = 1.0: expected no value, as in arm1"),
+        (
+            {"design": "arm1", "density": 1.0},
+            "arms.1.density (arm2) = 1.0: expected no value, as in arm1",
+        ),
         (
             {"design": "arm1", "rigid": True},
             "only one of design, pattern, rigid and sid, found design and",
