@@ -118,7 +118,8 @@ set_up() {
   # that was never finished or belongs to another Python is made anew.
   version=$(/usr/bin/python3 -c 'import sys; print("%d.%d" % sys.version_info[:2])') || exit 1
   if [ -f "$venv/ready" ] && [ -d "$venv/lib/python$version" ]; then
-    rm "$venv/ready"
+    # Runs that begin meanwhile go on with a base that is up to date: tests only add to it.
+    is_ready ready || rm "$venv/ready"
     [ ! -f "$venv/ready-dev" ] || project="${here}[dev]"
   else
     find "$venv" -mindepth 1 -maxdepth 1 ! -name setup.log -exec rm -rf {} +
@@ -149,6 +150,9 @@ ensure() {
     set_up "$@"
   ) 9<"$here" || exit
 }
+
+# The seconds that a run tells begin here: what came before was the set-up.
+begin_clock() { DOLFINOPT_STARTED=$(date +%s.%N) && export DOLFINOPT_STARTED; }
 
 # --- running --------------------------------------------------------------------------------------
 
@@ -280,6 +284,7 @@ case ${1-} in
     fi
     ensure ready "$here"
     answer_soon
+    begin_clock
     [ -n "$ranks" ] || exec "$python" "$@"
     exec 2> >(drop_chatter >&2)
     exec /usr/bin/mpirun -n "$ranks" "$python" "$@"
@@ -287,6 +292,7 @@ case ${1-} in
   *)
     ensure ready "$here"
     answer_soon
+    begin_clock
     # -P: a file in the current folder must not take the place of a module.
     [ -n "$ranks" ] || exec "$python" -P -m dolfinopt "$@"
     exec 2> >(drop_chatter >&2)

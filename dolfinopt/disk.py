@@ -96,9 +96,32 @@ def write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda stream: stream.write(text.encode()))
 
 
+def read_arrays(path: Path, remedy: str) -> dict[str, Any]:
+    """Return the arrays of an .npz file that the user has named.
+
+    Raises:
+        InputError: it is none, or damaged; says `remedy`.
+    """
+    import numpy as np
+
+    with open_input(path) as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as data:
+                return {key: data[key] for key in data.files}
+        except Exception:  # whatever NumPy may raise: a header may ask for any memory
+            raise InputError(f"{path}: no readable .npz file; {remedy}") from None
+
+
+def check_regular(path: Path) -> None:
+    """Raise OSError for what is neither file nor folder: reading a pipe would wait for ever."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "no regular file")
+
+
 def open_input(path: Path) -> IO[bytes]:
     """Open a file that the user has named; raise InputError where it cannot be read."""
     try:
+        check_regular(path)
         return open(path, "rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None

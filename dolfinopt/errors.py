@@ -22,6 +22,17 @@ class OutputError(RuntimeError):
     """
 
 
+def missing_package(error: BaseException | None) -> str:
+    """Return what to say of a package that is not installed; "" if that is not the reason."""
+    name = getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None
+    if not name or name.partition(".")[0] == "dolfinopt":
+        return ""
+    return (
+        f"the Python package {name} is not installed; on Debian run ./dolfinopt.sh, elsewhere: "
+        "pip install --force-reinstall dolfinopt, which brings what it needs"
+    )
+
+
 class OthersFailed(RuntimeError):
     """Work given up because another rank failed.
 

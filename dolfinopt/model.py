@@ -39,7 +39,7 @@ from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.motion import check_motion
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.output.design import read_design
+from dolfinopt.output.design import physical, read_design
 from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
@@ -350,24 +350,33 @@ class Model:
         folder: str | Path | None = None,
         *,
         resume: bool = False,
+        overwrite: bool = False,
         report: Callable[[HistoryRow], None] | None = None,
     ) -> OptimizationResult:
         """Optimise the scene's arms from its initial design.
 
         Args:
-            folder: existing one for history.csv and the checkpoint; None: nothing is written.
+            folder: for history.csv and the checkpoint; None: nothing is written.
             resume: go on from the folder's checkpoint.
+            overwrite: replace the results that the folder holds.
             report: called on rank 0 with every row of the history.
 
         Raises:
-            InputError: there is no fitting checkpoint to go on from.
+            InputError: there is no fitting checkpoint to go on from; the folder holds results, and
+                neither `resume` nor `overwrite` is set; another run works there.
             ConvergenceError: a simulation failed.
         """
         place = None if folder is None else Path(folder)
         partition, arms = self._arms()
         built = partition, {k: arm.fresh() for k, arm in arms.items()}
         found = optimize(
-            self.scene, place, resume=resume, world=self._world, report=report, built=built
+            self.scene,
+            place,
+            resume=resume,
+            overwrite=overwrite,
+            world=self._world,
+            report=report,
+            built=built,
         )
         stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
@@ -440,11 +449,12 @@ class Model:
         Raises:
             InputError: no part can be made of the design, or the folder holds files already.
         """
-        from dolfinopt.output.folders import check_unused, prepare_folder
+        from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
         from dolfinopt.part.of_scene import names_of, parts_of, write_of
 
         out = None if folder is None else Path(folder)
         if out is not None:
+            on_root(self._world, check_sources, out, names_of(self.scene), self.scene)
             on_root(self._world, check_unused, out, names_of(self.scene))
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
@@ -536,12 +546,13 @@ class Model:
             raise InputError(f"design: expected densities of {', '.join(names)}, found {found}")
         whole = {}
         for (k, order), name in zip(self._order.items(), names, strict=True):
-            values = np.asarray(x[name], dtype=float)
+            values = np.asarray(x[name])
             if values.shape != order.shape:
                 raise InputError(
                     f"design: arm {name!r}: expected densities of shape {order.shape}, "
                     f"found {values.shape}"
                 )
+            values = physical(f"design: density of arm {name!r}", values)
             whole[k] = np.empty_like(values)
             whole[k][order] = values
         return whole

@@ -4,27 +4,34 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import subprocess
 import sys
+import zipfile
 
+import click
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import overrides, run
+from runs import ROOT, TWO_ARM, environment, overrides, run
 
+import dolfinopt as do
 from dolfinopt import disk, locks
 from dolfinopt.data import paper_scene
 from dolfinopt.disk import append_text, make_folder, write_arrays, write_atomically, write_text
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.locks import has_locks, try_lock
+from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
+from dolfinopt.output.folders import write_question
 from dolfinopt.parallel import abort_together
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study.cases import Case
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
+ROUGH = ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 COARSE = ("arms.cells=[12,3]", "design.filter_radius=0.2", "optimizer.max_iterations=2")
 
@@ -213,3 +220,127 @@ def test_results_of_another_program_are_computed_anew(name, value, tmp_path, mon
     with pytest.raises(InputError, match="another version of dolfinopt wrote this checkpoint"):
         checkpoint.check(tmp_path, scene)
     assert computed() == 0  # those of this program are still there
+
+
+# -- files of others -------------------------------------------------------------------------
+
+
+def npz_with_header(path, arrays, name, shape):
+    """Write an .npz in which one array's header tells of a shape that the file does not hold."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for key, value in arrays.items():
+            stream = io.BytesIO()
+            if key == name:
+                header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(stream, header)
+            else:
+                np.lib.format.write_array(stream, value)
+            archive.writestr(f"{key}.npy", stream.getvalue())
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory):
+    """The arrays of a design.npz."""
+    folder = tmp_path_factory.mktemp("design")
+    run("simulate", TWO_ARM, *overrides(*ROUGH), "--no-plots", "--out", folder)
+    with np.load(folder / "design.npz") as data:
+        return dict(data)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("npy", r"no readable \.npz file"),
+        ("8 TiB", r"no readable \.npz file"),
+        ("complex", "density holds complex128, not real numbers"),
+        ("text", "density holds <U3, not real numbers"),
+        ("pipe", "no regular file"),
+    ],
+)
+def test_designs_that_are_none(design, tmp_path, kind, reason):
+    path = tmp_path / "design.npz"
+    if kind == "npy":
+        with open(path, "wb") as stream:
+            np.save(stream, np.zeros(3))
+    elif kind == "8 TiB":
+        npz_with_header(path, design, "arm1/density", (2**40,))
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        change = {"complex": lambda x: x + 1j, "text": lambda x: np.full(x.shape, "0.5")}[kind]
+        np.savez(path, **design | {"arm1/density": change(design["arm1/density"])})
+    with pytest.raises(InputError, match=reason):
+        run("simulate", TWO_ARM, *overrides(*ROUGH), "--design", path, "--out", tmp_path / "o")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.serial
+def test_densities_from_python(design):
+    """Rounding beyond 1 does no harm; complex numbers and more than rounding are refused."""
+    model = do.Model(TWO_ARM, *ROUGH)
+    full = {name: np.ones(36) for name in ("arm1", "arm2")}
+    expected = model.simulate(full).compliance
+    assert model.simulate({k: x + 1e-12 for k, x in full.items()}).compliance == expected
+    for x, reason in ((1.0 + 1e-6, "lie in"), (-0.1, "lie in"), (1.0 + 1j, "complex128")):
+        with pytest.raises(InputError, match=rf"density of arm 'arm2'.*{reason}"):
+            model.simulate(full | {"arm2": np.full(36, x)})
+
+
+@pytest.mark.serial
+def test_edited_checkpoints(tmp_path):
+    words = ("optimize", TWO_ARM, *overrides(*ROUGH), "--no-plots", "--out", tmp_path)
+    run(*words, "--set", "optimizer.max_iterations=1")
+    path = tmp_path / checkpoint.NAME
+    with np.load(path) as data:
+        arrays = dict(data)
+    for key in ("last", "history", "history_columns", "arm0/cells"):
+        np.savez(path, **arrays | {key: np.zeros((2, 2, 2))})
+        with pytest.raises(InputError, match="cannot read this checkpoint"):
+            run(*words, "--set", "optimizer.max_iterations=2", "--resume")
+
+
+def test_a_pipe_is_no_scene(tmp_path):
+    """Opening it would wait for ever."""
+    path = tmp_path / f"{COMM.rank}.toml"
+    os.mkfifo(path)
+    with pytest.raises(InputError, match="no regular file"):
+        load_scene(path)
+
+
+def test_folder_for_forms_that_cannot_be_made(monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    compat.check_form_cache.cache_clear()
+    with pytest.raises(InputError, match=r"/dev/null: compiled forms .*XDG_CACHE_HOME"):
+        compat.check_form_cache()
+    compat.check_form_cache.cache_clear()
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", ["pydantic", "scipy"])
+def test_a_package_that_is_missing_is_named(tmp_path, name):
+    """Before MPI is started, and after."""
+    text = f"raise ModuleNotFoundError('No module named {name}', name={name!r})\n"
+    (tmp_path / f"{name}.py").write_text(text)
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-m", "dolfinopt", "simulate", TWO_ARM, "--out", tmp_path / "o"],
+        env=environment() | {"PYTHONPATH": path},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert f"the Python package {name} is not installed" in done.stderr
+
+
+def test_question_on_a_full_disk(tmp_path, small_files):
+    with pytest.raises(OutputError, match=r"sweep\.json: cannot be written"):
+        write_question(tmp_path, "sweep", {"scene": 5000 * "x"}, [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_path_is_refused():
+    for option in ("--out", "--design"):
+        with pytest.raises(click.UsageError, match="expected a path, found nothing"):
+            run("simulate", TWO_ARM, option, "")

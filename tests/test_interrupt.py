@@ -9,10 +9,12 @@ import subprocess
 import sys
 import time
 
+import click
 import pytest
 from mpi4py import MPI
 
 from dolfinopt import interrupt
+from dolfinopt.cli.main import commands
 from dolfinopt.data import paper_scene
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 
@@ -129,3 +131,20 @@ def alive(process):
             return state.read().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("option", ["", "--overwrite"])
+def test_an_interrupted_optimisation_says_how_to_go_on(tmp_path, monkeypatch, option):
+    from dolfinopt.output import run as module
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module.loop, "run", interrupted)
+    words = ["optimize", str(paper_scene()), "--set", "arms.cells=[12,3]", "--out", str(tmp_path)]
+    words += ["--set", "design.filter_radius=0.2", *filter(None, [option])]
+    with pytest.raises(click.Abort) as caught:
+        commands.main(words, standalone_mode=False, obj=MPI.COMM_WORLD)
+    instead = " in place of --overwrite" if option else ""
+    assert caught.value.__cause__.args == (f"to go on, add --resume{instead}",)

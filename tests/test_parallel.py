@@ -163,6 +163,7 @@ def test_a_good_end_goes_unnoticed():
         (InputError("scene.toml: no"), 2, "dolfinopt: scene.toml: no\n"),
         (ConvergenceError("stuck"), 1, "dolfinopt: stuck\n"),
         (KeyboardInterrupt(), 130, "dolfinopt: interrupted\n"),
+        (KeyboardInterrupt("add --resume"), 130, "dolfinopt: interrupted: add --resume\n"),
     ],
 )
 def test_what_all_ranks_raise_the_root_reports_in_one_line(error, status, message, capsys):

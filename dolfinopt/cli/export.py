@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt.cli.options import (
+    PATH,
     design_option,
     out_option,
     overwrite_option,
@@ -39,7 +40,7 @@ KINDS = (".sid", ".sid.npz", ".fem")
 )
 @click.option(
     "--before",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DIR",
     help="with --urdf: an earlier run of the robot, for a table and a page of both",
 )
@@ -82,7 +83,7 @@ def export(
     from dolfinopt.scene.load import pose_scenarios
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
-    claim(world, folder, overwrite, names)
+    claim(world, folder, overwrite, names, scene=loaded)
     partition, arms, x_phys = design_of(world, loaded, design, Profile())
     prepare(world, folder)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))

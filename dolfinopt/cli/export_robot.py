@@ -68,6 +68,7 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     folder = out or run / "urdf"
     table = None if before is None else on_root(world, _table, before, run)
     names = [origin.file.name, *(f"{arm}.stl" for arm in origin.links)]
+    on_root(world, _check_robot, origin.file, folder, names)
     claim(world, folder, overwrite, [*names, *PAGES])
     after = _reduced(world, run, scene)
     corners = gather_cells(after.partition, {k: _corners(arm) for k, arm in after.arms.items()})
@@ -85,6 +86,23 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
             click.echo("\n".join(said))
 
 
+def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
+    """Raise InputError if the new robot would replace the one it is made of, or its meshes."""
+    from dolfinopt.exchange.urdf.read import mesh_path, safe_xml
+
+    if not file.is_file():
+        return  # told by whoever reads it
+    meshes = [one.get("filename", "") for one in safe_xml(file).getroot().iter("mesh")]
+    sources = [file, *(mesh_path(file, name) for name in meshes)]
+    read = {path.resolve(): path for path in sources if path is not None}
+    for name in names:
+        if source := read.get((folder / name).resolve()):
+            raise InputError(
+                f"{source}: the robot is read from this file, and the new one would replace it; "
+                "name another --out"
+            )
+
+
 def _reduced(world: MPI.Comm, run: Path, scene: Scene) -> _Run:
     """Return a finished run's arms, reduced (collective)."""
     from dolfinopt.parallel import gather_arms, together
@@ -100,12 +118,14 @@ def _reduced(world: MPI.Comm, run: Path, scene: Scene) -> _Run:
 def _write(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
     """Write all files, the robot last: where it is, the others belong to it (root only)."""
     from dolfinopt.disk import write_atomically
+    from dolfinopt.locks import working_in
     from dolfinopt.output.folders import prepare_folder, remove_stale
 
     prepare_folder(folder)
-    remove_stale(folder, [robot, *PAGES])
-    for name, data in files.items():
-        write_atomically(folder / name, partial(_put, data))
+    with working_in(folder):
+        remove_stale(folder, [robot, *PAGES])
+        for name, data in files.items():
+            write_atomically(folder / name, partial(_put, data))
 
 
 # -- before and after ------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.options import design_option, overwrite_option, scene_argument, set_option
+from dolfinopt.cli.options import PATH, design_option, overwrite_option, scene_argument, set_option
 from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.units import with_unit
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="gradient.npz; default: results/SCENE-gradient/gradient.npz",
 )

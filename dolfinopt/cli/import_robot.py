@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.options import out_option
+from dolfinopt.cli.options import PATH, out_option
 from dolfinopt.cli.shared import warn
 from dolfinopt.cli.start import start
 from dolfinopt.errors import InputError
@@ -30,14 +30,14 @@ SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
 @click.command(name="import")
-@click.argument("robot", type=click.Path(path_type=Path))
+@click.argument("robot", type=PATH)
 @click.option(
     "--links", required=True, metavar="A,B", help="links that become solids to be optimised"
 )
 @click.option(
     "--trajectory",
     required=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="table (CSV): t in s and a column for each joint, rad or m",
 )

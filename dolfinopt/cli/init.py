@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from dolfinopt.cli.options import PATH
 from dolfinopt.cli.start import led_by_another
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
@@ -24,7 +25,7 @@ TEMPLATES = {
     help="Write a commented scene, NAME.toml (default: scene.toml).\n\n"
     "\b\nTemplates:\n" + "\n".join(f"  {name:<16}{what}" for name, what in TEMPLATES.items())
 )
-@click.argument("name", default="scene", type=click.Path(path_type=Path))
+@click.argument("name", default="scene", type=PATH)
 @click.option(
     "--template", type=click.Choice(list(TEMPLATES)), default="two-arm", help="what to start from"
 )

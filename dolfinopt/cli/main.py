@@ -40,8 +40,8 @@ def main() -> None:
                 )
             except click.ClickException as error:
                 raise InputError(_with_help(error)) from None
-            except click.Abort:
-                raise KeyboardInterrupt from None
+            except click.Abort as error:
+                raise KeyboardInterrupt(*getattr(error.__cause__, "args", ())) from None
     except SystemExit:
         raise
     except BaseException as error:

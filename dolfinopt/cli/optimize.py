@@ -15,7 +15,7 @@ from dolfinopt.cli.options import (
     scene_argument,
     set_option,
 )
-from dolfinopt.cli.shared import claim, conclude, draw, elapsed, load, prepare, progress
+from dolfinopt.cli.shared import claim, conclude, draw, elapsed, load, progress
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
@@ -47,17 +47,24 @@ def optimize(
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
+    from dolfinopt.output.folders import working_alone
     from dolfinopt.output.run import optimize as run
     from dolfinopt.parallel import on_root
 
     if resume:
         on_root(world, checkpoint.check, folder, loaded)
     else:
-        claim(world, folder, overwrite, resume=True)
-    prepare(world, folder)
-    with progress(world, loaded) as report:
-        result = run(loaded, folder, resume=resume, world=world, report=report)
-    _write_result(loaded, folder, result, plots, animation)
+        claim(world, folder, overwrite, resume=True, scene=loaded)
+    with working_alone(world, folder):  # until all files of the run are written
+        try:
+            with progress(world, loaded) as report:
+                result = run(
+                    loaded, folder, resume=resume, overwrite=overwrite, world=world, report=report
+                )
+        except KeyboardInterrupt:
+            instead = " in place of --overwrite" if overwrite else ""
+            raise KeyboardInterrupt(f"to go on, add --resume{instead}") from None
+        _write_result(loaded, folder, result, plots, animation)
 
 
 def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, animation: bool) -> None:

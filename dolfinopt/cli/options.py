@@ -8,7 +8,23 @@ from typing import Any
 
 import click
 
-scene_argument = click.argument("scene", type=click.Path(path_type=Path))
+
+class GivenPath(click.Path):
+    """A path that is not empty: `--out ""` would be the current folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("expected a path, found nothing", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = GivenPath()
+
+
+scene_argument = click.argument("scene", type=PATH)
 
 
 set_option = click.option(
@@ -16,9 +32,7 @@ set_option = click.option(
 )
 
 
-design_option = click.option(
-    "--design", type=click.Path(path_type=Path), help="design.npz; default: the initial design"
-)
+design_option = click.option("--design", type=PATH, help="design.npz; default: the initial design")
 
 
 plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
@@ -34,6 +48,4 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="replace exist
 
 def out_option(what: str) -> Callable[..., Any]:
     """Return the --out option of a command that writes a folder."""
-    return click.option(
-        "--out", type=click.Path(path_type=Path), metavar="DIR", help=f"folder for {what}"
-    )
+    return click.option("--out", type=PATH, metavar="DIR", help=f"folder for {what}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.options import out_option, overwrite_option, plots_option
+from dolfinopt.cli.options import PATH, out_option, overwrite_option, plots_option
 from dolfinopt.cli.part_solid import make_solids
 from dolfinopt.cli.part_table import tell
 from dolfinopt.cli.shared import claim, elapsed, scene_of, warn
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="DIR", type=PATH)
 @out_option("the files; default: DIR/part")
 @click.option(
     "--tool-radius", type=float, metavar="M", help="of concave corners; default: a fifth of a cell"
@@ -94,7 +94,7 @@ def part(
         options = tool_radius, tolerance, curves == "arcs"
         make_solids(world, scene, folder, target, options, check, overwrite, plots)
         return
-    claim(world, target, overwrite, file_names(scene))
+    claim(world, target, overwrite, file_names(scene), scene=scene)
     parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)
     with together(world):
         if world.rank == 0:
@@ -104,7 +104,7 @@ def part(
             if polished is not None:
                 parts, meshes = polished.parts, polished.meshes
             found = _checked(scene, folder, parts, meshes) if check else None
-            _write(scene, target, parts, meshes, found, polished, plots)
+            _write(scene, folder, target, parts, meshes, found, polished, plots)
 
 
 def _polished(scene: Scene, parts: dict[int, Part], meshes: Meshes, steps: int) -> Polished:
@@ -129,6 +129,7 @@ def _checked(scene: Scene, folder: Path, parts: dict[int, Part], meshes: Meshes)
 
 def _write(
     scene: Scene,
+    run: Path,
     target: Path,
     parts: dict[int, Part],
     meshes: Meshes,
@@ -151,7 +152,7 @@ def _write(
     prepare_folder(target)
     drawn = pictures if plots else None
     bodies = meshes.fine if check is None else check.meshes
-    figures = write_parts(target, scene, parts, bodies, check, polished, drawn)
+    figures = write_parts(target, scene, parts, bodies, check, polished, drawn, run / "design.npz")
     for name, row in figures["arms"].items():
         points = f" with {row['control_points']} control points" if row["control_points"] else ""
         click.echo(

@@ -52,7 +52,7 @@ def make_solids(
     from dolfinopt.part.solid_files import file_names
     from dolfinopt.part.solid_part import make_solid_parts
 
-    claim(world, target, overwrite, file_names(scene))
+    claim(world, target, overwrite, file_names(scene), scene=scene)
     with _stages(world) as say:
         say("surfaces")
         parts = make_solid_parts(scene, folder, world, *curves)
@@ -64,7 +64,7 @@ def make_solids(
                 if check and meshes is not None:
                     found = _checked(scene, folder, parts, meshes, say)
                 say("files")
-                _write(scene, target, parts, meshes, found, plots)
+                _write(scene, folder, target, parts, meshes, found, plots)
     if world.rank == 0:
         _say_what(scene, target, parts, meshes is not None, found)
 
@@ -111,6 +111,7 @@ def _checked(
 
 def _write(
     scene: Scene,
+    run: Path,
     target: Path,
     parts: Parts,
     meshes: SolidMeshes | None,
@@ -133,7 +134,8 @@ def _write(
 
     prepare_folder(target)
     fine = None if meshes is None else meshes.fine
-    write_solid_parts(target, scene, parts, fine, check, pictures if plots else None)
+    drawn = pictures if plots else None
+    write_solid_parts(target, scene, parts, fine, check, drawn, run / "design.npz")
 
 
 def _say_what(scene: Scene, target: Path, parts: Parts, meshed: bool, check: Check | None) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.options import animation_option
+from dolfinopt.cli.options import PATH, animation_option
 from dolfinopt.cli.shared import design_of, draw, scene_of
 from dolfinopt.cli.start import start
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="DIR", type=PATH)
 @animation_option
 def plot(folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""

@@ -16,7 +16,14 @@ import click
 
 from dolfinopt.cli.start import alone, start
 from dolfinopt.errors import InputError
-from dolfinopt.output.folders import CHECKPOINT, RUN_FILES, check_unused, prepare_folder
+from dolfinopt.output.folders import (
+    CHECKPOINT,
+    RUN_FILES,
+    check_sources,
+    check_unused,
+    prepare_folder,
+    stale_parts,
+)
 from dolfinopt.units import NOT_MET, with_unit
 
 if TYPE_CHECKING:
@@ -54,6 +61,8 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
         check_forces(scene)
         warn(doubts_of_files(scene))
         warn(implausible(scene))
+        if path.name == "part.toml" and (stale := stale_parts(path.parent)):
+            warn([stale])
         return scene
 
     from dolfinopt.mesh.budget import check_budget
@@ -96,10 +105,16 @@ def claim(
     names: Collection[str] = RUN_FILES,
     *,
     resume: bool = False,
+    scene: Scene | None = None,
 ) -> None:
-    """Raise InputError if the folder holds results that --overwrite does not give up."""
+    """Raise InputError if the folder holds results that --overwrite does not give up.
+
+    Or files that `scene` reads: these are not replaced even so.
+    """
     from dolfinopt.parallel import on_root
 
+    if scene is not None:
+        on_root(world, check_sources, folder, names, scene)
     if not overwrite:
         on_root(world, partial(check_unused, resume=resume), folder, names)
 
@@ -266,7 +281,7 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
     optimised = summary["kkt"] is not None
     if optimised:
-        ending = f"{summary['iterations']} iterations ({ending}), {_sought(summary)}"
+        ending = f"{_counted(summary)} ({ending}), {_sought(summary)}"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
         f"{_largest(summary)}, {_stress(summary)}"
@@ -275,6 +290,12 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     )
     if summary["certificate"] is not None:
         click.echo(f"certificate: {summary['certificate']['sentence']}")
+
+
+def _counted(summary: Mapping[str, Any]) -> str:
+    """Return the number of iterations; those beyond the limit, back within constraints, apart."""
+    made, most = summary["iterations"], summary["scene"]["optimizer"]["max_iterations"]
+    return f"{made} iterations" if made <= most else f"{most} iterations and {made - most} further"
 
 
 def _sought(summary: Mapping[str, Any]) -> str:
@@ -358,10 +379,14 @@ def elapsed() -> float:
 
 
 def _age() -> float:
-    """Return how long ago this process was started, s; 0 where the system does not tell."""
+    """Return how long ago this process was started, s; 0 where the system does not tell.
+
+    The launcher's process becomes this one after its set-up, which does not count.
+    """
     try:
         words = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(words[19]) / os.sysconf("SC_CLK_TCK")
+        age = min(age, time.time() - float(os.environ.get("DOLFINOPT_STARTED", "-inf")))
     except (OSError, ValueError, IndexError, AttributeError):
         return 0.0
     return age if 0.0 <= age < 600.0 else 0.0  # imports do not take longer: another clock

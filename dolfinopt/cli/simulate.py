@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +17,9 @@ from dolfinopt.cli.options import (
     scene_argument,
     set_option,
 )
-from dolfinopt.cli.shared import claim, conclude, design_of, draw, elapsed, load, prepare
+from dolfinopt.cli.shared import claim, conclude, design_of, draw, elapsed, load
 
 if TYPE_CHECKING:
-    pass
-
     from dolfinopt.output.views import ArmView
 
 
@@ -47,28 +46,29 @@ def simulate(
     """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
-    from dolfinopt.output.folders import remove_stale
+    from dolfinopt.output.folders import check_unused, remove_stale, working_alone
     from dolfinopt.output.run_folder import Simulated, write_simulation
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.order_selection import choose_coordinates
 
-    claim(world, folder, overwrite)
+    claim(world, folder, overwrite, scene=loaded)
     profile = Profile()
     partition, arms, x_phys = design_of(world, loaded, design, profile)
-    prepare(world, folder)
-    choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
-    evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
-    simulated = Simulated(loaded, partition, arms, x_phys, evaluation, trajectory, profile, choice)
+    with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
+        choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
+        evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
+        simulated = Simulated(
+            loaded, partition, arms, x_phys, evaluation, trajectory, profile, choice
+        )
 
-    def pictures(views: list[ArmView]) -> None:
-        assert trajectory is not None
-        draw(folder, loaded, views, trajectory, [], None, animation=animation)
+        def pictures(views: list[ArmView]) -> None:
+            assert trajectory is not None
+            draw(folder, loaded, views, trajectory, [], None, animation=animation)
 
-    drawn = pictures if plots or animation else None
-    on_root(world, remove_stale, folder)
-    written = write_simulation(folder, simulated, elapsed(), pictures=drawn)
-    if written is None:
-        return
-    conclude(written.summary, folder)
+        drawn = pictures if plots or animation else None
+        on_root(world, remove_stale, folder)
+        written = write_simulation(folder, simulated, elapsed(), pictures=drawn)
+    if written is not None:
+        conclude(written.summary, folder)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.errors import ConvergenceError, InputError, OutputError
+from dolfinopt.errors import ConvergenceError, InputError, OutputError, missing_package
 from dolfinopt.interrupt import (
     INTERRUPTED,
     end_at_once,
@@ -105,10 +105,12 @@ def end_before_start(error: BaseException) -> int:
     if isinstance(error, InputError | ConvergenceError | KeyboardInterrupt) and told_by_another:
         return 0
     if isinstance(error, KeyboardInterrupt):
-        print("dolfinopt: interrupted", file=sys.stderr)
+        print(": ".join(["dolfinopt", "interrupted", *map(str, error.args)]), file=sys.stderr)
         return INTERRUPTED
     if isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
         print(f"dolfinopt: {error}", file=sys.stderr)
+    elif missing := missing_package(error):
+        print(f"dolfinopt: {missing}", file=sys.stderr)
     else:
         traceback.print_exception(error)
     return 2 if isinstance(error, InputError) else 1

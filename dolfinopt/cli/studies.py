@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.options import out_option, overwrite_option, plots_option, set_option
+from dolfinopt.cli.options import PATH, out_option, overwrite_option, plots_option, set_option
 from dolfinopt.cli.shared import load
 from dolfinopt.errors import ConvergenceError
 
@@ -25,7 +25,7 @@ designs_option = click.option(
     "designs",
     multiple=True,
     metavar="FILE",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="design.npz, any number of times; default: the initial and the optimised design",
 )
 

@@ -118,8 +118,11 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         pattern: the arm whose design it repeats, which says what stays solid and void.
 
     Raises:
-        InputError: the mesh file cannot be the arm, or the arm have its regions.
+        InputError: the mesh file cannot be the arm, or the arm have its regions; compiled forms
+            can be kept nowhere.
     """
+    with together(comm):
+        compat.check_form_cache()
     like = arm if pattern is None else pattern
     scales = [like.length / arm.length, like.height / arm.height, like.thickness / arm.thickness]
     if arm.mesh is not None:

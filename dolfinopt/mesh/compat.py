@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from dolfinopt.errors import InputError
 
 # DOLFINx 0.5 logs each JIT compilation through the root logger; a handler set beforehand keeps
 # `logging.basicConfig` from being triggered by the first message.
@@ -27,6 +33,23 @@ VERSION = tuple(int(part) for part in dolfinx.__version__.split(".")[:2])
 def dolfinx_version() -> str:
     """Return DOLFINx's version, e.g. "0.5.2"."""
     return dolfinx.__version__
+
+
+@cache
+def check_form_cache() -> None:
+    """Raise InputError unless DOLFINx finds a folder for the forms that it compiles."""
+    home = os.environ.get("XDG_CACHE_HOME")
+    try:
+        folder = Path(home or Path.home() / ".cache") / "fenics"
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK) and not any(folder.glob("*.so")):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except (OSError, RuntimeError) as error:  # Path.home() finds none
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"{home or '~/.cache'}: compiled forms cannot be kept there ({reason}); set the "
+            "environment variable XDG_CACHE_HOME to a folder that you may write"
+        ) from None
 
 
 @contextmanager

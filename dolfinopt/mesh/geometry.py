@@ -14,6 +14,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import check_mesh, flatten
+from dolfinopt.mesh.file_check import open_file
 from dolfinopt.mesh.gmsh_session import mesh_surfaces, silent_terminal
 from dolfinopt.mesh.groups import find_groups, rename_groups, unknown_names
 from dolfinopt.mesh.step_model import read_step
@@ -60,7 +61,8 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def _read_geo(gmsh: Any, arm: Arm, _: list[str]) -> bool:
     """Mesh the .geo file with those of the scene's values it has parameters for."""
-    gmsh.open(arm.mesh)
+    assert arm.mesh is not None
+    open_file(gmsh, arm.mesh)
     names = {re.sub(r"^.*/\s*\d*\s*", "", name): name for name in gmsh.onelab.getNames()}
     if arm.mesh_size is not None and SIZE not in names:
         raise InputError(
@@ -79,11 +81,12 @@ def _read_geo(gmsh: Any, arm: Arm, _: list[str]) -> bool:
     gmsh.clear()
     for key in values.keys() & names.keys():
         gmsh.onelab.setNumber(names[key], [values[key]])
-    gmsh.open(arm.mesh)
+    open_file(gmsh, arm.mesh)
     mesh_surfaces(gmsh, arm.cell_shape)
     return SOLID in names
 
 
 def _read_msh(gmsh: Any, arm: Arm, _: list[str]) -> bool:
-    gmsh.open(arm.mesh)
+    assert arm.mesh is not None
+    open_file(gmsh, arm.mesh)
     return False

@@ -14,6 +14,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+from dolfinopt.mesh.file_check import open_file
 from dolfinopt.parallel import together
 
 # Gmsh's numbers of straight triangles and quadrilaterals.
@@ -61,7 +62,7 @@ def _interrupts_kept() -> Iterator[None]:
 
 
 def _begin(gmsh: Any) -> None:
-    gmsh.initialize()
+    gmsh.initialize(readConfigFiles=False)  # same cells for every user
     gmsh.option.setNumber("General.Terminal", 0)
     # Parameters outlive gmsh.finalize: drop those of the mesh before.
     gmsh.onelab.clear()
@@ -109,7 +110,7 @@ def mesh_geo(gmsh: Any, path: Path, parameters: Mapping[str, float]) -> None:
     """Mesh a parametric .geo file; ONELAB `parameters` override its DefineConstant defaults."""
     for name, value in parameters.items():
         gmsh.onelab.setNumber(name, [float(value)])
-    gmsh.open(str(path))
+    open_file(gmsh, path)
     gmsh.model.mesh.generate(2)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import FRAME_TOLERANCE, remedy
+from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import silent_terminal
 from dolfinopt.mesh.groups import (
     DESIGN,
@@ -79,7 +80,7 @@ def _mesh(gmsh: Any, arm: Arm) -> None:
 
 def _read_groups(gmsh: Any, arm: Arm) -> Entities:
     """Read a .msh or .geo file and return the entities of our groups by their names there."""
-    gmsh.open(arm.mesh)
+    open_file(gmsh, str(arm.mesh))
     if Path(str(arm.mesh)).suffix.lower() == ".geo":
         _mesh(gmsh, arm)
     model, found = gmsh.model, _none(arm)
@@ -122,12 +123,11 @@ def _interface_names(arm: Arm) -> dict[int, str]:
 
 def _read_step(gmsh: Any, arm: Arm) -> Entities:
     """Read the solids of a STEP file, find their interfaces and mesh them."""
-    text = Path(str(arm.mesh)).read_bytes().decode("latin-1")
-    if not text.lstrip().startswith("ISO-10303-21"):  # Gmsh would complain on the terminal
-        raise InputError("it is no STEP file (ISO 10303-21)")
-    faces_named = read_shapes(text)[1]
+    path = Path(str(arm.mesh))
+    check_start(path)
+    faces_named = read_shapes(path.read_bytes().decode("latin-1"))[1]
     gmsh.option.setString("Geometry.OCCTargetUnit", "M")
-    gmsh.open(arm.mesh)
+    open_file(gmsh, path)
     model, found = gmsh.model, _none(arm)
     solids = model.getEntities(3)
     if not solids:

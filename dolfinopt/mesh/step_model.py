@@ -9,11 +9,13 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import remedy
+from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import mesh_surfaces
 from dolfinopt.mesh.groups import DESIGN, INBOARD, NAMES, OUTBOARD, PASSIVE, group_named
 from dolfinopt.mesh.step_names import read_shapes
 from dolfinopt.scene.tables.arms import Arm
 
+UNNAMED = "Open CASCADE STEP translator"  # and numbers: what Open CASCADE calls nameless products
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
 NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
 NORMAL = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
@@ -27,12 +29,11 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
     themselves or by the product they belong to. Few programs name edges: where none bears the name
     of an interface, `_joint_curves` finds it.
     """
-    text = Path(str(arm.mesh)).read_bytes().decode("latin-1")
-    if not text.lstrip().startswith("ISO-10303-21"):  # Gmsh would complain on the terminal
-        raise InputError("it is no STEP file (ISO 10303-21)")
-    named_edges, named_faces = read_shapes(text)
+    path = Path(str(arm.mesh))
+    check_start(path)
+    named_edges, named_faces = read_shapes(path.read_bytes().decode("latin-1"))
     gmsh.option.setString("Geometry.OCCTargetUnit", "M")
-    gmsh.open(arm.mesh)
+    open_file(gmsh, path)
     model = gmsh.model
     everywhere = _ends(model, model.getEntities(1))
     faces, owners, level = model.getEntities(2), model.getEntities(2), 0.0
@@ -43,7 +44,8 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
     labels, products = [], []
     for face, owner in zip(faces, owners, strict=True):
         outline = model.getBoundary([face], combined=False, oriented=False)
-        products.append(model.getEntityName(*owner).rpartition("/")[2].strip())
+        product = model.getEntityName(*owner).rpartition("/")[2].strip()
+        products.append("" if product.startswith(UNNAMED) else product)
         names = {products[-1]} | named_faces.names_at(_ends(model, outline), everywhere)
         labels.append({group_named(name, PASSIVE, DESIGN) for name in names})
     if len(set(products)) > 1:  # a single one bears the name of the part

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 NAME = CHECKPOINT
+SEAL = "digest"  # of all other arrays
 FURTHER = "further/"  # before the names of what further iterations left
 # Keys a resumed run may change: they say when to stop, not what design is computed.
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
@@ -38,7 +40,7 @@ def _scene_text(scene: Scene) -> str:
 def begin(folder: Path, scene: Scene) -> None:
     """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
     remove_stale(folder)
-    write_arrays(folder / NAME, {**_stamp(scene), "iteration": -1})
+    _sealed(folder, {**_stamp(scene), "iteration": np.array(-1)})
 
 
 def _stamp(scene: Scene) -> dict[str, np.ndarray]:
@@ -86,7 +88,21 @@ def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -
     if (further := memory.further) is not None:
         arrays[f"{FURTHER}begun"] = further.begun
         arrays[f"{FURTHER}designs"] = np.column_stack([further.objectives, further.feasible])
-    write_arrays(folder / NAME, arrays)
+    _sealed(folder, {key: np.asarray(value) for key, value in arrays.items()})
+
+
+def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write the checkpoint with a digest, so that a changed one is known."""
+    write_arrays(folder / NAME, {**arrays, SEAL: np.array(_digest(arrays))})
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    found = hashlib.blake2b(digest_size=16)
+    for key in sorted(arrays):
+        one = arrays[key]
+        found.update(f"{key} {one.dtype.str} {one.shape}".encode())
+        found.update(one.tobytes())
+    return found.hexdigest()
 
 
 def check(folder: Path, scene: Scene) -> None:
@@ -158,6 +174,8 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
+        if str(arrays.pop(SEAL)) != _digest(arrays):
+            raise ValueError("it was changed")
         theirs = json.loads(str(arrays["scene"]))
         if int(arrays["iteration"]) >= 0:
             arrays["history_columns"], arrays["last"]  # those of earlier versions have none

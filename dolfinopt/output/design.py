@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.disk import open_input, write_arrays
+from dolfinopt.disk import read_arrays, write_arrays
 from dolfinopt.errors import InputError
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Of the arrays of design.npz.
 UNITS = {"centroid": "m", "density": "-", "filtered": "-"}
+ROUNDING = 1e-9  # of densities that other programs have computed
 
 
 def write_design(folder: Path, views: Sequence[ArmView]) -> None:
@@ -127,20 +128,28 @@ def _repeat(arm: ArmKeys, pattern: ArmKeys, arrays: dict[str, np.ndarray]) -> No
 
 
 def _load_design(path: Path) -> dict[str, np.ndarray]:
-    with open_input(path) as stream:
-        try:
-            with np.load(stream, allow_pickle=False) as data:
-                return {key: data[key] for key in data.files}
-        except (ValueError, OSError, EOFError, KeyError, _zip_error()):
-            raise InputError(
-                f"{path}: no readable .npz file; give a design.npz that dolfinopt wrote"
-            ) from None
+    return read_arrays(path, "give a design.npz that dolfinopt wrote")
 
 
-def _zip_error() -> type[Exception]:
-    from zipfile import BadZipFile
+def physical(where: str, density: np.ndarray) -> np.ndarray:
+    """Return densities as numbers in [0, 1].
 
-    return BadZipFile
+    Args:
+        where: what the message begins with.
+        density: (n,) as the user has it; rounding beyond 0 and 1 does no harm.
+
+    Raises:
+        InputError: they are no numbers, or lie outside.
+    """
+    if density.dtype.kind not in "fiub":
+        raise InputError(f"{where} holds {density.dtype}, not real numbers")
+    outside = ~((density >= -ROUNDING) & (density <= 1.0 + ROUNDING))  # catches NaN
+    if outside.any():
+        raise InputError(
+            f"{where} = {density[outside][0]:g} at cell {np.flatnonzero(outside)[0]}: "
+            "physical densities lie in [0, 1]"
+        )
+    return np.clip(density.astype(float), 0.0, 1.0)
 
 
 def _fit(
@@ -166,18 +175,12 @@ def _fit(
             f"{path}: {keys[1]} has shape {density.shape} beside centroids of shape "
             f"{centroid.shape}; expected (n,) and (n, {mesh.dim})"
         )
-    try:
-        centroid, density = centroid.astype(float)[:, : mesh.dim], density.astype(float)
-    except (TypeError, ValueError):
-        raise InputError(f"{path}: {keys[1]} holds {density.dtype}, not numbers") from None
+    if centroid.dtype.kind not in "fiu":
+        raise InputError(f"{path}: {keys[0]} holds {centroid.dtype}, not real numbers")
+    centroid = centroid.astype(float)[:, : mesh.dim]
     if len(density) == 0 or not np.isfinite(centroid).all():
         raise InputError(f"{path}: {keys[0]} is empty or not finite; give a complete design")
-    outside = ~((density >= 0.0) & (density <= 1.0))  # catches NaN
-    if outside.any():
-        raise InputError(
-            f"{path}: {keys[1]} = {density[outside][0]:g} at cell {np.flatnonzero(outside)[0]}: "
-            "physical densities lie in [0, 1]"
-        )
+    density = physical(f"{path}: {keys[1]}", density)
     place = _nearest(path, mesh, centroid, cKDTree)
     filtered = arrays.get(f"{name}/filtered")
     if filtered is None:

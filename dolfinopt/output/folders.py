@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import FULL, unwritten
+from dolfinopt.disk import FULL, unwritten, write_text
 from dolfinopt.errors import InputError
+from dolfinopt.locks import working_in
+from dolfinopt.scene.contents import file_digest, named_files
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.scene.load import Scene
 
 CHECKPOINT = "checkpoint.npz"
 # All files that a run writes, the one that says a run is complete first; nothing else is removed.
@@ -31,6 +38,8 @@ RUN_FILES = (
     "stress.png",
     CHECKPOINT,
 )
+# The parts of a run's design, and the file there that lists them.
+PARTS, PARTS_LIST = "part", "part.json"
 
 
 def prepare_folder(folder: Path) -> None:
@@ -51,6 +60,45 @@ def prepare_folder(folder: Path) -> None:
         raise InputError(
             f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
         ) from None
+
+
+@contextmanager
+def working_alone(
+    world: MPI.Comm, folder: Path, check: Callable[[], object] | None = None
+) -> Iterator[None]:
+    """Keep other runs out of a folder until the block ends; create it first (collective).
+
+    Args:
+        world: all ranks.
+        folder: of the run.
+        check: on the root once no other run can write there any more.
+
+    Raises:
+        InputError: another run works there, or it cannot be written; what `check` raises.
+    """
+    from dolfinopt.parallel import on_root
+
+    with ExitStack() as held:
+
+        def enter() -> None:
+            prepare_folder(folder)
+            held.enter_context(working_in(folder))
+            if check is not None:
+                check()
+
+        on_root(world, enter)
+        yield
+
+
+def check_sources(folder: Path, names: Iterable[str], scene: Scene) -> None:
+    """Raise InputError if results would replace a file that the scene reads."""
+    written = {(folder / name).resolve() for name in names}
+    for key, row, name in named_files(scene.to_dict()):
+        if Path(row[name]).resolve() in written:
+            raise InputError(
+                f"{row[name]}: the scene reads this file ({key}), and the results would replace "
+                "it; name another --out"
+            )
 
 
 def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: bool = False) -> None:
@@ -128,6 +176,49 @@ def write_new(new: Mapping[Path, str | bytes], replaced: Mapping[Path, str]) -> 
         raise
 
 
+# -- parts: files made of a design, which may change after them ----------------------------------
+
+
+def record_of_parts(design: Path | None, folder: Path, files: Iterable[str]) -> dict[str, Any]:
+    """Return the entries of part.json that tell the files, and the design they were made of."""
+    record: dict[str, Any] = {"files": sorted(files)}
+    if design is not None:
+        place = Path(os.path.relpath(design, folder.absolute())).as_posix()
+        record["design"] = {"file": place, "sha256": file_digest(design)}
+    return record
+
+
+def stale_parts(folder: Path) -> str:
+    """Return why a folder's parts are not those of the design beside them; "" if they may be."""
+    made_of = _json(folder / PARTS_LIST).get("design")
+    if not isinstance(made_of, dict) or not isinstance(made_of.get("file"), str):
+        return ""
+    design = folder / made_of["file"]
+    if not design.is_file() or file_digest(design) == made_of.get("sha256"):
+        return ""
+    design = Path(os.path.normpath(design))
+    return (
+        f"{folder}: parts of another design than {design} holds now; make them anew: dolfinopt "
+        f"part {design.parent} --overwrite"
+    )
+
+
+def remove_stale_parts(run: Path) -> str:
+    """Remove the parts in a run's folder unless they are of its design; return what was done."""
+    folder = run / PARTS
+    if not stale_parts(folder):
+        return ""
+    names = [name for name in _json(folder / PARTS_LIST).get("files", []) if _is_name(name)]
+    remove_stale(folder, [PARTS_LIST, *names])
+    with suppress(OSError):  # something of the user's is in it
+        folder.rmdir()
+    return f"{folder}: removed, its parts were of another design; new ones: dolfinopt part {run}"
+
+
+def _is_name(name: Any) -> bool:
+    return isinstance(name, str) and Path(name).name == name
+
+
 # -- studies: many questions may be answered in one folder, each under a name of its own ----------
 
 
@@ -153,7 +244,7 @@ def check_question(folder: Path, name: str, question: Mapping[str, Any]) -> None
 def remove_listed(folder: Path, name: str) -> None:
     """Remove what a study of this name has written before."""
     for file in _record(folder, name).get("files", ()):
-        if Path(file).name == file:
+        if _is_name(file):
             (folder / file).unlink(missing_ok=True)
 
 
@@ -162,12 +253,17 @@ def write_question(
 ) -> None:
     """Write what a study asked, and its files, as FOLDER/NAME.json."""
     text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
-    (folder / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    write_text(folder / f"{name}.json", text + "\n")
 
 
 def _record(folder: Path, name: str) -> dict[str, Any]:
+    return _json(folder / f"{name}.json")
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file, nothing if it holds no table."""
     try:
-        record = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return record if isinstance(record, dict) else {}

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
+from dolfinopt.errors import InputError
 from dolfinopt.optimization import loop
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.loop import Report
 from dolfinopt.optimization.memory import Memory
 from dolfinopt.optimization.result import Result
 from dolfinopt.output import checkpoint
+from dolfinopt.output.folders import RUN_FILES, check_sources, check_unused, working_alone
 from dolfinopt.output.history import HistoryWriter
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
@@ -52,6 +55,7 @@ def optimize(
     folder: Path | None = None,
     *,
     resume: bool = False,
+    overwrite: bool = False,
     world: MPI.Comm | None = None,
     report: Report | None = None,
     built: tuple[Partition, dict[int, Arm]] | None = None,
@@ -62,20 +66,41 @@ def optimize(
 
     Args:
         scene: what to optimise.
-        folder: for history.csv and the checkpoint; what an earlier run left there is removed. None
-            keeps everything in memory.
+        folder: for history.csv and the checkpoint. None keeps everything in memory.
         resume: go on from the folder's checkpoint.
+        overwrite: remove what an earlier run left in the folder, once the arms are built.
         world: all ranks; default MPI.COMM_WORLD.
         report: called on the root with every row of the history.
         built: which ranks do which arm, and this rank's, without a design yet; None: they are
             meshed.
 
     Raises:
-        InputError: `resume` without a matching checkpoint.
+        InputError: `resume` without a matching checkpoint; the folder holds results, and neither
+            `resume` nor `overwrite` is set; another run works there.
         ConvergenceError: a simulation failed; the checkpoint keeps what was reached.
     """
     world = MPI.COMM_WORLD if world is None else world
-    if folder is not None and not resume:
+    if resume and overwrite:
+        raise InputError("resume, overwrite: expected only one of them")
+    if folder is None:
+        return _optimize(scene, None, False, False, world, report, built)
+    on_root(world, check_sources, folder, RUN_FILES, scene)
+    check = None if resume or overwrite else partial(check_unused, folder, resume=True)
+    with working_alone(world, folder, check):
+        return _optimize(scene, folder, resume, overwrite, world, report, built)
+
+
+def _optimize(
+    scene: Scene,
+    folder: Path | None,
+    resume: bool,
+    overwrite: bool,
+    world: MPI.Comm,
+    report: Report | None,
+    built: tuple[Partition, dict[int, Arm]] | None,
+) -> Result:
+    """Optimise in a folder that no other run works in."""
+    if folder is not None and not (resume or overwrite):
         on_root(world, checkpoint.begin, folder, scene)
     # Only now, so that a run killed while DOLFINx is imported can be resumed like any other.
     from dolfinopt.arms.arm import build_arms
@@ -85,6 +110,8 @@ def optimize(
         partition = partition_arms(world, scene.cell_counts)
         built = partition, build_arms(scene, partition, profile)
     partition, arms = built
+    if folder is not None and overwrite:  # not before: a mesh that fails leaves the old results
+        on_root(world, checkpoint.begin, folder, scene)
     memory, recorder = None, None
     if resume:
         assert folder is not None

@@ -18,6 +18,7 @@ from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.result import Result
 from dolfinopt.output.design import write_design
 from dolfinopt.output.fields import write_fields
+from dolfinopt.output.folders import remove_stale_parts
 from dolfinopt.output.summary import summarise, write_summary
 from dolfinopt.output.trajectory import write_trajectory
 from dolfinopt.output.views import ArmView, gather_views
@@ -108,6 +109,8 @@ def write_simulation(
         if one.trajectory is None:
             return None
         write_design(folder, views)
+        if removed := remove_stale_parts(folder):
+            summary["warnings"].append(removed)
         if paraview:
             write_fields(folder, views)
         write_trajectory(folder, one.trajectory, one.initial_deviation)

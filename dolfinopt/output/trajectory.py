@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.disk import write_arrays, write_text
+from dolfinopt.disk import read_arrays, write_arrays, write_text
 from dolfinopt.multibody.motion import CART
 from dolfinopt.scene.load import Scene
 
@@ -154,10 +154,10 @@ def read_initial_deviation(path: Path, even: np.ndarray) -> np.ndarray | None:
     """
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as data:
-        if "initial_deviation" not in data.files:
-            return None
-        return _between(data["t"], data["initial_deviation"], even)
+    arrays = read_arrays(path, "name the folder of a finished run")
+    if "initial_deviation" not in arrays:
+        return None
+    return _between(arrays["t"], arrays["initial_deviation"], even)
 
 
 def _between(t: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from dolfinopt.disk import write_atomically, write_text, writing
-from dolfinopt.output.folders import remove_stale
+from dolfinopt.locks import working_in
+from dolfinopt.output.folders import PARTS_LIST, record_of_parts, remove_stale
 from dolfinopt.part.body_mesh import BodyMesh
 from dolfinopt.part.drawings import dxf_text, r12_text, svg_text
 from dolfinopt.part.mesh import write_meshes
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
 STAGE = ".part-"  # folder of files about to be renamed
-SCENE, FIGURES = "part.toml", "part.json"
+SCENE, FIGURES = "part.toml", PARTS_LIST
 PICTURES = ("part.png", "deviation.png", "stress.png")
 
 
@@ -71,6 +72,7 @@ def write_parts(
     check: Check | None = None,
     polished: Polished | None = None,
     pictures: Callable[[Path], None] | None = None,
+    design: Path | None = None,
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
 
@@ -84,8 +86,10 @@ def write_parts(
         meshes: that the scene of the parts has, likewise.
         check, polished: what the parts do, and what polishing them brought, if it is known.
         pictures: draws `PICTURES` into a folder.
+        design: design.npz of which the parts were made, if they are to be known by it.
 
     Raises:
+        InputError: another run works in the folder.
         OutputError: the disk is full, for instance.
     """
     with tempfile.TemporaryDirectory(prefix="dolfinopt-part-") as name:
@@ -98,13 +102,26 @@ def write_parts(
         if pictures is not None:
             pictures(made)
         figures = figures_of(scene, parts, check, polished)
-        write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
-        publish(made, folder, file_names(scene))
+        publish(made, folder, file_names(scene), figures, design)
     return figures
 
 
-def publish(made: Path, folder: Path, names: Sequence[str]) -> None:
-    """Replace the files of a folder by those made elsewhere: all or none, the first name last."""
+def publish(
+    made: Path,
+    folder: Path,
+    names: Sequence[str],
+    figures: Mapping[str, Any],
+    design: Path | None,
+) -> None:
+    """Replace the files of a folder by those made elsewhere: all or none, part.json last."""
+    written = {FIGURES, *(name for name in names if (made / name).exists())}
+    record = {**figures, **record_of_parts(design, folder, written)}
+    write_text(made / FIGURES, json.dumps(record, indent=1) + "\n")
+    with working_in(folder):
+        _replace(made, folder, names)
+
+
+def _replace(made: Path, folder: Path, names: Sequence[str]) -> None:
     for left in folder.glob(f"{STAGE}*"):
         shutil.rmtree(left, ignore_errors=True)
     with writing(folder):

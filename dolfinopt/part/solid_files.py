@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -73,6 +72,7 @@ def write_solid_parts(
     meshes: Mapping[int, Tetrahedra] | None = None,
     check: Check | None = None,
     pictures: Callable[[Path], None] | None = None,
+    design: Path | None = None,
 ) -> dict[str, Any]:
     """Write the files of all arms into a folder that exists; return the content of part.json.
 
@@ -85,6 +85,7 @@ def write_solid_parts(
         meshes: for part.toml, likewise; None: there is none.
         check: what the parts do, if it is known.
         pictures: draws `files.PICTURES` into a folder.
+        design: design.npz of which the parts were made, if they are to be known by it.
 
     Raises:
         OutputError: the disk is full, for instance.
@@ -99,8 +100,7 @@ def write_solid_parts(
         if pictures is not None:
             pictures(made)
         figures = figures_of(scene, parts, meshes, check)
-        write_text(made / FIGURES, json.dumps(figures, indent=1) + "\n")
-        publish(made, folder, file_names(scene))
+        publish(made, folder, file_names(scene), figures, design)
     return figures
 
 

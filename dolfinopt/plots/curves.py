@@ -209,7 +209,7 @@ def deviation_figure(
 ) -> Figure:
     """Return the figure of `draw_deviation`; what a curve is stands at its peak."""
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
-    axes = figure.add_axes((0.07, 0.11, 0.91, 0.81))
+    axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
     curves = [("", t, deviation)]
     if initial_deviation is not None:
         times = np.linspace(t[0], t[-1], len(initial_deviation))

@@ -114,7 +114,9 @@ class Stress(Response):
                 weights[k] = area * sum(len(one.instants) for one in seen[k])
                 largest = max(largest, own)
         largest = max(partition.world.allgather(largest))
-        cut = NEGLIGIBLE ** (1.0 / p) * largest
+        # Of the instants that are summed: the largest of all samples may lie between them.
+        summed = [float(one.values.max(initial=0.0)) for each in seen.values() for one in each]
+        cut = NEGLIGIBLE ** (1.0 / p) * max(partition.world.allgather(max(summed, default=0.0)))
         chosen = {k: [one.above(cut) for one in each] for k, each in seen.items()}
         sums = {k: 0.0 for k in chosen}
         with together(partition.world), analysis.profile.phase("stress"):
@@ -248,6 +250,8 @@ def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[in
                 for which, place, where, by in each
                 if which == number and len(where)
             }
+            if not own:  # no instant of this scenario counts
+                continue
             profile.counts.adjoints += 1
             with profile.phase("adjoint"):
                 found = loads_gradient(analysis.scene, motion, own)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import os
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -79,26 +78,13 @@ def found_again(
 
 
 def file_digest(path: Path) -> str:
-    """Hash a file's content, and that of the files which a .geo merges or includes.
+    """Hash a file's content.
 
     Raises:
-        InputError: the file cannot be read; those it merges are Gmsh's business.
+        InputError: the file cannot be read.
     """
-    known: dict[Path, str] = {}
-
-    def take(path: Path, asked: bool) -> None:
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            if asked:
-                raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-            return  # Gmsh will say so
-        known[path] = hashlib.sha256(content).hexdigest()
-        if path.suffix.lower() == ".geo":
-            text = content.decode(errors="replace")
-            for name in re.findall(r'(?:Merge|Include)\s*\(?\s*"([^"]+)"', text):
-                if path.parent / name not in known:
-                    take(path.parent / name, False)
-
-    take(path, True)
-    return hashlib.sha256("".join(known.values()).encode()).hexdigest()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    return hashlib.sha256(content).hexdigest()

@@ -19,6 +19,7 @@ from typing import Any, get_origin
 from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
+from dolfinopt.disk import check_regular
 from dolfinopt.errors import InputError
 from dolfinopt.scene.completion import complete
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
@@ -37,6 +38,7 @@ from dolfinopt.scene.messages import (
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.spelling import cut, input_error, shown
 from dolfinopt.scene.tables.arms import (
+    MAX_ARMS,
     MAX_CELLS,
     MESH_KEYS,
     OWN_KEYS,
@@ -120,6 +122,9 @@ def _default_name(source: str) -> str:
 
 def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name: str) -> Scene:
     """Complete `data`, apply `overrides`, validate; `name` is the default of the scene's name."""
+    arms = data.get("arms")
+    if isinstance(arms, list) and len(arms) > MAX_ARMS:
+        raise input_error(source, f"arms: {len(arms)} of them, expected at most {MAX_ARMS}")
     tree = _copy_tables(data)
     tree.setdefault("name", name)
     tree.setdefault("material", {})  # so that the message names the first key missing in it
@@ -325,6 +330,7 @@ def _read_text(source: str) -> str:
     """Return the text of the file `source`; raise InputError if it cannot be read."""
     remedy = "give the path of a scene file (TOML)"
     try:
+        check_regular(Path(source))
         return Path(source).read_bytes().decode("utf-8-sig")  # editors may add a byte order mark
     except FileNotFoundError:
         reason = f"no such file; {remedy}"

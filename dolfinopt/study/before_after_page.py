@@ -82,7 +82,7 @@ def read_motion(run: Path, scene: Scene) -> Motion:
             )
         columns = forces[:, scene.driven_columns].T
         by_drive = dict(zip(scene.driven, columns, strict=True))
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except Exception as error:  # whatever a foreign file may raise
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}); name a finished run"
         ) from None

@@ -288,7 +288,14 @@ def _optimise(case: Case, place: _Place, progress: Progress) -> None:
         progress.tell(case.label, row.iteration, limit, text)
 
     try:
-        result = optimize(scene, folder, resume=resume, world=MPI.COMM_SELF, report=report)
+        result = optimize(
+            scene,
+            folder,
+            resume=resume,
+            overwrite=not resume,
+            world=MPI.COMM_SELF,
+            report=report,
+        )
     except ConvergenceError as error:
         place.fail(case, str(error))
         progress.tell(case.label, text=f"failed: {error}", finished=1)

@@ -6,6 +6,8 @@ import re
 import shutil
 import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,10 @@ import pytest
 from mpi4py import MPI
 from runs import ROOT, TWO_ARM, overrides, run, shell
 
+import dolfinopt as do
+from dolfinopt.cli import shared
 from dolfinopt.errors import InputError
+from dolfinopt.locks import RUN
 from dolfinopt.output.folders import RUN_FILES
 
 TINY = overrides("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
@@ -242,6 +247,18 @@ def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
 
 # -- used folders ----------------------------------------------------------------------------
 
+
+@pytest.mark.serial
+def test_the_launchers_set_up_does_not_count(monkeypatch):
+    """The launcher's process, which may have installed everything, becomes the command's."""
+    monkeypatch.setenv("DOLFINOPT_STARTED", str(time.time() + 1e3))
+    assert shared._age() == 0.0
+    monkeypatch.setenv("DOLFINOPT_STARTED", "0")
+    with_all = shared._age()
+    monkeypatch.delenv("DOLFINOPT_STARTED")
+    assert shared._age() >= with_all  # of a later moment
+
+
 USED = {
     "optimize": ["optimize", TWO_ARM, "--set", "optimizer.max_iterations=1", "--no-plots"],
     "simulate": ["simulate", TWO_ARM, "--no-plots"],
@@ -276,6 +293,81 @@ def test_results_are_replaced_only_when_asked(shared_tmp_path, name):
     if name in ("export", "gradient"):  # they write no pictures that could be stale
         own |= {"design.png", "motion.gif"}
     assert {path.name for path in folder.iterdir()} == written | own
+
+
+@pytest.mark.serial
+def test_a_run_that_cannot_begin_leaves_the_old_results(shared_tmp_path):
+    """--overwrite removes nothing before the arms are built."""
+    folder, mesh = shared_tmp_path / "o", shared_tmp_path / "bad.geo"
+    line = ["optimize", TWO_ARM, "--set", "optimizer.max_iterations=1", "--no-plots"]
+    run(*line, *TINY, "--out", folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    mesh.write_text("x = = 1;\n")
+    with pytest.raises(InputError, match="syntax error"):
+        run(*line, "--set", f"arms.mesh={mesh}", "--out", folder, "--overwrite")
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+HOLDER = """
+import pathlib, sys
+from dolfinopt.locks import working_in
+with working_in(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("command", ["optimize", "simulate"])
+def test_one_run_at_a_time_in_a_folder(optimised, tmp_path, command):
+    """Two runs with --overwrite, or --resume, wrote one history between them."""
+    folder = tmp_path / "o"
+    shutil.copytree(optimised, folder)
+    before = {path.name for path in folder.iterdir()}
+    line = [command, TWO_ARM, *SMALL, "--out", folder, "--no-plots"]
+    line += ["--set", "optimizer.max_iterations=3"]
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, folder],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert other.stdout is not None and other.stdin is not None
+    assert other.stdout.readline() == "held\n"
+    for how in ("--overwrite", *(["--resume"] if command == "optimize" else [])):
+        with pytest.raises(InputError, match=r"another run works in this folder; wait"):
+            run(*line, how)
+    assert {path.name for path in folder.iterdir()} == before | {RUN}
+    other.kill()  # whoever is killed holds nothing any more
+    other.communicate()
+    run(*line, "--overwrite")
+    assert RUN not in {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.serial
+def test_python_does_not_replace_results_either(tmp_path):
+    model = do.Model(TWO_ARM, *TINY[1::2], "optimizer.max_iterations=1")
+    model.optimize(tmp_path)
+    before = (tmp_path / "history.csv").read_bytes()
+    for again in (model.optimize, partial(do.optimize, model.scene)):
+        with pytest.raises(InputError, match="holds results already"):
+            again(tmp_path)
+    assert (tmp_path / "history.csv").read_bytes() == before
+    assert model.optimize(tmp_path, overwrite=True).iterations == 1
+    with pytest.raises(InputError, match="expected only one of them"):
+        model.optimize(tmp_path, overwrite=True, resume=True)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("command", ["optimize", "simulate"])
+def test_files_that_the_scene_reads_stay(tmp_path, command):
+    table = tmp_path / "trajectory.csv"
+    table.write_text("t, x, y\n0, -0.9, 0\n1, 0, 0.5\n1.9, 0.9, 0\n")
+    before = table.read_bytes()
+    words = overrides("motion.path=points", f"motion.file={table}")
+    with pytest.raises(InputError, match=r"trajectory\.csv: the scene reads this file \(motion"):
+        run(command, TWO_ARM, *TINY, *words, "--out", tmp_path, "--overwrite")
+    assert table.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
 def test_every_file_of_a_run_is_known(optimised):

@@ -14,7 +14,7 @@ from runs import ROOT, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
-from dolfinopt.cli.export_robot import link_inertia
+from dolfinopt.cli.export_robot import _check_robot, link_inertia
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
 from dolfinopt.exchange.urdf.checks import implausible_inertias
@@ -182,6 +182,30 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     total = sum(link.own.mass for link in again.links.values())
     rest = sum(link.own.mass for name, link in before.links.items() if name != "forearm")
     assert total == pytest.approx(rest + summary["mass"]["forearm"], rel=1e-9)
+
+
+def test_a_robot_is_never_replaced_by_the_new_one(tmp_path):
+    """--overwrite in the folder of the source deleted it."""
+    source = tmp_path / "robot"
+    source.mkdir()
+    file = source / "robot.urdf"
+    file.write_bytes(DEMO.read_bytes())
+    run_import(file, "forearm", DEMO_MOTION, tmp_path / "a")
+    coarse = ("--set", "arms.forearm.cells=[12,4,4]", "--set", "simulation.tolerance=1e-2",
+              "--no-plots")  # fmt: skip
+    run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
+    for words in ((), ("--overwrite",)):
+        with pytest.raises(InputError, match=r"the robot is read from this file.*name another"):
+            run("export", tmp_path / "run", "--urdf", "--out", source, *words)
+    assert [path.name for path in source.iterdir()] == ["robot.urdf"]
+    mesh = source / "forearm.stl"
+    trimesh.creation.box(extents=(0.1, 0.1, 0.8)).export(mesh)
+    shape = '<geometry><cylinder radius="0.055" length="0.84"/></geometry>'
+    (tmp_path / "robot.urdf").write_text(
+        DEMO.read_text().replace(shape, '<geometry><mesh filename="robot/forearm.stl"/></geometry>')
+    )
+    with pytest.raises(InputError, match=r"forearm\.stl: the robot is read"):
+        _check_robot(tmp_path / "robot.urdf", source, ["forearm.stl"])
 
 
 def test_before_and_after():

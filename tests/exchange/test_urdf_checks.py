@@ -188,6 +188,10 @@ def test_meshes_that_are_none(tmp_path):
         assert not forearm.measured and forearm.size == pytest.approx([0.07287] * 2)
 
 
+ENTITIES = """<!DOCTYPE robot [<!ENTITY other SYSTEM "file:///etc/hostname">]>
+<robot name="a"><link name="b">&other;</link></robot>"""
+
+
 def test_files_that_are_no_robots(tmp_path):
     file = tmp_path / "r.urdf"
     with pytest.raises(InputError, match=r"r\.urdf: cannot be read"):
@@ -196,10 +200,27 @@ def test_files_that_are_no_robots(tmp_path):
         ("<robot", "not XML"),
         ('<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"/>', "xacro"),
         ("<sdf/>", "expected an element <robot name"),
+        (ENTITIES, "declares XML entities"),
     ):
         file.write_text(text)
         with pytest.raises(InputError, match=message):
             read_robot(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "new"),
+    [
+        ("panda.urdf", "panda-plain.urdf"),
+        ("panda.urdf.xacro", "panda.urdf"),
+        ("panda.xacro", "panda.urdf"),
+    ],
+)
+def test_a_remedy_does_not_overwrite_the_file(tmp_path, name, new):
+    """`xacro panda.urdf > panda.urdf` would leave an empty file."""
+    file = tmp_path / name
+    file.write_text('<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"/>')
+    with pytest.raises(InputError, match=rf"xacro {name} > {new}$"):
+        read_robot(file)
 
 
 def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):

@@ -22,6 +22,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.output.folders import remove_stale_parts, stale_parts
 
 pytestmark = pytest.mark.serial
 
@@ -234,6 +235,41 @@ def test_bad_values_are_refused(tmp_path, words, reason):
     assert not (folder / "part").exists()
 
 
+def test_parts_of_another_design(tmp_path, capsys):
+    """A new design takes its folder's old parts away; those elsewhere are told when read."""
+    folder, other = folder_with(tmp_path / "run", frame), tmp_path / "other"
+    run("part", folder, *PLAIN)
+    run("part", folder, *PLAIN, "--out", other)
+    (folder / "part" / "note.txt").write_text("mine")
+    assert stale_parts(folder / "part") == stale_parts(other) == ""
+    assert remove_stale_parts(folder) == ""
+    with np.load(folder / "design.npz") as data:
+        arrays = {key: 0.5 * value if "density" in key else value for key, value in data.items()}
+    np.savez(folder / "design.npz", **arrays)
+    small = ["--set", "simulation.tolerance=1e-1", "--set", "motion.horizon=1.9", "--no-plots"]
+    run("simulate", other / "part.toml", *small, "--out", tmp_path / "simulated")
+    told = capsys.readouterr().err
+    assert f"warning: {other}: parts of another design than {folder / 'design.npz'}" in told
+    assert f"dolfinopt part {folder} --overwrite" in told
+    run("simulate", other / "part.toml", *small, "--out", folder, "--overwrite")
+    assert "removed, its parts were of another design" in capsys.readouterr().err
+    assert [path.name for path in (folder / "part").iterdir()] == ["note.txt"]
+
+
+def test_parts_do_not_replace_what_their_scene_reads(tmp_path):
+    """--overwrite would delete the mesh of the arm."""
+    (tmp_path / "out").mkdir()
+    mesh = shutil.copy(BORES, tmp_path / "out" / "bar.geo")
+    folder = folder_with(tmp_path / "run", frame, f"arms.0.mesh={mesh}", "arms.0.mesh_size=0.02")
+    summary = json.loads((folder / "summary.json").read_text())
+    mesh.rename(mesh.with_name("arm1.step"))
+    summary["scene"]["arms"][0]["mesh"] = str(mesh.with_name("arm1.step"))
+    (folder / "summary.json").write_text(json.dumps(summary))
+    with pytest.raises(InputError, match=r"arm1\.step: the scene reads this file \(arms\.0\.mesh"):
+        run("part", folder, *PLAIN, "--out", tmp_path / "out", "--overwrite")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["arm1.step"]
+
+
 def test_folder_without_a_design_is_refused(tmp_path):
     done = shell("part", tmp_path)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
@@ -296,10 +332,10 @@ def test_files_are_there_all_or_none(tmp_path, monkeypatch):
         place.mkdir(parents=True)
         for name in names:
             (place / name).write_text(str(place))
-    files.publish(made, folder, names)
-    assert {path.name: path.read_text() for path in folder.iterdir()} == dict.fromkeys(
-        names, str(made)
-    )
+    files.publish(made, folder, names, {"name": "a"}, None)
+    found = {path.name: path.read_text() for path in folder.iterdir()}
+    assert json.loads(found.pop("part.json")) == {"name": "a", "files": sorted(names)}
+    assert found == dict.fromkeys(names[1:], str(made))
 
     def full(source, target):
         if target.name == "part.toml":
@@ -309,7 +345,7 @@ def test_files_are_there_all_or_none(tmp_path, monkeypatch):
     replace = files.os.replace
     monkeypatch.setattr(files.os, "replace", full)
     with pytest.raises(OutputError, match="No space left"):
-        files.publish(made, folder, names)
+        files.publish(made, folder, names, {}, None)
     assert [path.name for path in folder.iterdir()] == ["arm1.svg"]
 
 

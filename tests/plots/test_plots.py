@@ -348,6 +348,19 @@ def test_limits_have_panels_in_millimetres_and_megapascals():
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("size", [1e-7, 1e-5, 0.3, 50.0])  # m
+def test_the_picture_of_the_deviation_holds_its_labels(size):
+    t = np.linspace(0.0, 3.0, 301)
+    deviation = size * np.stack([np.sin(7.0 * t), np.cos(7.0 * t) - 1.0], axis=1)
+    figure = curves.deviation_figure(t, deviation, 1.3 * deviation)
+    figure.canvas.draw()
+    width, height = figure.canvas.get_width_height()
+    axes = figure.axes[0]
+    for text in (axes.yaxis.label, axes.xaxis.label, axes.title, *axes.texts):
+        box = text.get_window_extent()
+        assert box.x0 >= 0.0 and box.y0 >= 0.0 and box.x1 <= width and box.y1 <= height
+
+
 def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
     t = np.linspace(0.0, 3.0, 301)
     optimised = 0.007 * np.sin(t)[:, None] * [0.6, 0.8]

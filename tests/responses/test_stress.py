@@ -267,6 +267,38 @@ def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert rates(value, slope, (4e-3, 1e-3)) == pytest.approx(2.0, abs=0.04)
 
 
+@pytest.mark.parametrize(
+    "keys",
+    [
+        ('scenarios=[{changes=["payload.mass=9"]},{changes=["payload.mass=0.05"]}]',),
+        (
+            "objective.stress_exponent=16",
+            "motion.duration=1.5",
+            "simulation.sample=0.2",
+            "objective.load_cases=5",
+        ),  # the largest stress lies between the instants summed
+    ],
+    ids=["unequal payloads", "p = 16"],
+)
+def test_exact_gradient_of_few_instants(keys: tuple[str, ...]) -> None:
+    """A scenario may have no instant whose stress counts; all of them together have one."""
+    built = build(*QUICK, "objective.kind=stress", *keys)
+    x, d = built.fields(lambda k, x, y: 0.8 + 0.1 * x), built.fields(uneven)
+    one = Analysed(built, x)
+    chosen = [c for each in one.response._found(one.analysis).chosen.values() for c in each]
+    assert any(len(c.instants) for c in chosen)
+    assert "scenarios" not in keys[0] or any(not len(c.instants) for c in chosen)
+    slope = built.dot(one.gradient(), d)
+
+    def value(h: float) -> float:
+        return Analysed(built, {k: x[k] + h * d[k] for k in x}).measure().smooth[0]
+
+    h = 1e-4
+    # Instants near the limit of those that count come and go.
+    assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
+    assert value(0.0) > 0.0
+
+
 @pytest.mark.parametrize("kind", ["control", "slider"])
 def test_exact_gradient_of_machines(kind: str) -> None:
     """Loads through free rigid coordinates and the closure's force are differentiated, too."""

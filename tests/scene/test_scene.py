@@ -497,6 +497,8 @@ BAD_VALUES = [
     ("arms.0.name", "12", '"12"', "not a digit"),
     ("arms.0.name", 65 * "a", 65 * "a", "1 to 64"),
     ("arms.0.name", "ARM2", '"arm2"', "no other arm has"),
+    ("arms.0.name", "arm2_face", '"arm2"', "files of both parts would have one name"),
+    ("arms.1.name", "Arm1_R12", '"Arm1_R12"', "files of both parts would have one name"),
     ("arms.0.length", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
     ("arms.0.design", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
     ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
@@ -672,11 +674,20 @@ BAD_VALUES = [
     ("arms", [], "[]", "an array of tables [[arms]], at least one"),
     ("arms.1", "arm2", '"arm2"', "a table with the keys name, length"),
 ]
+
+
 # Where two keys contradict each other the message may show the other one.
+def test_more_arms_than_any_machine_has():
+    """They were read for half a minute without a word."""
+    with pytest.raises(InputError, match="arms: 1001 of them, expected at most 1000"):
+        scene_from_dict(minimal(1001))
+
+
 SHOWN_KEY = {
     ("design.volume_fraction", 5e-4): "design.minimum",
     ("design.initial", 1e-3): "design.minimum",
     ("arms.0.name", "ARM2"): "arms.1.name",
+    ("arms.0.name", "arm2_face"): "arms.1.name",
     ("motion.path", "joints"): "motion.file",
     ("material.name", "stone"): "material",
 }
@@ -1364,7 +1375,10 @@ def test_who_owns_which_design():
     ("arm", "reason"),
     [
         ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
-        ({"design": "arm1", "density": 1.0}, "arms.1.density (arm2) = 1.0: expected None as arm1"),
+        (
+            {"design": "arm1", "density": 1.0},
+            "arms.1.density (arm2) = 1.0: expected no value, as in arm1",
+        ),
         (
             {"design": "arm1", "rigid": True},
             "only one of design, pattern, rigid and sid, found design and",

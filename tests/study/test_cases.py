@@ -137,20 +137,6 @@ def test_files_of_the_scene_count_by_content(tmp_path):
     assert key(tmp_path / "a.csv") != key(tmp_path / "b.csv")
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_merged_geometry_counts(tmp_path):
-    (tmp_path / "arm.geo").write_text('Include "part.geo";\n')
-    (tmp_path / "part.geo").write_text("a = 1;\n")
-
-    def key():
-        return Case(scene(f'arms.mesh="{tmp_path}/arm.geo"')).key
-
-    before = key()
-    assert key() == before
-    (tmp_path / "part.geo").write_text("a = 2;\n")
-    assert key() != before
-
-
 # -- doing them ------------------------------------------------------------------------------
 
 

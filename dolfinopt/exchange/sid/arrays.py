@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -56,7 +55,7 @@ def read_sid_npz(path: Path) -> StandardInputData:
         return _from_arrays(arrays)
     except KeyError as error:
         raise InputError(f"{path}: the array {error.args[0]!r} is missing") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # whatever a foreign file may raise
         problem = getattr(error, "strerror", None) or type(error).__name__
         raise InputError(f"{path}: cannot be read ({problem}); give an .sid.npz file") from None
 

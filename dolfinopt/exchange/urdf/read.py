@@ -83,20 +83,39 @@ def _quiet() -> Iterator[None]:
             one.setLevel(level)
 
 
+def safe_xml(file: Path, **options: Any) -> Any:
+    """Return the lxml tree of a file, which may not name other files or text that grows.
+
+    Raises:
+        InputError: it declares entities.
+        OSError, etree.XMLSyntaxError: it cannot be read, or is no XML.
+    """
+    from lxml import etree
+
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, **options)
+    tree = etree.parse(os.fspath(file), parser)
+    declared = tree.docinfo.internalDTD
+    if declared is not None and any(True for _ in declared.iterentities()):
+        raise InputError(f"{file}: declares XML entities, which no robot needs; write them out")
+    return tree
+
+
 def _parse(file: Path) -> bytes:
     """Return the file's XML, which is that of a robot."""
     from lxml import etree
 
     try:
-        root = etree.parse(os.fspath(file), etree.XMLParser(remove_blank_text=True)).getroot()
+        root = safe_xml(file, remove_blank_text=True).getroot()
     except OSError as error:
         reason = error.strerror or "no such file"
         raise InputError(f"{file}: cannot be read ({reason}); name a URDF file") from None
     except etree.XMLSyntaxError as error:
         raise InputError(f"{file}: not XML ({error.msg}); name a URDF file") from None
     if any("xacro" in str(uri) for uri in root.nsmap.values()) or file.suffix == ".xacro":
+        stem = file.name.removesuffix(".xacro").removesuffix(".urdf")
+        new = f"{stem}.urdf" if f"{stem}.urdf" != file.name else f"{stem}-plain.urdf"
         raise InputError(
-            f"{file}: a xacro file; make a URDF of it first: xacro {file.name} > {file.stem}.urdf"
+            f"{file}: a xacro file; make a URDF of it first: xacro {file.name} > {new}"
         )
     if root.tag != "robot" or "name" not in root.attrib:
         raise InputError(f"{file}: expected an element <robot name=...>, found <{root.tag}>")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dolfinopt.errors import InputError
+from dolfinopt.exchange.urdf.read import safe_xml
 from dolfinopt.exchange.urdf.robot import Inertia
 
 INDENT = "  "
@@ -43,7 +44,7 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
     from lxml import etree
 
     try:
-        tree = etree.parse(os.fspath(file))
+        tree = safe_xml(file)
     except (OSError, etree.XMLSyntaxError) as error:
         raise InputError(f"{file}: cannot be read ({error}); --urdf needs the robot") from None
     by_name = {one.get("name"): one for one in tree.getroot().iterfind("link")}

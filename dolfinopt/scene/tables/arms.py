@@ -39,6 +39,8 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
+MAX_ARMS = 1000  # every arm is checked beside all others
+PART_FILES = ("_face", "_r12")  # behind an arm's name in files of its part
 STEP_FILES = (".step", ".stp")
 MESH_FILES = (".geo", ".msh", *STEP_FILES)
 
@@ -465,6 +467,8 @@ class Arm(Table):
         # Some file systems do not tell capitals apart.
         if self.name.casefold() in (arm.name.casefold() for arm in before):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
+        if not scene.is_spatial:
+            self._check_files(before, at)
         if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "
@@ -478,6 +482,18 @@ class Arm(Table):
             self._check_pattern(before, at)
         if self.design is not None:
             self._check_shared(before, at)
+
+    def _check_files(self, before: tuple[Arm, ...], at: Loc) -> None:
+        """Refuse a name with which two files of a part would be one, such as a_face.step."""
+        own = self.name.casefold()
+        for other in (arm.name.casefold() for arm in before):
+            for longer, shorter in ((own, other), (other, own)):
+                if longer.removeprefix(shorter) in PART_FILES:
+                    raise Refusal(
+                        f"expected a name that is not another arm's with {' or '.join(PART_FILES)} "
+                        "behind it: files of both parts would have one name",
+                        (*at, "name"),
+                    )
 
     def _check_inertia(self, scene: Scene, at: Loc) -> None:
         """Refuse what a rigid arm in the plane cannot have, and inertia that no body has."""
@@ -507,8 +523,11 @@ class Arm(Table):
                 key not in ("name", "design", "pattern", *JOINT_KEYS)
                 and getattr(self, key) != value
             ):
+                expected = f"{shown(value)} as {self.design} has"
+                if value is None:
+                    expected = f"no value, as in {self.design}"
                 raise Refusal(
-                    f"expected {shown(value)} as {self.design} has, whose design it shares",
+                    f"expected {expected}, whose design it shares",
                     (*at, key),
                     (*at, "design"),
                 )
