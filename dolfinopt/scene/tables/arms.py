@@ -48,7 +48,7 @@ JOINT_KEYS = (
     "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
     "joint_damping",
 )  # fmt: skip
-MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape")
+MESH_KEYS = ("cells", "mesh", "mesh_size", "cell_shape", "interface_offset")
 # never taken from the arm before
 OWN_KEYS = (
     "name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
@@ -96,6 +96,12 @@ class Arm(Table):
         default=None,
         description="cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
         "a solid, with a .msh file, too [-]",
+    )
+    interface_offset: Length | None = Field(
+        default=None,
+        description="how far the middles of a solid mesh file's interfaces may lie from the joints "
+        "at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: a twentieth of "
+        "the larger of height and thickness [m]",
     )
     element: ElementName | None = Field(
         default=None,
@@ -303,10 +309,12 @@ class Arm(Table):
     @model_validator(mode="after")
     def _check_mesh(self) -> Arm:
         if self.mesh is None:
-            for key in ("mesh_size", "cell_shape"):
+            for key in ("mesh_size", "cell_shape", "interface_offset"):
                 if getattr(self, key) is not None:
                     raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
             return self
+        if self.interface_offset is not None and not self.is_solid:
+            raise Refusal("expected only with the mesh of a solid arm", ("interface_offset",))
         if self.cells is not None:
             raise Refusal(
                 "expected either cells (a rectangular arm) or mesh (a file), not both",
