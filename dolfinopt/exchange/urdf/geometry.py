@@ -29,19 +29,24 @@ CELLS = 6000  # of a solid, about
 MOST = 20000  # of one with thin walls
 FEWEST = 4  # cells over the smaller of height and thickness
 FINE = 3  # voxels along the side of a cell
+VOXELS = 1e7  # of a link, at most
 COARSE = 64  # voxels along a link where its volume is estimated
+MANY = 300  # pieces of a surface from which on it is filled as it is, not piece by piece
 TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
 GAP = 0.02  # of the link's size: half of the widest gap that a closing bridges
 SAMPLES = 12  # points on the surface of an open piece for each voxel that it passes
 SHORTEST = 0.4  # of the distance between the joints that the geometry must bridge to be cut there
 MARGIN = 0.03  # of that distance, which is cut off where the geometry ends before a joint
+KEPT_ALL = 0.995  # share of the largest piece from which on nothing is said of the others
 WHOLE = 0.5  # share of the geometry between the joints that the largest piece must have
 BETWEEN = 0.6  # share of a link's volume that must lie between its joints for it to be cut there
 KEPT = 0.85  # share of the volume that the cells must have
 FULL = 0.5  # share of a cube from which on it is a cell
-NEAR = 0.5  # of the link's size: how far a joint may be from the geometry
+NEAR = 0.5  # of the link's size or length: how far a joint may be from the geometry
 PATCH = 0.04  # share of the outer facets that are an interface where the link is not cut
-LEAST = 0.3  # of a cube's: Jacobian at a corner of a cell whose corners were moved
+LONGEST = 0.9  # of the side of a cell: move of a corner
+EASED = 0.85  # share of a move that is left where it spoils a cell, again and again
+LEAST = 0.15  # of a cube's: Jacobian at a corner of a cell whose corners were moved
 # Corners of a cube in the order of Gmsh's hexahedron, and its six sides, seen from outside.
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0],
                     [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # fmt: skip
@@ -112,6 +117,15 @@ class _Grid:
     step: float
     shape: tuple[int, int, int]
 
+    def around(self, box: np.ndarray, margin: int) -> tuple[_Grid, tuple[slice, slice, slice]]:
+        """Return these voxels continued beyond a box (2, 3), and where they are among them."""
+        high = self.low + self.step * np.array(self.shape)
+        before = np.maximum(np.ceil((self.low - box[0]) / self.step), 0).astype(int) + margin
+        after = np.maximum(np.ceil((box[1] - high) / self.step), 0).astype(int) + margin
+        a, b, c = (int(n) for n in before + np.array(self.shape) + after)
+        i, j, k = (slice(int(n), int(n) + m) for n, m in zip(before, self.shape, strict=True))
+        return _Grid(self.low - before * self.step, self.step, (a, b, c)), (i, j, k)
+
     def filled_by(self, closed: Trimesh) -> np.ndarray:
         """Return True for the voxels whose middle lies within a closed surface."""
         import pyvista
@@ -166,17 +180,40 @@ class _Pieces:
 
     def _within_open(self, grid: _Grid, closed: np.ndarray) -> np.ndarray:
         """Return True for the voxels within the open surfaces, with the closed ones' help."""
-        shell = np.zeros(grid.shape, dtype=bool)
-        for one in self.open:
-            shell |= grid.passed_by(one)
         radius = max(1, round(GAP * float(np.ptp(self.bounds, axis=0).max()) / grid.step))
-        wide = np.pad(shell | closed, radius + 1)
-        wide = ndimage.binary_dilation(wide, iterations=radius)
-        wide = ndimage.binary_fill_holes(wide)
-        wide = ndimage.binary_erosion(wide, iterations=radius)
-        inner = slice(radius + 1, -radius - 1)
+        # All of it is needed: what is cut off closes what is left.
+        whole, inner = grid.around(self.bounds, radius + 1)
+        shell = np.zeros(whole.shape, dtype=bool)
+        shell[inner] = closed
+        for one in self.open:
+            shell |= whole.passed_by(one)
+        shell = ndimage.binary_dilation(shell, iterations=radius)
+        shell = ndimage.binary_fill_holes(shell)
+        shell = ndimage.binary_erosion(shell, iterations=radius)
         # A sheet that encloses nothing has no volume.
-        return np.asarray(ndimage.binary_opening(wide[inner, inner, inner], iterations=1))
+        return np.asarray(ndimage.binary_opening(shell, iterations=1)[inner])
+
+    def distance(self, points: np.ndarray, near: float) -> np.ndarray:
+        """Return the signed distance (n,) from closed pieces, positive outside, m; far: `near`."""
+        found = np.full(len(points), near)
+        for pieces, sign in ((self.closed, 1.0), (self.hollows, -1.0)):
+            for one in pieces:
+                low, high = one.bounds
+                at = ((points > low - near) & (points < high + near)).all(axis=1)
+                own = sign * _distance(one, points[at])
+                found[at] = np.minimum(found[at], own) if sign > 0 else np.maximum(found[at], own)
+        return found
+
+
+def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
+    """Return the signed distance (n,) of points from a closed surface, negative inside, m."""
+    import pyvista
+
+    if not len(points):
+        return np.zeros(0)
+    surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+    found = pyvista.PolyData(points).compute_implicit_distance(surface)
+    return np.asarray(found["implicit_distance"])
 
 
 def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCells:
@@ -194,25 +231,24 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
         NoSolid: there is no geometry, it encloses nothing, or is too thin for cells.
     """
     pieces = _pieces(shapes, inverse(body.frame))
-    low, high = pieces.bounds
-    step = float((high - low).max()) / COARSE
-    first, _ = _region(pieces, _grid(low, high, step), None)
-    ends, notes = _ends(float(low[0]), float(high[0]), body.length), list(pieces.done)
-    volume = float(first.sum()) * step**3
-    between = 0.0 if ends is None else _cut(pieces, ends, step)
-    if ends is not None and between > BETWEEN * volume:
-        volume = between
+    piece = _largest(pieces)
+    notes, ends = list(pieces.done), _ends(*piece.box[:, 0], body.length)
+    between = None if ends is None else _between(pieces, piece, ends)
+    if ends is not None and between is not None and between.volume > BETWEEN * piece.volume:
+        piece = between
         notes += _shortened(ends, body.length)
     else:
-        near = [_away(first, low, step, x) for x in (0.0, body.length)]
-        if max(near) > NEAR * float((high - low).max()):
-            raise NoSolid(f"its geometry is {max(near):.3g} m away from a joint")
         notes.append("not cut at the joints: rigid where it is nearest to them")
         ends = None
+    away = max(piece.away(x) for x in (0.0, body.length))
+    if away > NEAR * max(piece.size, body.length):
+        raise NoSolid(f"its geometry is {away:.3g} m away from a joint")
+    if piece.share < KEPT_ALL:
+        notes.append(f"the largest part kept, {100.0 * piece.share:.3g} % of it")
     count = CELLS
     while count <= MOST:
-        side = (volume / count) ** (1.0 / 3.0)
-        cells = _cells(pieces, ends, side, body.length, notes)
+        side = (piece.volume / count) ** (1.0 / 3.0)
+        cells = _cells(pieces, piece.box, ends, side, body.length, notes)
         if cells is not None:
             return cells
         count = round(1.5 * count)
@@ -236,16 +272,20 @@ def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
         if shape.is_volume and shape.body_count == 1:
             closed.append(shape)
             continue
-        own = list(shape.split(only_watertight=False))
+        if shape.body_count > MANY:
+            left.append(shape)
+            continue
+        own = list(shape.split(only_watertight=False, repair=False))
         is_solid = shape.is_volume  # its pieces turned inwards are hollows
         for one in own:
             if np.ptp(one.bounds, axis=0).max() < TINY * size:
                 dropped += 1
             elif one.is_watertight:
                 if is_solid and one.volume < 0.0 and _lies_in_another(one, own):
+                    one.invert()
                     hollows.append(one)
                 else:
-                    turned += int(not one.is_winding_consistent or one.volume < 0.0)
+                    turned += int(_turn_outwards(one))
                     closed.append(one)
             elif (whole := _with_holes_closed(one)) is not None:
                 filled += 1
@@ -292,6 +332,18 @@ def _lies_in_another(one: Trimesh, pieces: Sequence[Trimesh]) -> bool:
     )
 
 
+def _turn_outwards(piece: Trimesh) -> bool:
+    """Turn the triangles of a closed piece outwards; return whether there was need to."""
+    from trimesh import repair
+
+    if piece.is_winding_consistent and piece.volume > 0.0:
+        return False
+    repair.fix_winding(piece)
+    if piece.volume < 0.0:
+        piece.invert()
+    return True
+
+
 def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     """Return a piece with its holes closed by VTK; None where it stays open."""
     import pyvista
@@ -301,7 +353,10 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     surface = pyvista.PolyData.from_regular_faces(piece.vertices, piece.faces)
     found = surface.fill_holes(wide).triangulate()
     whole = trimesh.Trimesh(found.points, found.regular_faces, process=True)
-    return whole if whole.is_watertight and len(whole.faces) > 3 else None
+    if not whole.is_watertight or len(whole.faces) < 4:
+        return None
+    _turn_outwards(whole)
+    return whole
 
 
 # -- where it is cut -------------------------------------------------------------------------
@@ -340,15 +395,66 @@ def _ends(low: float, high: float, length: float) -> tuple[float, float] | None:
     return (first, last) if last - first > SHORTEST * length else None
 
 
-def _cut(pieces: _Pieces, ends: tuple[float, float], step: float) -> float:
-    """Return the volume of the piece that leads from one end to the other; 0 without one."""
-    low, high = (one.copy() for one in pieces.bounds)
-    low[0], high[0] = ends
-    step = (ends[1] - ends[0]) / max(8, round((ends[1] - ends[0]) / step))
-    region, share = _region(pieces, _grid(low, high, step), ends)
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """The largest piece of a link on a coarse grid, its share; its box (2, 3) to a voxel."""
+
+    region: np.ndarray
+    share: float
+    grid: _Grid
+    box: np.ndarray
+
+    @property
+    def volume(self) -> float:
+        return float(self.region.sum()) * self.grid.step**3
+
+    @property
+    def size(self) -> float:
+        return float(np.ptp(self.box, axis=0).max())
+
+    def away(self, x: float) -> float:
+        """Return the distance from a joint at (x, 0, 0), m."""
+        middles = self.grid.low + (np.argwhere(self.region) + 0.5) * self.grid.step
+        return float(np.linalg.norm(middles - [x, 0.0, 0.0], axis=1).min())
+
+
+def _piece(region: np.ndarray, share: float, grid: _Grid, box: np.ndarray) -> _Piece:
+    """Return a piece with its box, within that of what was looked at."""
+    where = np.argwhere(region)
+    low = grid.low + where.min(axis=0) * grid.step
+    high = grid.low + (where.max(axis=0) + 1) * grid.step
+    # Half a voxel is lost where a surface passes beyond the middles of voxels.
+    low[1:], high[1:] = low[1:] - grid.step, high[1:] + grid.step
+    return _Piece(
+        region, share, grid, np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
+    )
+
+
+def _largest(pieces: _Pieces) -> _Piece:
+    """Return the largest piece; looked at again where it is much smaller than what there is."""
+    box, share = pieces.bounds, 1.0
+    for _ in range(4):
+        size = float(np.ptp(box, axis=0).max())
+        grid = _grid(box[0], box[1], size / COARSE)
+        region, now = _region(pieces, grid, None)
+        share = min(share, now)
+        found = _piece(region, share, grid, box)
+        if found.size > 0.7 * size:
+            break
+        box = found.box
+    return found
+
+
+def _between(pieces: _Pieces, whole: _Piece, ends: tuple[float, float]) -> _Piece | None:
+    """Return the piece that leads from one end to the other; None without one."""
+    box = whole.box.copy()
+    box[:, 0] = ends
+    along = ends[1] - ends[0]
+    grid = _grid(box[0], box[1], along / max(8, round(along / whole.grid.step)))
+    region, share = _region(pieces, grid, ends)
     if share < WHOLE or not (region[2].any() and region[-3].any()):
-        return 0.0
-    return float(region.sum()) * step**3
+        return None
+    return _piece(region, share * whole.share, grid, box)
 
 
 def _shortened(ends: tuple[float, float], length: float) -> list[str]:
@@ -357,40 +463,29 @@ def _shortened(ends: tuple[float, float], length: float) -> list[str]:
     return [f"ends {gap:.3g} m before the {name} joint" for name, gap in gaps if gap > 0.0]
 
 
-def _away(region: np.ndarray, low: np.ndarray, step: float, x: float) -> float:
-    """Return the distance of a joint from a region of `_grid`, m, about."""
-    middles = _middles(region, low, step)
-    return float(np.linalg.norm(middles - [x, 0.0, 0.0], axis=1).min())
-
-
-def _middles(region: np.ndarray, low: np.ndarray, step: float) -> np.ndarray:
-    return np.asarray(low + (np.argwhere(region) - 1.5) * step)
-
-
 # -- cells -----------------------------------------------------------------------------------
 
 
 def _cells(
     pieces: _Pieces,
+    box: np.ndarray,
     ends: tuple[float, float] | None,
     side: float,
     length: float,
     notes: Sequence[str],
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
-    low, high = (one.copy() for one in pieces.bounds)
-    if ends is not None:
-        low[0], high[0] = ends
+    low, high = box
     side = min(side, float((high - low)[1:].min()) / FEWEST)
     if ends is not None:
         side = (ends[1] - ends[0]) / max(FEWEST, round((ends[1] - ends[0]) / side))
     blocks = np.ceil((high - low) / side - 1e-6).astype(int)
     start = 0.5 * (low + high) - 0.5 * blocks * side
-    if blocks.prod() * FINE**3 > 3e7:
+    if blocks.prod() * FINE**3 > VOXELS:
         return None
     along, over, through = (int(FINE * n) for n in blocks)
     fine = _Grid(start, side / FINE, (along, over, through))
-    region, share = _region(pieces, fine, ends)
+    region, _ = _region(pieces, fine, ends)
     pooled = region.reshape(blocks[0], FINE, blocks[1], FINE, blocks[2], FINE).mean(axis=(1, 3, 5))
     labels, count = ndimage.label(pooled >= FULL)
     if not count:
@@ -414,10 +509,8 @@ def _cells(
     else:
         patches = _nearest(points, facets, length)
     held = [np.unique(one) for one in patches]
-    points = _on_surface(points, cells, facets, region, fine, held, ends is not None)
-    lost = 1.0 - share
-    more = [f"the largest piece kept, {100 * share:.3g} %"] if lost > 1e-3 else []
-    return LinkCells(points, cells, patches[0], patches[1], side, (*notes, *more))
+    points = _on_surface(pieces, points, cells, facets, region, fine, held, ends is not None)
+    return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
 
 
 def _facets(solid: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -452,6 +545,7 @@ def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.n
 
 
 def _on_surface(
+    pieces: _Pieces,
     points: np.ndarray,
     cells: np.ndarray,
     facets: np.ndarray,
@@ -462,7 +556,8 @@ def _on_surface(
 ) -> np.ndarray:
     """Move the outer points onto the surface, as far as the cells stay good.
 
-    The distance from the surface comes from the voxels. Points of flat ends stay in their plane.
+    The way comes from the voxels, and how far from the surfaces of closed pieces; where there are
+    open ones from the voxels, too. Points of flat ends stay in their plane.
     """
     pad = 2
     # Beyond a flat end the geometry goes on: there its surface is no surface.
@@ -480,21 +575,23 @@ def _on_surface(
         free[np.isin(outer, np.concatenate(held)), 0] = 0.0
     for _ in range(4):
         at = ((moved - grid.low) / grid.step - 0.5 + pad).T
-        value = ndimage.map_coordinates(away, at, order=1, mode="nearest")
         slope = np.stack([ndimage.map_coordinates(g, at, order=1, mode="nearest") for g in slopes])
-        way = (slope * slope).sum(axis=0)
-        step = -value / np.maximum(way, 0.25) * slope
-        moved += step.T * free
+        way = slope.T * free
+        if pieces.open:
+            value = ndimage.map_coordinates(away, at, order=1, mode="nearest")
+        else:
+            value = pieces.distance(moved, FINE * grid.step)
+        moved -= (value / np.maximum((way * slope.T).sum(axis=1), 0.25))[:, None] * way
     shift = np.zeros_like(points)
     shift[outer] = moved - points[outer]
     longest = np.linalg.norm(shift, axis=1, keepdims=True)
     cell = FINE * grid.step
-    shift *= np.minimum(1.0, 0.6 * cell / np.maximum(longest, 1e-30))
-    for _ in range(8):
+    shift *= np.minimum(1.0, LONGEST * cell / np.maximum(longest, 1e-30))
+    for _ in range(20):
         bad = _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3
         if not bad.any():
             return np.asarray(points + shift)
-        shift[np.unique(cells[bad])] *= 0.5
+        shift[np.unique(cells[bad])] *= EASED
     shift[np.unique(cells[bad])] = 0.0
     while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3).any():
         shift[np.unique(cells[bad])] = 0.0
