@@ -153,7 +153,7 @@ def check_limits(summary, file):
     found = summary["joint_limits"]
     assert set(found) == set(summary["drive_peak"])
     for name, limits in found.items():
-        force, q = rows[f"joint_force_{name}"].abs(), rows[name]
+        force, q = rows[f"joint_force_{name}"].abs(), rows[f"q_r_{name}"]
         one = limits["effort"]
         assert one["value"] == pytest.approx(force.max(), rel=1e-3)  # instants beside the file's
         assert one["instant"] == pytest.approx(rows["t"][force.idxmax()], abs=2e-3)

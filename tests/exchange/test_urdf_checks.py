@@ -220,6 +220,8 @@ def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
     head = '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">'
     file.write_text(f'{head}<!-- <xacro:include/> --><link name="b"/></robot>')
     assert list(read_robot(file).links) == ["b"]
+    file.write_text('<robot><link name="b"/></robot>')
+    assert read_robot(file).name == "r"  # its file's, where it has none
 
 
 @pytest.mark.parametrize(

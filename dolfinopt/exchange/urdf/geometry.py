@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +34,7 @@ VOXELS = 1e7  # of a link, at most
 COARSE = 64  # voxels along a link where its volume is estimated
 MANY = 300  # pieces of a surface from which on it is filled as it is, not piece by piece
 TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
+SHELL = 128  # voxels along a link on which open pieces are filled
 GAP = 0.02  # of the link's size: half of the widest gap that a closing bridges
 SAMPLES = 12  # points on the surface of an open piece for each voxel that it passes
 SHORTEST = 0.4  # of the distance between the joints that the geometry must bridge to be cut there
@@ -117,14 +119,17 @@ class _Grid:
     step: float
     shape: tuple[int, int, int]
 
-    def around(self, box: np.ndarray, margin: int) -> tuple[_Grid, tuple[slice, slice, slice]]:
-        """Return these voxels continued beyond a box (2, 3), and where they are among them."""
-        high = self.low + self.step * np.array(self.shape)
-        before = np.maximum(np.ceil((self.low - box[0]) / self.step), 0).astype(int) + margin
-        after = np.maximum(np.ceil((box[1] - high) / self.step), 0).astype(int) + margin
-        a, b, c = (int(n) for n in before + np.array(self.shape) + after)
-        i, j, k = (slice(int(n), int(n) + m) for n, m in zip(before, self.shape, strict=True))
-        return _Grid(self.low - before * self.step, self.step, (a, b, c)), (i, j, k)
+    def taken_from(self, other: _Grid, found: np.ndarray) -> np.ndarray:
+        """Return what is True at the middles of these voxels on another grid, False beyond it."""
+        at, inside = [], []
+        for k, count in enumerate(self.shape):
+            middle = self.low[k] + (np.arange(count) + 0.5) * self.step
+            index = np.floor((middle - other.low[k]) / other.step).astype(int)
+            inside.append((index >= 0) & (index < other.shape[k]))
+            at.append(np.clip(index, 0, other.shape[k] - 1))
+        return np.asarray(
+            found[np.ix_(*at)] & inside[0][:, None, None] & inside[1][:, None] & inside[2]
+        )
 
     def filled_by(self, closed: Trimesh) -> np.ndarray:
         """Return True for the voxels whose middle lies within a closed surface."""
@@ -175,23 +180,27 @@ class _Pieces:
         for one in self.hollows:
             found &= ~grid.filled_by(one)
         if self.open:
-            found |= self._within_open(grid, found)
+            found |= grid.taken_from(*self._within_open)
         return found
 
-    def _within_open(self, grid: _Grid, closed: np.ndarray) -> np.ndarray:
-        """Return True for the voxels within the open surfaces, with the closed ones' help."""
-        radius = max(1, round(GAP * float(np.ptp(self.bounds, axis=0).max()) / grid.step))
-        # All of it is needed: what is cut off closes what is left.
-        whole, inner = grid.around(self.bounds, radius + 1)
-        shell = np.zeros(whole.shape, dtype=bool)
-        shell[inner] = closed
+    @cached_property
+    def _within_open(self) -> tuple[_Grid, np.ndarray]:
+        """A grid about all pieces, and True for its voxels within open ones, or within closed."""
+        low, high = self.bounds
+        size = float((high - low).max())
+        radius = round(GAP * SHELL)
+        margin = (radius + 1) * size / SHELL
+        grid = _grid(low - margin, high + margin, size / SHELL)
+        shell = np.zeros(grid.shape, dtype=bool)
+        for one in self.closed:
+            shell |= grid.filled_by(one)
         for one in self.open:
-            shell |= whole.passed_by(one)
+            shell |= grid.passed_by(one)
         shell = ndimage.binary_dilation(shell, iterations=radius)
         shell = ndimage.binary_fill_holes(shell)
         shell = ndimage.binary_erosion(shell, iterations=radius)
         # A sheet that encloses nothing has no volume.
-        return np.asarray(ndimage.binary_opening(shell, iterations=1)[inner])
+        return grid, ndimage.binary_opening(shell, iterations=1)
 
     def distance(self, points: np.ndarray, near: float) -> np.ndarray:
         """Return the signed distance (n,) from closed pieces, positive outside, m; far: `near`."""
@@ -232,7 +241,7 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
     """
     pieces = _pieces(shapes, inverse(body.frame))
     piece = _largest(pieces)
-    notes, ends = list(pieces.done), _ends(*piece.box[:, 0], body.length)
+    notes, ends = list(pieces.done), _ends(piece.box, body.length)
     between = None if ends is None else _between(pieces, piece, ends)
     if ends is not None and between is not None and between.volume > BETWEEN * piece.volume:
         piece = between
@@ -387,8 +396,9 @@ def _region(
     return labels == 1 + int(sizes.argmax()), float(sizes.max() / sizes.sum())
 
 
-def _ends(low: float, high: float, length: float) -> tuple[float, float] | None:
+def _ends(box: np.ndarray, length: float) -> tuple[float, float] | None:
     """Return where along x the geometry is cut; None where it hardly lies between its joints."""
+    low, high = float(box[0, 0]), float(box[1, 0])
     margin = MARGIN * length
     first = 0.0 if low < 1e-3 * length else low + margin
     last = length if high > (1.0 - 1e-3) * length else high - margin

@@ -100,8 +100,9 @@ def _parse(file: Path) -> bytes:
     except etree.XMLSyntaxError as error:
         raise InputError(f"{file}: not XML ({error.msg}); name a URDF file") from None
     _check_expanded(file, root)
-    if root.tag != "robot" or "name" not in root.attrib:
+    if root.tag != "robot":
         raise InputError(f"{file}: expected an element <robot name=...>, found <{root.tag}>")
+    root.set("name", root.get("name") or file.stem)
     text: bytes = etree.tostring(root)
     return text
 
