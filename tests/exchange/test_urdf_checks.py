@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 
 import numpy as np
 import pytest
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
-from runs import run
+from runs import ROOT, run
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.bodies import scene_bodies
@@ -213,6 +214,15 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
         read_robot(DEMO)
     line = f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
     assert str(caught.value) == line  # an interpreter that is there, a package that pip finds
+
+
+def test_the_launcher_installs_what_import_needs():
+    """Whatever it sets up has an extra with yourdfpy."""
+    projects = re.findall(r'ensure ready\S* "(.*)"', (ROOT / "dolfinopt.sh").read_text())
+    extras = tree_of(ROOT / "pyproject.toml")["project"]["optional-dependencies"]
+    assert len(projects) == 3 and any("yourdfpy" in one for one in extras["robots"])
+    assert any("[docs,robots]" in one for one in extras["dev"])
+    assert {one.removeprefix("${here}") for one in projects} == {"[robots]", "[dev]"}
 
 
 def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
