@@ -106,7 +106,8 @@ install_packages() {
     "${apt[@]}" install --no-install-recommends "${packages[@]}"
 }
 
-# set_up STAMP PROJECT: PROJECT is what pip installs, with or without the extras for tests.
+# set_up STAMP PROJECT: PROJECT is what pip installs: with what `dolfinopt import` needs of robots,
+# or with that and what tests need.
 set_up() {
   local stamp=$1 project=$2 version
   is_ready "$stamp" && return # another call did it while this one waited for the lock
@@ -139,7 +140,7 @@ PYTHON
   step "checking the set-up" "$python" -c "import dolfinx.fem, gmsh, slepc4py, pyvista"
 
   fingerprint >"$venv/ready"
-  [ "$project" = "$here" ] || cp "$venv/ready" "$venv/ready-dev"
+  [ "$project" != "${here}[dev]" ] || cp "$venv/ready" "$venv/ready-dev"
 }
 
 # ensure STAMP PROJECT: sets up unless that was done; one call at a time.
@@ -282,7 +283,7 @@ case ${1-} in
       say "python needs a script: ./dolfinopt.sh python FILE ..."
       exit 2
     fi
-    ensure ready "$here"
+    ensure ready "${here}[robots]"
     answer_soon
     begin_clock
     [ -n "$ranks" ] || exec "$python" "$@"
@@ -290,7 +291,7 @@ case ${1-} in
     exec /usr/bin/mpirun -n "$ranks" "$python" "$@"
     ;;
   *)
-    ensure ready "$here"
+    ensure ready "${here}[robots]"
     answer_soon
     begin_clock
     # -P: a file in the current folder must not take the place of a module.

@@ -12,6 +12,7 @@ SUMMARY = {
     "settling": "m",
     "stress": "Pa",
     "mass": "kg",
+    "designed_mass": "kg",
     "grayness": "-",
     "volume_fraction": "-",
     "minimum_member_measured": "m",

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.robot import Robot
     from dolfinopt.exchange.urdf.scene import RobotScene
 
-CELLS = 6000  # of a solid that is meshed, about
-TETRAHEDRA = 8.5  # that fill the cube of their edge
-FEWEST = 4  # cells over height and thickness
 SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
@@ -44,46 +41,63 @@ SAMPLES = 2000  # at which a trajectory's rates are looked at
 @click.option(
     "--tool", metavar="LINK", help="end-effector; default: end of the chosen links' chain"
 )
+@click.option(
+    "--package-path",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="folder with ROS packages, for package:// in ROBOT; may be given several times. Then "
+    "ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders above ROBOT are looked through",
+)
 @click.option("--boxes", is_flag=True, help="solid boxes, whatever the links' geometry")
 @out_option("the scene; default: ROBOT without its ending")
 def import_robot(
-    robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool, out: Path | None
+    robot: Path,
+    links: str,
+    trajectory: Path,
+    tool: str | None,
+    package_path: tuple[Path, ...],
+    boxes: bool,
+    out: Path | None,
 ) -> None:
     """Make a scene of ROBOT, a URDF file.
 
-    The links named become solids: their geometry between the joints where it is closed, else boxes
-    to edit. The others are rigid. Inertias that cannot be are told, and so are joints beyond their
-    limits.
+    The links named become solids in their own shape, mended where it must be, or boxes to edit
+    where there is none. The others are rigid. Inertias that cannot be are told, and so are joints
+    beyond their limits.
     """
     world = start()
     from dolfinopt.parallel import together
 
     with together(world):
         if world.rank == 0:
-            _import(robot, links, trajectory, tool, boxes, out)
+            with ending_at_once():
+                model = _robot(robot, package_path)
+                found = _read(model, links, trajectory, tool, boxes)
+            _write(out or Path(robot.stem), *found)
 
 
-def _import(
-    robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool, out: Path | None
-) -> None:
-    with ending_at_once():
-        found = _read(robot, links, trajectory, tool, boxes)
-    _write(out or Path(robot.stem), *found)
+def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
+    """Return the robot, its packages looked for in folders that are there."""
+    from dolfinopt.exchange.urdf.read import read_robot
+
+    for folder in package_path:
+        if not folder.is_dir():
+            raise InputError(f"--package-path {folder}: expected a folder with ROS packages")
+    return read_robot(file, package_path)
 
 
 def _read(
-    robot: Path, links: str, trajectory: Path, tool: str | None, boxes: bool
+    model: Robot, links: str, trajectory: Path, tool: str | None, boxes: bool
 ) -> tuple[RobotScene, list[str], np.ndarray, np.ndarray]:
     """Return the scene, names of the joints that move, instants (n,) and rows (n, joints)."""
     from dolfinopt.exchange.urdf.bodies import check_links, default_tool, scene_bodies
     from dolfinopt.exchange.urdf.checks import implausible_inertias
-    from dolfinopt.exchange.urdf.read import read_robot
     from dolfinopt.exchange.urdf.scene import RobotScene, scene_names
 
-    model = read_robot(robot)
     chosen = tuple(name for word in links.split(",") if (name := word.strip()))
     if not chosen:
-        raise InputError(f"--links {links!r}: expected names of links of {robot}, A,B")
+        raise InputError(f"--links {links!r}: expected names of links of {model.file}, A,B")
     check_links(model, chosen, tool)
     bodies = scene_bodies(model, chosen, tool or default_tool(model, chosen))
     joints = scene_names(body.joint.name for body in bodies)
@@ -96,22 +110,40 @@ def _read(
 
 
 def _meshed(model: Robot, body: SceneBody) -> SceneBody:
-    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
-    from dolfinopt.exchange.urdf.bodies import SolidMesh
-    from dolfinopt.exchange.urdf.geometry import NoSolid, between_joints
-    from dolfinopt.mesh.surface_solid import mesh_of_surface
+    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be.
 
+    The shape is that of the collision elements; of the visual ones where those are no solid.
+    """
+    from dolfinopt.exchange.urdf.bodies import SolidMesh
+    from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
+    from dolfinopt.mesh.surface_solid import msh_bytes
+
+    link = model.links[body.link]
+    done: tuple[str, ...] = ()
     try:
-        surface = between_joints(model.links[body.link], body)
-        _, height, thickness = (float(f"{one:.6g}") for one in surface.extents)
-        volume = float(surface.volume)
-        side = (TETRAHEDRA * volume / CELLS) ** (1.0 / 3.0)
-        size = min(side, min(height, thickness) / FEWEST)
-        data, cells = mesh_of_surface(surface.vertices, surface.faces, body.length, size)
-    except (NoSolid, InputError) as error:
+        try:
+            found = cells_between_joints(link.shapes, body)
+        except NoSolid as error:
+            if link.visual is None:
+                raise
+            try:
+                found = cells_between_joints(link.visual(), body)
+            except NoSolid:
+                raise error from None
+            done = ("visual geometry",)
+    except NoSolid as error:
         warn([f"{model.file}: link {body.link!r} becomes a box: {error}"])
         return body
-    mesh = SolidMesh(data, cells, size, volume)
+    _, height, thickness = map(float, found.extents)
+    mesh = SolidMesh(
+        msh_bytes(found),
+        len(found.cells),
+        found.side,
+        found.volume,
+        found.ends_within(found.side),
+        found.offset(body.length),
+        (*done, *found.done),
+    )
     return replace(body, size=(height, thickness), mesh=mesh)
 
 
@@ -166,7 +198,9 @@ def _write(
         if body.size is not None:
             sides = " x ".join(f"{one:.3g}" for one in (body.length, *body.size))
             what = "a box to edit" if body.mesh is None else f"its shape, {body.mesh.cells} cells"
-            click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}")
+            click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
+            if body.mesh is not None and body.mesh.done:
+                click.echo(f"{scene.arms[body.link]}: {'; '.join(body.mesh.done)}")
     try:
         load_scene(path)
     except InputError as error:

@@ -342,6 +342,8 @@ def _minimised(summary: Mapping[str, Any]) -> str:
         how = "weighted sum" if options["scenarios"] == "sum" else "worst"
         name += f" ({how} of {len(scenarios)} scenarios)"
     text = with_unit(f"{name} {summary['objective']:.4g}", response.unit)
+    if options["kind"] == "mass" and "designed_mass" in summary:
+        text += f" ({summary['designed_mass']:.4g} kg of it designed)"
     if response.stands_for:
         frequencies = summary["loaded_frequency"].items()
         found = ", ".join(f"{arm} {value:.4g} {response.limit_unit}" for arm, value in frequencies)

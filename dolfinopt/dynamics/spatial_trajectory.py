@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +20,31 @@ from dolfinopt.multibody.spatial.end_effector import (
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 from dolfinopt.multibody.spatial.motion import JointMotion
+
+ROUNDING = 1e-6  # of a limit, which files round
+
+
+@dataclass(frozen=True)
+class JointLimit:
+    """How near a motion comes to one of a joint's limits.
+
+    Attributes:
+        joint: its name.
+        quantity: "position", "velocity" or "effort".
+        limit: of the coordinate, or of the absolute value.
+        value: where it is nearest to the limit or farthest beyond it.
+        instant: of that, s.
+        unit: of limit and value.
+        met: whether it stays within the limit.
+    """
+
+    joint: str
+    quantity: str
+    limit: float
+    value: float
+    instant: float
+    unit: str
+    met: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,3 +121,34 @@ class SpatialTrajectory(Trajectory):
             free = self.problem.drives.free
             by[:, : len(free)] = by_joints[:, free]
         return by, by_bodies
+
+    @property
+    def joint_limits(self) -> tuple[JointLimit, ...]:
+        """How the motion stands to the limits that the scene states of its joints."""
+        return tuple(self._joint_limits())
+
+    def _joint_limits(self) -> Iterator[JointLimit]:
+        for k, joint in enumerate(self.scene.movable):
+            slides = joint.type == "prismatic"
+            length, force = ("m", "N") if slides else ("rad", "N m")
+            if joint.position_limits is not None:
+                q = self.motion.q[:, k]
+                width = joint.position_limits[1] - joint.position_limits[0]
+                ends = zip(joint.position_limits, (-1.0, 1.0), strict=True)
+                beyond = [(sign * (q - limit), limit) for limit, sign in ends]
+                over, limit = max(beyond, key=lambda one: float(one[0].max()))
+                at = int(np.argmax(over))
+                met = bool(over[at] <= ROUNDING * max(width, abs(limit)))
+                value, instant = float(q[at]), float(self.t[at])
+                yield JointLimit(joint.name, "position", limit, value, instant, length, met)
+            for quantity, limit, values, unit in (
+                ("velocity", joint.velocity_limit, self.motion.qd, f"{length}/s"),
+                ("effort", joint.effort_limit, self.joint_forces, force),
+            ):
+                if limit is None:
+                    continue
+                size = np.abs(values[:, k])
+                at = int(np.argmax(size))
+                value, met = float(size[at]), bool(size[at] <= (1.0 + ROUNDING) * limit)
+                instant = float(self.t[at])
+                yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)

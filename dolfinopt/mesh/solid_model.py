@@ -292,11 +292,11 @@ def _elements(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
 
 def _check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    tolerance = FRAME_TOLERANCE * max(arm.height, arm.thickness)
+    tolerance = arm.interface_offset or FRAME_TOLERANCE * max(arm.height, arm.thickness)
     if np.linalg.norm(middle - [x, 0.0, 0.0]) > tolerance:
         place = ", ".join(f"{value:.6g}" for value in middle)
         expected = "(0, 0, 0)" if name == "inboard" else f"(length, 0, 0) = ({x:.6g}, 0, 0)"
         raise InputError(
             f'group "{name}" has its middle at ({place}) m, expected {expected} m within '
-            f"{tolerance:.3g} m; {remedy(middle[0], x)}"
+            f"{tolerance:.3g} m; {remedy(middle[0], x, 'length and interface_offset')}"
         )

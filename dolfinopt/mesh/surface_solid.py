@@ -1,4 +1,4 @@
-"""A closed surface of triangles, meshed with tetrahedra as a solid arm's .msh file."""
+"""A closed surface of triangles, meshed with tetrahedra; cells as a solid arm's .msh file."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import math
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root, silent_terminal
+from dolfinopt.mesh.gmsh_session import QUADRILATERAL, TRIANGLE, gmsh_on_root, silent_terminal
 from dolfinopt.mesh.groups import DESIGN, INBOARD, NAMES, OUTBOARD
-from dolfinopt.mesh.solid_model import TETRAHEDRON
+from dolfinopt.mesh.solid_model import HEXAHEDRON, TETRAHEDRON
+
+if TYPE_CHECKING:
+    from dolfinopt.exchange.urdf.geometry import LinkCells
 
 EDGE = math.radians(40.0)  # between triangles, from which on there is an edge between faces
-FLAT = 1e-5  # of the length: how far a flat end's corners may be from its plane
 LOST = 0.1  # largest share of the volume that flat cells may miss at curved faces
 INSIDE = 0.5  # share of a face's area that is an interface's, from which on the face is the latter
 
@@ -66,23 +68,11 @@ class Tetrahedra:
         return np.asarray(facets[count[which.ravel()] == 1])
 
 
-def mesh_of_surface(
-    points: np.ndarray, triangles: np.ndarray, length: float, size: float
-) -> tuple[bytes, int]:
-    """Return a .msh file of the solid within a closed surface, and the number of its cells.
-
-    On this process alone; see `tetrahedra_of`. Its interfaces are its flat ends.
-    """
-    found = tetrahedra_of(points, triangles, length, size)
-    return msh_bytes(found), len(found.cells)
-
-
 def tetrahedra_of(
     points: np.ndarray,
     triangles: np.ndarray,
-    length: float,
     size: float,
-    interfaces: tuple[np.ndarray, np.ndarray] | None = None,
+    interfaces: tuple[np.ndarray, np.ndarray],
     edge: float = EDGE,
 ) -> Tetrahedra:
     """Mesh the solid within a closed surface, on this process alone.
@@ -92,10 +82,8 @@ def tetrahedra_of(
     Args:
         points: (n, 3) corners of the surface in the arm's frame, m.
         triangles: (m, 3) their indices, counterclockwise from outside.
-        length: of the arm, m; its ends lie in x = 0 and x = length.
         size: of the cells, m.
-        interfaces: (m,) True of the triangles of the inboard and the outboard interface; None:
-            these are the flat ends.
+        interfaces: (m,) True of the triangles of the inboard and the outboard interface.
         edge: between triangles, from which on there is an edge between faces, rad.
 
     Raises:
@@ -104,7 +92,7 @@ def tetrahedra_of(
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
         try:
             with silent_terminal():
-                return _meshed(gmsh, points, triangles, length, size, interfaces, edge)
+                return _meshed(gmsh, points, triangles, size, interfaces, edge)
         except InputError:
             raise
         except Exception as error:
@@ -118,9 +106,8 @@ def _meshed(
     gmsh: Any,
     points: np.ndarray,
     triangles: np.ndarray,
-    length: float,
     size: float,
-    interfaces: tuple[np.ndarray, np.ndarray] | None,
+    interfaces: tuple[np.ndarray, np.ndarray],
     edge: float,
 ) -> Tetrahedra:
     model = gmsh.model
@@ -132,24 +119,17 @@ def _meshed(
     model.mesh.createGeometry()
     faces = [tag for _, tag in model.getEntities(2)]
     chosen = {}
-    if interfaces is not None:
-        for group, mark in zip((INBOARD, OUTBOARD), interfaces, strict=True):
-            chosen[group] = _faces_of(model, faces, points, triangles, mark)
+    for group, mark in zip((INBOARD, OUTBOARD), interfaces, strict=True):
+        chosen[group] = _faces_of(model, faces, points, triangles, mark)
     solid = model.geo.addVolume([model.geo.addSurfaceLoop(faces)])
     model.geo.synchronize()
     for key in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
         gmsh.option.setNumber(key, size)
     gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
     model.mesh.generate(3)
-    for group, x in ((INBOARD, 0.0), (OUTBOARD, length)):
-        if interfaces is None:
-            chosen[group] = [f for f in faces if _lies_in(model, f, x, FLAT * length)]
-        if not chosen[group]:
-            raise InputError(
-                f"it has no flat end in x = {x:g} m"
-                if interfaces is None
-                else f"the {NAMES[group]} interface is lost in its faces"
-            )
+    for group, own in chosen.items():
+        if not own:
+            raise InputError(f"the {NAMES[group]} interface is lost in its faces")
     found = _cells(model, solid, chosen)
     volumes = found.volumes
     expected = np.einsum("na,na->", *_fans(points[triangles])) / 6.0
@@ -172,12 +152,6 @@ def _faces_of(
         if area[inside].sum() > INSIDE * area.sum():
             found.append(face)
     return found
-
-
-def _lies_in(model: Any, face: int, x: float, near: float) -> bool:
-    """Tell whether a meshed face lies in a plane across the arm."""
-    places = model.mesh.getNodes(2, face, includeBoundary=True)[1].reshape(-1, 3)
-    return bool(np.abs(places[:, 0] - x).max() < near)
 
 
 def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
@@ -208,19 +182,21 @@ def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners[:, 0], np.cross(corners[:, 1], corners[:, 2])
 
 
-def msh_bytes(mesh: Tetrahedra) -> bytes:
+def msh_bytes(mesh: Tetrahedra | LinkCells) -> bytes:
     """Return the .msh file that `arms.mesh` reads back, on this process alone."""
+    is_tetrahedron = mesh.cells.shape[1] == 4
+    cell, side = (TETRAHEDRON, TRIANGLE) if is_tetrahedron else (HEXAHEDRON, QUADRILATERAL)
     with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
         model = gmsh.model
         model.add("solid")
         solid = model.addDiscreteEntity(3)
         model.mesh.addNodes(3, solid, np.arange(1, len(mesh.points) + 1), mesh.points.ravel())
-        model.mesh.addElementsByType(solid, TETRAHEDRON, [], mesh.cells.ravel() + 1)
+        model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
         model.addPhysicalGroup(3, [solid], DESIGN)
         model.setPhysicalName(3, DESIGN, NAMES[DESIGN])
         for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
             face = model.addDiscreteEntity(2)
-            model.mesh.addElementsByType(face, TRIANGLE, [], facets.ravel() + 1)
+            model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
             model.addPhysicalGroup(2, [face], group)
             model.setPhysicalName(2, group, NAMES[group])
         gmsh.option.setNumber("Mesh.Binary", 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import resource
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.spatial_trajectory import JointLimit, SpatialTrajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.multibody.stiffening import WARN, Stiffening
@@ -197,6 +198,7 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_warnings(run.scene, run.evaluation),
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
+        *_limits_exceeded(run.trajectory),
         *(filter_warnings(run.scene, sizes) if run.iterations else ()),
         *(
             [FALLS_APART]
@@ -233,15 +235,45 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     found = {
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
+        "designed_mass": _designed_mass(scene, bodies),
         "drive_peak": by_drive(peak),
         "drive_rms": by_drive(rms),
     }
+    if isinstance(trajectory, SpatialTrajectory) and trajectory.joint_limits:
+        found["joint_limits"] = _by_joint(trajectory.joint_limits)
     if free := free_drives(scene):
         errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
         found["drive_error_peak"] = {name: errors[name] for name in free}
     if trajectory.closure_force is not None:
         found["closure_force_peak"] = float(np.linalg.norm(trajectory.closure_force, axis=1).max())
     return found
+
+
+def _designed_mass(scene: Scene, bodies: Sequence[Any]) -> float:
+    """Return the mass of the arms that have a design, of their own or another's, kg."""
+    pairs = zip(bodies, scene.owners, strict=True)
+    return float(sum(body.mass for body, owner in pairs if owner is not None))
+
+
+def _by_joint(limits: Iterable[JointLimit]) -> dict[str, dict[str, Any]]:
+    """Return the limits of joints by joint and quantity."""
+    found: dict[str, dict[str, Any]] = {}
+    for one in limits:
+        entry = asdict(one)
+        found.setdefault(entry.pop("joint"), {})[entry.pop("quantity")] = entry
+    return found
+
+
+def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
+    """Return a sentence that names the limits of joints beyond which the motion goes."""
+    if not isinstance(trajectory, SpatialTrajectory):
+        return []
+    beyond = [
+        f"{one.joint} {one.value:.4g} of {one.limit:.4g} {one.unit} at {one.instant:.3g} s"
+        for one in trajectory.joint_limits
+        if not one.met
+    ]
+    return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []
 
 
 def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | None:

@@ -105,8 +105,7 @@ def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     inboard, outboard = (
         distance_to_faces(centres, faces) < near for faces in (domain.inboard, domain.outboard)
     )
-    length = float(domain.outboard[..., 0].max())
-    return tetrahedra_of(surface.points, surface.triangles, length, size, (inboard, outboard), edge)
+    return tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
 
 
 def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:

@@ -41,6 +41,7 @@ from dolfinopt.scene.tables.arms import (
     MAX_ARMS,
     MAX_CELLS,
     MESH_KEYS,
+    OF_OTHER_MESHES,
     OWN_KEYS,
     PATTERN_KEYS,
     SIZE_KEYS,
@@ -396,7 +397,7 @@ def _replaced(arm: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     if "cells" in arm:
         yield MESH_KEYS
     if "mesh" in arm:
-        yield ("cells",)
+        yield OF_OTHER_MESHES
     if "material" in arm:
         yield MATERIAL_VALUES
     if "pattern" in arm:
@@ -430,7 +431,7 @@ def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
     arm = tree["arms"][loc[1]]
     if not isinstance(arm, dict):
         return
-    others = MESH_KEYS if loc[2] == "cells" else ("cells",)
+    others = MESH_KEYS if loc[2] == "cells" else OF_OTHER_MESHES
     for key in others:
         arm.pop(key, None)
 

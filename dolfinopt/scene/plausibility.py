@@ -52,7 +52,7 @@ def _sizes(scene: Scene) -> list[str]:
         radius = scene.filter_radius(index) if arm.designed else 0.0
         if not arm.own:
             continue
-        if arm.height > arm.length:
+        if arm.height > arm.length and arm.interface_offset is None:
             found.append(
                 f"arms.{arm.name}: its height, {arm.height:g} m, exceeds its length, "
                 f"{arm.length:g} m, which is measured from joint to joint; check both"

@@ -3,22 +3,39 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, tree_of, write_uneven
+from robots import (
+    DEMO,
+    DEMO_MOTION,
+    frames_of,
+    mechanism_of,
+    run_import,
+    tree_of,
+    write_uneven,
+)
 from runs import run
 
+from dolfinopt.arms.arm import build_arms
+from dolfinopt.arms.patterns import uniform_design
 from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
+from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
 from dolfinopt.exchange.urdf.read import read_robot
 from dolfinopt.exchange.urdf.robot import MASSLESS, Robot, roll_pitch_yaw_of
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.mesh.solid_checks import check_cells
+from dolfinopt.mesh.solid_model import TENSOR
 from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.motion import JointMotion
 from dolfinopt.multibody.spatial.rotations import exponential, roll_pitch_yaw
+from dolfinopt.output.summary import _cell_size, filter_warnings
+from dolfinopt.parallel import partition_arms
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import load_scene
 
 yourdfpy = pytest.importorskip("yourdfpy")
@@ -218,22 +235,191 @@ def test_the_end_effector_is_the_last_arm(tmp_path):
         assert np.abs(end - read_robot(file).poses(q)[tool][:3, 3]).max() < 1e-12
 
 
-def test_a_closed_geometry_becomes_the_solid(tmp_path, capsys):
-    """Cut at the joints and meshed; a box with a reason where that cannot be."""
-    file = tmp_path / "robot.urdf"
+def test_a_links_geometry_becomes_the_solid(tmp_path, capsys):
+    """Cut at the joints and meshed, off centre and a little short, too; else a box and a reason."""
+    text = DEMO.read_text()
     rod = '<geometry><cylinder radius="0.07" length="1.0"/></geometry>'
-    assert rod in DEMO.read_text()  # the upper arm's, which is to be too short
-    file.write_text(DEMO.read_text().replace(rod, rod.replace("1.0", "0.8")))
-    links = "upper_arm,forearm"
+    assert rod in text  # the upper arm's, which is to be too short
+    text = text.replace(rod, rod.replace("1.0", "0.8"))
+    wrist = '<link name="wrist_1">'
+    assert wrist in text
+    ball = '<geometry><sphere radius="0.09"/></geometry>'
+    away = f'<collision><origin xyz="0 0.7 0.17"/>{ball}</collision>'
+    file = tmp_path / "robot.urdf"
+    file.write_text(text.replace(wrist, wrist + away))
+    links = "upper_arm,forearm,wrist_1"
     run("import", file, "--links", links, "--trajectory", DEMO_MOTION, "--out", tmp_path / "a")
     said = capsys.readouterr()
-    assert re.search(r"forearm: solid, 0.729 x 0.11 x 0.11 m, its shape, \d{4} cells", said.out)
-    assert "upper_arm: solid, 0.862 x 0.14 x 0.14 m, a box to edit" in said.out
-    assert "'upper_arm' becomes a box: its geometry does not reach the inboard joint" in said.err
+    assert re.search(
+        r"forearm: solid, 0.729 x 0.11\d* x 0.11\d* m, its shape, \d{4} cells", said.out
+    )
+    assert re.search(r"upper_arm: solid, 0.862 x 0.1\d+ x 0.1\d+ m, its shape, \d{4}", said.out)
+    assert "upper_arm: ends 0.0569 m before the inboard joint, ends 0.0569 m before the out" in (
+        said.out.replace(";", ",")
+    )
+    assert re.search(r"wrist_1: solid, .* m, a box to edit; starts at", said.out)
+    assert "link 'wrist_1' becomes a box: its geometry is " in said.err
     scene = load_scene(tmp_path / "a" / "robot.toml")
-    index = [arm.name for arm in scene.arms].index("forearm")
-    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[index])
-    ring = 0.5 * 64 * np.sin(2 * np.pi / 64) * 0.055**2  # of the cylinder's flat sides
-    assert mesh.area.sum() == pytest.approx(ring * 0.7287, rel=0.02)
-    assert 2000 < mesh.num_cells < 10000
-    assert 0.05 < mesh.area[mesh.passive].sum() / mesh.area.sum() < 0.1
+    names = [arm.name for arm in scene.arms]
+    fore, upper = (
+        arm_mesh(MPI.COMM_SELF, scene.arms[names.index(name)]) for name in ("forearm", "upper_arm")
+    )
+    assert fore.area.sum() == pytest.approx(np.pi * 0.055**2 * 0.7287, rel=0.02)
+    assert upper.area.sum() == pytest.approx(np.pi * 0.07**2 * (0.862 - 2 * 0.0569), rel=0.02)
+    assert 5000 < fore.num_cells < 8000
+    # A mean cube's side: what the filter's radius is compared with.
+    side = _cell_size(scene, names.index("forearm"), SimpleNamespace(mesh=fore))
+    assert side == pytest.approx((fore.area.sum() / fore.num_cells) ** (1 / 3))
+    assert filter_warnings(scene, {names.index("forearm"): side}) == []
+    # One layer of cells stays solid at both ends.
+    assert 0.01 < fore.area[fore.passive].sum() / fore.area.sum() < 0.05
+
+
+def test_the_start_weighs_what_the_file_says(tmp_path):
+    """Boxes as they are written, their ends solid and the design filtered."""
+    run_import(DEMO, "upper_arm,forearm", DEMO_MOTION, tmp_path / "a")
+    scene = load_scene(tmp_path / "a" / "robot.toml")
+    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = build_arms(scene, partition, Profile())
+    start = uniform_design(scene, partition, arms, scene.design.initial)
+    found = sum(scene.material_of(k).density * arm.mesh.area @ start[k] for k, arm in arms.items())
+    robot = read_robot(DEMO)
+    expected = sum(robot.links[name].own.mass for name in ("upper_arm", "forearm"))
+    assert found == pytest.approx(expected, rel=0.01)  # of the filter's ends
+    fractions = [arm.volume_fraction(start[k]) for k, arm in arms.items()]
+    assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
+
+
+@pytest.mark.parametrize("radius", [0.0331, 0.0452, 0.0575, 0.0618, 0.0704])
+def test_the_filter_is_wide_enough_for_the_cells(tmp_path, radius):
+    """What the command writes, the run does not warn of."""
+    text = DEMO.read_text().replace('cylinder radius="0.055"', f'cylinder radius="{radius}"')
+    assert text != DEMO.read_text()
+    (tmp_path / "robot.urdf").write_text(text)
+    run_import(tmp_path / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "a")
+    scene = load_scene(tmp_path / "a" / "robot.toml")
+    sizes = {k: scene.arms[k].cell_size for k in scene.designed}
+    assert None not in sizes.values() and filter_warnings(scene, sizes) == []
+
+
+# -- shapes ----------------------------------------------------------------------------------
+
+SIDES = (0.5, 0.1, 0.08)
+SPAN = SimpleNamespace(frame=np.eye(4), length=0.4)  # joints at x = 0 and 0.4 m
+BETWEEN = 0.4 * 0.1 * 0.08
+
+
+def bar(sides=SIDES, at=(0.2, 0.0, 0.0)):
+    found = trimesh.creation.box(extents=sides)
+    found.apply_translation(at)
+    return found
+
+
+def inside_out():
+    found = bar()
+    found.invert()
+    return [found]
+
+
+def without_a_lid():
+    found = bar()
+    found.update_faces(found.face_normals[:, 2] < 0.5)
+    return [found]
+
+
+def two_in_one_file():
+    return [trimesh.util.concatenate([bar(at=(0.15, 0, 0)), bar(at=(0.25, 0, 0))])]
+
+
+def hollow():
+    inner = bar((0.3, 0.06, 0.04))
+    inner.invert()
+    return [trimesh.util.concatenate([bar(), inner])]
+
+
+def in_shards():
+    """Every triangle apart from its neighbours, as in drawings for screens."""
+    whole = bar().subdivide_to_size(0.03)
+    corners = whole.triangles
+    middle = corners.mean(axis=1, keepdims=True)
+    points = (middle + 0.97 * (corners - middle)).reshape(-1, 3)
+    return [trimesh.Trimesh(points, np.arange(len(points)).reshape(-1, 3), process=False)]
+
+
+def with_a_part_apart():
+    return [bar(), bar((0.5, 0.02, 0.02), (0.2, 0.0, 0.2))]
+
+
+@pytest.mark.parametrize(
+    ("shapes", "volume", "done"),
+    [
+        (lambda: [bar()], BETWEEN, ()),
+        (inside_out, BETWEEN, ("1 piece inside out turned",)),
+        (without_a_lid, BETWEEN, ("holes of 1 piece closed",)),
+        (two_in_one_file, BETWEEN, ("2 pieces united",)),
+        (lambda: [bar(at=(0.15, 0, 0)), bar(at=(0.25, 0, 0))], BETWEEN, ("2 pieces united",)),
+        (hollow, BETWEEN - 0.3 * 0.06 * 0.04, ()),
+        (in_shards, BETWEEN, ("wide holes filled",)),
+        (with_a_part_apart, BETWEEN, ("2 pieces united", "the largest part kept, 9")),
+        (lambda: [bar(at=(0.2, 0.07, 0.0))], BETWEEN, ()),
+        (lambda: [bar((0.45, 0.1, 0.08), (0.255, 0, 0))], 0.895 * BETWEEN, ("ends 0.042 m bef",)),
+        (lambda: [bar((0.9, 0.1, 0.08))], None, ("not cut at the joints",)),
+    ],
+)
+def test_geometry_is_mended(shapes, volume, done):
+    """Closed, open, turned inwards, in parts, off centre, too short, and an elbow."""
+    found = cells_between_joints(shapes(), SPAN)
+    for one in done:
+        assert any(one in word for word in found.done), found.done
+    assert done or found.done == ()
+    check_cells(found.points, found.cells[:, TENSOR[8]])
+    assert 1500 < len(found.cells) < 20000
+    if volume is not None:  # but for corners, and voxels of open surfaces
+        assert found.volume == pytest.approx(volume, rel=0.06 if "fill" in str(done) else 0.01)
+        for facets in (found.inboard, found.outboard):
+            assert np.ptp(found.points[facets][..., 0]) < 1e-12
+    else:
+        assert found.volume == pytest.approx(0.9 * 0.1 * 0.08, rel=0.01)
+        assert not np.intersect1d(found.inboard, found.outboard).size
+    assert found.offset(0.4) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        (lambda: [], "it has no geometry"),
+        (lambda: [trimesh.Trimesh([[0, 0, 0], [0.4, 0, 0], [0.4, 0.1, 0]], [[0, 1, 2]])],
+         "encloses nothing"),
+        (lambda: [bar(at=(0.2, 0.0, 2.0))], "its geometry is 1.9"),
+    ],
+)  # fmt: skip
+def test_geometry_that_is_no_solid(shapes, message):
+    with pytest.raises(NoSolid, match=message):
+        cells_between_joints(shapes(), SPAN)
+
+
+def test_visual_geometry_where_the_collision_one_is_no_solid(tmp_path, capsys):
+    """A mesh in mm, turned inwards, found in its package."""
+    folder = tmp_path / "ws" / "my_robot" / "meshes"
+    folder.mkdir(parents=True)
+    visual = trimesh.creation.cylinder(radius=55.0, height=840.0, sections=24)
+    visual.invert()
+    visual.export(folder / "rod.stl")
+    shape = '<geometry><cylinder radius="0.055" length="0.84"/></geometry>'
+    text = DEMO.read_text()
+    start = text.index("<collision>", text.index('<link name="forearm">'))
+    end = text.index("</collision>", start) + len("</collision>")
+    own = text[start:end]
+    assert shape in own
+    name = "package://my_robot/meshes/rod.stl"
+    mesh = f'<geometry><mesh filename="{name}" scale="0.001 0.001 0.001"/></geometry>'
+    away = '<origin xyz="3 0 0.06"/><geometry><sphere radius="0.1"/></geometry>'
+    new = own.replace(shape, mesh).replace("collision>", "visual>")
+    new += f"<collision>{away}</collision>"
+    file = tmp_path / "robot.urdf"
+    file.write_text(text[:start] + new + text[end:])
+    run("import", file, "--links", "forearm", "--trajectory", DEMO_MOTION, "--out",
+        tmp_path / "a", "--package-path", tmp_path / "ws")  # fmt: skip
+    said = capsys.readouterr()
+    assert "forearm: visual geometry; 1 piece inside out turned" in said.out
+    assert "forearm: solid, 0.729 x 0.1" in said.out

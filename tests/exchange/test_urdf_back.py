@@ -15,6 +15,7 @@ from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.cli.export_robot import _check_robot, link_inertia
+from dolfinopt.cli.shared import _minimised
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
 from dolfinopt.exchange.urdf.checks import implausible_inertias
@@ -35,8 +36,8 @@ LINK = ROOT / "demos" / "robot_link.toml"
 def same_kinematics(one: Robot, other: Robot) -> bool:
     """Return whether all joints are alike, to the last bit."""
     return all(
-        (a.name, a.kind, a.parent, a.child, a.lower, a.upper, a.velocity)
-        == (b.name, b.kind, b.parent, b.child, b.lower, b.upper, b.velocity)
+        (a.name, a.kind, a.parent, a.child, a.lower, a.upper, a.velocity, a.effort)
+        == (b.name, b.kind, b.parent, b.child, b.lower, b.upper, b.velocity, b.effort)
         and np.array_equal(a.pose, b.pose)
         and np.array_equal(a.axis, b.axis)
         for a, b in zip(one.joints, other.joints, strict=True)
@@ -146,11 +147,42 @@ def drawn(monkeypatch):
     return titles
 
 
+def check_limits(summary, file):
+    """The file's limits and those stated: worst values and instants, told where beyond."""
+    rows = pd.read_csv(file)
+    found = summary["joint_limits"]
+    assert set(found) == set(summary["drive_peak"])
+    for name, limits in found.items():
+        force, q = rows[f"joint_force_{name}"].abs(), rows[f"q_r_{name}"]
+        one = limits["effort"]
+        assert one["value"] == pytest.approx(force.max(), rel=1e-3)  # instants beside the file's
+        assert one["instant"] == pytest.approx(rows["t"][force.idxmax()], abs=2e-3)
+        assert one["met"] == (one["value"] <= one["limit"]) and one["unit"] == "N m"
+        rate = np.abs(np.gradient(q, rows["t"])).max()
+        assert limits["velocity"]["value"] == pytest.approx(rate, rel=1e-2, abs=1e-3)
+        assert limits["velocity"]["met"] and limits["position"]["met"] == (name != "elbow")
+    beyond = found["elbow"]["position"]
+    assert beyond["limit"] in (-1.0, 1.0) and abs(beyond["value"]) > 1.0
+    effort = found["elbow"]["effort"]
+    assert (effort["limit"], effort["met"]) == (20.0, False)
+    (said,) = summary["warnings"]
+    assert said == (
+        f"limits exceeded: elbow {beyond['value']:.4g} of {beyond['limit']:.4g} rad at "
+        f"{beyond['instant']:.3g} s, elbow {effort['value']:.4g} of 20 N m at "
+        f"{effort['instant']:.3g} s"
+    )
+    assert summary["designed_mass"] == pytest.approx(summary["mass"]["forearm"], rel=1e-15)
+    told = _minimised(summary | {"scene": {"objective": {"kind": "mass", "scenarios": None}}})
+    assert told.endswith(f" kg ({summary['designed_mass']:.4g} kg of it designed)")
+
+
 def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     """A finished run's link in the robot: its mass, its surface, and the same scene again."""
     run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
     coarse = ("--set", "arms.forearm.cells=[12,4,4]", "--set", "design.initial=1.0",
-              "--set", "simulation.tolerance=1e-2", "--no-plots")  # fmt: skip
+              "--set", "simulation.tolerance=1e-2", "--no-plots",
+              "--set", "joints.elbow.effort_limit=20",
+              "--set", "joints.elbow.position_limits=[-1.0, 1.0]")  # fmt: skip
     run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
     run("export", tmp_path / "run", "--urdf", "--before", tmp_path / "run")
     said = capsys.readouterr().out
@@ -163,6 +195,7 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     assert all(len(one["alt"]) > 10 and one["src"][:5] == "data:" for one in page.all("img"))
     assert len(page.all("tr")) == 1 + len(rows) and page.all("li") == []  # of one scene
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    check_limits(summary, tmp_path / "run" / "trajectory.csv")
     before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
     assert same_kinematics(before, after)
     fore = after.links["forearm"]
@@ -236,7 +269,8 @@ def test_the_demo_is_what_the_import_writes(tmp_path):
     run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")
     made, kept = tree_of(tmp_path / "a" / "robot.toml"), tree_of(LINK)
     for arm in (*made["arms"], *kept["arms"]):
-        arm.pop("cells", None)
+        for key in ("cells", "passive"):
+            arm.pop(key, None)
     assert made["arms"] == kept["arms"] and made["joints"] == kept["joints"]
     origins = [read_origin(one / "robot.json") for one in (tmp_path / "a", LINK.parent)]
     assert origins[0].links == origins[1].links and origins[1].file.samefile(DEMO)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 
 import numpy as np
 import pytest
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
+from runs import ROOT, run
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.bodies import scene_bodies
@@ -88,7 +90,7 @@ def test_ctrl_c_ends_the_import_before_it_writes(tmp_path, monkeypatch):
     handlers = [signal.default_int_handler]
     monkeypatch.setattr(
         "dolfinopt.exchange.urdf.read.read_robot",
-        lambda file: handlers.append(signal.getsignal(signal.SIGINT)) or read_robot(file),
+        lambda *of: handlers.append(signal.getsignal(signal.SIGINT)) or read_robot(*of),
     )
     before = signal.signal(signal.SIGINT, handlers[0])
     try:
@@ -198,7 +200,11 @@ def test_files_that_are_no_robots(tmp_path):
         read_robot(file)
     for text, message in (
         ("<robot", "not XML"),
-        ('<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"/>', "xacro"),
+        (
+            '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="b">\n'
+            '<xacro:include filename="c"/></link></robot>',
+            r"line 2: an element of xacro, include; .* xacro r.urdf > r-plain.urdf$",
+        ),
         ("<sdf/>", "expected an element <robot name"),
         (ENTITIES, "declares XML entities"),
     ):
@@ -225,8 +231,88 @@ def test_a_remedy_does_not_overwrite_the_file(tmp_path, name, new):
 
 def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    with pytest.raises(InputError, match=r"pip install 'dolfinopt\[robots\]'"):
+    with pytest.raises(InputError) as caught:
         read_robot(DEMO)
+    line = f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
+    assert str(caught.value) == line  # an interpreter that is there, a package that pip finds
+
+
+def test_the_launcher_installs_what_import_needs():
+    """Whatever it sets up has an extra with yourdfpy."""
+    projects = re.findall(r'ensure ready\S* "(.*)"', (ROOT / "dolfinopt.sh").read_text())
+    extras = tree_of(ROOT / "pyproject.toml")["project"]["optional-dependencies"]
+    assert len(projects) == 3 and any("yourdfpy" in one for one in extras["robots"])
+    assert any("[docs,robots]" in one for one in extras["dev"])
+    assert {one.removeprefix("${here}") for one in projects} == {"[robots]", "[dev]"}
+
+
+def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
+    file = tmp_path / "r.urdf"
+    head = '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+    file.write_text(f'{head}<!-- <xacro:include/> --><link name="b"/></robot>')
+    assert list(read_robot(file).links) == ["b"]
+    file.write_text('<robot><link name="b"/></robot>')
+    assert read_robot(file).name == "r"  # its file's, where it has none
+
+
+@pytest.mark.parametrize(
+    "how", ["option", "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "above", "link"]
+)
+def test_meshes_are_found_in_their_package(tmp_path, monkeypatch, how):
+    """package://arm/meshes/a.stl; a package of the same name without the mesh is passed over."""
+    for name in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    package = tmp_path / "there" / ("share/arm" if how.startswith("AMENT") else "arm")
+    (package / "meshes").mkdir(parents=True)
+    (tmp_path / "empty" / "arm").mkdir(parents=True)
+    trimesh.creation.box().export(package / "meshes" / "a.stl")
+    mesh = '<visual><geometry><mesh filename="package://arm/meshes/a.stl"/></geometry></visual>'
+    text = f'<robot name="r"><link name="b">{mesh}</link></robot>'
+    here = tmp_path / "here"
+    here.mkdir()
+    file, stated = here / "r.urdf", ()
+    if how == "option":
+        stated = (tmp_path / "empty", tmp_path / "there")
+    elif how in ("above", "link"):
+        file = package / "urdf" / "r.urdf"
+        file.parent.mkdir()
+    else:
+        monkeypatch.setenv(how, f"{tmp_path / 'empty'}:{tmp_path / 'there'}")
+    file.write_text(text)
+    if how == "link":
+        (here / "r.urdf").symlink_to(file)
+        file = here / "r.urdf"
+    link = read_robot(file, stated).links["b"]
+    assert not link.missing and link.volume == pytest.approx(1.0)
+    if how == "option":
+        assert read_robot(file).links["b"].missing == ("package://arm/meshes/a.stl",)
+
+
+def test_a_package_path_that_is_none(tmp_path):
+    with pytest.raises(InputError, match=r"--package-path .*: expected a folder with ROS packages"):
+        run("import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION, "--package-path",
+            tmp_path / "none")  # fmt: skip
+
+
+def test_limits_come_into_the_scene(tmp_path):
+    """None where the file says none, or zero."""
+    text = DEMO.read_text()
+    old = '<limit lower="-3.1416" upper="3.1416" effort="430" velocity="2.618"/>'
+    assert text.count(old) == 1
+    new = '<limit lower="-3.1416" upper="3.1416" effort="0" velocity="0"/>'
+    (tmp_path / "r.urdf").write_text(text.replace(old, new, 1))
+    run_import(tmp_path / "r.urdf", "forearm", DEMO_MOTION, tmp_path / "a")
+    robot, scene = read_robot(DEMO), load_scene(tmp_path / "a" / "r.toml")
+    joints = {joint.name: joint for joint in robot.movable}
+    none = [one.name for one in scene.movable if one.effort_limit is None]
+    assert len(none) == 1
+    for one in scene.movable:
+        joint = joints[one.name]
+        assert one.position_limits == (joint.lower, joint.upper)
+        if one.name in none:
+            assert one.velocity_limit is None
+        else:
+            assert (one.velocity_limit, one.effort_limit) == (joint.velocity, joint.effort)
 
 
 # -- inertias --------------------------------------------------------------------------------

@@ -206,4 +206,7 @@ def test_names_of_faces(shared_tmp_path):
             found.append(mesh_of(path, mesh_size=0.04))
         except InputError as error:
             assert 'group "outboard" has its middle at' in str(error)
+            elsewhere = path
     assert len(found) == 1
+    off = mesh_of(elsewhere, mesh_size=0.04, interface_offset=1.0)
+    assert len(off.outboard_facets) and off.num_cells == found[0].num_cells

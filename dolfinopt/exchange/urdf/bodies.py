@@ -34,16 +34,22 @@ class SolidMesh:
     """A solid in the shape of its link.
 
     Attributes:
-        data: .msh file of its tetrahedra.
+        data: .msh file of its hexahedra.
         cells: their number.
         size: of a cell, m.
         volume: m3.
+        ends: volume of the cells within `size` of the interfaces, m3.
+        offset: largest distance of an interface's middle from its joint, m.
+        done: what was done with the link's geometry, in a few words each.
     """
 
     data: bytes
     cells: int
     size: float
     volume: float
+    ends: float
+    offset: float
+    done: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)

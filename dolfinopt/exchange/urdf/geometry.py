@@ -1,57 +1,617 @@
-"""A link's closed geometry between its joints, as the surface of a solid in the arm's frame."""
+"""A link's geometry, mended, as hexahedra between its joints, in the arm's frame.
+
+Meshes of robots are made for pictures and collisions: open, in many pieces, inside out. What they
+enclose is therefore found on a grid. A piece that is closed fills what lies within it; holes of an
+open one are closed by VTK (pyvista's `fill_holes`), and where that does not close it, by filling
+the grid within its surface after a morphological closing (Serra, Image Analysis and Mathematical
+Morphology, 1982). Their union is cut at the joints; of its pieces the largest stays. Cubes that
+are at least half full are the cells, and their outer corners are moved onto the surface.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from dolfinopt.exchange.urdf.bodies import SceneBody
-from dolfinopt.exchange.urdf.robot import RobotLink, inverse
+from dolfinopt.exchange.urdf.robot import inverse
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-CENTRED = 0.04  # of the larger side, how far the middle of an end may be from its joint
-FLAT = 1e-6  # of the length
+CELLS = 6000  # of a solid, about
+MOST = 20000  # of one with thin walls
+FEWEST = 4  # cells over the smaller of height and thickness
+FINE = 3  # voxels along the side of a cell
+VOXELS = 1e7  # of a link, at most
+COARSE = 64  # voxels along a link where its volume is estimated
+MANY = 300  # pieces of a surface from which on it is filled as it is, not piece by piece
+TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
+SHELL = 128  # voxels along a link on which open pieces are filled
+GAP = 0.02  # of the link's size: half of the widest gap that a closing bridges
+SAMPLES = 12  # points on the surface of an open piece for each voxel that it passes
+SHORTEST = 0.4  # of the distance between the joints that the geometry must bridge to be cut there
+MARGIN = 0.03  # of that distance, which is cut off where the geometry ends before a joint
+KEPT_ALL = 0.995  # share of the largest piece from which on nothing is said of the others
+WHOLE = 0.5  # share of the geometry between the joints that the largest piece must have
+BETWEEN = 0.6  # share of a link's volume that must lie between its joints for it to be cut there
+KEPT = 0.85  # share of the volume that the cells must have
+FULL = 0.5  # share of a cube from which on it is a cell
+NEAR = 0.5  # of the link's size or length: how far a joint may be from the geometry
+PATCH = 0.04  # share of the outer facets that are an interface where the link is not cut
+LONGEST = 0.9  # of the side of a cell: move of a corner
+EASED = 0.85  # share of a move that is left where it spoils a cell, again and again
+LEAST = 0.15  # of a cube's: Jacobian at a corner of a cell whose corners were moved
+# Corners of a cube in the order of Gmsh's hexahedron, and its six sides, seen from outside.
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0],
+                    [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # fmt: skip
+SIDES = {
+    (0, -1): (0, 4, 7, 3), (0, 1): (1, 2, 6, 5), (1, -1): (0, 1, 5, 4),
+    (1, 1): (3, 7, 6, 2), (2, -1): (0, 3, 2, 1), (2, 1): (4, 5, 6, 7),
+}  # fmt: skip
+# Neighbours of every corner of a cube, right-handed.
+AROUND = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
 
 
 class NoSolid(ValueError):
     """A link's geometry is no solid between its joints; the message says why."""
 
 
-def between_joints(link: RobotLink, body: SceneBody) -> Trimesh:
-    """Return a link's geometry from x = 0 to x = length, closed and flat at both ends.
+@dataclass(frozen=True, eq=False)
+class LinkCells:
+    """A link's shape as hexahedra in the arm's frame.
 
-    Shapes are united and what is beyond the joints is cut off.
+    Attributes:
+        points: (n, 3) m.
+        cells: (m, 8) points of a cell, in Gmsh's order.
+        inboard, outboard: (k, 4) points of the interfaces' facets, seen from outside.
+        side: of a cell, m.
+        done: what was done with the geometry, in a few words each.
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    inboard: np.ndarray
+    outboard: np.ndarray
+    side: float
+    done: tuple[str, ...]
+
+    @property
+    def volume(self) -> float:
+        """Volume of the cells, m3."""
+        return float(_jacobians(self.points[self.cells]).mean(axis=1).sum())
+
+    @property
+    def extents(self) -> np.ndarray:
+        """Extents (3,) along the axes of the arm's frame, m."""
+        return np.asarray(np.ptp(self.points, axis=0))
+
+    def ends_within(self, distance: float) -> float:
+        """Return the volume of the cells whose middle is nearer to an interface, m3."""
+        corners = self.points[self.cells]
+        facets = self.points[np.concatenate([self.inboard, self.outboard])]
+        places = np.concatenate([facets.reshape(-1, 3), facets.mean(axis=1)])
+        near = cKDTree(places).query(corners.mean(axis=1))[0] < distance
+        return float(_jacobians(corners[near]).mean(axis=1).sum())
+
+    def offset(self, length: float) -> float:
+        """Largest distance of an interface's middle from its joint, m."""
+        away = []
+        for facets, x in ((self.inboard, 0.0), (self.outboard, length)):
+            at = self.points[facets].reshape(-1, 3)
+            middle = 0.5 * (at.min(axis=0) + at.max(axis=0))
+            away.append(float(np.linalg.norm(middle - [x, 0.0, 0.0])))
+        return max(away)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Voxels: the middle of voxel (i, j, k) is low + (i + 1/2, j + 1/2, k + 1/2) step."""
+
+    low: np.ndarray
+    step: float
+    shape: tuple[int, int, int]
+
+    def taken_from(self, other: _Grid, found: np.ndarray) -> np.ndarray:
+        """Return what is True at the middles of these voxels on another grid, False beyond it."""
+        at, inside = [], []
+        for k, count in enumerate(self.shape):
+            middle = self.low[k] + (np.arange(count) + 0.5) * self.step
+            index = np.floor((middle - other.low[k]) / other.step).astype(int)
+            inside.append((index >= 0) & (index < other.shape[k]))
+            at.append(np.clip(index, 0, other.shape[k] - 1))
+        return np.asarray(
+            found[np.ix_(*at)] & inside[0][:, None, None] & inside[1][:, None] & inside[2]
+        )
+
+    def filled_by(self, closed: Trimesh) -> np.ndarray:
+        """Return True for the voxels whose middle lies within a closed surface."""
+        import pyvista
+
+        image = pyvista.ImageData(
+            dimensions=self.shape,
+            spacing=(self.step,) * 3,
+            origin=(self.low + 0.5 * self.step).tolist(),
+        )
+        surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+        found = surface.voxelize_binary_mask(reference_volume=image)["mask"]
+        return np.asarray(found).reshape(self.shape, order="F") > 0
+
+    def passed_by(self, surface: Trimesh) -> np.ndarray:
+        """Return True for the voxels that a surface passes."""
+        from trimesh.sample import sample_surface
+
+        count = math.ceil(SAMPLES * surface.area / self.step**2)
+        places = np.vstack([sample_surface(surface, count, seed=0)[0], surface.vertices])
+        inside = np.floor((places - self.low) / self.step).astype(int)
+        inside = inside[((inside >= 0) & (inside < self.shape)).all(axis=1)]
+        found = np.zeros(self.shape, dtype=bool)
+        found[tuple(inside.T)] = True
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """The pieces of a link's surface in the arm's frame, and what was done to close them."""
+
+    closed: tuple[Trimesh, ...]
+    hollows: tuple[Trimesh, ...]
+    open: tuple[Trimesh, ...]
+    done: tuple[str, ...]
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest corner (2, 3) of the box around them, m."""
+        every = np.array([one.bounds for one in (*self.closed, *self.open)])
+        return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
+
+    def on(self, grid: _Grid) -> np.ndarray:
+        """Return True for the voxels within the geometry."""
+        found = np.zeros(grid.shape, dtype=bool)
+        for one in self.closed:
+            found |= grid.filled_by(one)
+        for one in self.hollows:
+            found &= ~grid.filled_by(one)
+        if self.open:
+            found |= grid.taken_from(*self._within_open)
+        return found
+
+    @cached_property
+    def _within_open(self) -> tuple[_Grid, np.ndarray]:
+        """A grid about all pieces, and True for its voxels within open ones, or within closed."""
+        low, high = self.bounds
+        size = float((high - low).max())
+        radius = round(GAP * SHELL)
+        margin = (radius + 1) * size / SHELL
+        grid = _grid(low - margin, high + margin, size / SHELL)
+        shell = np.zeros(grid.shape, dtype=bool)
+        for one in self.closed:
+            shell |= grid.filled_by(one)
+        for one in self.open:
+            shell |= grid.passed_by(one)
+        shell = ndimage.binary_dilation(shell, iterations=radius)
+        shell = ndimage.binary_fill_holes(shell)
+        shell = ndimage.binary_erosion(shell, iterations=radius)
+        # A sheet that encloses nothing has no volume.
+        return grid, ndimage.binary_opening(shell, iterations=1)
+
+    def distance(self, points: np.ndarray, near: float) -> np.ndarray:
+        """Return the signed distance (n,) from closed pieces, positive outside, m; far: `near`."""
+        found = np.full(len(points), near)
+        for pieces, sign in ((self.closed, 1.0), (self.hollows, -1.0)):
+            for one in pieces:
+                low, high = one.bounds
+                at = ((points > low - near) & (points < high + near)).all(axis=1)
+                own = sign * _distance(one, points[at])
+                found[at] = np.minimum(found[at], own) if sign > 0 else np.maximum(found[at], own)
+        return found
+
+
+def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
+    """Return the signed distance (n,) of points from a closed surface, negative inside, m."""
+    import pyvista
+
+    if not len(points):
+        return np.zeros(0)
+    surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+    found = pyvista.PolyData(points).compute_implicit_distance(surface)
+    return np.asarray(found["implicit_distance"])
+
+
+def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCells:
+    """Return a link's shape from x = 0 to x = length as hexahedra.
+
+    What is beyond the joints is cut off, and its interfaces are the flat ends. Where the geometry
+    ends before a joint it is cut a little before its own end; where no piece leads from one end to
+    the other, as in an elbow, it stays whole and its interfaces are the facets nearest the joints.
+
+    Args:
+        shapes: surfaces in the link's frame.
+        body: with the arm's frame and length.
 
     Raises:
-        NoSolid: there is no geometry, it is open, in several parts, or its ends are not about the
-            joints.
+        NoSolid: there is no geometry, it encloses nothing, or is too thin for cells.
     """
-    from trimesh import boolean, creation
+    pieces = _pieces(shapes, inverse(body.frame))
+    piece = _largest(pieces)
+    notes, ends = list(pieces.done), _ends(piece.box, body.length)
+    between = None if ends is None else _between(pieces, piece, ends)
+    if ends is not None and between is not None and between.volume > BETWEEN * piece.volume:
+        piece = between
+        notes += _shortened(ends, body.length)
+    else:
+        notes.append("not cut at the joints: rigid where it is nearest to them")
+        ends = None
+    away = max(piece.away(x) for x in (0.0, body.length))
+    if away > NEAR * max(piece.size, body.length):
+        raise NoSolid(f"its geometry is {away:.3g} m away from a joint")
+    if piece.share < KEPT_ALL:
+        notes.append(f"the largest part kept, {100.0 * piece.share:.3g} % of it")
+    count = CELLS
+    while count <= MOST:
+        side = (piece.volume / count) ** (1.0 / 3.0)
+        cells = _cells(pieces, piece.box, ends, side, body.length, notes)
+        if cells is not None:
+            return cells
+        count = round(1.5 * count)
+    raise NoSolid(f"its walls are too thin for {MOST} cells")
 
-    if not link.shapes:
+
+# -- pieces ----------------------------------------------------------------------------------
+
+
+def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
+    """Return the pieces of surfaces, transformed, with their holes closed."""
+    if not shapes:
         raise NoSolid("it has no geometry")
-    if not link.is_closed:
-        raise NoSolid("its geometry is not closed")
-    shapes = [one.copy() for one in link.shapes]
-    far = 10.0 * (body.length + float(np.abs(link.points).max()))
-    for one in shapes:
-        one.apply_transform(inverse(body.frame))
-    box = creation.box(bounds=[[0.0, -far, -far], [body.length, far, far]])
-    whole = boolean.union(shapes, engine="manifold") if len(shapes) > 1 else shapes[0]
-    found = boolean.intersection([whole, box], engine="manifold")
-    if not len(found.faces) or not found.is_watertight:
-        raise NoSolid("none of its geometry is between its joints")
-    if found.body_count > 1:
-        raise NoSolid(f"its geometry is in {found.body_count} parts")
-    sides = np.ptp(found.vertices, axis=0)[1:]
-    for x, joint in ((0.0, "inboard"), (body.length, "outboard")):
-        at = found.vertices[np.abs(found.vertices[:, 0] - x) < FLAT * body.length, 1:]
-        if len(at) < 3:
-            raise NoSolid(f"its geometry does not reach the {joint} joint")
-        middle = 0.5 * (at.min(axis=0) + at.max(axis=0))
-        if np.linalg.norm(middle) > CENTRED * sides.max():
-            raise NoSolid(f"its geometry is not centred about the {joint} joint")
+    closed: list[Trimesh] = []
+    hollows: list[Trimesh] = []
+    left: list[Trimesh] = []
+    filled = turned = dropped = 0
+    every = [_tidy(one, to_arm) for one in shapes]
+    size = max(float(np.ptp(np.vstack([one.bounds for one in every]), axis=0).max()), 1e-9)
+    for shape in every:
+        if shape.is_volume and shape.body_count == 1:
+            closed.append(shape)
+            continue
+        if shape.body_count > MANY:
+            left.append(shape)
+            continue
+        own = list(shape.split(only_watertight=False, repair=False))
+        is_solid = shape.is_volume  # its pieces turned inwards are hollows
+        for one in own:
+            if np.ptp(one.bounds, axis=0).max() < TINY * size:
+                dropped += 1
+            elif one.is_watertight:
+                if is_solid and one.volume < 0.0 and _lies_in_another(one, own):
+                    one.invert()
+                    hollows.append(one)
+                else:
+                    turned += int(_turn_outwards(one))
+                    closed.append(one)
+            elif (whole := _with_holes_closed(one)) is not None:
+                filled += 1
+                closed.append(whole)
+            else:
+                left.append(one)
+    if not closed and not left:
+        raise NoSolid("its geometry has no extent")
+    many = len(closed) + len(left)
+    said = [
+        (turned, f"{_pieces_of(turned)} inside out turned"),
+        (filled, f"holes of {_pieces_of(filled)} closed"),
+        (len(left), f"{_pieces_of(len(left))} with wide holes filled"),
+        (many - 1, f"{_pieces_of(many)} united"),
+        (dropped, f"{_pieces_of(dropped)} below {100 * TINY:g} % of its size left out"),
+    ]
+    return _Pieces(tuple(closed), tuple(hollows), tuple(left), tuple(w for n, w in said if n))
+
+
+def _pieces_of(count: int) -> str:
+    return f"{count} piece" if count == 1 else f"{count} pieces"
+
+
+def _tidy(shape: Trimesh, to_arm: np.ndarray) -> Trimesh:
+    """Return a surface in the arm's frame: corners merged, no triangle twice or without area."""
+    import trimesh
+
+    found = trimesh.Trimesh(shape.vertices, shape.faces, process=True)
+    found.merge_vertices(merge_tex=True, merge_norm=True)
+    found.update_faces(found.nondegenerate_faces())
+    found.update_faces(found.unique_faces())
+    found.remove_unreferenced_vertices()
+    found.apply_transform(to_arm)
     return found
+
+
+def _lies_in_another(one: Trimesh, pieces: Sequence[Trimesh]) -> bool:
+    return any(
+        other.volume > 0.0
+        and (other.bounds[0] <= one.bounds[0]).all()
+        and (one.bounds[1] <= other.bounds[1]).all()
+        for other in pieces
+        if other is not one
+    )
+
+
+def _turn_outwards(piece: Trimesh) -> bool:
+    """Turn the triangles of a closed piece outwards; return whether there was need to."""
+    from trimesh import repair
+
+    if piece.is_winding_consistent and piece.volume > 0.0:
+        return False
+    repair.fix_winding(piece)
+    if piece.volume < 0.0:
+        piece.invert()
+    return True
+
+
+def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
+    """Return a piece with its holes closed by VTK; None where it stays open."""
+    import pyvista
+    import trimesh
+
+    wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
+    surface = pyvista.PolyData.from_regular_faces(piece.vertices, piece.faces)
+    found = surface.fill_holes(wide).triangulate()
+    whole = trimesh.Trimesh(found.points, found.regular_faces, process=True)
+    if not whole.is_watertight or len(whole.faces) < 4:
+        return None
+    _turn_outwards(whole)
+    return whole
+
+
+# -- where it is cut -------------------------------------------------------------------------
+
+
+def _grid(low: np.ndarray, high: np.ndarray, step: float) -> _Grid:
+    """Return a grid about a box, in the middle of it across the arm, with two voxels around."""
+    count = np.ceil((high - low) / step - 1e-6).astype(int) + 4
+    start = 0.5 * (low + high) - 0.5 * count * step
+    start[0] = low[0] - 2.0 * step
+    return _Grid(start, step, (int(count[0]), int(count[1]), int(count[2])))
+
+
+def _region(
+    pieces: _Pieces, grid: _Grid, ends: tuple[float, float] | None
+) -> tuple[np.ndarray, float]:
+    """Return the largest piece between the ends on a grid, and its share of what is there."""
+    found = pieces.on(grid)
+    if ends is not None:
+        x = grid.low[0] + (np.arange(grid.shape[0]) + 0.5) * grid.step
+        found[(x < ends[0]) | (x > ends[1])] = False
+    labels, count = ndimage.label(found)
+    if not count:
+        if ends is None:
+            raise NoSolid("its geometry encloses nothing")
+        return found, 0.0
+    sizes = np.bincount(labels.ravel())[1:]
+    return labels == 1 + int(sizes.argmax()), float(sizes.max() / sizes.sum())
+
+
+def _ends(box: np.ndarray, length: float) -> tuple[float, float] | None:
+    """Return where along x the geometry is cut; None where it hardly lies between its joints."""
+    low, high = float(box[0, 0]), float(box[1, 0])
+    margin = MARGIN * length
+    first = 0.0 if low < 1e-3 * length else low + margin
+    last = length if high > (1.0 - 1e-3) * length else high - margin
+    return (first, last) if last - first > SHORTEST * length else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """The largest piece of a link on a coarse grid, its share; its box (2, 3) to a voxel."""
+
+    region: np.ndarray
+    share: float
+    grid: _Grid
+    box: np.ndarray
+
+    @property
+    def volume(self) -> float:
+        return float(self.region.sum()) * self.grid.step**3
+
+    @property
+    def size(self) -> float:
+        return float(np.ptp(self.box, axis=0).max())
+
+    def away(self, x: float) -> float:
+        """Return the distance from a joint at (x, 0, 0), m."""
+        middles = self.grid.low + (np.argwhere(self.region) + 0.5) * self.grid.step
+        return float(np.linalg.norm(middles - [x, 0.0, 0.0], axis=1).min())
+
+
+def _piece(region: np.ndarray, share: float, grid: _Grid, box: np.ndarray) -> _Piece:
+    """Return a piece with its box, within that of what was looked at."""
+    where = np.argwhere(region)
+    low = grid.low + where.min(axis=0) * grid.step
+    high = grid.low + (where.max(axis=0) + 1) * grid.step
+    # Half a voxel is lost where a surface passes beyond the middles of voxels.
+    low[1:], high[1:] = low[1:] - grid.step, high[1:] + grid.step
+    return _Piece(
+        region, share, grid, np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
+    )
+
+
+def _largest(pieces: _Pieces) -> _Piece:
+    """Return the largest piece; looked at again where it is much smaller than what there is."""
+    box, share = pieces.bounds, 1.0
+    for _ in range(4):
+        size = float(np.ptp(box, axis=0).max())
+        grid = _grid(box[0], box[1], size / COARSE)
+        region, now = _region(pieces, grid, None)
+        share = min(share, now)
+        found = _piece(region, share, grid, box)
+        if found.size > 0.7 * size:
+            break
+        box = found.box
+    return found
+
+
+def _between(pieces: _Pieces, whole: _Piece, ends: tuple[float, float]) -> _Piece | None:
+    """Return the piece that leads from one end to the other; None without one."""
+    box = whole.box.copy()
+    box[:, 0] = ends
+    along = ends[1] - ends[0]
+    grid = _grid(box[0], box[1], along / max(8, round(along / whole.grid.step)))
+    region, share = _region(pieces, grid, ends)
+    if share < WHOLE or not (region[2].any() and region[-3].any()):
+        return None
+    return _piece(region, share * whole.share, grid, box)
+
+
+def _shortened(ends: tuple[float, float], length: float) -> list[str]:
+    """Return a sentence for every end at which the geometry does not reach its joint."""
+    gaps = (("inboard", ends[0]), ("outboard", length - ends[1]))
+    return [f"ends {gap:.3g} m before the {name} joint" for name, gap in gaps if gap > 0.0]
+
+
+# -- cells -----------------------------------------------------------------------------------
+
+
+def _cells(
+    pieces: _Pieces,
+    box: np.ndarray,
+    ends: tuple[float, float] | None,
+    side: float,
+    length: float,
+    notes: Sequence[str],
+) -> LinkCells | None:
+    """Return the cells of about a side; None where they are too coarse for the walls."""
+    low, high = box
+    side = min(side, float((high - low)[1:].min()) / FEWEST)
+    if ends is not None:
+        side = (ends[1] - ends[0]) / max(FEWEST, round((ends[1] - ends[0]) / side))
+    blocks = np.ceil((high - low) / side - 1e-6).astype(int)
+    start = 0.5 * (low + high) - 0.5 * blocks * side
+    if blocks.prod() * FINE**3 > VOXELS:
+        return None
+    along, over, through = (int(FINE * n) for n in blocks)
+    fine = _Grid(start, side / FINE, (along, over, through))
+    region, _ = _region(pieces, fine, ends)
+    pooled = region.reshape(blocks[0], FINE, blocks[1], FINE, blocks[2], FINE).mean(axis=(1, 3, 5))
+    labels, count = ndimage.label(pooled >= FULL)
+    if not count:
+        return None
+    sizes = np.bincount(labels.ravel())[1:]
+    solid = labels == 1 + int(sizes.argmax())
+    if sizes.max() < KEPT * pooled.sum() or sizes.max() > 2 * MOST:
+        return None
+    if ends is not None and not (solid[0].any() and solid[-1].any()):
+        return None
+    where = np.argwhere(solid)
+    corners = (where[:, None] + CORNERS).reshape(-1, 3)
+    nodes, cells = np.unique(corners, axis=0, return_inverse=True)
+    cells = cells.reshape(-1, 8)
+    points = start + side * nodes
+    facets, axes = _facets(solid, cells)
+    if ends is not None:
+        flat = axes == 0
+        x = points[facets].mean(axis=1)[:, 0]
+        patches = [facets[flat & (np.abs(x - one) < 1e-6 * side)] for one in ends]
+    else:
+        patches = _nearest(points, facets, length)
+    held = [np.unique(one) for one in patches]
+    points = _on_surface(pieces, points, cells, facets, region, fine, held, ends is not None)
+    return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
+
+
+def _facets(solid: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outer facets (k, 4) of the cells of a grid, and the axis across each (k,)."""
+    where = np.argwhere(solid)
+    around = np.pad(solid, 1)
+    found, axes = [], []
+    for (axis, way), side in SIDES.items():
+        beside = where + 1
+        beside[:, axis] += way
+        outer = ~around[tuple(beside.T)]
+        found.append(cells[outer][:, side])
+        axes.append(np.full(outer.sum(), axis))
+    return np.concatenate(found), np.concatenate(axes)
+
+
+def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.ndarray]:
+    """Return the outer facets nearest to each joint, without common points."""
+    middles = points[facets].mean(axis=1)
+    away = np.stack([np.linalg.norm(middles - [x, 0.0, 0.0], axis=1) for x in (0.0, length)])
+    count = max(4, math.ceil(PATCH * len(facets)))
+    own = [np.flatnonzero(away[k] <= away[1 - k]) for k in (0, 1)]
+    found = []
+    for k, mine in enumerate(own):
+        chosen = mine[np.argsort(away[k, mine], kind="stable")[:count]]
+        found.append(facets[chosen])
+    shared = np.intersect1d(found[0], found[1])
+    found[1] = found[1][~np.isin(found[1], shared).any(axis=1)]
+    if not all(map(len, found)):
+        raise NoSolid("both joints are nearest to the same place of its geometry")
+    return found
+
+
+def _on_surface(
+    pieces: _Pieces,
+    points: np.ndarray,
+    cells: np.ndarray,
+    facets: np.ndarray,
+    region: np.ndarray,
+    grid: _Grid,
+    held: Sequence[np.ndarray],
+    flat: bool,
+) -> np.ndarray:
+    """Move the outer points onto the surface, as far as the cells stay good.
+
+    The way comes from the voxels, and how far from the surfaces of closed pieces; where there are
+    open ones from the voxels, too. Points of flat ends stay in their plane.
+    """
+    pad = 2
+    # Beyond a flat end the geometry goes on: there its surface is no surface.
+    inside = np.pad(region, ((pad, pad),) * 3, mode="edge" if flat else "constant")
+    for axis in (1, 2):
+        for edge in (slice(0, pad), slice(-pad, None)):
+            inside[tuple(edge if k == axis else slice(None) for k in range(3))] = False
+    away = ndimage.distance_transform_edt(~inside) - ndimage.distance_transform_edt(inside)
+    away = ndimage.gaussian_filter(away - 0.5 * np.sign(away), 1.0) * grid.step
+    slopes = np.gradient(away, grid.step)
+    outer = np.unique(facets)
+    moved = points[outer].copy()
+    free = np.ones_like(moved)
+    if flat:
+        free[np.isin(outer, np.concatenate(held)), 0] = 0.0
+    for _ in range(4):
+        at = ((moved - grid.low) / grid.step - 0.5 + pad).T
+        slope = np.stack([ndimage.map_coordinates(g, at, order=1, mode="nearest") for g in slopes])
+        way = slope.T * free
+        if pieces.open:
+            value = ndimage.map_coordinates(away, at, order=1, mode="nearest")
+        else:
+            value = pieces.distance(moved, FINE * grid.step)
+        moved -= (value / np.maximum((way * slope.T).sum(axis=1), 0.25))[:, None] * way
+    shift = np.zeros_like(points)
+    shift[outer] = moved - points[outer]
+    longest = np.linalg.norm(shift, axis=1, keepdims=True)
+    cell = FINE * grid.step
+    shift *= np.minimum(1.0, LONGEST * cell / np.maximum(longest, 1e-30))
+    for _ in range(20):
+        bad = _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3
+        if not bad.any():
+            return np.asarray(points + shift)
+        shift[np.unique(cells[bad])] *= EASED
+    shift[np.unique(cells[bad])] = 0.0
+    while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3).any():
+        shift[np.unique(cells[bad])] = 0.0
+    return np.asarray(points + shift)
+
+
+def _jacobians(corners: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (n, 8) at the corners of hexahedra (n, 8, 3), m3."""
+    found = []
+    for k, around in enumerate(AROUND):
+        a, b, c = (corners[:, j] - corners[:, k] for j in around)
+        found.append(np.einsum("na,na->n", a, np.cross(b, c)))
+    return np.stack(found, axis=1)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import os
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -31,8 +32,12 @@ SECTIONS = 64  # flat sides of a cylinder
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}  # of shapes
 
 
-def read_robot(file: Path) -> Robot:
+def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
     """Read a robot and the surfaces of its links.
+
+    Args:
+        file: URDF.
+        package_path: folders with ROS packages, looked through before others, see `mesh_path`.
 
     Raises:
         InputError: yourdfpy is not installed; no such file; not URDF; joints that a scene does not
@@ -54,7 +59,7 @@ def read_robot(file: Path) -> Robot:
         _check_names(file, "joint", [joint.name for joint in model.joints])
         joints = [_joint(file, one) for one in model.joints]
         _check_mimics(file, joints)
-        links = {one.name: _link(file, one) for one in model.links}
+        links = {one.name: _link(file, one, package_path) for one in model.links}
     root, ordered = _ordered(file, list(links), joints)
     return Robot(model.name, file, links, ordered, root)
 
@@ -64,7 +69,7 @@ def _library() -> Any:
         import yourdfpy
     except ImportError:
         raise InputError(
-            "robots need the package yourdfpy: pip install 'dolfinopt[robots]'"
+            f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
         ) from None
     return yourdfpy
 
@@ -111,16 +116,25 @@ def _parse(file: Path) -> bytes:
         raise InputError(f"{file}: cannot be read ({reason}); name a URDF file") from None
     except etree.XMLSyntaxError as error:
         raise InputError(f"{file}: not XML ({error.msg}); name a URDF file") from None
-    if any("xacro" in str(uri) for uri in root.nsmap.values()) or file.suffix == ".xacro":
-        stem = file.name.removesuffix(".xacro").removesuffix(".urdf")
-        new = f"{stem}.urdf" if f"{stem}.urdf" != file.name else f"{stem}-plain.urdf"
-        raise InputError(
-            f"{file}: a xacro file; make a URDF of it first: xacro {file.name} > {new}"
-        )
-    if root.tag != "robot" or "name" not in root.attrib:
+    _check_expanded(file, root)
+    if root.tag != "robot":
         raise InputError(f"{file}: expected an element <robot name=...>, found <{root.tag}>")
+    root.set("name", root.get("name") or file.stem)
     text: bytes = etree.tostring(root)
     return text
+
+
+def _check_expanded(file: Path, root: Any) -> None:
+    """Refuse elements of xacro; its namespace alone, as xacro leaves it behind, means nothing."""
+    for element in root.iter("{*}*"):
+        if "xacro" in element.tag.rpartition("}")[0]:
+            stem = file.name.removesuffix(".xacro").removesuffix(".urdf")
+            new = f"{stem}.urdf" if f"{stem}.urdf" != file.name else f"{stem}-plain.urdf"
+            raise InputError(
+                f"{file}: line {element.sourceline}: an element of xacro, "
+                f"{element.tag.rpartition('}')[2]}; make a URDF of it first: "
+                f"xacro {file.name} > {new}"
+            )
 
 
 def _check_names(file: Path, what: str, names: list[str]) -> None:
@@ -155,7 +169,10 @@ def _joint(file: Path, one: Any) -> RobotJoint:
         _check_finite(f"{where}: limit", [x for x in (limit.lower, limit.upper) if x is not None])
         if lower > upper:
             raise InputError(f"{where}: limit lower = {lower:g} above upper = {upper:g}")
-    velocity = math.inf if limit is None or not limit.velocity else limit.velocity
+    rate, effort = (
+        math.inf if limit is None else _limit(where, word, getattr(limit, word))
+        for word in ("velocity", "effort")
+    )
     return RobotJoint(
         one.name,
         one.type,
@@ -165,9 +182,19 @@ def _joint(file: Path, one: Any) -> RobotJoint:
         axis / length if length else np.array([1.0, 0.0, 0.0]),
         lower,
         upper,
-        velocity,
+        rate,
+        effort,
         _mimic(one.mimic) if one.type != "fixed" else None,
     )
+
+
+def _limit(where: str, word: str, value: float | None) -> float:
+    """Return a limit of rate or effort; files that know none say 0, or nothing."""
+    if not value:
+        return math.inf
+    if math.isnan(value) or value < 0.0:
+        raise InputError(f"{where}: limit {word} = {value:g}; expected a positive number")
+    return float(value)
 
 
 def _mimic(one: Any) -> Mimic | None:
@@ -228,19 +255,33 @@ def _pose(origin: Any) -> np.ndarray:
     return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
 
 
-def _link(file: Path, one: Any) -> RobotLink:
+def _link(file: Path, one: Any, package_path: Sequence[Path]) -> RobotLink:
+    shapes, missing = _shapes(file, one.name, one.collisions or one.visuals, package_path)
+
+    def visual() -> tuple[Trimesh, ...]:
+        with _quiet():
+            return _shapes(file, one.name, one.visuals, package_path)[0]
+
+    both = one.collisions and one.visuals
+    return RobotLink(one.name, _inertia(file, one), shapes, missing, visual if both else None)
+
+
+def _shapes(
+    file: Path, link: str, elements: Sequence[Any], package_path: Sequence[Path]
+) -> tuple[tuple[Trimesh, ...], tuple[str, ...]]:
+    """Return the surfaces of a link's elements in its frame, and meshes that cannot be read."""
     shapes, missing = [], []
-    for element in one.collisions or one.visuals:
+    for element in elements:
         try:
-            shape = _shape(file, one.name, element.geometry)
+            shape = _shape(file, link, element.geometry, package_path)
         except FileNotFoundError:
             missing.append(element.geometry.mesh.filename or "without a name")
             continue
         pose = _pose(element.origin)
-        _check_finite(f"{file}: link {one.name!r}: origin of a shape", pose)
+        _check_finite(f"{file}: link {link!r}: origin of a shape", pose)
         shape.apply_transform(pose)
         shapes.append(shape)
-    return RobotLink(one.name, _inertia(file, one), tuple(shapes), tuple(missing))
+    return tuple(shapes), tuple(missing)
 
 
 def _inertia(file: Path, link: Any) -> Inertia | None:
@@ -264,7 +305,7 @@ def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
                          f"found {found}")  # fmt: skip
 
 
-def _shape(file: Path, link: str, geometry: Any) -> Trimesh:
+def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -> Trimesh:
     """Return the surface of a geometry element of a link.
 
     Raises:
@@ -284,13 +325,13 @@ def _shape(file: Path, link: str, geometry: Any) -> Trimesh:
     if geometry.cylinder is not None:
         one = geometry.cylinder
         return creation.cylinder(radius=one.radius, height=one.length, sections=SECTIONS)
-    return _mesh(file, geometry.mesh)
+    return _mesh(file, geometry.mesh, package_path)
 
 
-def _mesh(file: Path, mesh: Any) -> Trimesh:
+def _mesh(file: Path, mesh: Any, package_path: Sequence[Path]) -> Trimesh:
     import trimesh
 
-    path = mesh_path(file, mesh.filename) if mesh.filename else None
+    path = mesh_path(file, mesh.filename, package_path) if mesh.filename else None
     if path is None:
         raise FileNotFoundError(mesh.filename)
     load: Callable[..., Any] = trimesh.load_mesh
@@ -305,13 +346,46 @@ def _mesh(file: Path, mesh: Any) -> Trimesh:
     return found
 
 
-def mesh_path(file: Path, name: str) -> Path | None:
+def mesh_path(file: Path, name: str, package_path: Sequence[Path] = ()) -> Path | None:
     """Return where a mesh that a URDF file names lies; None where it is not found.
 
-    "package://ROBOT/meshes/a.stl" is looked for beside the file and in the folders above it.
+    "package://ROBOT/meshes/a.stl" is looked for in a folder ROBOT within those of `package_path`
+    and of ROS_PACKAGE_PATH, in share/ROBOT within those of AMENT_PREFIX_PATH, and in the folders
+    above the file, as it is named and where symbolic links lead. Such a folder may be ROBOT itself.
+    Last, ROBOT left out, beside the file and in the folders above it.
     """
-    import yourdfpy
+    scheme, colon, rest = name.partition("://")
+    if not colon or scheme == "file":
+        path = Path(rest if colon else name)
+        places = [path] if path.is_absolute() else [one / path for one in _folders_above(file)]
+    else:
+        package, _, inner = rest.lstrip("/").partition("/")
+        places = [found / inner for found in _packages(file, package, package_path)]
+        places += [folder / inner for folder in _folders_above(file)]
+    return next((place for place in places if place.is_file()), None)
 
-    with _quiet():
-        found = Path(yourdfpy.filename_handler_magic(name, os.path.dirname(os.path.abspath(file))))
-    return found if found.is_file() else None
+
+def _packages(file: Path, package: str, package_path: Sequence[Path]) -> Iterator[Path]:
+    """Yield the folders that may be a ROS package."""
+
+    def stated(variable: str) -> list[Path]:
+        return [Path(one) for one in os.environ.get(variable, "").split(os.pathsep) if one]
+
+    for folder in (*package_path, *stated("ROS_PACKAGE_PATH")):
+        if folder.absolute().name == package:
+            yield folder
+        yield folder / package
+        yield from sorted(one / package for one in folder.glob("*/"))  # a workspace of stacks
+        yield folder / "share" / package
+    for folder in stated("AMENT_PREFIX_PATH"):
+        yield folder / "share" / package
+    for folder in _folders_above(file):
+        if folder.name == package:
+            yield folder
+        yield folder / package
+
+
+def _folders_above(file: Path) -> list[Path]:
+    """Return a file's folder and those above it, as it is named and without symbolic links."""
+    named, real = Path(os.path.abspath(file)), file.resolve()
+    return list(dict.fromkeys([*named.parents, *real.parents]))

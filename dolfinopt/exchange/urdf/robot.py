@@ -7,6 +7,7 @@ components of the inner frame to those of the outer one.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -40,7 +41,8 @@ class RobotJoint:
         pose: of the child's frame in the parent's, all joint coordinates zero.
         axis: (3,) unit vector in the child's frame.
         lower, upper: limits of its coordinate, rad or m; infinite where there is none.
-        velocity: limit of its rate, rad/s or m/s.
+        velocity: limit of its rate, rad/s or m/s; infinite where there is none.
+        effort: limit of what drives it, N m or N; infinite where there is none.
         mimic: which joint it follows, or None.
     """
 
@@ -53,6 +55,7 @@ class RobotJoint:
     lower: float = -math.inf
     upper: float = math.inf
     velocity: float = math.inf
+    effort: float = math.inf
     mimic: Mimic | None = None
 
     @property
@@ -106,12 +109,14 @@ class RobotLink:
         shapes: closed or open surfaces in the link's frame, collision ones if there are any, else
             visual ones.
         missing: mesh files that are not there or cannot be read.
+        visual: reads the visual surfaces where `shapes` are collision ones; None without them.
     """
 
     name: str
     inertia: Inertia | None
     shapes: tuple[Trimesh, ...]
     missing: tuple[str, ...] = ()
+    visual: Callable[[], tuple[Trimesh, ...]] | None = None
 
     @property
     def own(self) -> Inertia:

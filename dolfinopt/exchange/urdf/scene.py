@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,15 @@ CELLS = 6000  # of a solid, about
 FEWEST = 4  # over its height and over its thickness
 RADIUS = 2.0  # of the filter, in cells
 MATERIAL, DENSITY = "aluminium 6082-T6", 2700.0  # kg/m3
+FRACTION = 0.4  # of the volume of solids whose mass the file does not tell
+LEAST = 0.05  # initial density, of a link that weighs next to nothing in the file
+# What solid ends of one layer of cells add to the mass, over their own: the filter, a Helmholtz
+# kernel of length l = radius / (2 sqrt(3)), carries l / 2 (1 - exp(-a / l)) of a layer a thick
+# into the cells beside it; with a radius of two cells 0.24 a.
+BLURRED = 1.24
+MOST_SOLID = 0.9  # of the volume of a solid of few cells that its ends are
+CENTRED = 0.04  # of height or thickness: offset of interfaces up to which nothing is said of it
+PASSIVE = 0.4  # of a solid's length: longest solid end
 SETTLING = 0.3  # of the motion's duration, simulated after it
 ROUNDING = 1e-15  # m, rad: less is written as zero
 TIME = "t"  # a column of tables
@@ -93,36 +103,68 @@ class RobotScene:
         return "\n".join(lines) + "\n"
 
     def _solid(self, body: SceneBody) -> list[str]:
-        assert body.size is not None
         own, file = body.inertia, _one_line(self.robot.file.name)
+        one = _extent(body)
         if body.mesh is None:
-            sides = height, thickness = (_up(body.size[0]), _up(body.size[1]))
-            weight = DENSITY * body.length * height * thickness
             by = (
                 "the extents of its geometry"
                 if body.measured
                 else "a guess: its geometry does not tell"
             )
-            keys = [f"cells = {list(cells_of(body.length, *sides))}"]
+            keys = [f"cells = {list(cells_of(body.length, *one.sides))}"]
         else:
-            sides, weight, by = body.size, DENSITY * body.mesh.volume, "those of its geometry"
+            by = "those of its geometry"
             keys = [
-                f"mesh = {_string(self.mesh_name(body))}  # {body.mesh.cells} cells, its geometry "
-                "between the joints",
-                'cell_shape = "tetrahedron"',
-                f"passive = {_number(_down(min(sides[0] / 4, body.length / 10)))}  # m, kept solid "
-                "at both ends",
+                f"mesh = {_string(self.mesh_name(body))}  # {body.mesh.cells} cells, its geometry",
+                'cell_shape = "hexahedron"',
             ]
+            if body.mesh.done:
+                keys.insert(0, f"# {'; '.join(body.mesh.done)}")
+            if body.mesh.offset > CENTRED * max(one.sides):
+                keys.append(
+                    f"interface_offset = {_number(_up(1.001 * body.mesh.offset))}  # m, of their "
+                    "middles from the joints"
+                )
         return [
             "[[arms]]",
             f"name = {_string(self.arms[body.link])}",
             f"length = {_number(body.length)}  # m, from joint to joint",
-            f"height = {_number(sides[0])}  # m, {by}{'' if body.mesh else ': edit them'}",
-            f"thickness = {_number(sides[1])}",
+            f"height = {_number(one.sides[0])}  # m, {by}{'' if body.mesh else ': edit them'}",
+            f"thickness = {_number(one.sides[1])}",
             *keys,
-            f"# all solid it weighs {weight:.4g} kg; {file}: "
+            f"passive = {_number(one.passive)}  # m, kept solid at the joints: one layer of cells, "
+            f"{DENSITY * one.ends:.3g} kg",
+            f"# all solid it weighs {DENSITY * one.volume:.4g} kg; {file}: "
             f"{own.mass:.4g} kg, centre {_rounded(own.centre)}",
         ]
+
+    @cached_property
+    def start(self) -> tuple[float, float]:
+        """Volume fraction and initial density with which the solids weigh what the file says.
+
+        All of them together, for there is one of each. Where the file says nothing `FRACTION`; the
+        density is at least `LEAST` and at most 1.
+        """
+        solids = [_extent(body) for body in self.bodies if body.is_solid]
+        whole = sum(one.volume for one in solids)
+        ends = sum(one.blurred for one in solids)
+        mass = sum(body.inertia.mass for body in self.bodies if body.is_solid)
+        wanted = mass / (DENSITY * whole) if mass > 0.0 else FRACTION
+        initial = min(1.0, max(LEAST, (wanted * whole - ends) / (whole - ends)))
+        initial = float(f"{initial:.4g}")
+        return float(f"{(ends + initial * (whole - ends)) / whole:.4g}"), initial
+
+    def masses(self, body: SceneBody) -> str:
+        """Return what a solid weighs at the start, in the file, and all solid."""
+        one, initial = _extent(body), self.start[1]
+        start = DENSITY * (one.blurred + initial * (one.volume - one.blurred))
+        said = f"starts at {start:.3g} kg of {DENSITY * one.volume:.3g} kg all solid"
+        return f"{said}, the file says {body.inertia.mass:.3g} kg"
+
+    @property
+    def _weighed(self) -> bool:
+        """Whether the file tells the mass of every solid."""
+        return all(body.inertia.mass > 0.0 for body in self.bodies if body.is_solid)
 
     def mesh_name(self, body: SceneBody) -> str:
         """Return the name of a solid's mesh file."""
@@ -156,11 +198,24 @@ class RobotScene:
             f"origin = {_list(_tidy(body.pose[:3, 3]))}",
             f"rpy = {_list(_tidy(np.array(roll_pitch_yaw_of(R))))}",
         ]
-        return [*lines, f"axis = {_list(_tidy(body.axis))}"] if joint.moves else lines
+        if not joint.moves:
+            return lines
+        lines.append(f"axis = {_list(_tidy(body.axis))}")
+        length, force = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
+        if math.isfinite(joint.lower) and math.isfinite(joint.upper):
+            lines.append(f"position_limits = {_list((joint.lower, joint.upper))}  # {length}")
+        for key, value, unit in (
+            ("velocity_limit", joint.velocity, f"{length}/s"),
+            ("effort_limit", joint.effort, force),
+        ):
+            if math.isfinite(value):
+                lines.append(f"{key} = {_number(value)}  # {unit}")
+        return lines
 
     def _rest(self) -> list[str]:
         """Return motion, payload and what of the defaults is not for a solid of this size."""
-        side = max(_cell_size(body) for body in self.bodies if body.is_solid)
+        side = max(_extent(body).cell for body in self.bodies if body.is_solid)
+        fraction, initial = self.start
         return [
             "[motion]",
             'path = "joints"',
@@ -178,7 +233,9 @@ class RobotScene:
             "coordinates = 6  # of a solid link: those of its outboard interface alone",
             "",
             "[design]",
-            "volume_fraction = 0.4  # of each solid link may stay",
+            f"volume_fraction = {_number(fraction)}  # of each solid link may stay: together as "
+            "heavy as in the URDF file" + ("" if self._weighed else ", as far as it tells"),
+            f"initial = {_number(initial)}  # density with which they begin so",
             f"filter_radius = {_number(_up(RADIUS * side))}  # m",
         ]
 
@@ -237,13 +294,41 @@ def cells_of(length: float, height: float, thickness: float) -> tuple[int, int, 
     return max(1, along), max(FEWEST, across[0]), max(FEWEST, across[1])
 
 
-def _cell_size(body: SceneBody) -> float:
-    """Return the longest side of a solid's cells, m."""
+@dataclass(frozen=True)
+class _Extent:
+    """A solid as it stands in the scene.
+
+    Attributes:
+        sides: height and thickness, m.
+        cell: longest side of a cell, m.
+        passive: length kept solid at the joints, m.
+        volume, ends: of all cells, and of those kept solid, m3.
+    """
+
+    sides: tuple[float, float]
+    cell: float
+    passive: float
+    volume: float
+    ends: float
+
+    @property
+    def blurred(self) -> float:
+        """Volume that solid ends have once the design is filtered, m3."""
+        return min(BLURRED * self.ends, MOST_SOLID * self.volume)
+
+
+def _extent(body: SceneBody) -> _Extent:
     assert body.size is not None
     if body.mesh is not None:
-        return body.mesh.size
-    box = (body.length, *body.size)
-    return max(size / count for size, count in zip(box, cells_of(*box), strict=True))
+        one, passive = body.mesh, min(body.mesh.size, PASSIVE * body.length)
+        return _Extent(body.size, one.size, float(f"{passive:.6g}"), one.volume, one.ends)
+    height, thickness = (_up(one) for one in body.size)
+    cells = cells_of(body.length, height, thickness)
+    along, *across = (x / n for x, n in zip((body.length, height, thickness), cells, strict=True))
+    volume = body.length * height * thickness
+    passive = min(along, PASSIVE * body.length)
+    ends = 2.0 * volume / cells[0]
+    return _Extent((height, thickness), max(along, *across), float(f"{passive:.6g}"), volume, ends)
 
 
 def _path_from(file: Path, folder: Path) -> str:
@@ -254,12 +339,6 @@ def _up(value: float) -> float:
     """Return a number rounded up to three digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)
     return float(f"{math.ceil(round(value / unit, 6)) * unit:.3g}")
-
-
-def _down(value: float) -> float:
-    """Return a number rounded down to two digits."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(f"{math.floor(round(value / unit, 6)) * unit:.2g}")
 
 
 def _tidy(values: np.ndarray) -> np.ndarray:

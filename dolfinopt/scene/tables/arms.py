@@ -51,7 +51,8 @@ JOINT_KEYS = (
 )  # fmt: skip
 SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
-MESH_KEYS = ("cells", "mesh", *SIZE_KEYS)
+MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset")
+OF_OTHER_MESHES = ("cells", "interface_offset")  # what an arm with a mesh of its own does not take
 SIZE_PARAMETER = "mesh size (m)"  # its name in a .geo file
 CELLS_ACROSS = 12  # the height of an arm from a STEP file without mesh_size
 SOLID_CELLS_ACROSS = 4  # the smaller of height and thickness of a solid one
@@ -104,6 +105,12 @@ class Arm(Table):
         default=None,
         description="cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
         "a solid, with a .msh file, too [-]",
+    )
+    interface_offset: Length | None = Field(
+        default=None,
+        description="how far the middles of a solid mesh file's interfaces may lie from the joints "
+        "at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: a twentieth of "
+        "the larger of height and thickness [m]",
     )
     element: ElementName | None = Field(
         default=None,
@@ -311,10 +318,12 @@ class Arm(Table):
     @model_validator(mode="after")
     def _check_mesh(self) -> Arm:
         if self.mesh is None:
-            for key in SIZE_KEYS:
+            for key in (*SIZE_KEYS, "interface_offset"):
                 if getattr(self, key) is not None:
                     raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
             return self
+        if self.interface_offset is not None and not self.is_solid:
+            raise Refusal("expected only with the mesh of a solid arm", ("interface_offset",))
         if self.cells is not None:
             raise Refusal(
                 "expected either cells (a rectangular arm) or mesh (a file), not both",

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 JointType = Literal["revolute", "prismatic", "fixed"]
 Component = Annotated[float, Field(ge=-1e6, le=1e6)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
+Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
+LIMITS = ("position_limits", "velocity_limit", "effort_limit")
 GROUND = "ground"
 TIME = "t"  # column of a table of joint coordinates
 PATHS = ("joints", "points", "line")  # of machines in space
@@ -62,10 +65,36 @@ class Joint(Table):
         "frame, as in URDF [rad]",
     )
 
+    position_limits: tuple[Coordinate, Coordinate] | None = Field(
+        default=None,
+        description="least and largest coordinate, as in URDF; told where the motion exceeds them "
+        "[rad, m]",
+    )
+    velocity_limit: Limit | None = Field(
+        default=None,
+        description="largest rate of the coordinate either way, as in URDF; told where the motion "
+        "exceeds it [rad/s, m/s]",
+    )
+    effort_limit: Limit | None = Field(
+        default=None,
+        description="largest torque or force of the drive either way, as in URDF; told where the "
+        "motion asks for more. The optimiser minds control.limits and constraints.peak_force "
+        "[N m, N]",
+    )
+
     @property
     def moves(self) -> bool:
         """Whether it has a coordinate."""
         return self.type != "fixed"
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Joint:
+        for key in LIMITS:
+            if getattr(self, key) is not None and not self.moves:
+                raise Refusal("expected none with a fixed joint", (key,), ("type",))
+        if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
+            raise Refusal("expected the least first, then the largest", ("position_limits",))
+        return self
 
     @model_validator(mode="after")
     def _check_axis(self) -> Joint:
