@@ -102,8 +102,7 @@ def _spatial_system(
     scene: Scene, bodies: list[ShapeIntegrals], motion: Callable[[np.ndarray], Any]
 ) -> MachineSystem | SpatialSystem:
     """Return the equations of a scene in space: joints prescribed, or controlled."""
-    from dolfinopt.dynamics.spatial_machine import SpatialMachineSystem
-    from dolfinopt.dynamics.spatial_system import SpatialSystem
+    from dolfinopt.dynamics.spatial_system import SpatialMachineSystem, SpatialSystem
     from dolfinopt.multibody.spatial.links import build_spatial_mechanism
 
     tree, instants = build_spatial_mechanism(scene, bodies), breakpoints(scene)

@@ -88,7 +88,7 @@ class DriveForces:
             return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
         if isinstance(system, MachineSystem):
             return _Machine(system.at(t), (y, yd, ydd))
-        from dolfinopt.dynamics.spatial_machine import SPACE
+        from dolfinopt.dynamics.spatial_system import SPACE
 
         return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), SPACE)
 

@@ -9,15 +9,17 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.spatial_machine import SpatialMachineSystem
-from dolfinopt.dynamics.spatial_system import SpatialSystem, interface_rotations
-from dolfinopt.multibody.spatial.body_loads import load_coefficients
+from dolfinopt.dynamics.spatial_system import (
+    SpatialMachineSystem,
+    SpatialSystem,
+    interface_rotations,
+)
 from dolfinopt.multibody.spatial.end_effector import (
     deviation,
     end_effector,
     end_effector_gradient,
 )
-from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics, load_coefficients
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 from dolfinopt.multibody.spatial.motion import JointMotion
 

@@ -8,6 +8,7 @@ Where the loads change the stiffness of no arm by more than `SURELY_OFF`, nothin
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +18,13 @@ from dolfinopt.dynamics.build import build_mechanism, closure_of
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.motion import rigid_motion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, shape_integrals
-from dolfinopt.multibody.stiffening import Stiffening, largest_change
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    linear_part,
+    rigid_part,
+    shape_integrals,
+)
+from dolfinopt.multibody.stiffening import Stiffening, largest_change, stiffness_change
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
@@ -136,11 +142,16 @@ def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
     if not scene.is_spatial:
         mechanism = build_mechanism(scene, bodies)
         return largest_change(mechanism, rigid_motion(t, scene), closure_of(scene))
+    from dolfinopt.multibody.spatial import inverse_dynamics as space
     from dolfinopt.multibody.spatial.links import build_spatial_mechanism
     from dolfinopt.multibody.spatial.motion import joint_motion
-    from dolfinopt.multibody.spatial.stiffening import largest_change as spatial_change
 
-    return spatial_change(build_spatial_mechanism(scene, bodies), joint_motion(t, scene))
+    stiffened, motion = build_spatial_mechanism(scene, bodies), joint_motion(t, scene)
+    rigid, none = replace(stiffened, bodies=tuple(map(rigid_part, bodies))), np.zeros((len(t), 0))
+    links = space.outward_pass(rigid, motion, (none, none, none))
+    loads = space.body_loads(links, space.inward_pass(rigid, links).outboard)
+    pairs = zip(stiffened.bodies, loads, strict=True)
+    return max((stiffness_change(body, p) for body, p in pairs), default=0.0)
 
 
 def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> float | None:

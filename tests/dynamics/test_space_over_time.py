@@ -14,8 +14,7 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.spatial_machine import SpatialMachineSystem
-from dolfinopt.dynamics.spatial_system import SpatialSystem
+from dolfinopt.dynamics.spatial_system import SpatialMachineSystem, SpatialSystem
 from dolfinopt.multibody.drives import Drives
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion

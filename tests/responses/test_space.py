@@ -104,7 +104,7 @@ CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.
     [
         ("deviation", SCENARIOS),
         ("effort", CONTROL),
-        ("stress", ()),
+        ("stress", ("simulation.stiffening=true",)),
         ("tip_deflection", ()),
         ("eigenfrequency", ()),
     ],

@@ -15,6 +15,7 @@ from dolfinopt.multibody.spatial.body_motion import BodyMotion
 from dolfinopt.multibody.spatial.kinematics import Interface, Load, Motion, MovingJoint
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
 from dolfinopt.multibody.spatial.motion import JointMotion
+from dolfinopt.multibody.spatial.rotations import ONE
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,3 +143,43 @@ def elastic_residual(
     """Return the elastic residual (n, N) of `inverse_dynamics` alone."""
     links = outward_pass(mechanism, motion, (q, qd, qdd))
     return elastic_rows(links, inward_pass(mechanism, links))
+
+
+# -- what loads every body: its frame's acceleration, and from outboard ------------------------
+
+
+def body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.ndarray]:
+    """Return p = (a, A_ab, force, moment) (n, 18) of every body.
+
+    The moment is what works on the rotation vector of the interface. Of several interfaces force
+    and moment of one stand behind those of the other.
+    """
+    found = []
+    for link, loads in zip(links, outboard, strict=True):
+        count = len(link.body.a)
+        pull = np.zeros((count, len(link.body.constants.B)))
+        for s, load in loads.items():
+            flexible, interface = link.body.is_flexible, link.interfaces[s]
+            own = interface.conjugate(load) if flexible else np.hstack(load)
+            pull[:, interface.rows_of] = own
+        found.append(np.hstack([link.body.a, link.body.A.reshape(count, 9), pull]))
+    return found
+
+
+def load_coefficients(
+    mechanism: SpatialMechanism, motion: JointMotion, rates: Rates
+) -> list[np.ndarray]:
+    """Return c (n, 18 + 9 q) of every body: what loads its nodes, as inertia acts.
+
+    c = -(a, A_ab, force, moment, A_ab z + 2 Omega_ab zd + delta_ab zdd), ab before the modes,
+    z being the displacement along them, see `modal_displacement`.
+    """
+    links = outward_pass(mechanism, motion, rates)
+    found = []
+    for link, p in zip(links, body_loads(links, inward_pass(mechanism, links).outboard)):
+        modal = link.body.modal
+        z, zd, zdd = (x[:, None, None] for x in (modal.z, modal.zd, modal.zdd))
+        A, Omega = link.body.A[..., None], link.body.Omega[..., None]
+        elastic = A * z + 2.0 * Omega * zd + ONE[:, :, None] * zdd
+        found.append(-np.hstack([p, elastic.reshape(len(p), -1)]))
+    return found

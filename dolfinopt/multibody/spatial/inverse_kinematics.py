@@ -11,15 +11,17 @@ doi:10.1007/978-1-84628-642-1; Nakamura & Hanafusa (1986), doi:10.1115/1.3143764
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.spatial.end_path import EndPath, end_path, num_rows
+from dolfinopt.multibody.spatial.end_path import EndPath, end_path, num_rows, prescribed_joints
+from dolfinopt.multibody.spatial.links import end_chain
 from dolfinopt.multibody.spatial.rigid_chain import Pose, RigidChain
+from dolfinopt.scene.duration import file_stamp
 from dolfinopt.scene.load import Scene
 
 REACHED = 1e-11  # residual over the reach that rounding leaves
@@ -34,6 +36,7 @@ NEWTON = 3  # iterations from the dense table, right to 1e-5: the last one leave
 DAMPED = 200  # iterations at the start
 STALLED = 1e-9  # part by which the distance falls in one of them, below which it is the least
 GUESSES = 10  # at the start: the first as stated, the others around it at random
+MOST = 6  # joints that a pose determines
 KEPT = 16  # sets of instants whose joints are kept: the integrator asks for the same ones again
 
 
@@ -300,3 +303,46 @@ class Follower:
     def _key(self) -> str:
         motion = self.scene.motion
         return "motion.start, motion.end" if motion.path == "line" else "the table motion.file"
+
+
+# -- which joints follow, and which the path's table prescribes ---------------------------------
+
+
+def follower(scene: Scene) -> Follower:
+    """Return what follows the scene's path in space.
+
+    Raises:
+        InputError: the path does not determine the joints; names them and the remedy.
+    """
+    return _follower(scene, file_stamp(scene.motion))
+
+
+@lru_cache(maxsize=16)
+def _follower(scene: Scene, stamp: int) -> Follower:
+    chain, names = end_chain(scene), scene.driven
+    given = np.array([names.index(name) for name in prescribed_joints(scene)], dtype=int)
+    unknown = np.array([k for k in range(len(names)) if k not in given], dtype=int)
+    where = f'{scene.source}: motion.path = "{scene.motion.path}"'
+    column = 'columns of joints in the table of motion.path = "points"'
+    tables = 'joint tables, motion.path = "joints"'
+    idle = ", ".join(names[k] for k in unknown if k not in chain.coordinates)
+    if idle:
+        raise InputError(
+            f"{where}: joints that do not move the end-effector ({idle}) have no motion; give them "
+            f"{column}, or {tables}"
+        )
+    rows = end_path(np.zeros(1), scene).rows
+    moving = ", ".join(names[k] for k in unknown)
+    if len(unknown) == 0:
+        raise InputError(f"{where}: its table prescribes all joints; give {tables}, instead")
+    if len(unknown) > rows:
+        what, more = "a pose determines", ""
+        if rows == 3:
+            what = "x, y and z determine"
+            turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
+            more = f"the orientation ({turn}), " if len(unknown) <= MOST else ""
+        raise InputError(
+            f"{where}: expected at most {rows} joints, which {what}, found {len(unknown)} "
+            f"({moving}); give {more}{column}, or {tables}"
+        )
+    return Follower(scene, chain, unknown, given)

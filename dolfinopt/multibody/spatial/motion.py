@@ -34,7 +34,7 @@ def joint_motion(t: np.ndarray, scene: Scene) -> JointMotion:
         InputError: the table cannot be used, or the path cannot be followed.
     """
     if scene.motion.path != "joints":
-        from dolfinopt.multibody.spatial.following import follower
+        from dolfinopt.multibody.spatial.inverse_kinematics import follower
 
         return JointMotion(*follower(scene).at(t))
     return JointMotion(*along_table(t, scene.motion, columns_of(scene)))
