@@ -247,8 +247,9 @@ def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.
     Of three axes the first one is that of coordinates themselves: T^-1 x.
     """
     if rank == 3:
-        value = _transformed(value, T, 2, first)
-        return np.tensordot(np.linalg.pinv(T), value, 1) if len(value) else value
+        if len(value) == 0:
+            return np.zeros((0, T.shape[1], T.shape[1]))
+        return np.tensordot(np.linalg.pinv(T), _transformed(value, T, 2, first), 1)
     q = T.shape[1]
     out = np.empty((*value.shape[:-rank], *(first + q,) * rank))
     if rank == 1:

@@ -97,21 +97,26 @@ def stiffening_of_each(
     if stated and groups[0][0].is_spatial:  # where it takes most of the memory of a solid arm
         return [Stiffening(None, group[0].simulation.stiffening is True) for group in groups]
     with together(partition.world):
-        mine = {k: _static_body(arm) for k, arm in arms.items()}
+        mine = {k: _static_body(arm, simulated=not stated) for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
     found: list[Stiffening] = on_root(partition.world, _decided, groups, owned)
     return found
 
 
-def _static_body(arm: Arm) -> ShapeIntegrals:
-    """Return the body in the static modes of its outboard interface: they need no eigenproblem."""
+def _static_body(arm: Arm, simulated: bool) -> ShapeIntegrals:
+    """Return the body in the static modes of its outboard interface: they need no eigenproblem.
+
+    What the inertia of the modes stiffens is not needed for the estimate alone.
+    """
     state = arm.current
     elastic, static = state.elastic, state.elastic.constraint_modes()
     none = np.empty((len(static.interior), 0))
     weighted = elastic.mass_times(static.field)
     basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)
     damping = state.scene.damping.stiffness_proportional
-    loads = state.unit_loads.with_modes(static.field, weighted)
+    loads = state.unit_loads
+    if simulated:
+        loads = loads.with_modes(static.field, weighted)
     return shape_integrals(elastic, basis, damping, loads)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, plane_body
+from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
 
 # By which integrals a function of a body is differentiated.
 CONSTANTS = [one.name for one in TABLE if one.name != "outboard_point"]
@@ -367,7 +367,7 @@ def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
     for index in np.ndindex(shape):
         change = np.zeros(shape)
         change[index] = 1.0
-        if name in ("K", "D", "K0", "K0_outboard"):
+        if name in ("K", "D", *STIFFENING):
             change = change + change.swapaxes(-1, -2)
         elif name == "W":
             change[0] += change[0].T

@@ -74,10 +74,12 @@ def test_stiffening_is_that_of_the_run(made, tmp_path):
     """Decided anew, a softer form of the arms might be simulated as another machine."""
     summary = json.loads((made[0] / "summary.json").read_text())
     for on in (True, False):
-        text = json.dumps(summary | {"stiffening": {"on": on, "estimate": 0.01}})
+        asked = summary["scene"] | {"simulation": summary["scene"]["simulation"]}
+        asked["simulation"] |= {"stiffening": "auto"}
+        text = json.dumps(summary | {"stiffening": {"on": on, "estimate": 0.01}, "scene": asked})
         (tmp_path / "summary.json").write_text(text)
         assert scene_of(tmp_path).simulation.stiffening is on
-    assert scene_of(made[0]).simulation.stiffening == "auto"
+    assert scene_of(made[0]).simulation.stiffening is False  # as the scene states
 
 
 def test_limits_are_those_of_the_outline(made):

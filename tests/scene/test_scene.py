@@ -92,7 +92,7 @@ def checked_line(caught, source):
 
 def test_demo_holds_the_defaults():
     demo = load_scene(TWO_ARM)
-    ends = ["arms.passive=0.0"]  # as in the paper
+    ends = ["arms.passive=0.0", "simulation.stiffening=false"]  # as in the paper
     assert scene_from_dict(minimal(name="two-arm manipulator"), overrides=ends) == demo
 
 
@@ -132,6 +132,7 @@ def test_demo_states_every_other_key():
         # in space
         *("type", "parent", "child", "axis", "origin", "rpy", "centre", "offset"),
         *("parent_interface", "point", "arm", "interface", "initial_joints"),
+        *("position_limits", "velocity_limit", "effort_limit", "interface_offset"),
         *("pattern", "box", "circle", "depth", "material", "yield_strength"),
         "kkt_tolerance",
         "exact_iterations",
@@ -164,7 +165,6 @@ def test_demo_states_every_other_key():
         "cell_shape",
         "element",
         *("symmetric", "symmetric_z", "extruded", "depth"),
-        "stiffening",
         *("speed", "start_angle", "cart_mass"),
         *("joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio"),
         *("joint_stiffness", "joint_damping"),
@@ -522,6 +522,7 @@ BAD_VALUES = [
     ("arms.0.mesh", 1, "1", "a string"),
     ("arms.0.mesh_size", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
     ("arms.0.mesh_size", 0.01, "0.01", "only with mesh"),
+    ("arms.0.interface_offset", 0.01, "0.01", "only with mesh"),
     ("arms.0.cell_shape", "hexagon", '"hexagon"', '"quadrilateral" | "triangle"'),
     ("arms.0.cell_shape", "triangle", '"triangle"', "only with mesh"),
     ("arms.0.element", "cubic", '"cubic"', '"incompatible" | "linear" | "quadratic"'),

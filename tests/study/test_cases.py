@@ -172,8 +172,10 @@ def test_files_and_outcomes(plan, done):
     assert outcomes[made].folder == folder / "cases" / made.key
     assert outcomes[made].iterations == 3 and len(outcomes[made].history()) == 4
     t, distance = outcomes[made].deviation()
-    assert distance.max() == outcomes[made].max_deviation
-    assert t[distance.argmax()] == outcomes[made].max_deviation_time
+    # The file has samples; extremes are looked for between them, too.
+    assert distance.max() <= outcomes[made].max_deviation * (1.0 + 1e-12)
+    assert distance.max() == pytest.approx(outcomes[made].max_deviation, rel=1e-3)
+    assert abs(t[distance.argmax()] - outcomes[made].max_deviation_time) <= t[1] - t[0]
     assert outcomes[plan[0]].case is plan[0]
 
 

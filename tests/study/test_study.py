@@ -382,7 +382,9 @@ def test_objective(folder):
         peak = float(row["deviation [mm]"])
         peaks[row["line"]] = max(peak, peaks.get(row["line"], 0.0))
     deviation = dict(zip(names, column(rows, "maximal deviation [mm]"), strict=True))
-    assert peaks == pytest.approx(deviation, rel=1e-9)
+    # Curves are of the files' samples, 0.1 % below the extremes.
+    assert peaks == pytest.approx(deviation, rel=2e-3)
+    assert all(peaks[name] <= deviation[name] * (1.0 + 1e-9) for name in peaks)
 
 
 def test_solid_ends_allow_nothing_attached():
