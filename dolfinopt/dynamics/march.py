@@ -127,7 +127,7 @@ SHORTER = 0.5  # steps after a failure: each attempt costs a window, too short o
 LONGER = 2.0  # largest growth of the steps from one window to the next
 LEAST_STEP = 1e-7  # of the horizon: where shorter ones fail the motion has no continuation
 MAX_STEPS = 20_000
-MAX_ITERATIONS = 4_000  # of Newton's method, of all windows: about 2 ms each
+MAX_ITERATIONS = 2_500  # of Newton's method, of all windows: 2 to 6 ms each
 # A step's angle is w h, if w is the frequency of a vibration as large as the whole motion that has
 # the accelerations' highest derivative. Errors of even steps of 2 pi / 8 stand in `radau`.
 ANGLES = (0.05, 1.0)  # bounds of it
