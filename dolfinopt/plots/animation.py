@@ -17,13 +17,13 @@ from dolfinopt.plots.loops import BASE, block_corners, close_loop, draw_ground, 
 from dolfinopt.plots.shapes import (
     CART,
     CELLS,
+    Drawing,
     base_corners,
     chain,
     decimals,
-    deformed_cells,
+    draw_coarsely,
     filled,
     slender,
-    thin,
 )
 from dolfinopt.plots.style import DENSITY, GREY, ORANGE, PathLike, round_number, ticks
 
@@ -60,7 +60,7 @@ class Film:
     """The frames of a motion before they are drawn.
 
     Attributes:
-        views: of the arms, thinned.
+        arms: as they are drawn.
         parts: each arm's place in q_e.
         t: (n,) s.
         q_e: (n, N) elastic coordinates, magnified.
@@ -77,7 +77,7 @@ class Film:
         is_free: whether rigid coordinates may leave the desired motion.
     """
 
-    views: tuple[ArmView, ...]
+    arms: tuple[Drawing, ...]
     parts: tuple[slice, ...]
     t: np.ndarray
     q_e: np.ndarray
@@ -99,12 +99,12 @@ class Film:
 
     def cells(self, index: int, frame: int) -> np.ndarray:
         """Return an arm's deformed cells (n_cells, k, 2), m, in one frame."""
-        return deformed_cells(
-            self.views[index],
-            self.place[frame, index],
-            self.swing[frame, index],
-            self.q_e[frame, self.parts[index]],
-        )
+        return self.arms[index].cells(*self.pose(index, frame))
+
+    def pose(self, index: int, frame: int) -> tuple[complex, complex, np.ndarray]:
+        """Return place and swing of an arm's tangent frame, and the arm's elastic coordinates."""
+        q = self.q_e[frame, self.parts[index]]
+        return self.place[frame, index], self.swing[frame, index], q
 
 
 def make_film(
@@ -135,7 +135,7 @@ def make_film(
     at = np.unique(np.round(np.linspace(0, len(t) - 1, frames)).astype(int))
     end = -1 if closure is None or closure.count == 1 else -2
     return Film(
-        views=tuple(slender(thin(view, CELLS // len(views)), size) for view in views),
+        arms=tuple(draw_coarsely(slender(view, size), CELLS // len(views)) for view in views),
         parts=mechanism.slices,
         t=t[at],
         q_e=q_e[at],
@@ -265,10 +265,10 @@ def film_bounds(film: Film) -> tuple[np.ndarray, np.ndarray]:
         parts.append(ground_points(film.place[:, -1], film.size, film.closure))
     lows, highs = [p.min(axis=0) for p in parts], [p.max(axis=0) for p in parts]
     for frame in range(len(film.t)):
-        for index in range(len(film.views)):
-            cells = film.cells(index, frame)
-            lows.append(cells.min(axis=(0, 1)))
-            highs.append(cells.max(axis=(0, 1)))
+        for index, arm in enumerate(film.arms):
+            points = arm.points(*film.pose(index, frame))
+            lows.append(points.min(axis=0))
+            highs.append(points.max(axis=0))
     margin = 0.04 * film.size
     return np.min(lows, axis=0) - margin, np.max(highs, axis=0) + margin
 
@@ -336,8 +336,8 @@ class Stage:
         self.axes.add_patch(self.cart)
         self.axes.add_patch(self.slider)
         self.arms: list[Any] = []
-        for view in self.film.views:
-            cells = filled(np.zeros((0, 4, 2)), view.density, designed=view.designed)
+        for arm in self.film.arms:
+            cells = filled(np.zeros((0, 4, 2)), arm.view.density, designed=arm.view.designed)
             self.arms.append(self.axes.add_collection(cells, autolim=False))
         self.joints = self.axes.plot([], [], "o", mfc="white", mec="black", ms=7)[0]
         size = 11 if mechanism.payload_mass > 0.0 and self.film.closure is None else 6
@@ -355,7 +355,7 @@ class Stage:
     def _draw_keys(self, mechanism: Mechanism, right: float, box: tuple[float, ...]) -> None:
         """Draw colour scale and legend."""
         bar = self.figure.add_axes((right, box[1], 0.02, box[3]))
-        shown = [k for k, view in enumerate(self.film.views) if view.designed] or [0]
+        shown = [k for k, arm in enumerate(self.film.arms) if arm.view.designed] or [0]
         self.figure.colorbar(self.arms[shown[0]], cax=bar, label=DENSITY)
         keys = self._names(float(mechanism.payload_mass))
         self.figure.legend(
@@ -405,6 +405,9 @@ class Stage:
             self.slider.set_xy(block_corners(place[-1], film.size, film.closure))
         for k, cells in enumerate(self.arms):
             cells.set_verts(film.cells(k, frame))
+            border = film.arms[k].border(*film.pose(k, frame))
+            if border is not None:
+                cells.set_clip_path(border, self.axes.transData)
         self.ghost.set_data(rigid.real, rigid.imag)
         self.trace.set_data(*film.trace[: film.at[frame] + 1].T)
         self.joints.set_data(place[:-1].real, place[:-1].imag)

@@ -13,15 +13,15 @@ from dolfinopt.output.views import ArmView
 from dolfinopt.plots.loops import BASE, block_corners, close_loop, draw_ground, ground_points
 from dolfinopt.plots.shapes import (
     CELLS,
+    Drawing,
     base_corners,
     boundary,
     chain,
     decimals,
-    deformed_cells,
+    draw_coarsely,
     filled,
     sides,
     slender,
-    thin,
 )
 from dolfinopt.plots.style import DENSITY, GREY, ORANGE, SOLID_FROM, new_figure
 
@@ -101,15 +101,13 @@ def machine_figure(
     if closure is not None:
         at = poses_of_turn(place[:, 1], q_r[:, 1], LOOP_POSES)
     stands = bool(np.ptp(place[:, 0].real) == 0.0)
-    thinned = [slender(thin(view, 2 * CELLS // len(views)), size) for view in views]
-    cells = [
-        [deformed_cells(view, place[n, k], swing[n, k], np.zeros(view.modes.shape[-1]))
-         for k, view in enumerate(thinned)]
-        for n in at
-    ]  # fmt: skip
+    drawings = [draw_coarsely(slender(view, size), 2 * CELLS // len(views)) for view in views]
+    rest = [np.zeros(view.modes.shape[-1]) for view in views]
+    frames = [[(place[n, k], swing[n, k], q) for k, q in enumerate(rest)] for n in at]
     bases = [base_corners(place[n, 0], size, stands) for n in at]
     paths = _paths(mechanism, place, desired, end, closure)
-    points = [*paths.values(), *bases, *(one.reshape(-1, 2) for pose in cells for one in pose)]
+    points = [*paths.values(), *bases]
+    points += [one.points(*frame) for pose in frames for one, frame in zip(drawings, pose)]
     if closure is not None:
         points.append(ground_points(place[at, -1], size, closure))
     low, high = (
@@ -128,12 +126,12 @@ def machine_figure(
         axes.plot(*path.T, color=ORANGE, dashes=dashes, lw=1.2, zorder=1.0, label=label)
     if len(paths) > 1:
         axes.legend(loc="best", frameon=False, fontsize=9)
-    edges = [boundary(view.corners) for view in thinned]
-    for number, (n, pose) in enumerate(zip(at, cells)):
+    edges = [boundary(one.view.corners) for one in drawings]
+    for number, (n, pose) in enumerate(zip(at, frames)):
         # Loops lie on top of each other: but for the first pose they are pale.
         pale = closure is not None and number > 0
         order = 2.0 + (len(at) if closure is not None and number == 0 else number)
-        _draw_pose(axes, pose, thinned, edges, place[n], bases[number], order, pale=pale)
+        _draw_pose(axes, drawings, edges, pose, place[n], bases[number], order, pale=pale)
         if closure is not None and closure.count == 1:
             _draw_slider(axes, block_corners(place[n, -1], size, closure), order, pale=pale)
         words = f"{t[n]:.{decimals(t)}f} s" if len(at) > 1 else ""
@@ -197,9 +195,9 @@ def _draw_ground(axes: Axes, bases: Sequence[np.ndarray], stands: bool) -> None:
 
 def _draw_pose(
     axes: Axes,
-    cells: Sequence[np.ndarray],
-    views: Sequence[ArmView],
+    drawings: Sequence[Drawing],
     edges: Sequence[np.ndarray],
+    frames: Sequence[tuple[complex, complex, np.ndarray]],
     place: np.ndarray,
     base: np.ndarray,
     order: float,
@@ -211,8 +209,10 @@ def _draw_pose(
     from matplotlib.patches import Polygon
 
     axes.add_patch(Polygon(base, facecolor="#d9d9d9", edgecolor="black", zorder=order))
-    for corners, view, outer in zip(cells, views, edges, strict=True):
-        frame = LineCollection(list(sides(corners)[outer]), colors=GREY, linewidths=0.6)
+    for drawing, outer, frame in zip(drawings, edges, frames, strict=True):
+        view, corners, border = drawing.view, drawing.cells(*frame), drawing.border(*frame)
+        lines = list(sides(corners)[outer]) if border is None else border.to_polygons()
+        rim = LineCollection(lines, colors=GREY, linewidths=0.6)
         solid = view.density > SOLID_FROM
         fine = filled(
             corners[solid],
@@ -221,10 +221,12 @@ def _draw_pose(
             designed=view.designed,
             strength=PALE if pale else 1.0,
         )
-        frame.set_alpha(PALE if pale else None)
-        for drawn in (fine, frame):
+        rim.set_alpha(PALE if pale else None)
+        for drawn in (fine, rim):
             drawn.set_zorder(order + 0.1)
             axes.add_collection(drawn, autolim=False)
+        if border is not None:
+            fine.set_clip_path(border, axes.transData)
     joints = np.stack([place.real, place.imag])
     style: dict[str, Any] = {
         "linestyle": "",

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots.style import COLOURS
+
+if TYPE_CHECKING:
+    from matplotlib.path import Path
 
 BAR = 0.025  # largest height of a rigid arm, as a share of the arms' reach
 UNDESIGNED = "#8a8a8a"  # arms without a design
@@ -19,9 +22,14 @@ CART = np.array([0.06, 0.045])  # half its width and its height, as shares of th
 
 def cell_areas(corners: np.ndarray) -> np.ndarray:
     """Return the areas (n,), m2, of polygons with corners (n, k, 2), m, in order around each."""
+    return np.abs(signed_areas(corners))
+
+
+def signed_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the areas (n,), m2, of polygons (n, k, 2), m; clockwise ones are negative."""
     x, y = corners[..., 0], corners[..., 1]
     after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    return 0.5 * np.abs(np.sum(x * after_y - after_x * y, axis=1))
+    return 0.5 * np.sum(x * after_y - after_x * y, axis=1)
 
 
 def volume_fraction(view: ArmView) -> float:
@@ -45,14 +53,34 @@ def boundary(corners: np.ndarray) -> np.ndarray:
 
     It stays the same in every deformation and place of the polygons.
     """
-    flat = corners.reshape(-1, 2)
-    low, size = flat.min(axis=0), float(np.ptp(flat, axis=0).max()) or 1.0
-    column, row = np.round((flat - low) / (1e-7 * size)).astype(np.int64).T
-    node = np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+    node = _nodes(corners)
     after = np.roll(node, -1, axis=1)
     edge = (np.minimum(node, after) * (node.max() + 1) + np.maximum(node, after)).ravel()
     _, first, count = np.unique(edge, return_index=True, return_counts=True)
     return first[count == 1]
+
+
+def _nodes(corners: np.ndarray) -> np.ndarray:
+    """Return numbers (m, k) from 0 of the places of corners (m, k, 2), equal to 1e-7."""
+    flat = corners.reshape(-1, 2)
+    low, size = flat.min(axis=0), float(np.ptp(flat, axis=0).max()) or 1.0
+    column, row = np.round((flat - low) / (1e-7 * size)).astype(np.int64).T
+    return np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+
+
+def rings(corners: np.ndarray) -> list[np.ndarray]:
+    """Return the closed loops around polygons (m, k, 2), as indices of their m * k corners.
+
+    They run counterclockwise around the polygons, clockwise around holes.
+    """
+    from dolfinopt.part.recognise import loops
+
+    node = _nodes(corners)
+    ends = np.stack([node, np.roll(node, -1, axis=1)], axis=2)
+    clockwise = (signed_areas(corners) < 0.0)[:, None, None]
+    ends = np.where(clockwise, ends[..., ::-1], ends).reshape(-1, 2)
+    first = np.unique(node, return_index=True)[1]
+    return [first[loop] for loop in loops(ends[boundary(corners)])]
 
 
 def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,29 +107,72 @@ def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.nd
     return np.stack(place, axis=1), np.stack(swing, axis=1)
 
 
-def deformed_cells(view: ArmView, place: complex, swing: complex, q: np.ndarray) -> np.ndarray:
-    """Return an arm's cells in space (n_cells, k, 2), m.
+def moved(
+    points: np.ndarray, modes: np.ndarray, place: complex, swing: complex, q: np.ndarray
+) -> np.ndarray:
+    """Return in space the points (..., 2), m, of an arm that has deformed.
 
     Args:
-        view: of the arm.
-        place, swing: of its tangent frame, see `chain`.
+        points: (..., 2) m, of the arm at rest.
+        modes: (..., 2, q) of these points.
+        place, swing: of the arm's tangent frame, see `chain`.
         q: (q,) its elastic coordinates.
     """
-    local = view.corners + view.modes @ q
+    local = points + modes @ q
     turned = place + swing * (local[..., 0] + 1j * local[..., 1])
     return np.stack([turned.real, turned.imag], axis=-1)
 
 
-def thin(view: ArmView, limit: int) -> ArmView:
-    """Return the arm with about `limit` cells at most: itself, or a raster of rectangles.
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """An arm as a picture shows it.
+
+    Attributes:
+        view: of the arm, of cells that are large enough to be seen.
+        rim: (n, 2) m, the closed loops around the arm, one after the other, each with its first
+            point once more at its end; None where the cells themselves have the arm's shape.
+        modes: (n, 2, q) of the points of `rim`.
+        starts: (loops + 1,) where each loop begins in `rim`, and the end of the last.
+    """
+
+    view: ArmView
+    rim: np.ndarray | None = None
+    modes: Any = None
+    starts: tuple[int, ...] = ()
+
+    def cells(self, place: complex, swing: complex, q: np.ndarray) -> np.ndarray:
+        """Return the cells in space (n_cells, k, 2), m; see `moved`."""
+        return moved(self.view.corners, self.view.modes, place, swing, q)
+
+    def border(self, place: complex, swing: complex, q: np.ndarray) -> Path | None:
+        """Return the loops in space, m, that clip the cells; None where nothing is clipped."""
+        from matplotlib.path import Path
+
+        if self.rim is None:
+            return None
+        codes = np.full(len(self.rim), Path.LINETO, dtype=Path.code_type)
+        codes[list(self.starts[:-1])] = Path.MOVETO
+        codes[np.array(self.starts[1:]) - 1] = Path.CLOSEPOLY
+        return Path(moved(self.rim, self.modes, place, swing, q), codes)
+
+    def points(self, place: complex, swing: complex, q: np.ndarray) -> np.ndarray:
+        """Return the outermost points (n, 2) in space, m, and others."""
+        if self.rim is None:
+            return self.cells(place, swing, q).reshape(-1, 2)
+        return moved(self.rim, self.modes, place, swing, q)
+
+
+def draw_coarsely(view: ArmView, limit: int) -> Drawing:
+    """Return the arm with about `limit` cells at most: itself, or rectangles cut off at its rim.
 
     A rectangle takes the mean density of the cells whose centroid lies in it, or else that of the
-    cell around its middle. Its corners move like the arm's nearest.
+    cell nearest to its middle. Its corners move like the arm's nearest.
     """
+    if len(view.density) <= limit:
+        return Drawing(view)
+    import shapely
     from scipy.spatial import cKDTree
 
-    if len(view.density) <= limit:
-        return view
     low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
     side = np.sqrt(np.prod(high - low) / limit)
     nx, ny = np.maximum(1, np.round((high - low) / side)).astype(int)
@@ -111,34 +182,31 @@ def thin(view: ArmView, limit: int) -> ArmView:
     area = np.bincount(column * ny + row, areas, nx * ny)
     mass = np.bincount(column * ny + row, areas * view.density, nx * ny)
     first = low + size * np.stack(np.divmod(np.arange(nx * ny), ny), axis=1)
-    around = cells_around(first + 0.5 * size, view)
-    kept = (area > 0.0) | (around >= 0)
-    density = np.divide(mass, area, out=view.density[around], where=area > 0.0)
-    corners = first[kept, None] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    near = cKDTree(np.concatenate(view.corners)).query(np.concatenate(corners))[1]
-    modes = np.concatenate(view.modes)[near]
-    return replace(
+    corners = first[:, None] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    kept = area > 0.0
+    density = np.divide(mass, area, out=np.zeros(nx * ny), where=kept)
+    # Rectangles at the rim, or smaller than the cell that they lie in, hold no centroid.
+    empty = np.flatnonzero(~kept)
+    tree = shapely.STRtree(shapely.polygons(view.corners))
+    density[empty] = view.density[tree.nearest(shapely.points(first[empty] + 0.5 * size))]
+    kept[empty[tree.query(shapely.polygons(corners[empty]), predicate="intersects")[0]]] = True
+    corners, density = corners[kept], density[kept]
+    points = view.corners.reshape(-1, 2)
+    modes = view.modes.reshape(len(points), 2, -1)
+    near = cKDTree(points).query(corners)[1]
+    coarse = replace(
         view,
         corners=corners,
         centroid=corners.mean(axis=1),
-        density=density[kept],
-        modes=modes.reshape(*corners.shape, modes.shape[-1]),
+        density=density,
+        modes=modes[near],
     )
-
-
-def cells_around(points: np.ndarray, view: ArmView) -> np.ndarray:
-    """Return which convex cell of an arm each point (n, 2), m, lies in (n,); -1 is none."""
-    from scipy.spatial import cKDTree
-
-    # Neighbours may differ in size: the cell around a point need not be the one nearest to it.
-    near = cKDTree(view.centroid).query(points, k=min(8, len(view.centroid)))[1]
-    near = near.reshape(len(points), -1)
-    to = view.corners[near] - points[:, None, None, :]
-    after = np.roll(to, -1, axis=2)
-    turn = to[..., 0] * after[..., 1] - to[..., 1] * after[..., 0]
-    inside = np.all(turn >= 0.0, axis=2) | np.all(turn <= 0.0, axis=2)
-    first = np.argmax(inside, axis=1)
-    return np.where(inside.any(axis=1), near[np.arange(len(points)), first], -1)
+    if np.prod(size) * len(density) <= (1.0 + 1e-9) * areas.sum():
+        return Drawing(coarse)  # of a rectangular arm
+    loops = [np.append(ring, ring[0]) for ring in rings(view.corners)]
+    at = np.concatenate(loops)
+    starts = tuple(np.cumsum([0, *map(len, loops)]).tolist())
+    return Drawing(coarse, points[at], modes[at], starts)
 
 
 def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
