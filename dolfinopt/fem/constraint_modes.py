@@ -23,7 +23,7 @@ MOST_ROUNDING = 1e-3
 # translations, the assembled matrix does: where they are lost in it, refinement fails.
 TRANSLATION = 0.03
 POWER_STEPS = 6  # of the estimate; four give two digits
-ROUNDED = 1e-10  # part of a load or deflection that may come of rounding, by factors
+ROUNDED = 1e-8  # part of a deflection that may come of rounding, by factors of long arms
 
 
 @dataclass(frozen=True, eq=False)
