@@ -24,11 +24,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import build, wave
-from runs import TWO_ARM
+from runs import ROOT, TWO_ARM
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
 from dolfinopt.dynamics.build import build_mechanism
+from dolfinopt.fem import interior
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.tangent import linearise
@@ -164,6 +165,46 @@ def test_only_what_the_scene_needs(run: Run, overrides: tuple[str, ...]) -> None
     found = counts(run("optimize", *overrides))
     expected = CASES[overrides]
     assert {key: found[key] for key in expected} == expected
+
+
+SPATIAL = ROOT / "demos" / "spatial_arm.toml"
+ONE_LOAD, TIP = "objective.loads=[[0,1,0,0,0,0]]", "constraints.tip_deflection=1.0"
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("width", "overrides", "most"),
+    [
+        (10**9, (ONE_LOAD,), 1),
+        (0, (ONE_LOAD, TIP), 2),  # one adjoint, unless the link deflects as it is loaded
+        # The interior's modes need its own factor.
+        (10**9, (ONE_LOAD, "constraints.first_frequency=1.0"), 6),
+    ],
+    ids=["one load", "deflection", "frequency"],
+)
+def test_static_loads_of_solids(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    width: int,
+    overrides: tuple[str, ...],
+    most: int,
+) -> None:
+    """In space a solve a load, where nothing else is asked for, not one a constraint mode."""
+    monkeypatch.setattr(interior, "WIDEST", width)
+    line = ["optimize", str(SPATIAL), "--no-plots", "--out", str(tmp_path / "out")]
+    kept = ("arms.link1.cells=[6,2,2]", "arms.link2.cells=[6,2,2]", "arms.passive=0.08",
+            "simulation.sample=0.05", "simulation.tolerance=1e-2", "objective.load_cases=3",
+            "objective.kind=static", f"optimizer.max_iterations={ITERATIONS}")  # fmt: skip
+    for override in (*kept, *overrides):
+        line += ["--set", override]
+    commands.main(line, standalone_mode=False, obj=MPI.COMM_SELF)
+    found = counts(tmp_path / "out")
+    assert found["factorisations"] == EACH and found["reductions"] == 0
+    if most < 6:
+        assert found["assemblies"] == EACH and found["eigenproblems"] == 0
+        assert EACH <= found["solves"] <= most * EACH
+    else:
+        assert found["solves"] >= most * EACH
 
 
 def test_a_simulation_needs_no_gradient(run: Run) -> None:

@@ -31,6 +31,7 @@ from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
+from dolfinopt.scene.tables.responses import STATICS, needs_alone
 
 THRESHOLDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 
@@ -103,7 +104,9 @@ class Arm:
             except InputError as error:
                 raise InputError(f"{scene.source}: {error}") from None
             operators = element.operators(self.mesh, arm.depth, self.solid.poisson_ratio)
-            self.substructure = Substructure(self.mesh, operators, profile, field_tolerance(scene))
+            self.substructure = Substructure(
+                self.mesh, operators, profile, field_tolerance(scene), needs_alone(scene, STATICS)
+            )
             # A design that is another arm's is filtered there.
             radius = scene.filter_radius(index) if pattern is None else 0.0
             # A member along an edge would be half as thin if the filter mirrored it there.
@@ -388,7 +391,7 @@ class Arm:
     @property
     def guesses(self) -> Guesses | None:
         """What the next design's iterative solves set out from; None where there is nothing."""
-        return self.substructure.interior.guesses
+        return self.substructure.guesses
 
     @guesses.setter
     def guesses(self, guesses: Guesses | None) -> None:

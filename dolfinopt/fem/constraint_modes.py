@@ -1,4 +1,4 @@
-"""Static fields of unit displacements of the outboard interface; what rounding does to them."""
+"""Static fields of the outboard interface, by displacement and load; what rounding does there."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.cells import cell_values, sum_at_nodes
 from dolfinopt.fem.floating import HARMLESS, extremes
+from dolfinopt.parallel import on_root
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
@@ -22,6 +23,7 @@ MOST_ROUNDING = 1e-3
 # translations, the assembled matrix does: where they are lost in it, refinement fails.
 TRANSLATION = 0.03
 POWER_STEPS = 6  # of the estimate; four give two digits
+ROUNDED = 1e-8  # part of a deflection that may come of rounding, by factors of long arms
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +53,97 @@ def static_modes(arm: ElasticArm) -> ConstraintModes:
     Raises:
         ConvergenceError: the contrast between solid and void is too large for this design.
     """
+    floating = floats(arm)
+    if not floating:  # of a machine that moves after static loads
+        arm.substructure.release_extended()
     coupling, corner = arm.restrict(arm.substructure.rigid_forces(arm.young))
     modes = _with_energies(arm, arm.solve(-coupling, "constraint modes"), coupling, corner)
-    if floats(arm):
+    if floating:
         modes = _refined(arm, modes)
     if not _is_stiffness(modes.stiffness):
         raise _lost_in_rounding(arm)
     return modes
+
+
+@dataclass(frozen=True, eq=False)
+class StaticFields:
+    """m static fields of one arm, which span those of the loads that were asked for.
+
+    Of the fields U a, with the tip's displacement T a, that of a load f has the least energy
+    a' U'KU a / 2 - a' T'f: errors of U make one of second order in the displacement under it.
+
+    Attributes:
+        directions: (b, m) orthonormal, of the loads; b of them need no more fields.
+        field: (n_nodes, d, m) U.
+        tip: (b, m) T, displacements and rotations of the outboard interfaces.
+        stiffness: (m, m) U'KU.
+    """
+
+    directions: np.ndarray
+    field: np.ndarray
+    tip: np.ndarray
+    stiffness: np.ndarray
+
+    def amplitudes(self, loads: np.ndarray) -> np.ndarray:
+        """Return a (m, k) of loads (b, k)."""
+        return np.linalg.solve(self.stiffness, self.tip.T @ loads)
+
+
+def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None) -> StaticFields:
+    """Return the static fields of loads (b, k): one solve for each that others do not make up.
+
+    Constraint modes where these are known, or take no longer.
+    Collective on the arm's ranks.
+
+    Args:
+        arm: of the design.
+        loads: forces and moments at its outboard interfaces, N, N m.
+        known: of earlier loads, which are kept.
+
+    Raises:
+        ConvergenceError: as of `static_modes`.
+    """
+    b = len(loads)
+    if known is None:
+        known = StaticFields(*(np.empty((*n, 0)) for n in ((b,), arm.points.shape, (b,), (0,))))
+    extended = arm.substructure.extended
+    # What a symmetric design's deflection has across the load is an error of the fields.
+    error = extended.tolerance if extended and extended.is_iterative else ROUNDED
+    new = on_root(arm.comm, _new_directions, known.directions, loads, error)
+    if new.shape[1] == 0:
+        return known
+    if arm.has_constraint_modes or extended is None or floats(arm):
+        modes = arm.constraint_modes()
+        return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
+    purpose = "adjoint loads" if known.directions.shape[1] else "static loads"
+    interior, tip = arm.solve_loads(new, purpose)
+    field = np.concatenate([known.field, arm.expand(interior, tip)], axis=2)
+    found = StaticFields(
+        np.hstack([known.directions, new]),
+        field,
+        np.hstack([known.tip, tip]),
+        arm.energy_matrix(field),
+    )
+    if not _is_stiffness(found.stiffness):
+        raise _lost_in_rounding(arm)
+    return found
+
+
+def _new_directions(known: np.ndarray, loads: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return an orthonormal basis (b, j) of what loads (b, k) have beside that of known ones.
+
+    In the order of the loads, so that unit loads stay what they are. Less than the tolerance of
+    a load is nothing.
+    """
+    basis = known
+    for load in loads.T:
+        rest = load
+        for _ in range(2):  # once leaves rounding of the part that is taken off
+            rest = rest - basis @ (basis.T @ rest)
+        length = np.linalg.norm(rest)
+        if length > tolerance * np.linalg.norm(load):
+            basis = np.column_stack([basis, rest / length])
+    return basis[:, known.shape[1] :]
 
 
 def floats(arm: ElasticArm) -> bool:

@@ -21,11 +21,22 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem import cells
 from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs, UniformMatrix
-from dolfinopt.fem.constraint_modes import ConstraintModes, static_modes
+from dolfinopt.fem.constraint_modes import (
+    ConstraintModes,
+    StaticFields,
+    static_fields,
+    static_modes,
+)
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.floating import Connectivity, joins
 from dolfinopt.fem.interface import InterfaceTransformation
-from dolfinopt.fem.interior import TETRAHEDRA, Guesses, InteriorSystem
+from dolfinopt.fem.interior import (
+    TETRAHEDRA,
+    ExtendedStiffness,
+    ExtendedSystem,
+    Guesses,
+    InteriorSystem,
+)
 from dolfinopt.fem.stress import element_centres, stress_operator
 from dolfinopt.fem.uniform import single, uniform_cells
 from dolfinopt.fem.uniform_stress import UniformStress
@@ -54,12 +65,14 @@ class Substructure:
         operators: ElementOperators,
         profile: Profile,
         tolerance: float | None = None,
+        statics_alone: bool = False,
     ):
         """Number the interior dofs and lay down the sparsity patterns (collective).
 
         Args:
             mesh, operators, profile: see above.
             tolerance: of iterative solutions, see `InteriorSystem`.
+            statics_alone: whether nothing is asked of its designs but what static loads do.
 
         Raises:
             InputError: the mesh lacks an interface.
@@ -91,7 +104,27 @@ class Substructure:
         self.interior = InteriorSystem(
             self.T, self._stiffness, self._mass, profile, tolerance, wider
         )
+        self._statics_alone, self._solution = statics_alone, (tolerance, wider)
         self._last: ElasticArm | None = None
+
+    @cached_property
+    def extended(self) -> ExtendedSystem | None:
+        """The system with the interfaces' rows, for solids of which statics alone are asked.
+
+        None of others. Collective.
+        """
+        if not self._statics_alone or self.T.dim == 2:
+            return None
+        touched = np.zeros((*self.operators.points.shape, 1))
+        touched[self.operators.cells[self._rigid_forces[0]]] = 1.0
+        near = np.flatnonzero(self.T.restrict(touched)[0])
+        matrices = self._stiffness, self._mass
+        found = ExtendedSystem(self.T, *matrices, self.profile, *self._solution, near)
+        return found if found.is_worth_it else None
+
+    def release_extended(self) -> None:
+        """Free the memory of `extended`, which is made anew when it is asked for."""
+        self.__dict__.pop("extended", None)
 
     @cached_property
     def connectivity(self) -> Connectivity:
@@ -164,12 +197,25 @@ class Substructure:
             return None
         return UniformStress(self.uniform, derivatives, stress)
 
+    def extend(self, K: sp.csr_matrix, young: np.ndarray) -> ExtendedStiffness:
+        """Return what `extended` takes of K of a design, which has this modulus (collective)."""
+        assert self.extended is not None
+        coupling, corner = self.T.restrict(self.rigid_forces(young))
+        return ExtendedStiffness(K, np.append(coupling[self.extended.near].ravel(), corner))
+
+    @property
+    def guesses(self) -> Guesses | None:
+        """What the next design's iterative solves set out from; None where there is nothing."""
+        return (self.extended or self.interior).guesses
+
     def set_guesses(self, guesses: Guesses | None) -> None:
         """Let iterative solves set out as others did, see `InteriorSystem.guesses` (collective)."""
-        K = None
-        if guesses is not None and not self.interior.has_hierarchy_of(guesses):
+        system, K = self.extended or self.interior, None
+        if guesses is not None and not system.has_hierarchy_of(guesses):
             K = AssembledMatrix(self._stiffness, guesses.young, Profile()).matrix
-        self.interior.set_guesses(guesses, K)
+            if self.extended is not None:
+                K = self.extend(K, guesses.young)
+        system.set_guesses(guesses, K)
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.
@@ -252,6 +298,7 @@ class ElasticArm:
         self.interior_nodes = T.interior_nodes
         self.num_interior, self.num_dofs = T.num_interior, T.num_dofs
         self.expand, self.restrict = T.expand, T.restrict
+        self._static_fields: StaticFields | None = None
 
     @property
     def young(self) -> np.ndarray:
@@ -356,14 +403,36 @@ class ElasticArm:
         interior.factorise(self.K.matrix, self.young)
         with self.profile.phase("solves"):
             out, failed = interior.solve(self.K.matrix, right, purpose)
-        self.profile.counts.solves += right.shape[1]
+        self._count(right.shape[1], failed)
+        return out
+
+    @cached_property
+    def _extended(self) -> ExtendedStiffness:
+        return self.substructure.extend(self.K.matrix, self.young)
+
+    def solve_loads(self, loads: np.ndarray, purpose: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return what loads (b, k) of the outboard interfaces do, see `ExtendedSystem.solve_loads`.
+
+        Raises:
+            ConvergenceError: K is singular but for rounding.
+        """
+        extended = self.substructure.extended
+        assert extended is not None
+        extended.factorise(self._extended, self.young)
+        with self.profile.phase("solves"):
+            interior, tip, failed = extended.solve_loads(self._extended, loads, purpose)
+        self._count(loads.shape[1], failed)
+        return interior, tip
+
+    def _count(self, solves: int, failed: bool) -> None:
+        """Count solutions; raise ConvergenceError where they failed."""
+        self.profile.counts.solves += solves
         if failed:  # the same on all ranks
             raise ConvergenceError(
                 f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is too "
                 "soft for double precision beside solid; raise "
                 "interpolation.floor or design.minimum"
             )
-        return out
 
     def interior_inverse(self, right: np.ndarray) -> np.ndarray:
         """Return K_II^-1 right for one right side (num_interior,) of owned rows."""
@@ -392,3 +461,19 @@ class ElasticArm:
             ConvergenceError: the contrast between solid and void is too large for this design.
         """
         return self._constraint_modes
+
+    @property
+    def has_constraint_modes(self) -> bool:
+        """Whether somebody has asked for them."""
+        return "_constraint_modes" in self.__dict__
+
+    def static_fields(self, loads: np.ndarray) -> StaticFields:
+        """Return the static fields that such loads (b, k) of the outboard interfaces need.
+
+        Those of earlier loads are kept.
+
+        Raises:
+            ConvergenceError: as of `constraint_modes`.
+        """
+        self._static_fields = static_fields(self, loads, self._static_fields)
+        return self._static_fields

@@ -35,6 +35,7 @@ class InterfaceTransformation:
         num_coordinates: b, outboard.
         inboard, outboard: (n_nodes,) True for the nodes of the interface; of any outboard one.
         ends: those of every outboard interface by itself.
+        places: (n_ends, d) their reference points, m.
         rigid: (n_nodes, d, b) nodal fields of unit outboard coordinates, zero in the interior.
         interior_nodes: owned ones, in the order of the interior dofs.
         num_interior: interior dofs that this rank owns.
@@ -63,6 +64,7 @@ class InterfaceTransformation:
         self.inboard = self._nodes_of(mesh, mesh.inboard_facets, "inboard")
         self.outboard = self._nodes_of(mesh, mesh.outboard_facets, "outboard")
         self.ends = [self.outboard]
+        self.places = np.array([mesh.outboard_point, *mesh.further_points])
         self.rigid = self._rigid_field(self.outboard, mesh.outboard_point)
         if mesh.further:
             self._add_further(mesh)
@@ -94,8 +96,7 @@ class InterfaceTransformation:
                         f"arm {mesh.name!r}: interfaces {names[j]!r} and {names[k]!r} share nodes; "
                         "each is rigid: leave a cell between them"
                     )
-        points = [mesh.outboard_point, *mesh.further_points]
-        fields = [self._rigid_field(at, x) for at, x in zip(self.ends, points, strict=True)]
+        fields = [self._rigid_field(at, x) for at, x in zip(self.ends, self.places, strict=True)]
         self.rigid = np.concatenate(fields, axis=2)
         self.outboard = np.any(self.ends, axis=0)
 

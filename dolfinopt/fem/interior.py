@@ -20,7 +20,7 @@ from dolfinopt.fem.assembly import (
     interior_blocks,
     interior_entries,
 )
-from dolfinopt.fem.interface import InterfaceTransformation
+from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
 from dolfinopt.mesh.budget import free_memory, ranks_here
 from dolfinopt.profiling import Profile
 from dolfinopt.solver import (
@@ -63,6 +63,9 @@ FREE_SHARE = 0.5
 # right to its square, mass and inertia to it, gradients of frozen loads to five times it.
 TOLERANCE = 1e-8
 TIGHT = 1e-12  # where a Krylov space is made of solutions
+# Bandwidth of K with the interfaces' rows behind, of that without, up to which it is factorised in
+# its place: nodes numbered along the arm end at the interface, others may lie anywhere.
+WIDER = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +90,9 @@ class InteriorSystem:
 
     Patterns, ordering and symbolic factor last for the whole run. What one design left is
     overwritten when another one asks; the first one then pays, and counts, another factorisation.
+
+    Attributes:
+        tolerance: of conjugate gradients in energy, relative.
     """
 
     def __init__(
@@ -110,7 +116,7 @@ class InteriorSystem:
         """
         self._wider = wider
         self._T, self._profile = T, profile
-        self._tolerance = tolerance or TOLERANCE
+        self.tolerance = tolerance or TOLERANCE
         self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
         self._factor: Factor | None = None
         self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
@@ -129,9 +135,19 @@ class InteriorSystem:
             return interior_blocks(self._patterns[0], self._block, self._T.numbers)
         return interior_entries(self._patterns[0], 1, self._T.numbers)
 
+    @property
+    def _num_rows(self) -> int:
+        """Rows of the stiffness that this rank owns."""
+        return self._T.num_interior
+
+    @property
+    def _bandwidth(self) -> int:
+        """That of the stiffness on one rank."""
+        return self._T.bandwidth
+
     @cached_property
     def _stiffness(self) -> InteriorMatrix:
-        return InteriorMatrix(self._T.comm, self._entries, self._T.num_interior)
+        return InteriorMatrix(self._T.comm, self._entries, self._num_rows)
 
     @cached_property
     def _mass(self) -> InteriorMatrix:
@@ -145,8 +161,8 @@ class InteriorSystem:
         """LAPACK's factor, where one rank owns a band that is narrow enough."""
         if self._T.comm.size > 1 or has_options(OPTIONS):
             return None
-        size, most = self._T.num_interior, MOST_WORK if self._T.dim == 2 else MOST_SOLID_WORK
-        if size * float(self._T.bandwidth) ** 2 > most:
+        size, most = self._num_rows, MOST_WORK if self._T.dim == 2 else MOST_SOLID_WORK
+        if size * float(self._bandwidth) ** 2 > most:
             return None
         return BandCholesky(self._entries.rows, self._entries.columns, size)
 
@@ -184,11 +200,15 @@ class InteriorSystem:
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:
         from dolfinopt.fem.block_gradients import BlockConjugateGradients
+
+        self._tell_rigid_motions()
+        return BlockConjugateGradients(self._stiffness.mat, self.tolerance)
+
+    def _tell_rigid_motions(self) -> None:
         from dolfinopt.fem.multigrid import with_rigid_motions
 
         T = self._T
         with_rigid_motions(self._stiffness.mat, T.points[T.interior_nodes])
-        return BlockConjugateGradients(self._stiffness.mat, self._tolerance)
 
     @property
     def solver_name(self) -> str:
@@ -347,3 +367,133 @@ class InteriorSystem:
             self._mass.update(M.data)
             self._mass_of = M
         return self._mass.mat
+
+
+@dataclass(frozen=True, eq=False)
+class ExtendedStiffness:
+    """K of one design, and what `ExtendedSystem` takes of it at the outboard interfaces.
+
+    Attributes:
+        matrix: K over local dofs.
+        border: coupling of the owned nodes beside the interfaces with the interfaces'
+            coordinates, then stiffness of these alone.
+    """
+
+    matrix: sp.csr_matrix
+    border: np.ndarray
+
+    @property
+    def data(self) -> np.ndarray:
+        """All values, one behind the other; not kept."""
+        return np.concatenate([self.matrix.data.ravel(), self.border])
+
+
+class ExtendedSystem(InteriorSystem):
+    """[K_II, K_Ib; K_bI, K_bb] of a solid: a load of its outboard interfaces takes one solution.
+
+    The interfaces' coordinates are the last rank's last rows: two nodes an interface, one for its
+    displacement, one for its rotation. Rigid motions of the body are known of these, too, so
+    multigrid needs few more steps than for K_II.
+    """
+
+    def __init__(
+        self,
+        T: InterfaceTransformation,
+        stiffness: AffineMatrix | UniformMatrix,
+        mass: AffineMatrix | UniformMatrix,
+        profile: Profile,
+        tolerance: float | None,
+        wider: float,
+        near: np.ndarray,
+    ):
+        """Set up as an `InteriorSystem`.
+
+        Args:
+            T, stiffness, mass, profile, tolerance, wider: see there.
+            near: interior dofs of this rank that an outboard interface's coordinates couple with.
+        """
+        super().__init__(T, stiffness, mass, profile, tolerance, wider)
+        self.near = near
+        self._is_last = T.comm.rank == T.comm.size - 1
+
+    @property
+    def is_worth_it(self) -> bool:
+        """Whether factors take no longer than those of the interior (collective)."""
+        alone = self._T.comm.size == 1
+        return not alone or self.is_iterative or self._bandwidth <= WIDER * self._T.bandwidth
+
+    @property
+    def _bandwidth(self) -> int:
+        return max(
+            self._T.bandwidth, self._num_rows - 1 - int(self.near.min(initial=self._num_rows))
+        )
+
+    @property
+    def _num_rows(self) -> int:
+        return self._T.num_interior + (self._T.num_coordinates if self._is_last else 0)
+
+    @cached_property
+    def _entries(self) -> InteriorEntries:
+        T, inner, near = self._T, super()._entries, self.near
+        b, size = T.num_coordinates, T.num_dofs - T.num_coordinates
+        outer = size + np.arange(b)
+        first = T.comm.exscan(T.num_interior) or 0
+        rows, columns = np.repeat(first + near, b), np.tile(outer, len(near))
+        sides = [(rows, columns), (columns, rows)]
+        places = np.arange(rows.size)
+        sources = [places, places]
+        if self._is_last:
+            sides.append((np.repeat(outer, b), np.tile(outer, b)))
+            sources.append(rows.size + np.arange(b * b))
+        rows, columns = (np.concatenate(each) for each in zip(*sides, strict=True))
+        source = self._patterns[0].nnz * self._block**2 + np.concatenate(sources)
+        order = np.lexsort((columns, rows))
+        rows = np.append(inner.rows, rows[order].astype(inner.rows.dtype))
+        # Sorted already but for the rows beside the interfaces, whose last entries these are.
+        merged = np.argsort(rows, kind="stable")
+        columns = np.append(inner.columns, columns[order].astype(PETSc.IntType))
+        source = np.append(inner.source, source[order].astype(inner.source.dtype))
+        return InteriorEntries(rows[merged], columns[merged], source[merged])
+
+    def _tell_rigid_motions(self) -> None:
+        from dolfinopt.fem.multigrid import with_motions
+
+        T = self._T
+        parts = [rigid_motions(T.points[T.interior_nodes]).reshape(-1, 6)]
+        if self._is_last:
+            for motion in rigid_motions(T.places):
+                parts += [motion, np.eye(6)[3:]]
+        with_motions(self._stiffness.mat, np.concatenate(parts))
+
+    def _owned(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+        return np.concatenate([interior, outboard]) if self._is_last else interior
+
+    def solve_loads(
+        self, K: ExtendedStiffness, loads: np.ndarray, purpose: str
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Return what loads (b, k) of the interfaces do, and whether that failed (collective).
+
+        Args:
+            K: of the design.
+            loads: forces and moments, N, N m.
+            purpose: see `solve`; of the last solution the interior is kept, and the interfaces'
+                displacements are any.
+
+        Returns:
+            Owned interior rows (num_interior, k), and the outboard ones (b, k) on every rank.
+        """
+        T = self._T
+        size, b = T.num_interior, T.num_coordinates
+        factor = self.factorise(K)
+        right = self._owned(np.zeros((size, loads.shape[1])), loads)
+        if self.is_iterative:
+            guess = self._solutions.get(purpose)
+            if guess is not None:
+                fixed = np.hstack([np.zeros((b, guess.shape[1])), np.eye(b)])
+                guess = self._owned(np.hstack([guess, np.zeros((size, b))]), fixed)
+            out = self._iterative.solve(right, guess)
+            self._note_hierarchy()
+            self._solutions[purpose] = out[:size].copy()
+        else:
+            out = factor.solve(right)
+        return out[:size], T.comm.bcast(out[size:], root=T.comm.size - 1), factor.failed

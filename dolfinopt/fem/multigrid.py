@@ -245,6 +245,19 @@ def _told(options: PETSc.Options, ours: dict[str, str]) -> Iterator[None]:
             options.delValue(key)
 
 
+def with_motions(matrix: PETSc.Mat, motions: np.ndarray) -> None:
+    """Tell a matrix of blocks of three rows its near-nullspace (owned rows, 6) (collective)."""
+    matrix.setBlockSize(3)
+    gram = matrix.comm.tompi4py().allreduce(motions.T @ motions)
+    scale = 1.0 / np.sqrt(np.diag(gram))
+    inverse = np.linalg.inv(np.linalg.cholesky(gram * np.outer(scale, scale)))
+    vectors = []
+    for column in ((motions * scale) @ inverse.T).T:
+        vectors.append(matrix.createVecLeft())
+        vectors[-1].array = column
+    matrix.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=matrix.comm))
+
+
 def with_rigid_motions(matrix: PETSc.Mat, points: np.ndarray) -> None:
     """Tell a matrix of three dofs a node, at points (n, 3), its near-nullspace (collective)."""
     matrix.setBlockSize(3)

@@ -54,14 +54,14 @@ class StaticResponse:
 def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
     """Load the outboard interface of one arm (collective on its ranks).
 
-    The interface's displacement is b = S^-1 f with S from `ElasticArm.constraint_modes`; neither
-    the mass matrix nor a reduced model is needed.
+    By `ElasticArm.static_fields`; neither the mass matrix nor a reduced model is needed.
 
     Args:
         arm: of the design.
         loads: (k, 3) F_x, F_y (N) and moment (N m) of every case; of a solid arm (k, 6).
     """
-    S, columns = arm.constraint_modes().stiffness, np.array(loads, dtype=float).T
-    if len(S) > len(columns):  # further interfaces are free
-        columns = np.concatenate([columns, np.zeros((len(S) - len(columns), columns.shape[1]))])
-    return StaticResponse(columns, np.linalg.solve(S, columns))
+    columns = np.array(loads, dtype=float).T
+    free = arm.rigid.shape[2] - len(columns)  # further interfaces are
+    columns = np.concatenate([columns, np.zeros((free, columns.shape[1]))])
+    fields = arm.static_fields(columns)
+    return StaticResponse(columns, fields.tip @ fields.amplitudes(columns))

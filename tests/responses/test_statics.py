@@ -9,11 +9,18 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 from remainders import build, rates, tip, uneven, wave
 from runs import TWO_ARM
+from solids import HEIGHT as HIGH
+from solids import LENGTH as LONG
+from solids import THICKNESS as THICK
+from solids import solid_scene
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
+from dolfinopt.fem import interior
 from dolfinopt.responses.response import Measured
+from dolfinopt.responses.sensitivity import deflection_gradient, static_gradient
 from dolfinopt.responses.statics import StaticResponse, static_response
+from dolfinopt.scene.tables.interfaces import Interface
 
 YOUNG, LENGTH, HEIGHT, THICKNESS = 70e9, 1.0, 0.06, 0.01  # of the scene
 AREA, INERTIA = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0
@@ -221,3 +228,159 @@ def test_gradients_are_ones(overrides: list[str], direction) -> None:
             continue
         rate = rates(lambda h, j=j: deflections(h).smooth[j] / limits[j], along)
         assert rate == pytest.approx(2.0, abs=0.1)
+
+
+# -- solids: a solve for every load -----------------------------------------------------------
+
+SIDE = (Interface(name="side", point=(0.27, 0.02, 0.0), radius=0.012),)
+ACROSS, TWIST = (0.0, 1.0, 0.3, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+SEVEN = [*np.eye(6), np.ones(6)]  # more than there are coordinates
+
+
+def static_link(
+    comm: MPI.Comm = MPI.COMM_WORLD, tolerance: float | None = None, **told: object
+) -> Arm:
+    """Return a solid link of whose designs nothing is asked but what static loads do."""
+    scene = solid_scene(**{"cells": (12, 4, 3), **told})  # type: ignore[arg-type]
+    scene = scene.model_copy(
+        update={"objective": scene.objective.model_copy(update={"kind": "static"})}
+    )
+    arm = Arm(scene, 0, comm, do.Profile())
+    for system in (arm.substructure.interior, arm.substructure.extended):
+        if system is not None:
+            system.tolerance = tolerance or system.tolerance
+    return arm
+
+
+def holed(arm: Arm, void: float = 0.05) -> np.ndarray:
+    """Return densities without a symmetry, the same on any partition."""
+    x, y, z = arm.mesh.centroid.T / np.array([LONG, HIGH, THICK])[:, None]
+    hole = (np.abs(x - 0.4) < 0.2) & (np.abs(y) < 0.3) & (z < 0.2)
+    return np.where(hole, void, 0.6 + 0.3 * np.sin(5.0 * x + 2.0 * y - z))
+
+
+@pytest.fixture(params=["factors", "conjugate gradients"])
+def width(request, monkeypatch) -> str:
+    """Let every solid be solved so; return its name."""
+    monkeypatch.setattr(interior, "WIDEST", 0 if request.param != "factors" else 10**9)
+    return request.param
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("loads", "solves", "interfaces"),
+    [
+        ([ACROSS], 2, ()),  # and one for the adjoint of the deflection
+        ([ACROSS, ACROSS], 2, ()),
+        # Adjoint loads are forces: those across the first case, of three directions, stay.
+        ([ACROSS, TWIST], 4, ()),
+        (SEVEN, 6, ()),
+        ([ACROSS], 2, SIDE),
+    ],
+    ids=["one", "twice the same", "two", "seven", "two interfaces"],
+)
+def test_a_solid_link_takes_a_solve_for_a_load(width, loads, solves, interfaces) -> None:
+    """As by all constraint modes: what it is loaded by, and both gradients.
+
+    Fields solved with the interface's rows know it to the digits that (length / cell)^3 leaves;
+    what follows from their energy has twice as many.
+    """
+    told = {"interfaces": interfaces, "coordinates": 6 + 6 * len(interfaces)}
+    if interfaces and width == "factors":  # in the middle of a band, which they would widen
+        solves = 12
+    found = []
+    for by_modes in (True, False):
+        arm = static_link(tolerance=1e-10, **told)
+        state = arm.state(holed(arm))
+        if by_modes:
+            state.elastic.constraint_modes()
+        before = arm.profile.counts.solves
+        response = static_response(state.elastic, np.array(loads))
+        slopes = static_gradient(state, response), deflection_gradient(state, response, 8.0)
+        found.append((response, slopes))
+        count = arm.profile.counts.solves - before
+        assert count == (0 if by_modes else solves)
+    (one, expected), (other, slopes) = found
+    assert other.compliance == pytest.approx(one.compliance, rel=1e-11)
+    assert other.deflection(8.0) == pytest.approx(one.deflection(8.0), rel=1e-8)
+    for slope, right in zip(slopes, expected, strict=True):
+        assert np.abs(slope - right).max() < 1e-8 * np.abs(right).max()
+
+
+@pytest.mark.serial
+def test_gradients_of_a_solid_link(width) -> None:
+    """By all densities: remainders of second order."""
+    arm = static_link(tolerance=1e-10)
+    x = holed(arm)
+    d = uneven(0, *arm.mesh.centroid.T[:2]) * (0.5 + arm.mesh.centroid[:, 2] / THICK)
+    loads = np.array([ACROSS, TWIST])
+
+    def at(h: float) -> StaticResponse:
+        return static_response(arm.state(x + h * d).elastic, loads)
+
+    state = arm.state(x)
+    response = static_response(state.elastic, loads)
+    slope = static_gradient(state, response) @ d, deflection_gradient(state, response, 8.0) @ d
+    assert rates(lambda h: at(h).compliance, slope[0]) == pytest.approx(2.0, abs=0.05)
+    assert rates(lambda h: at(h).deflection(8.0), slope[1]) == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.serial
+def test_a_symmetric_solid_needs_no_adjoint(width) -> None:
+    """What its deflection has across the load is an error of the field."""
+    arm = static_link()
+    state = arm.state(np.full(arm.mesh.num_cells, 0.5))
+    response = static_response(state.elastic, np.eye(6)[1:2])
+    deflection_gradient(state, response, 8.0)
+    assert arm.profile.counts.solves == 1
+
+
+@pytest.mark.serial
+def test_floating_solids_are_judged_by_constraint_modes(width) -> None:
+    """Void of 1e-8 of solid in a hole, and in a gap: six solves there, and those of refinement."""
+    arm = static_link()
+    x, y, _ = arm.mesh.centroid.T / np.array([LONG, HIGH, THICK])[:, None]
+    near = np.abs(x - 0.5) < 0.1
+    for void, floating in ((near & (np.abs(y) < 0.3), False), (near, True)):
+        young = np.where(void, 700.0, YOUNG)
+        elastic = arm.substructure.at(young, np.ones_like(young))
+        before = arm.profile.counts.solves
+        static_response(elastic, np.eye(6)[1:2])
+        assert elastic.has_constraint_modes == floating
+        assert (arm.profile.counts.solves - before > 12) == floating
+
+
+@pytest.mark.serial
+def test_a_solid_link_sets_out_from_the_last_design(monkeypatch) -> None:
+    """In fewer steps; from the same guesses, as when a run is resumed, to the same digits."""
+    monkeypatch.setattr(interior, "WIDEST", 0)
+    arm, other = (static_link(tolerance=1e-5, cells=(40, 4, 3)) for _ in range(2))
+    loads = np.array([ACROSS])
+
+    def tip_of(one: Arm, factor: float) -> np.ndarray:
+        return static_response(one.state(factor * holed(one)).elastic, loads).tip
+
+    tip_of(arm, 1.0)
+    extended = arm.substructure.extended
+    assert extended is not None
+    cold, guesses = extended._iterative.steps, arm.guesses
+    warm = tip_of(arm, 0.95)
+    assert extended._iterative.steps < 0.9 * cold and extended._iterative.grid.setups == 1
+    other.guesses = guesses
+    # Products of arrays round otherwise where these lie elsewhere in memory.
+    np.testing.assert_allclose(tip_of(other, 0.95), warm, rtol=1e-10)
+    assert other.substructure.extended is not None
+    assert other.substructure.extended._iterative.steps == extended._iterative.steps
+    # A machine that moves needs the constraint modes, and no more of this.
+    arm.state(holed(arm)).elastic.constraint_modes()
+    assert arm.guesses is None
+
+
+def test_a_solid_link_cut_in_two(width) -> None:
+    """The same on the ranks that share it."""
+    tips = []
+    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        arm = static_link(comm, tolerance=1e-9)
+        tips.append(static_response(arm.state(holed(arm)).elastic, np.array([ACROSS])).tip)
+        assert arm.profile.counts.solves == 1
+    np.testing.assert_allclose(tips[1], tips[0], rtol=1e-7, atol=1e-8 * np.abs(tips[0]).max())

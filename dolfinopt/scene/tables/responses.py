@@ -68,6 +68,11 @@ def freezes(scene: Scene) -> bool:
     return bool(set(need_of(scene, "motion")) - EXACT_ONLY)
 
 
+def needs_alone(scene: Scene, what: Collection[Need]) -> bool:
+    """Return whether nothing of `asked` needs anything else."""
+    return all(NEEDS[name] <= frozenset(what) for name in asked(scene))
+
+
 def need_of(scene: Scene, what: Need) -> list[str]:
     """Return those of `asked` that need that; of words that are no scene's nothing is known."""
     return [name for name in asked(scene) if what in NEEDS.get(name, ())]
