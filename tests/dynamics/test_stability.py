@@ -300,12 +300,13 @@ def test_shapes(height: float, cells: tuple[int, int]) -> None:
     """Arms of aspect 1/2 to 1e4, cells of 1/50 to 200: statics right to what K's digits allow.
 
     Bending stiffness is (height / length)^2 of the axial one: 1e-8 at 1e4. A cell that bends has
-    (height / length)^2 of the stiffness to its shear, which its matrix is the difference of.
+    (height / length)^2 of the stiffness to its shear, which its matrix is the difference of. At an
+    aspect of 1e4 one digit is left: 0.02 to 0.18 of error, by the rounding of the design.
     """
     arm = one_arm(f"arms.height={height}", "reduction.coordinates=3", cells=cells)
     arm.set_design(np.full(arm.mesh.num_cells, 0.7))
     slender = height / cells[1] * cells[0]  # height over length of a cell
-    assert compliance_error(arm) < max(1e-9 / min(height, 1.0), 1e-14 / (slender * height) ** 2)
+    assert compliance_error(arm) < max(1e-9 / min(height, 1.0), 5e-14 / (slender * height) ** 2)
 
 
 # -- modes -----------------------------------------------------------------------------------
