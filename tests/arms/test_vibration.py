@@ -328,8 +328,8 @@ def test_p_mean_where_modes_coincide(direction: Field, exponent: float) -> None:
     """The two lowest eigenvalues are equal to 1e-11, their vectors any: the gradient is one.
 
     Of either mode alone it is none: the remainder is of first order. Rounding turns the vectors;
-    where they nearly fit the direction, that of second order is as large at longer steps: here
-    with 2e-3, at the steps of one mode alone it is a hundredth.
+    where they nearly fit the direction, the part of second order is as large with steps of 1e-3,
+    but 3 % of it with those for one mode alone.
     """
     arm, carried = stubby(), coinciding()
     x, d = design_of(arm, symmetric), design_of(arm, direction)
