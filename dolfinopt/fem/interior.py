@@ -60,7 +60,8 @@ TETRAHEDRA = 2.0  # times WIDEST
 FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
 FREE_SHARE = 0.5
 # Of conjugate gradients in energy, relative, where nobody says what is needed: stiffness is then
-# right to its square, mass and inertia to it, gradients of frozen loads to five times it.
+# right to its square, mass and inertia to it, gradients of frozen loads to five times it, geometric
+# stiffness to ten times.
 TOLERANCE = 1e-8
 TIGHT = 1e-12  # where a Krylov space is made of solutions
 
