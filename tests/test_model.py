@@ -153,7 +153,7 @@ def test_scenes_from_dictionaries_and_scenes() -> None:
     [
         ({"arm1": np.zeros(96)}, "expected densities of arm1, arm2"),
         ({"arm1": np.zeros(95), "arm2": np.zeros(96)}, r"arm 'arm1'.*\(96,\).*\(95,\)"),
-        ({"arm1": np.full(96, 2.0), "arm2": np.zeros(96)}, "density 2"),
+        ({"arm1": np.full(96, 2.0), "arm2": np.zeros(96)}, "density of arm 'arm1' = 2 at cell 0"),
     ],
 )
 def test_designs_that_do_not_fit_are_refused_on_all_ranks(model: Model, x, words) -> None:

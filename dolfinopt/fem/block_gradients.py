@@ -16,6 +16,7 @@ WORSE = 1.5
 # Steps a digit from cold beyond which a hierarchy of smaller aggregates is made: it takes half of
 # the steps, each as long again, and three times the work to make it.
 SLOW = 12.0
+LEAST = 1e-12  # tolerance that rounding allows, of the right side's own length
 INDEPENDENT = 1e-12  # least share of a direction's length that is none of the others'
 
 
@@ -46,6 +47,7 @@ class BlockConjugateGradients:
         self.grid = Multigrid(matrix)
         self._comm: MPI.Comm = matrix.comm.tompi4py()
         self.failed, self.steps, self.rate = False, 0, 0.0
+        self._digits = 1.0  # of the residual that its tolerance has asked for
         self._first_rate = 0.0  # right after the hierarchy was made
         self._fresh = True
 
@@ -73,7 +75,11 @@ class BlockConjugateGradients:
         self._fresh = True
 
     def solve(
-        self, right: np.ndarray, guess: np.ndarray | None = None, tolerance: float | None = None
+        self,
+        right: np.ndarray,
+        guess: np.ndarray | None = None,
+        tolerance: float | None = None,
+        held: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the solution (n,) or (n, k) of the owned rows (collective).
 
@@ -81,27 +87,35 @@ class BlockConjugateGradients:
             right: of that shape.
             guess: (n, m) fields in whose space there may be something like it; or None.
             tolerance: in place of the own one.
+            held: (k,) energies, twice, of boundary motions before the solutions relax them, N m:
+                the tolerance is of what is left of them then.
         """
         if right.ndim == 1:
             return self.solve(right[:, None], guess, tolerance)[:, 0]
         tolerance = tolerance or self.tolerance
-        out = self._by_parts(right, guess, tolerance)
+        out = self._by_parts(right, guess, tolerance, held)
         if self.failed and not self.grid.gradual:
             self._make(True)
-            out = self._by_parts(right, guess, tolerance)
-        self.rate = self.steps / -np.log10(tolerance)
+            out = self._by_parts(right, guess, tolerance, held)
+        self.rate = self.steps / self._digits
         if self._fresh and guess is None:
             self._first_rate, self._fresh = self.rate, False
         return out
 
     def _by_parts(
-        self, right: np.ndarray, guess: np.ndarray | None, tolerance: float
+        self,
+        right: np.ndarray,
+        guess: np.ndarray | None,
+        tolerance: float,
+        held: np.ndarray | None,
     ) -> np.ndarray:
         """Return the solution (n, k), so many columns at a time."""
         out, self.failed, most = np.empty_like(right), False, 0
+        self._digits = -np.log10(tolerance)
         for first in range(0, right.shape[1], COLUMNS):
             part = slice(first, first + COLUMNS)
-            out[:, part] = self._solve(right[:, part], guess, tolerance)
+            energies = None if held is None else held[part]
+            out[:, part] = self._solve(right[:, part], guess, tolerance, energies)
             most = max(most, self.steps)
         self.steps = most
         return out
@@ -114,12 +128,26 @@ class BlockConjugateGradients:
         part = np.einsum("nk,nk->k", left, right)
         return part if self._comm.size == 1 else self._comm.allreduce(part)
 
-    def _solve(self, B: np.ndarray, guess: np.ndarray | None, tolerance: float) -> np.ndarray:
+    def _solve(
+        self,
+        B: np.ndarray,
+        guess: np.ndarray | None,
+        tolerance: float,
+        held: np.ndarray | None,
+    ) -> np.ndarray:
         grid, fine = self.grid, self.grid.levels[0]
         R = np.array(B, order="F")
         Z = grid.cycle(R)
-        goal = tolerance**2 * self._lengths(R, Z)
+        own = self._lengths(R, Z)
         X = np.zeros_like(R)
+
+        def goal() -> np.ndarray:
+            """Return the squared tolerance (k,) of the residual."""
+            if held is None:
+                return tolerance**2 * own
+            left = held - self._lengths(B, X)  # falls to that of the whole field, step by step
+            return np.clip(tolerance**2 * left, LEAST**2 * own, tolerance**2 * own)
+
         if guess is not None:  # the best of their space, in energy
             P = self._orthonormal(guess)
             Q = fine.times(P)
@@ -131,7 +159,7 @@ class BlockConjugateGradients:
             Z = grid.cycle(R)
         P = self._orthonormal(Z)
         self.steps = 0
-        while not (self._lengths(R, Z) <= goal).all():  # not a number included
+        while not (self._lengths(R, Z) <= goal()).all():  # not a number included
             if self.steps == MAX_STEPS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
                 self.failed = True
                 break
@@ -145,6 +173,8 @@ class BlockConjugateGradients:
             Z = grid.cycle(R)
             self.steps += 1
             P = self._orthonormal(Z - P @ (inverse @ self._dot(Q, Z)))
+        shares = np.sqrt(goal()[own > 0.0] / own[own > 0.0])
+        self._digits = max(self._digits, -np.log10(shares.min(initial=1.0)))
         return X
 
     def _orthonormal(self, P: np.ndarray) -> np.ndarray:

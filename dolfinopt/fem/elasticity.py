@@ -389,12 +389,15 @@ class ElasticArm:
         """Return M_II, valid until another design of the arm asks for its own."""
         return self.substructure.interior.mass(self.M.matrix)
 
-    def solve(self, right: np.ndarray, purpose: str = "") -> np.ndarray:
+    def solve(
+        self, right: np.ndarray, purpose: str = "", held: np.ndarray | None = None
+    ) -> np.ndarray:
         """Solve K_II U = right for (num_interior, k) owned rows.
 
         Args:
             right: right sides.
             purpose: what for, where the design before had similar ones, see `InteriorSystem.solve`.
+            held: (k,) see `InteriorSystem.solve`.
 
         Raises:
             ConvergenceError: K_II is singular but for rounding.
@@ -402,7 +405,7 @@ class ElasticArm:
         interior = self.substructure.interior
         interior.factorise(self.K.matrix, self.young)
         with self.profile.phase("solves"):
-            out, failed = interior.solve(self.K.matrix, right, purpose)
+            out, failed = interior.solve(self.K.matrix, right, purpose, held)
         self._count(right.shape[1], failed)
         return out
 

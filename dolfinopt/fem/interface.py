@@ -17,7 +17,7 @@ from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 
-SAME_PLACE = 1e9  # places along an arm that are told apart
+SAME_PLACE = 1e-9  # of an arm's length: places no farther apart than this are one
 
 
 class InterfaceTransformation:
@@ -219,10 +219,10 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray,
         graph: (n, n) with an entry where two nodes share a cell.
         points: (n, d) m.
     """
-    x = points[:, 0]
-    along = np.round((x - x.min()) / max(np.ptp(x), np.finfo(float).tiny) * SAME_PLACE)
+    nearest = SAME_PLACE * np.ptp(points[:, 0])
+    along, *across = (_places(each, nearest) for each in points.T)
     orders = (
-        np.lexsort((*points.T[1:], along)),
+        np.lexsort((*across, along)),
         reverse_cuthill_mckee(graph, symmetric_mode=True),
     )
     rows, columns = graph.nonzero()
@@ -235,3 +235,11 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray,
     widths = [bandwidth(order) for order in orders]
     best = int(np.argmin(widths))
     return orders[best], widths[best]
+
+
+def _places(values: np.ndarray, nearest: float) -> np.ndarray:
+    """Number values in ascending order, those as one that differ from the next by rounding only."""
+    order = np.argsort(values)
+    number = np.empty(len(values), dtype=np.int64)
+    number[order] = np.cumsum(np.diff(values[order], prepend=values[order[0]]) > nearest)
+    return number

@@ -60,7 +60,8 @@ TETRAHEDRA = 2.0  # times WIDEST
 FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
 FREE_SHARE = 0.5
 # Of conjugate gradients in energy, relative, where nobody says what is needed: stiffness is then
-# right to its square, mass and inertia to it, gradients of frozen loads to five times it.
+# right to its square, mass and inertia to it, gradients of frozen loads to five times it, geometric
+# stiffness to ten times.
 TOLERANCE = 1e-8
 TIGHT = 1e-12  # where a Krylov space is made of solutions
 # Bandwidth of K with the interfaces' rows behind, of that without, up to which it is factorised in
@@ -260,18 +261,20 @@ class InteriorSystem:
         if self._iterative.grid.setups != self._setups:
             self._setups, self._young = self._iterative.grid.setups, self._asked
 
-    def solve(self, K: sp.csr_matrix, right: np.ndarray, purpose: str) -> tuple[np.ndarray, bool]:
+    def solve(
+        self, K: sp.csr_matrix, right: np.ndarray, purpose: str, held: np.ndarray | None = None
+    ) -> tuple[np.ndarray, bool]:
         """Return K_II^-1 right (num_interior, k) and whether that failed (collective).
 
         Conjugate gradients set out from the best in the space of the last solutions for the same
-        purpose, which the design before has left.
+        purpose, which the design before has left; of `held` see `BlockConjugateGradients.solve`.
         """
         factor = self.factorise(K)
         if not self.is_iterative:
             return factor.solve(right), factor.failed
         if right.shape[1] == 0:
             return right.copy(), False
-        out = self._iterative.solve(right, self._solutions.get(purpose))
+        out = self._iterative.solve(right, self._solutions.get(purpose), held=held)
         self._note_hierarchy()
         if purpose:
             self._solutions[purpose] = out

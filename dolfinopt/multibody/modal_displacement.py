@@ -60,23 +60,24 @@ class ModalDisplacement:
         """Return J x (n, q): what z changes by a change x of q."""
         return x if self.L is None else x - product(self._bent[0], x)
 
-    def rate_by_q(self, x: np.ndarray) -> np.ndarray | float:
-        """Return x . d(zd)/dq (n, q), x (n, q); zero if z is q."""
-        return 0.0 if self.L is None else -self._transposed(x, 1)
+    def rate_by_q(self, x: np.ndarray) -> np.ndarray:
+        """Return x . d(zd)/dq (n, q) or (n, m, q), where z is not q."""
+        return -self._transposed(x, 1)
 
-    def second_rate_by_q(self, x: np.ndarray) -> np.ndarray | float:
-        """Return x . d(zdd)/dq (n, q); by qd it is twice `rate_by_q`."""
-        return 0.0 if self.L is None else -self._transposed(x, 2)
+    def second_rate_by_q(self, x: np.ndarray) -> np.ndarray:
+        """Return x . d(zdd)/dq; by qd it is twice `rate_by_q`."""
+        return -self._transposed(x, 2)
 
     @property
-    def convective(self) -> np.ndarray | float:
-        """What zdd has without qdd: -qd' L qd (n, q)."""
-        return 0.0 if self.L is None else -product(self._bent[1], self.qd)
+    def convective(self) -> np.ndarray:
+        """What zdd has without qdd: -qd' L qd (n, q), where z is not q."""
+        return -product(self._bent[1], self.qd)
 
     def _transposed(self, x: np.ndarray, rate: int) -> np.ndarray:
         """Return x_k L_k times q, qd or qdd."""
         bent = self._bent[rate]
-        return x @ bent if x.ndim == 3 else (x[:, None] @ bent)[:, 0]
+        found: np.ndarray = x @ bent if x.ndim == 3 else (x[:, None] @ bent)[:, 0]
+        return found
 
     def tangent(
         self, inertia: np.ndarray, M: np.ndarray, by_z: np.ndarray, by_zd: np.ndarray
@@ -126,4 +127,5 @@ class ModalDisplacement:
 
 def product(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return A x (n, q) at every instant of matrices (n, q, q)."""
-    return (A @ x[:, :, None])[:, :, 0]
+    found: np.ndarray = (A @ x[:, :, None])[:, :, 0]
+    return found

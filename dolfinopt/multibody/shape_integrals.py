@@ -477,13 +477,13 @@ def rigid_bar(
 def padded(by: ShapeIntegrals, like: ShapeIntegrals) -> ShapeIntegrals:
     """Return derivatives by `rigid_part` as those by the whole body `like`: zero by its modes."""
     whole = in_basis(by, np.zeros((0, like.num_modes)))
-    zero = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
+    zero: dict[str, Any] = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
     return replace(whole, **zero)
 
 
 def linear_part(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body without geometric stiffness."""
-    linear = np.zeros((0, body.num_modes, body.num_modes))
+    linear: Any = np.zeros((0, body.num_modes, body.num_modes))
     return replace(body, **dict.fromkeys(STIFFENING, linear))
 
 

@@ -124,13 +124,16 @@ def _compared(
     room = np.minimum(x - xmin, xmax - x)
     free = (width > 0.0) & (room > AT_BOUND * width)
     g, h = np.where(free, exact * width, 0.0), np.where(free, frozen * width, 0.0)
-    gg, gh, hh = total(
-        {k: np.array([g[p] @ g[p], g[p] @ h[p], h[p] @ h[p]]) for k, p in parts.items()}
-    )
+    gg, hh = total({k: np.array([g[p] @ g[p], h[p] @ h[p]]) for k, p in parts.items()})
     if not (gg > 0.0 and hh > 0.0):
         return np.nan, np.nan
-    cosine = np.clip(gh / np.sqrt(gg * hh), -1.0, 1.0)
-    return float(np.degrees(np.arccos(cosine))), float(np.sqrt(hh / gg))
+    # From the diagonals of the rhombus: a cosine would lose angles below 1e-6 degrees to rounding.
+    g, h = g / np.sqrt(gg), h / np.sqrt(hh)
+    across, along = total(
+        {k: np.array([np.sum((g - h)[p] ** 2), np.sum((g + h)[p] ** 2)]) for k, p in parts.items()}
+    )
+    angle = 2.0 * np.arctan2(np.sqrt(across), np.sqrt(along))
+    return float(np.degrees(angle)), float(np.sqrt(hh / gg))
 
 
 def without_exact_gradient(scene: Scene) -> str:

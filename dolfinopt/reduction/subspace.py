@@ -21,6 +21,10 @@ SHRINKS = 0.1
 # Largest entry of V' M V - I: two rounds leave 1e-15 to 1e-14.
 ORTHONORMAL = 1e-12
 MAX_ROUNDS = 4  # two are the rule
+# Least eigenvalue of the vectors' energies, scaled to one each, by the largest: rounding leaves
+# 1e-16 of dependent vectors, independent ones have 1e-2. Whether Cholesky's method
+# notices depends on the sign of that rounding.
+INDEPENDENT_ENERGY = 1e-12
 
 
 def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -172,7 +176,11 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     )
 
     def solved() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        length = np.sqrt(np.diag(energy))
         try:
+            shares = np.linalg.eigvalsh(energy / np.outer(length, length))
+            if not shares[0] > INDEPENDENT_ENERGY * shares[-1]:  # not a number included
+                raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:
             raise dependent from None

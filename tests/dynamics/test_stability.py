@@ -6,6 +6,7 @@ Nothing here knows of ranks but the last test.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -299,12 +300,13 @@ def test_shapes(height: float, cells: tuple[int, int]) -> None:
     """Arms of aspect 1/2 to 1e4, cells of 1/50 to 200: statics right to what K's digits allow.
 
     Bending stiffness is (height / length)^2 of the axial one: 1e-8 at 1e4. A cell that bends has
-    (height / length)^2 of the stiffness to its shear, which its matrix is the difference of.
+    (height / length)^2 of the stiffness to its shear, which its matrix is the difference of. At an
+    aspect of 1e4 one digit is left: 0.02 to 0.18 of error, by the rounding of the design.
     """
     arm = one_arm(f"arms.height={height}", "reduction.coordinates=3", cells=cells)
     arm.set_design(np.full(arm.mesh.num_cells, 0.7))
     slender = height / cells[1] * cells[0]  # height over length of a cell
-    assert compliance_error(arm) < max(1e-9 / min(height, 1.0), 1e-14 / (slender * height) ** 2)
+    assert compliance_error(arm) < max(1e-9 / min(height, 1.0), 5e-14 / (slender * height) ** 2)
 
 
 # -- modes -----------------------------------------------------------------------------------
@@ -401,10 +403,10 @@ def distance(trajectory: Trajectory, other: Solution) -> float:
         ["motion.duration=0.2", "motion.horizon=0.3"],
         ["motion.duration=20.0", "motion.horizon=22.0", "simulation.sample=0.01"],
         ["payload.mass=0.0"],
-        ["payload.mass=1e4", "motion.horizon=1.9"],
+        ["payload.mass=1e3", "motion.horizon=1.9"],  # deflections of 46 % of the length
         ["payload.inertia=1e3"],
-        ["material.young_modulus=1e3"],
-        ["material.young_modulus=1e6", "motion.horizon=1.9"],
+        ["material.young_modulus=2e9"],  # 21 %
+        ["material.young_modulus=1.5e9", "motion.horizon=1.9"],  # 28 %
         ["material.density=1e-6"],
         ["damping.stiffness_proportional=0.0"],
         ["damping.stiffness_proportional=1.0"],
@@ -426,6 +428,29 @@ def test_motions(overrides: list[str]) -> None:
     fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
     assert np.isfinite(trajectory.deviation).all() and np.isfinite(trajectory.joint_forces).all()
     assert distance(trajectory, fine) < 1.1e-4
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["payload.mass=1e4", "motion.horizon=1.9"],
+        ["material.young_modulus=1e3"],
+        ["material.young_modulus=1e6", "motion.horizon=1.9"],
+    ],
+    ids=" ".join,
+)
+def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> None:
+    """By the deflection and what to change, in one line, whether Newton's method converges or not.
+
+    The lightest of them bends an arm by 54 % of its length before Newton's method fails.
+    """
+    with pytest.raises(ConvergenceError) as refusal:
+        moved(*overrides)
+    said = str(refusal.value)
+    deflection = re.search(r"deflects by ([0-9.]+) % of its length: beyond 50 %", said)
+    assert deflection is not None and float(deflection[1]) > 100.0 * march.VALID
+    assert "material.young_modulus" in said and "motion.duration" in said and "\n" not in said
 
 
 def quasi_static(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
@@ -561,8 +586,9 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
 
 @pytest.mark.serial
 def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Arms that fold over: with Newton's method refused for more than 20 steps, the same motion."""
-    trajectory = moved("motion.duration=0.4", "motion.horizon=0.6", field=checkerboard)
+    """Deflections of 28 %: with Newton's method refused for more than 20 steps, the same motion."""
+    trajectory = moved("material.young_modulus=1.5e9", "motion.horizon=1.9")
+    assert len(trajectory.solution.time_grid) > 21
     method, refused = newton.newton, []
 
     def stubborn(stages, state, a, *others, **options):
@@ -572,7 +598,7 @@ def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPa
         return method(stages, state, a, *others, **options)
 
     monkeypatch.setattr(march, "newton", stubborn)
-    again = radau.integrate(trajectory.problem, 1e-4, 3, do.Profile())
+    again = radau.integrate(trajectory.problem, 1e-4, 5, do.Profile())
     assert refused
     assert distance(trajectory, again) < 2e-4
 

@@ -224,7 +224,10 @@ def test_files_that_are_no_robots(tmp_path):
 def test_a_remedy_does_not_overwrite_the_file(tmp_path, name, new):
     """`xacro panda.urdf > panda.urdf` would leave an empty file."""
     file = tmp_path / name
-    file.write_text('<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"/>')
+    file.write_text(
+        '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+        '<xacro:property name="length" value="0.4"/><link name="b"/></robot>'
+    )
     with pytest.raises(InputError, match=rf"xacro {name} > {new}$"):
         read_robot(file)
 

@@ -211,8 +211,10 @@ def test_products_that_open_cascade_has_numbered_have_no_names(shared_tmp_path):
     path = shared_tmp_path / "two.step"
 
     def halves(gmsh):
-        for x in (0.0, 500.0 * LENGTH):
-            gmsh.model.occ.addRectangle(x, -500.0 * HEIGHT, 0.0, 500.0 * LENGTH, 1e3 * HEIGHT)
+        # Open CASCADE keeps the unit of what the process read before.
+        gmsh.option.setString("Geometry.OCCTargetUnit", "M")
+        for x in (0.0, 0.5 * LENGTH):
+            gmsh.model.occ.addRectangle(x, -0.5 * HEIGHT, 0.0, 0.5 * LENGTH, HEIGHT)
         gmsh.model.occ.synchronize()
 
     gmsh_writes(path, halves)

@@ -153,14 +153,15 @@ def evaluator_of(built):
 def test_an_objective_turned_round_rises():
     """The tips are to move as far as they can: as in a compliant machine."""
     changes = ["objective.kind=tip_deflection", "objective.direction=maximize"]
-    result = do.optimize(scene(*changes, "constraints.first_frequency=[0.5,1.0]", iterations=20))
+    # Deflections of 26 % of an arm's length: with half of the frequencies they exceed 50 %.
+    result = do.optimize(scene(*changes, "constraints.first_frequency=[1.0,2.0]", iterations=20))
     if WORLD.rank == 0:
         first, *_, last = (row.objective for row in result.history)
-        assert last > 50.0 * first
+        assert last > 30.0 * first  # 34.5 times
     found = values(result)
     assert {name: one.limit for name, one in found.items()} == {
-        "first_frequency_arm1": 0.5,
-        "first_frequency_arm2": 1.0,
+        "first_frequency_arm1": 1.0,
+        "first_frequency_arm2": 2.0,
     }
     assert all(one.least and one.met for one in found.values())
 
