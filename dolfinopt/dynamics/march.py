@@ -193,8 +193,11 @@ class _Graded:
         self.angle = float(np.clip(angle, *ANGLES))
         self.state: State = self.system.initial_state()
         self.h, self.count, self.first = step, LONGEST, step
-        self.ends, self.pieces = [0.0], [np.zeros((0, stages, self.system.num_coordinates))]
-        self.held = np.zeros((1, 1, self.system.num_coordinates))  # accelerations at the end
+        self.ends = [0.0]
+        self.pieces: list[np.ndarray] = [np.zeros((0, stages, self.system.num_coordinates))]
+        self.held: np.ndarray = np.zeros(
+            (1, 1, self.system.num_coordinates)
+        )  # accelerations at the end
         self.size = self.system.norm(self.state[0])  # largest so far, by group
         self.iterations = self.work = self.windows = 0
 

@@ -213,7 +213,7 @@ def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
     for place, side in ((0, 0), (2, 1)):
         face = np.take(cube, side, axis=axis)
         middle = 0.25 * ((face[:, 0, 0] + face[:, 1, 1]) + (face[:, 0, 1] + face[:, 1, 0]))
-        at = [slice(None), 1, 1, 1]
+        at: list[slice | int] = [slice(None), 1, 1, 1]
         at[axis] = place
         grid[tuple(at)] = middle
 

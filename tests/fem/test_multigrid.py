@@ -54,7 +54,7 @@ def difference(one: ShapeIntegrals, other: ShapeIntegrals) -> float:
 @pytest.mark.serial
 @pytest.mark.parametrize("void", [0.1, 0.01, 1e-3])  # contrasts of 1e3, 1e6, 1e9 but for the floor
 def test_as_the_direct_solution(direct, iterative, void):
-    """Body and gradient to 50 times the tolerance of 1e-7; geometric stiffness, 10, is the worst."""
+    """Body and gradient to 50 times the tolerance of 1e-7; the geometric stiffness is the worst."""
     states = [arm.state(hollow(arm, void)) for arm in (direct, iterative)]
     assert difference(*(state.body for state in states)) < 5e-6
     by = states[0].body

@@ -138,7 +138,7 @@ class _Grid:
         image = pyvista.ImageData(
             dimensions=self.shape,
             spacing=(self.step,) * 3,
-            origin=(self.low + 0.5 * self.step).tolist(),
+            origin=[float(x) + 0.5 * self.step for x in self.low],
         )
         surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
         found = surface.voxelize_binary_mask(reference_volume=image)["mask"]
