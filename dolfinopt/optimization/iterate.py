@@ -94,7 +94,7 @@ class Iterate:
         if len(self.convexity) != len(problem.values):
             self.convexity = np.zeros(len(problem.values))
         for attempt in range(ATTEMPTS):
-            last = attempt == ATTEMPTS - 1 or not guarded
+            last = attempt == ATTEMPTS - 1
             self._update(problem, move)
             try:
                 self.evaluate()

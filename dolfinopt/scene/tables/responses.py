@@ -69,8 +69,9 @@ def freezes(scene: Scene) -> bool:
 
 
 def needs_alone(scene: Scene, what: Collection[Need]) -> bool:
-    """Return whether nothing of `asked` needs anything else."""
-    return all(NEEDS[name] <= frozenset(what) for name in asked(scene))
+    """Return whether nothing of `asked` needs anything else; of unknown words nothing is known."""
+    known = [NEEDS.get(name) for name in asked(scene)]
+    return all(needs is not None and needs <= frozenset(what) for needs in known)
 
 
 def need_of(scene: Scene, what: Need) -> list[str]:
