@@ -200,6 +200,7 @@ class _Graded:
         )  # accelerations at the end
         self.size = self.system.norm(self.state[0])  # largest so far, by group
         self.iterations = self.work = self.windows = 0
+        self.deflection = 0.0  # largest so far, as a share of an arm's length
 
     @property
     def t(self) -> float:
@@ -265,9 +266,10 @@ class _Graded:
         self.ends += list(ends)
         self.pieces.append(a)
         self.state, self.held, self.windows = (q[-1:], qd), a[-1:, -1:], self.windows + 1
-        if (deflection := self.system.deflection(q)) > VALID:
+        self.deflection = max(self.deflection, self.system.deflection(q))
+        if self.deflection > VALID:
             raise GivenUp(
-                f"at t = {self.t:.4g} s an arm deflects by {100 * deflection:.0f} % of its length: "
+                f"at t = {self.t:.4g} s an arm deflects by {100 * self.deflection:.0f} % of its length: "
                 f"{BEYOND}; {REMEDY.replace('them', 'the arms', 1)}"
             )
 
@@ -285,7 +287,7 @@ class _Graded:
     def _stuck(self, spent: str) -> str:
         """Return the message of a motion that cannot be followed."""
         return (
-            f"the simulation gets no further than t = {self.t:.4g} s with {spent}: there "
-            f"{self.system.describe(self.state[0])}, beyond small-deflection theory; "
-            f"{REMEDY.replace('them', 'the arms', 1)}"
+            f"the simulation gets no further than t = {self.t:.4g} s with {spent}: the motion "
+            f"changes too fast for arms that deflect by {100 * self.deflection:.0f} % of their "
+            f"length; {REMEDY.replace('them', 'the arms', 1)}"
         )
