@@ -10,7 +10,7 @@ from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.fem import interior
-from dolfinopt.solver import BandCholesky, direct_solver
+from dolfinopt.solver import BandCholesky, PetscFactor, direct_solver
 
 COMM = MPI.COMM_WORLD
 
@@ -68,6 +68,28 @@ def test_an_empty_band():
     band = BandCholesky(none, none, 0)
     assert band.factorise(np.empty(0))
     assert band.solve(np.empty((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("pivot", [2.0, 0.0])
+def test_mumps_solves_several_loads_at_once(pivot):
+    """As one by one, on any number of ranks; of a singular matrix all are said to fail."""
+    size = 12
+    mat = PETSc.Mat().createAIJ((size, size), nnz=1, comm=COMM)
+    first, last = mat.getOwnershipRange()
+    for row in range(first, last):
+        mat.setValue(row, row, pivot if row == 5 else 1.0 + row)
+    mat.assemble()
+    for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
+        mat.setOption(option, True)
+    solver = direct_solver(mat, "natural", "test_", own=False)
+    solver.setUp()
+    factor = PetscFactor(solver)
+    right = np.arange(first, last)[:, None] + np.array([1.0, 2.0, 3.0])
+    found = factor.solve(right)
+    assert factor.failed == (pivot == 0.0)
+    if pivot:
+        scale = np.where(np.arange(first, last) == 5, pivot, 1.0 + np.arange(first, last))
+        assert np.abs(found - right / scale[:, None]).max(initial=0.0) < 1e-14  # rounding
 
 
 @pytest.mark.serial

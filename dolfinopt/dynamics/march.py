@@ -269,8 +269,8 @@ class _Graded:
         self.deflection = max(self.deflection, self.system.deflection(q))
         if self.deflection > VALID:
             raise GivenUp(
-                f"at t = {self.t:.4g} s an arm deflects by {100 * self.deflection:.0f} % of its length: "
-                f"{BEYOND}; {REMEDY.replace('them', 'the arms', 1)}"
+                f"at t = {self.t:.4g} s an arm deflects by {100 * self.deflection:.0f} % of its "
+                f"length: {BEYOND}; {REMEDY.replace('them', 'the arms', 1)}"
             )
 
     def _angles(self, stages: Stages, begin: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

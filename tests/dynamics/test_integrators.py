@@ -622,7 +622,7 @@ def test_estimate_below_the_tolerance_is_no_refusal(
     if share < 1.0:
         assert solve("radau", problem, 1e-4).error == estimated.error
     else:
-        with pytest.raises(ConvergenceError, match="simulation.tolerance"):
+        with pytest.raises(ConvergenceError, match=r"simulation\.tolerance"):
             solve("radau", problem, 1e-4)
 
 
