@@ -9,7 +9,8 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.paths.tables import TIME, column_names, last_instant, read_table
-from dolfinopt.paths.time_laws import Law, Limits, law_for
+from dolfinopt.paths.time_laws import Law as TimeLaw
+from dolfinopt.paths.time_laws import Limits, law_for
 from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points
@@ -17,7 +18,7 @@ SPACE_POINT = ("x", "y", "z")
 SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
 
 
-def time_law(motion: Motion) -> Law:
+def time_law(motion: Motion) -> TimeLaw:
     """Return the law by which the scene runs along its path.
 
     Raises:
@@ -39,7 +40,7 @@ def limits_of(motion: Motion) -> Limits:
     return Limits(*(np.inf if value is None else value for value in values))
 
 
-def too_short(law: Law) -> str:
+def too_short(law: TimeLaw) -> str:
     """Return what is wrong with a duration that the limits do not allow."""
     return (
         f"expected at least {law.least:.6g} [s], which motion.max_speed, max_acceleration and "

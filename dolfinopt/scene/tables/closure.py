@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
 from dolfinopt.scene.tables.base import Loc, Position, Refusal, Table
+from dolfinopt.scene.tables.joints import Component
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
 ClosureKind = Literal["slider", "pin"]
-Component = Annotated[float, Field(ge=-1e6, le=1e6)]
 # Responses of the deviation at the end of the chain, which a pin leaves none.
 OF_THE_END = ("deviation", "settling")
 DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the last ones
