@@ -24,9 +24,7 @@ from dolfinopt.multibody.modal_displacement import Rates
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.spatial_system import SpatialSystem
-
-    Problem = ElasticSystem | MachineSystem | SpatialSystem
+    from dolfinopt.dynamics.simulation import Problem
 
 
 CHUNK = 512  # instants whose matrices are made at once

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.multibody.inverse_dynamics import body_loads
 from dolfinopt.multibody.mechanism import ElasticBodies
 from dolfinopt.multibody.modal_displacement import ModalDisplacement, Rates
@@ -29,9 +28,7 @@ from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import SPACE, ShapeIntegrals, in_basis
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.spatial_system import SpatialSystem
-
-    Problem = ElasticSystem | MachineSystem | SpatialSystem
+    from dolfinopt.dynamics.simulation import Problem
 
 
 @dataclass(frozen=True)

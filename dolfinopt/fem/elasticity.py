@@ -19,8 +19,8 @@ from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem import cells
 from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs, UniformMatrix
+from dolfinopt.fem.cells import cell_values, mass_products, stiffness_products
 from dolfinopt.fem.constraint_modes import (
     ConstraintModes,
     StaticFields,
@@ -342,7 +342,7 @@ class ElasticArm:
         if uniform is not None:
             part = uniform.energy_matrix(field, self.young)
         else:
-            values = cells.cell_values(self.operators, field)
+            values = cell_values(self.operators, field)
             products = (self.operators.stiffness @ values) * self.young[:, None, None]
             part = values.reshape(-1, field.shape[2]).T @ products.reshape(-1, field.shape[2])
         energy = self.comm.allreduce(part)
@@ -356,7 +356,7 @@ class ElasticArm:
         self.profile.counts.energy_fields += left.shape[2]
         if (uniform := self.substructure.uniform) is not None and self.weighed is None:
             return uniform.stiffness_products(left, right)
-        return cells.stiffness_products(self._weighed_operators, left, right)
+        return stiffness_products(self._weighed_operators, left, right)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
@@ -366,7 +366,7 @@ class ElasticArm:
         self.profile.counts.energy_fields += left.shape[2]
         if (uniform := self.substructure.uniform) is not None and self.weighed is None:
             return uniform.mass_products(left, right)
-        return cells.mass_products(self._weighed_operators, left, right)
+        return mass_products(self._weighed_operators, left, right)
 
     @property
     def _weighed_operators(self) -> ElementOperators:

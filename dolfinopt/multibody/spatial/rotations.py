@@ -23,7 +23,7 @@ import numpy as np
 TERMS, NEAR = 10, 1.0
 MANY_TERMS, FAR = 40, 10.0
 
-ONE = np.eye(3)
+ONE: np.ndarray = np.eye(3)
 _NEXT, _OTHER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
