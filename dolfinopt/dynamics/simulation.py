@@ -37,11 +37,11 @@ from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    from typing_extensions import Self, TypeAlias
 
     from dolfinopt.dynamics.spatial_system import SpatialSystem
 
-    Problem = ElasticSystem | MachineSystem | SpatialSystem
+    Problem: TypeAlias = ElasticSystem | MachineSystem | SpatialSystem
 
 
 @dataclass(frozen=True, eq=False)
