@@ -10,8 +10,7 @@ from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
-from dolfinopt.scene.tables.constraints import Constraints
-from dolfinopt.scene.tables.responses import NEEDS
+from dolfinopt.scene.tables.objective import NEEDS, Constraints
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "pages" / "validation" / "verification.md"

@@ -29,8 +29,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm, build_arms, fixed_body
-from dolfinopt.arms.patterns import uniform_design
+from dolfinopt.arms.arm import Arm, build_arms, fixed_body, uniform_design
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.build import check_forces
 from dolfinopt.dynamics.simulation import Trajectory
@@ -449,7 +448,7 @@ class Model:
         Raises:
             InputError: no part can be made of the design, or the folder holds files already.
         """
-        from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
+        from dolfinopt.output.run_folder import check_sources, check_unused, prepare_folder
         from dolfinopt.part.of_scene import names_of, parts_of, write_of
 
         out = None if folder is None else Path(folder)

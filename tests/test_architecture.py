@@ -11,11 +11,9 @@ from dolfinopt.density.interpolation import LAWS
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene.tables.arms import ElementName
-from dolfinopt.scene.tables.constraints import Constraints
-from dolfinopt.scene.tables.interpolation import Law
-from dolfinopt.scene.tables.objective import ObjectiveKind
-from dolfinopt.scene.tables.reduction import ReductionMethod
-from dolfinopt.scene.tables.responses import NEEDS
+from dolfinopt.scene.tables.design import Law
+from dolfinopt.scene.tables.objective import NEEDS, Constraints, ObjectiveKind
+from dolfinopt.scene.tables.simulation import ReductionMethod
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

@@ -15,8 +15,8 @@ from dolfinopt.arms.arm import build_arms
 from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.parallel import gather_arms, partition_arms
 from dolfinopt.profiling import Profile
+from dolfinopt.responses.constraints import load_cases
 from dolfinopt.responses.evaluation import evaluate, gradient
-from dolfinopt.responses.objective import load_cases
 from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.scene.load import load_scene
 

@@ -22,7 +22,19 @@ from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.mesh import compat
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.output import checkpoint, design, history, iterate_arrays, run, summary, views
+from dolfinopt.output import (
+    checkpoint,
+    design,
+    run,
+    summary,
+    views,
+)
+from dolfinopt.output import (
+    checkpoint as iterate_arrays,
+)
+from dolfinopt.output import (
+    design as history,
+)
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import (
@@ -32,8 +44,9 @@ from dolfinopt.parallel import (
     partition_arms,
     together,
 )
-from dolfinopt.responses import eigenfrequency, evaluation, motion, static, tip_deflection
+from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
+from dolfinopt.responses import static as tip_deflection
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study import store
 from dolfinopt.study import studies as study
@@ -187,9 +200,9 @@ EVALUATIONS = {
     "reduction": (design_state, "shape_integrals", ()),
     "statics": (static, "static_response", ('objective.kind="static"',)),
     "deflections": (tip_deflection, "static_response", ("constraints.tip_deflection=1.0",)),
-    "rigid integrals": (eigenfrequency, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
+    "rigid integrals": (frequency, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
     "loaded modes": (design_state, "loaded_modes", ("constraints.first_frequency=1.0",)),
-    "squared period": (eigenfrequency, "squared_period", ('objective.kind="eigenfrequency"',)),
+    "squared period": (frequency, "squared_period", ('objective.kind="eigenfrequency"',)),
 }
 
 
@@ -244,10 +257,10 @@ GRADIENTS = {
     "exact": (motion, "exact_gradient", ('objective.gradient="exact"',)),
     "adjoint": (motion, "_cotangents", ('objective.gradient="exact"',)),
     "statics": (static, "static_gradient", ('objective.kind="static"',)),
-    "period": (eigenfrequency, "period_gradient", ('objective.kind="eigenfrequency"',)),
-    "carried": (eigenfrequency, "rigid_gradient", ('objective.kind="eigenfrequency"',)),
+    "period": (frequency, "period_gradient", ('objective.kind="eigenfrequency"',)),
+    "carried": (frequency, "rigid_gradient", ('objective.kind="eigenfrequency"',)),
     "deflection": (tip_deflection, "deflection_gradient", ("constraints.tip_deflection=1.0",)),
-    "frequency": (eigenfrequency, "period_gradient", ("constraints.first_frequency=1.0",)),
+    "frequency": (frequency, "period_gradient", ("constraints.first_frequency=1.0",)),
 }
 
 

@@ -14,24 +14,24 @@ from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState, InitialVectors, options, same_basis
 from dolfinopt.arms.vibration import Carried, LoadedModes
-from dolfinopt.density.filter import HelmholtzFilter
+from dolfinopt.density.filter import AxisSymmetry, Extrusion, HelmholtzFilter
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
-from dolfinopt.density.symmetry import AxisSymmetry, Extrusion
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.budget import check_budget
+from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
 from dolfinopt.multibody.standard_input import load_body
-from dolfinopt.multibody.stiffening import Stiffening
 from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
-from dolfinopt.scene.tables.responses import STATICS, needs_alone
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.objective import STATICS, needs_alone
 
 THRESHOLDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 
@@ -542,7 +542,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
             )
         return linear_part(body)
     if scene.is_spatial:
-        from dolfinopt.multibody.spatial.links import rigid_link
+        from dolfinopt.multibody.spatial.mechanism import rigid_link
 
         return rigid_link(arm, scene.material_of(index).density)
     mass = arm.mass
@@ -550,3 +550,99 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
         mass = scene.material_of(index).density * arm.length * arm.height * arm.thickness
     assert not isinstance(arm.inertia, tuple)  # the scene would have refused it
     return rigid_bar(arm.length, arm.height, mass, arm.inertia)
+
+
+# -- arms that repeat another's design: densities travel from cell to cell, gradients back -------
+
+Cells = Mapping[int, np.ndarray]
+
+
+class Patterns:
+    """Which arms repeat which, and their cells' partners, on any ranks.
+
+    An arm with `arms.pattern` has as many cells along and across as its pattern; the cell at the
+    same place in both rows has the same physical density. Without such arms nothing travels.
+
+    Attributes:
+        repeats: of every arm that repeats another's design the index of that arm.
+    """
+
+    def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
+        """Number the cells of this rank's arms that take part by their places in the grid."""
+        self.repeats = scene.patterns
+        self._world = partition.world
+        involved = {*self.repeats, *self.repeats.values()}
+        self._place = {k: _grid_place(arm, scene) for k, arm in arms.items() if k in involved}
+        self._size = {k: scene.arms[k].n_cells for k in involved}
+
+    def spread(self, densities: Cells) -> dict[int, np.ndarray]:
+        """Return densities of all arms from those of the arms with a design (collective).
+
+        Args:
+            densities: (n_cells,) of this rank's arms with design variables.
+        """
+        if not self.repeats:
+            return dict(densities)
+        patterns = set(self.repeats.values())
+        whole = self._whole({k: x for k, x in densities.items() if k in patterns})
+        repeated = {
+            k: whole[pattern][self._place[k]]
+            for k, pattern in self.repeats.items()
+            if k in self._place
+        }
+        return {**densities, **repeated}
+
+    def collect(self, gradient: Cells) -> dict[int, np.ndarray]:
+        """Return derivatives by the densities that arms have together (collective): the transpose.
+
+        Args:
+            gradient: (n_cells,) by the densities of this rank's arms; an arm without an entry has
+                no influence.
+
+        Returns:
+            Of arms with design variables, with what the arms that repeat theirs add.
+        """
+        if not self.repeats:
+            return dict(gradient)
+        whole = self._whole({k: g for k, g in gradient.items() if k in self.repeats})
+        total = {k: g for k, g in gradient.items() if k not in self.repeats}
+        for k in sorted(whole):  # the same order on any number of ranks
+            pattern = self.repeats[k]
+            if pattern in self._place:
+                part = whole[k][self._place[pattern]]
+                total[pattern] = total[pattern] + part if pattern in total else part
+        return total
+
+    def _whole(self, parts: Cells) -> dict[int, np.ndarray]:
+        """Return arrays of whole arms by the places of their cells, on all ranks (collective)."""
+        whole: dict[int, np.ndarray] = {}
+        for pieces in self._world.allgather({k: (self._place[k], x) for k, x in parts.items()}):
+            for k, (place, x) in pieces.items():
+                whole.setdefault(k, np.zeros(self._size[k]))[place] = x
+        return whole
+
+
+def _grid_place(arm: Arm, scene: Scene) -> np.ndarray:
+    """Return the place (n_cells,) of a rectangular arm's cells: rows across, from inboard on."""
+    one = scene.arms[arm.places[0]]
+    assert one.cells is not None
+    along, *across = one.cells
+    x, *others = arm.mesh.centroid.T
+    place = np.floor(x / one.length * along).astype(int)
+    for y, size, count in zip(others, (one.height, one.thickness), across, strict=False):
+        place = place * count + np.floor((y / size + 0.5) * count).astype(int)
+    return np.asarray(place)
+
+
+def uniform_design(
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], density: float
+) -> dict[int, np.ndarray]:
+    """Return the physical densities of the same design variable in all cells (collective).
+
+    Args:
+        scene, partition, arms: which arms there are, and this rank's.
+        density: the design variable, in [0, 1].
+    """
+    with together(partition.world):
+        mine = {k: arm.uniform(density) for k, arm in arms.items() if k not in scene.patterns}
+    return Patterns(scene, partition, arms).spread(mine)

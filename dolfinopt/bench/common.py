@@ -19,8 +19,7 @@ import pandas as pd
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.arms.arm import Arm, build_arms, chain_of
-from dolfinopt.arms.patterns import uniform_design
+from dolfinopt.arms.arm import Arm, build_arms, chain_of, uniform_design
 from dolfinopt.disk import write_text
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.run import optimize

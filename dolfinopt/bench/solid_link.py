@@ -125,7 +125,7 @@ def plain(scene: Scene, cells: tuple[int, int, int], comm: MPI.Comm) -> Found:
     from dolfinopt.arms.arm import field_tolerance
     from dolfinopt.fem.multigrid import with_rigid_motions
     from dolfinopt.mesh import compat
-    from dolfinopt.mesh.box import box_arm
+    from dolfinopt.mesh.arm_mesh import box_arm
 
     arm = box_arm(comm, "link", (LENGTH, HEIGHT, THICKNESS), cells)
     V, material = compat.lagrange_space(arm.mesh, 1, components=3), scene.material_of(0)

@@ -23,10 +23,9 @@ from dolfinopt.bench.common import (
 )
 from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics.build import build_mechanism
-from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.modal_coordinates import modes_of
+from dolfinopt.dynamics.collocation import even_steps
+from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import deviation
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics

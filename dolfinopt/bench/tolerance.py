@@ -18,11 +18,9 @@ from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, arms_of, bodi
 from dolfinopt.bench.time import scipy_motion
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import build_mechanism
-from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.collocation import Solution, even_steps
+from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.profiling import Profile

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.options import out_option
-from dolfinopt.cli.shared import prepare
-from dolfinopt.cli.start import start
+from dolfinopt.cli.shared import out_option, prepare, start
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:

@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.options import (
+from dolfinopt.cli.shared import (
     PATH,
+    claim,
+    design_of,
     design_option,
+    load,
     out_option,
     overwrite_option,
+    prepare,
     scene_argument,
     set_option,
+    tell,
 )
-from dolfinopt.cli.shared import claim, design_of, load, prepare, tell
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -63,7 +67,7 @@ def export(
         if design is not None or overrides:
             raise InputError("--urdf: expected no --design and no --set, they are the run's")
         # Imports NumPy, which the help of commands does without.
-        from dolfinopt.cli.export_robot import export_robot
+        from dolfinopt.cli.robots import export_robot
 
         export_robot(scene, out, overwrite, before)
         return
@@ -78,8 +82,8 @@ def export(
     from dolfinopt.exchange.sid import sid_arrays, sid_text
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
+    from dolfinopt.responses.evaluation import decide_stiffening
     from dolfinopt.responses.order_selection import choose_coordinates
-    from dolfinopt.responses.stiffening import decide_stiffening
     from dolfinopt.scene.load import pose_scenarios
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
@@ -139,7 +143,7 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
             return None
         return standard_input.to_sid(body, title), mbdyn.modal_element(body)
     from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
-    from dolfinopt.multibody.plate_moments import spatial_moments
+    from dolfinopt.multibody.shape_integrals import spatial_moments
     from dolfinopt.multibody.standard_input import to_sid
 
     assert arm.basis is not None

@@ -3,31 +3,161 @@
 from __future__ import annotations
 
 import difflib
+import json
+import os
+import re
 import sys
+import textwrap
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
+from fnmatch import fnmatchcase
 from io import StringIO
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from dolfinopt.cli.bench import bench
-from dolfinopt.cli.compare import compare
 from dolfinopt.cli.export import export
-from dolfinopt.cli.gradient import gradient
-from dolfinopt.cli.import_robot import import_robot
-from dolfinopt.cli.init import init
-from dolfinopt.cli.keys import keys
-from dolfinopt.cli.optimize import optimize
+from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.plot import plot
 from dolfinopt.cli.reproduce import reproduce
-from dolfinopt.cli.schema import schema
-from dolfinopt.cli.simulate import simulate
-from dolfinopt.cli.start import Start, end_before_start
-from dolfinopt.cli.sweep import sweep
-from dolfinopt.cli.uncertainty import uncertainty
+from dolfinopt.cli.robots import import_robot
+from dolfinopt.cli.shared import PATH, Start, end_before_start, led_by_another
+from dolfinopt.cli.studies import compare, sweep, uncertainty
+from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
 from dolfinopt.version import __version__
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.messages import KeyInfo
+
+
+# -- `dolfinopt init` ----------------------------------------------------------------------------
+
+TEMPLATES = {
+    "two-arm": "two arms on a cart, half a circle (default)",
+    "pick-and-place": "two arms on a fixed base, a path through points, gravity",
+    "single-arm": "one arm on a fixed joint lifts a payload against gravity",
+    "step": "arms of your own shape, from a STEP file",
+}
+
+
+@click.command(
+    help="Write a commented scene, NAME.toml (default: scene.toml).\n\n"
+    "\b\nTemplates:\n" + "\n".join(f"  {name:<16}{what}" for name, what in TEMPLATES.items())
+)
+@click.argument("name", default="scene", type=PATH)
+@click.option(
+    "--template", type=click.Choice(list(TEMPLATES)), default="two-arm", help="what to start from"
+)
+def init(name: Path, template: str) -> None:
+    if led_by_another():
+        return
+    from dolfinopt.output.run_folder import write_new
+    from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
+    from dolfinopt.scene.tables.base import Refusal
+
+    path = name if name.suffix == ".toml" else name.with_name(f"{name.name}.toml")
+    try:
+        title = check_scene_name(path.stem)
+    except Refusal as error:
+        raise InputError(f"{path.stem}: the name of a scene: {error.reason}") from None
+    texts = {}
+    for source in sorted(template_folder().glob(f"{template}.*"), reverse=True):
+        text = source.read_text(encoding="utf-8")
+        for mark, value in (("@NAME@", title), ("@STEM@", path.stem)):
+            text = text.replace(f'"{mark}', '"' + json.dumps(value, ensure_ascii=False)[1:-1])
+        texts[path.with_suffix(source.suffix)] = text
+    schema = path.with_name(SCHEMA_FILE)
+    write_new(texts, {schema: json.dumps(scene_schema(), indent=2) + "\n"})
+    written = ", ".join(os.fspath(one) for one in texts)
+    click.echo(f"{written}: edit the values that differ for your machine")
+    click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
+    if template == "step":
+        click.echo(f"put your STEP file beside it, as {path.with_name('arm.step')}")
+    click.echo("then:")
+    click.echo(f"  dolfinopt simulate {path}    # what the machine does with half the material")
+    click.echo(f"  dolfinopt optimize {path}")
+
+
+# -- `dolfinopt keys` ----------------------------------------------------------------------------
+
+WIDTH = 92
+
+
+@click.command()
+@click.argument("pattern", required=False)
+def keys(pattern: str | None) -> None:
+    """Explain the keys of a scene.
+
+    Lists unit, allowed values, default and meaning of the keys that contain PATTERN (payload, mass)
+    or match its wildcards ("arms.*"); without PATTERN of all keys. "dolfinopt keys material" lists
+    the materials of the catalogue, too, and "dolfinopt keys steel" those whose name contains it.
+    """
+    from dolfinopt.scene.load import describe_keys
+
+    known = describe_keys()
+    found = [info for info in known if _fits(info.key, pattern)]
+    materials = _materials(pattern, found)
+    if not found and not materials:
+        near = difflib.get_close_matches(str(pattern), [info.key for info in known], 3)
+        near += difflib.get_close_matches(
+            str(pattern), sorted({part for info in known for part in info.key.split(".")}), 3
+        )
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        raise InputError(f"{pattern}: no such key; {hint}dolfinopt keys lists all of them")
+    click.echo("\n".join([*map(_explained, found), *materials]))
+
+
+def _fits(key: str, pattern: str | None) -> bool:
+    if pattern is None:
+        return True
+    return fnmatchcase(key, pattern) if re.search(r"[*?\[]", pattern) else pattern in key
+
+
+def _materials(pattern: str | None, found: list[KeyInfo]) -> list[str]:
+    """Return a line for every material of the catalogue whose name, or whose key, was asked for."""
+    from dolfinopt.scene.materials import CATALOGUE
+
+    if pattern is None:
+        return []
+    asked = any(info.key == "material.name" for info in found)
+    word = pattern.casefold()
+    rows = [
+        f"{name:<24}{one.young_modulus / 1e9:>7.4g} GPa{one.poisson_ratio:>7.3g}"
+        f"{one.density:>7.0f} kg/m3{one.yield_strength / 1e6:>6.0f} MPa  {one.source}"
+        for name, one in CATALOGUE.items()
+        if asked or word in name.casefold()
+    ]
+    head = f"{'material':<24}{'Young':>11}{'Poisson':>8}{'density':>12}{'yield':>10}  source"
+    return [head, *rows] if rows else []
+
+
+def _explained(info: KeyInfo) -> str:
+    """Return a key, its unit and what is allowed, and below what it means."""
+    meaning, unit = info.description, ""
+    if match := re.fullmatch(r"(.*) \[([^\]]*)\]", info.description):
+        meaning, unit = match[1], "" if match[2] == "-" else f" [{match[2]}]"
+    default = "required" if not info.default else f"default {info.default}"
+    rows = [f"{info.key}{unit}: {info.allowed}; {default}", meaning]
+    return "\n".join(
+        textwrap.fill(row, WIDTH, initial_indent=indent, subsequent_indent="    ")
+        for row, indent in zip(rows, ("", "    "))
+    )
+
+
+# -- `dolfinopt schema` --------------------------------------------------------------------------
+
+
+@click.command()
+def schema() -> None:
+    """Print the JSON schema of scene files, for editors."""
+    from dolfinopt.scene.schema import scene_schema
+
+    click.echo(json.dumps(scene_schema(), indent=2))
+
+
+# -- the command and its end: parse, call, exit code ---------------------------------------------
 
 
 def main() -> None:

@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.options import (
+from dolfinopt.cli.shared import (
+    PATH,
     animation_option,
+    claim,
+    conclude,
+    design_of,
+    design_option,
+    draw,
+    elapsed,
+    load,
     out_option,
     overwrite_option,
     plots_option,
+    prepare,
+    progress,
     scene_argument,
+    scene_of,
     set_option,
+    start,
+    tell,
 )
-from dolfinopt.cli.shared import claim, conclude, draw, elapsed, load, progress
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.units import with_unit
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.arms.arm import Arm
     from dolfinopt.optimization.result import Result
     from dolfinopt.output.views import ArmView
+    from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene
 
 
@@ -47,8 +66,8 @@ def optimize(
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
-    from dolfinopt.output.folders import working_alone
     from dolfinopt.output.run import optimize as run
+    from dolfinopt.output.run_folder import working_alone
     from dolfinopt.parallel import on_root
 
     if resume:
@@ -100,3 +119,193 @@ def _next(scene: Scene, folder: Path, grayness: float) -> str:
         f"no design for the workshop: with a grayness of {grayness:.2g} parts would be another "
         'design; optimise with design.projection = "robust", then dolfinopt part'
     )
+
+
+# -- `dolfinopt simulate` ------------------------------------------------------------------------
+
+
+@click.command()
+@scene_argument
+@design_option
+@out_option("the results; default: results/SCENE-simulation")
+@overwrite_option
+@set_option
+@plots_option
+@animation_option
+def simulate(
+    scene: Path,
+    design: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    overrides: tuple[str, ...],
+    plots: bool,
+    animation: bool,
+) -> None:
+    """Simulate SCENE with a given design.
+
+    Writes the trajectory, and prints compliance and deviation.
+    """
+    world, loaded = load(scene, overrides)
+    folder = out or Path("results") / f"{scene.stem}-simulation"
+    from dolfinopt.output.run_folder import (
+        Simulated,
+        check_unused,
+        remove_stale,
+        working_alone,
+        write_simulation,
+    )
+    from dolfinopt.parallel import on_root
+    from dolfinopt.profiling import Profile
+    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.order_selection import choose_coordinates
+
+    claim(world, folder, overwrite, scene=loaded)
+    profile = Profile()
+    partition, arms, x_phys = design_of(world, loaded, design, profile)
+    with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
+        choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
+        evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
+        simulated = Simulated(
+            loaded, partition, arms, x_phys, evaluation, trajectory, profile, choice
+        )
+
+        def pictures(views: list[ArmView]) -> None:
+            assert trajectory is not None
+            draw(folder, loaded, views, trajectory, [], None, animation=animation)
+
+        drawn = pictures if plots or animation else None
+        on_root(world, remove_stale, folder)
+        written = write_simulation(folder, simulated, elapsed(), pictures=drawn)
+    if written is not None:
+        conclude(written.summary, folder)
+
+
+# -- `dolfinopt gradient` ------------------------------------------------------------------------
+
+
+@click.command()
+@scene_argument
+@design_option
+@click.option(
+    "--kind",
+    type=click.Choice(["esl", "exact"]),
+    help="which gradient; default: the scene's objective.gradient",
+)
+@click.option(
+    "--out",
+    type=PATH,
+    metavar="FILE",
+    help="gradient.npz; default: results/SCENE-gradient/gradient.npz",
+)
+@click.option(
+    "--check",
+    is_flag=True,
+    help="compare with differences of the whole simulation",
+)
+@overwrite_option
+@set_option
+def gradient(
+    scene: Path,
+    design: Path | None,
+    kind: str | None,
+    out: Path | None,
+    check: bool,
+    overwrite: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Write the gradient by the physical densities to FILE."""
+    out = out or Path("results") / f"{scene.stem}-gradient" / "gradient.npz"
+    if out.is_dir():
+        raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
+    if kind is not None:
+        overrides = (*overrides, f'objective.gradient="{kind}"')
+    world, loaded = load(scene, overrides)
+    from dolfinopt.optimization.gradient_check import check_exact
+    from dolfinopt.output.design import write_gradient
+    from dolfinopt.profiling import Profile
+    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.evaluation import gradient as slopes
+    from dolfinopt.responses.order_selection import choose_coordinates
+    from dolfinopt.responses.response import needs, objective_of
+
+    claim(world, out.parent, overwrite, [out.name])
+    if check:
+        check_exact(loaded)
+    profile = Profile()
+    partition, arms, x_phys = design_of(world, loaded, design, profile)
+    prepare(world, out.parent)
+    moves = needs(loaded, "motion")
+    if moves:
+        tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
+    evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile, simulated=False)
+    by_cell = slopes(loaded, partition, arms, trajectory, profile)
+    write_gradient(out, loaded, partition, arms, by_cell, evaluation.objective)
+    if world.rank == 0:
+        unit = objective_of(loaded).unit
+        name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
+        value = with_unit(f"{evaluation.objective:.6g}", unit)
+        click.echo(f"objective {value}; {name} gradient in {out}")
+    if check:
+        _check_gradient(world, loaded, partition, arms, x_phys, profile)
+
+
+def _check_gradient(
+    world: MPI.Comm,
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x: Mapping[int, Any],
+    profile: Any,
+) -> None:
+    """Print the Taylor test; raise ConvergenceError where a rate is too low."""
+    from dolfinopt.optimization.gradient_check import PASSES, STEPS, taylor_test
+
+    test = taylor_test(scene, partition, arms, x, profile)
+    if world.rank == 0:
+        steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
+        click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
+        for row in test.rows:
+            remainders = "".join(f"{r:12.2e}" for r in row.remainders)
+            slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
+            click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
+        if scene.objective.has_esl_gradient:
+            click.echo(
+                f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
+                f"{test.ratio:.3f} times as long"
+            )
+    if not test.passed:
+        raise ConvergenceError(
+            f"the Taylor remainders fall at a rate below {PASSES}: the gradient is not exact here; "
+            "repeat with a smaller simulation.tolerance to see whether the simulation is the cause"
+        )
+
+
+# -- `dolfinopt plot` ----------------------------------------------------------------------------
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=PATH)
+@animation_option
+def plot(folder: Path, animation: bool) -> None:
+    """Redraw the pictures of a finished run in DIR."""
+    world = start()
+    from dolfinopt.output.design import read_history
+    from dolfinopt.output.trajectory import read_initial_deviation
+    from dolfinopt.output.views import gather_views
+    from dolfinopt.parallel import on_root
+    from dolfinopt.profiling import Profile
+    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.stress_report import stress_report
+
+    loaded = on_root(world, scene_of, folder)
+    profile = Profile()
+    partition, arms, x_phys = design_of(world, loaded, folder / "design.npz", profile)
+    _, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
+    stress = stress_report(partition, arms, trajectory, profile)
+    views = gather_views(loaded, partition, arms, x_phys, stress)
+    if trajectory is None:
+        return
+    history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
+    initial = read_initial_deviation(folder / "trajectory.npz", trajectory.t)
+    draw(folder, loaded, views, trajectory, history, initial, animation=animation)
+    click.echo(f"pictures in {folder}")

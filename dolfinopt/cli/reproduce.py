@@ -6,9 +6,7 @@ from pathlib import Path
 
 import click
 
-from dolfinopt.cli.options import out_option, plots_option, set_option
-from dolfinopt.cli.shared import warn
-from dolfinopt.cli.start import start
+from dolfinopt.cli.shared import out_option, plots_option, set_option, start, warn
 from dolfinopt.errors import ConvergenceError
 
 

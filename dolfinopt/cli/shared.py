@@ -5,18 +5,35 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+import traceback
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    contextmanager,
+    nullcontext,
+    redirect_stdout,
+)
 from functools import partial
+from importlib.util import find_spec
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from dolfinopt.cli.start import alone, start
-from dolfinopt.errors import InputError
-from dolfinopt.output.folders import (
+from dolfinopt.errors import ConvergenceError, InputError, OutputError, missing_package
+from dolfinopt.interrupt import (
+    INTERRUPTED,
+    end_at_once,
+    end_with_launcher,
+    launched_rank,
+    raise_again,
+)
+from dolfinopt.optimization.history import FurtherRow, HistoryRow
+from dolfinopt.output.run_folder import (
     CHECKPOINT,
     RUN_FILES,
     check_sources,
@@ -32,7 +49,6 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
-    from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.responses.order_selection import OrderSelection
@@ -54,7 +70,7 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     def load() -> Scene:
         from dolfinopt.dynamics.build import check_forces
         from dolfinopt.multibody.motion import check_motion
-        from dolfinopt.scene.plausibility import implausible
+        from dolfinopt.scene.messages import implausible
 
         scene = load_scene(path, overrides)
         check_motion(scene)
@@ -138,8 +154,8 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 def scene_of(folder: Path) -> Scene:
     """Return the scene of a run, with what "auto" came to: coordinates and stiffening."""
-    from dolfinopt.scene.contents import found_again
     from dolfinopt.scene.load import scene_from_dict
+    from dolfinopt.scene.schema import found_again
 
     path = folder / "summary.json"
     try:
@@ -174,8 +190,7 @@ def design_of(
     world: MPI.Comm, scene: Scene, design: Path | None, profile: Any
 ) -> tuple[Partition, dict[int, Arm], dict[int, Any]]:
     """Build the arms and return them with the physical densities of a file or the initial ones."""
-    from dolfinopt.arms.arm import build_arms
-    from dolfinopt.arms.patterns import uniform_design
+    from dolfinopt.arms.arm import build_arms, uniform_design
     from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
 
@@ -369,7 +384,6 @@ def progress(
     """Return a live line on the root's terminal, lines every few seconds where it has none."""
     if world.rank != 0:
         return nullcontext(None)
-    from dolfinopt.cli.live_line import live_line, plain_lines
 
     shown = live_line if sys.stderr.isatty() else plain_lines
     return shown(scene.optimizer.max_iterations)
@@ -395,3 +409,220 @@ def _age() -> float:
 
 
 BEGUN = time.perf_counter() - _age()
+
+
+# -- options that several commands have ----------------------------------------------------------
+
+
+class GivenPath(click.Path):
+    """A path that is not empty: `--out ""` would be the current folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("expected a path, found nothing", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = GivenPath()
+
+
+scene_argument = click.argument("scene", type=PATH)
+
+
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a scene value"
+)
+
+
+design_option = click.option("--design", type=PATH, help="design.npz; default: the initial design")
+
+
+plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
+
+
+animation_option = click.option(
+    "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
+)
+
+
+overwrite_option = click.option("--overwrite", is_flag=True, help="replace existing results")
+
+
+def out_option(what: str) -> Callable[..., Any]:
+    """Return the --out option of a command that writes a folder."""
+    return click.option("--out", type=PATH, metavar="DIR", help=f"folder for {what}")
+
+
+# -- when MPI and PETSc are loaded: by a command that has something to compute, not before -------
+#
+# Whatever can be answered from the words alone (help, completion, a wrong word) is answered without
+# them. A launcher's ranks then know one another only by the environment.
+
+NEEDED = ("petsc4py", "slepc4py", "mpi4py", "dolfinx", "gmsh")
+
+
+class MissingLibrary(RuntimeError):
+    """A library that does not come with pip is not installed."""
+
+
+class Start:
+    """Loads MPI when a command asks for the ranks; from then on all ranks end together."""
+
+    def __init__(self) -> None:
+        self._ending = ExitStack()
+        self._world: MPI.Comm | None = None
+
+    def __enter__(self) -> Start:
+        if launched_rank():
+            self._ending.enter_context(redirect_stdout(StringIO()))  # the root speaks
+        return self
+
+    def __exit__(self, *error: object) -> bool | None:
+        return self._ending.__exit__(*error)  # type: ignore[arg-type]
+
+    @property
+    def world(self) -> MPI.Comm:
+        """All ranks; the first access starts MPI (collective)."""
+        if self._world is None:
+            missing = [name for name in NEEDED if find_spec(name) is None]
+            if missing:
+                raise MissingLibrary(
+                    f"{', '.join(missing)} not installed; on Debian 12 or 13 run ./dolfinopt.sh, "
+                    "elsewhere: conda install -c conda-forge fenics-dolfinx slepc4py python-gmsh"
+                )
+            end_with_launcher()
+            import petsc4py
+
+            # PETSc would turn a closed pipe or Ctrl-C into an abort with a page of advice.
+            petsc4py.init(["dolfinopt", "-no_signal_handler"])
+            from mpi4py import MPI
+
+            from dolfinopt.parallel import abort_together
+            from dolfinopt.progress import show_slow_work
+
+            self._world = MPI.COMM_WORLD
+            show_slow_work()
+            if raise_again():
+                self._ending.callback(end_at_once)
+            self._ending.enter_context(abort_together(self._world))
+            if self._world.rank > 0:
+                self._ending.enter_context(redirect_stdout(StringIO()))
+        return self._world
+
+
+def start() -> MPI.Comm:
+    """Return all ranks for the command at work, and start MPI unless that was done."""
+    given = click.get_current_context().obj
+    return given.world if isinstance(given, Start) else given
+
+
+def alone() -> bool:
+    """Tell whether this process is known to be the only rank before MPI is started."""
+    return isinstance(click.get_current_context().obj, Start) and launched_rank() is None
+
+
+def led_by_another() -> bool:
+    """Tell whether another rank does the work of a command that never starts MPI."""
+    return isinstance(click.get_current_context().obj, Start) and bool(launched_rank())
+
+
+def end_before_start(error: BaseException) -> int:
+    """Report an error that came before MPI was started; return the exit status.
+
+    What all ranks found wrong alike is printed by the first one. The others end with status 0: a
+    launcher kills all ranks as soon as one fails, which could be before the first has spoken.
+    """
+    told_by_another = (launched_rank() or 0) > 0
+    if isinstance(error, InputError | ConvergenceError | KeyboardInterrupt) and told_by_another:
+        return 0
+    if isinstance(error, KeyboardInterrupt):
+        print(": ".join(["dolfinopt", "interrupted", *map(str, error.args)]), file=sys.stderr)
+        return INTERRUPTED
+    if isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
+        print(f"dolfinopt: {error}", file=sys.stderr)
+    elif missing := missing_package(error):
+        print(f"dolfinopt: {missing}", file=sys.stderr)
+    else:
+        traceback.print_exception(error)
+    return 2 if isinstance(error, InputError) else 1
+
+
+# -- how far an optimisation is: a live line on a terminal, a line every few seconds elsewhere ---
+
+WIDE = 110  # characters a line
+EVERY = 5.0  # s between two lines where there is no terminal
+
+
+def _words(row: HistoryRow, iterations: int) -> str:
+    """Return a row of the history, or of the further iterations after it, in words."""
+    count, kind = iterations, ""
+    if isinstance(row, FurtherRow):
+        count, kind = row.of, "exact gradient, further "
+    return (
+        f"{kind}{row.iteration}/{count} objective {row.objective:.4g} "
+        f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
+        f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
+        + (f", {row.tightest}" if row.tightest else "")
+    )
+
+
+@contextmanager
+def plain_lines(iterations: int, every: float = EVERY) -> Iterator[Callable[[HistoryRow], None]]:
+    """Yield a function that takes a history row; print the last one every few seconds.
+
+    A thread prints, so that a single long iteration is not silent either.
+
+    Args:
+        iterations: at most.
+        every: s from one line on standard error to the next.
+    """
+    begun, ended = time.monotonic(), threading.Event()
+    last = ["setting up"]
+
+    def run() -> None:
+        while not ended.wait(every):
+            line = f"{last[0]}, {time.monotonic() - begun:.0f} s"
+            print(line, file=sys.stderr, flush=True)
+
+    def show(row: HistoryRow) -> None:
+        last[0] = _words(row, iterations)
+
+    thread = threading.Thread(target=run, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        thread.join()
+
+
+@contextmanager
+def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
+    """Yield a function that shows a history row: figures, bar, and time left.
+
+    The time left assumes all `iterations`; convergence may end the run before.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.table import Column
+
+    console = Console(stderr=True)
+    # Eighty characters hold the figures; a bar wants more.
+    columns: list[ProgressColumn] = [
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(compact=True),
+    ]
+    if console.width >= WIDE:
+        columns.insert(1, BarColumn(bar_width=None))
+    with Progress(*columns, console=console, expand=console.width >= WIDE) as progress:
+        task = progress.add_task("setting up", total=iterations)
+
+        def show(row: HistoryRow) -> None:
+            total = row.of if isinstance(row, FurtherRow) else iterations
+            words = _words(row, iterations)
+            progress.update(task, total=total, completed=row.iteration, description=words)
+
+        yield show

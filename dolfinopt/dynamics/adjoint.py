@@ -16,7 +16,9 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.dynamics.collocation import (
+    Solution,
     Stages,
+    lagrange_integrals,
     radau_iia,
     stage_values,
     stages_of,
@@ -25,14 +27,13 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.newton_matrix import (
+from dolfinopt.dynamics.newton import (
     NewtonMatrix,
     factorise,
     limits_for,
     next_slow_coordinates,
     windows,
 )
-from dolfinopt.dynamics.solution import Solution, lagrange_integrals
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 

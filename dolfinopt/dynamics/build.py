@@ -12,13 +12,19 @@ from scipy.interpolate import make_interp_spline
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.drives import Closure, Drives, Springs, pin, slider
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism
+from dolfinopt.multibody.mechanism import (
+    Closure,
+    Drives,
+    JointHardware,
+    Mechanism,
+    Springs,
+    pin,
+    slider,
+)
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
-from dolfinopt.scene.duration import stamp
-from dolfinopt.scene.load import Arm, Scene
+from dolfinopt.scene.load import Arm, Scene, stamp
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.spatial_system import SpatialSystem
@@ -69,7 +75,7 @@ def is_machine(scene: Scene) -> bool:
 def desired_motion(scene: Scene) -> Callable[[np.ndarray], Any]:
     """Return the scene's motion as a function of instants (n,), s."""
     if scene.is_spatial:
-        from dolfinopt.multibody.spatial.motion import joint_motion
+        from dolfinopt.multibody.spatial.mechanism import joint_motion
 
         return partial(joint_motion, scene=scene)
     return partial(rigid_motion, scene=scene)
@@ -103,7 +109,7 @@ def _spatial_system(
 ) -> MachineSystem | SpatialSystem:
     """Return the equations of a scene in space: joints prescribed, or controlled."""
     from dolfinopt.dynamics.spatial_system import SpatialMachineSystem, SpatialSystem
-    from dolfinopt.multibody.spatial.links import build_spatial_mechanism
+    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
 
     tree, instants = build_spatial_mechanism(scene, bodies), breakpoints(scene)
     if scene.control is None:

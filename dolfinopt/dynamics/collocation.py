@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
-from dolfinopt.dynamics.solution import lagrange_integrals
 from dolfinopt.dynamics.system import (
     Instants,
     Linearisation,
     Preconditioner,
     State,
+    System,
     relative_errors,
 )
+from dolfinopt.errors import ConvergenceError
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,3 +199,337 @@ def end_gain(stages: Stages, a: np.ndarray) -> np.ndarray:
     by_q = h * h * np.einsum("j,njkm->nkm", stages.method.A2[-1], a)
     by_v = h * np.einsum("j,njkm->nkm", stages.method.A[-1], a)
     return np.concatenate([by_q, by_v], axis=1)
+
+
+# -- piecewise polynomial solution that every integrator returns, and Lagrange polynomials -------
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Piecewise polynomial elastic motion.
+
+    On step n, tau = (t - time_grid[n]) / h:  qdd = sum_j l_j(tau) a[n, j] with the Lagrange
+    polynomials of `nodes`, integrated twice from q[n], qd[n].
+
+    Attributes:
+        time_grid: (n + 1,) ends of the steps, s.
+        nodes: (s,) of each step, in [0, 1].
+        q, qd: (n, N) at the steps' beginnings.
+        a: (n, s, N) accelerations at the nodes.
+        error: estimated relative error of the elastic coordinates.
+        iterations: Newton iterations spent.
+        windows: runs of steps that were solved one after the other; 1 where Newton's method
+            converged over all steps at once.
+    """
+
+    time_grid: np.ndarray
+    nodes: np.ndarray
+    q: np.ndarray
+    qd: np.ndarray
+    a: np.ndarray
+    error: float
+    iterations: int
+    windows: int = 1
+
+    def sample(self, t: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Return q, qd or qdd (n, N), by order of `derivative`, at instants t (n,) s."""
+        step = np.clip(np.searchsorted(self.time_grid, t, side="left") - 1, 0, len(self.a) - 1)
+        h = np.diff(self.time_grid)[step]
+        tau = (t - self.time_grid[step]) / h
+        integrals = lagrange_integrals(self.nodes, tau)[2 - derivative]
+        weights = integrals * (h ** (2 - derivative))[:, None]
+        value = (weights[:, None] @ self.a[step])[:, 0]
+        if derivative == 0:
+            value += self.q[step] + (h * tau)[:, None] * self.qd[step]
+        elif derivative == 1:
+            value += self.qd[step]
+        return value
+
+    def accelerations(self, time_grid: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Return qdd (m, s, N) at the nodes (s,) of the steps of another grid (m + 1,), s.
+
+        The horizon of this solution is stretched to that of the grid.
+        """
+        if np.array_equal(self.time_grid, time_grid) and np.array_equal(self.nodes, nodes):
+            return self.a
+        times = time_grid[:-1, None] + np.diff(time_grid)[:, None] * nodes
+        stretch = self.time_grid[-1] / time_grid[-1]
+        return self.sample(times.ravel() * stretch, 2).reshape(*times.shape, -1)
+
+
+def lagrange_integrals(
+    nodes: np.ndarray, tau: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Lagrange polynomials of `nodes` at tau, their integral from 0 and its integral.
+
+    Returns:
+        Three arrays (len(tau), s).
+    """
+    s = len(nodes)
+    powers = np.arange(s)
+    coefficients = np.linalg.inv(nodes[:, None] ** powers)  # (power, node)
+    value = tau[:, None] ** powers
+    first = tau[:, None] ** (powers + 1) / (powers + 1)
+    second = tau[:, None] ** (powers + 2) / ((powers + 1) * (powers + 2))
+    return value @ coefficients, first @ coefficients, second @ coefficients
+
+
+def lagrange_derivatives(nodes: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Return Lagrange polynomials of `nodes`, their first and second derivatives (3, m, s) at tau.
+
+    Args:
+        nodes: (s,).
+        tau: (m,).
+    """
+    powers = np.arange(len(nodes), dtype=float)
+    coefficients = np.linalg.inv(nodes[:, None] ** powers)  # (power, node)
+    value = tau[:, None] ** powers
+    first = powers * tau[:, None] ** np.maximum(powers - 1.0, 0.0)
+    second = powers * (powers - 1.0) * tau[:, None] ** np.maximum(powers - 2.0, 0.0)
+    return np.stack([value, first, second]) @ coefficients
+
+
+# -- time grids: steps of an integrator, and the instants at which responses look at its
+# solution
+
+STEPS_PER_PERIOD = 8.0  # of the slowest vibration
+MOST_STEPS = 20_000  # of a first grid: more are asked for by estimated errors alone
+LONGEST = 1e-3  # s from one instant to the next
+MOST_INSTANTS = 1_000_000  # `LONGEST` apart; they take 1 GB and 3 s
+OF_LONG_MOTIONS = 100_000  # instants of a longer motion, unless it bends faster
+# Share of the largest elastic deflection by which an extreme may exceed its neighbouring instants:
+# the default simulation.tolerance.
+EXCEEDED = 1e-4
+EVEN = 1e-9  # difference of steps, over the time between breakpoints, that is rounding
+
+
+def even_steps(system: System, count: int) -> np.ndarray:
+    """Return the ends (n + 1,) of about `count` even steps between the breakpoints, s."""
+    ends = np.asarray(system.breakpoints)
+    lengths = np.diff(ends)
+    steps = np.maximum(np.ceil(count * lengths / lengths.sum() - 1e-9), 1).astype(int)
+    pieces = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(ends[:-1], ends[1:], steps, strict=True)
+    ]
+    return np.append(np.concatenate(pieces), ends[-1])
+
+
+def first_num_steps(system: System) -> int:
+    """Return a number of steps from cold: eight a period of the slowest vibration at t = 0."""
+    slowest, horizon = system.slowest_frequency(), system.breakpoints[-1]
+    pieces = len(system.breakpoints) - 1
+    smooth = 20 * min(pieces, 4) + 5 * max(pieces - 4, 0)  # many pieces are short ones
+    wanted = STEPS_PER_PERIOD * horizon * slowest / (2.0 * np.pi)
+    return int(np.clip(wanted, smooth, MOST_STEPS))
+
+
+def divided(system: System, time_grid: np.ndarray, count: int) -> np.ndarray:
+    """Return about `count` steps (n + 1,) that are short where those of a grid (m + 1,) are, s."""
+    if not is_graded(system, time_grid):
+        return even_steps(system, count)
+    ends = np.searchsorted(time_grid, system.breakpoints)
+    pieces = []
+    for first, last in pairwise(ends):
+        steps = max(int(np.ceil((last - first) * count / (len(time_grid) - 1) - 1e-9)), 1)
+        places = np.linspace(first, last, steps, endpoint=False)
+        pieces.append(np.interp(places, np.arange(len(time_grid)), time_grid))
+    return np.append(np.concatenate(pieces), time_grid[-1])
+
+
+def is_graded(system: System, time_grid: np.ndarray) -> bool:
+    """Return whether steps (n + 1,) that end at the breakpoints are not even between them."""
+    if not np.isin(system.breakpoints, time_grid).all():
+        return False  # those of a system with another horizon
+    ends = np.searchsorted(time_grid, system.breakpoints)
+    return any(
+        np.ptp(np.diff(time_grid[first : last + 1])) > EVEN * (time_grid[last] - time_grid[first])
+        for first, last in pairwise(ends)
+    )
+
+
+def steps_between_breakpoints(system: System, time_grid: np.ndarray) -> np.ndarray:
+    """Return how many steps of a grid (n + 1,) lie between the breakpoints."""
+    return np.diff(np.searchsorted(time_grid, system.breakpoints))
+
+
+def response_instants(
+    solution: Solution,
+    stiffness: np.ndarray,
+    elastic: np.ndarray | slice,
+    horizon: float,
+    least: int,
+) -> np.ndarray:
+    """Return the instants (n,) of all extremes and integrals over time, s.
+
+    They lie evenly from 0 to the horizon, both included, at most 1 ms apart (of a horizon above
+    1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
+    that it could exceed two neighbouring instants by more than `EXCEEDED` of its largest value:
+    between instants d apart by max |qdd| d^2 / 8 at most. More than two for each stage of a step
+    say nothing new of a polynomial.
+
+    Args:
+        solution: the integrator's.
+        stiffness: (N, N) of the elastic coordinates; its energy is the norm.
+        elastic: their columns in the solution.
+        horizon: s.
+        least: number of intervals that are wanted at least.
+    """
+    count = max(1, int(np.ceil(horizon / LONGEST * (1.0 - 1e-9))))
+    if count > MOST_INSTANTS:
+        count = OF_LONG_MOTIONS
+    largest = _largest(solution.q[:, elastic], stiffness)
+    wanted = float(least)
+    if largest > 0.0:
+        bend = _largest(solution.a[..., elastic], stiffness)
+        known = 2.0 * solution.a.shape[0] * solution.a.shape[1]
+        wanted = max(wanted, min(horizon * np.sqrt(bend / (8.0 * EXCEEDED * largest)), known))
+    return np.linspace(0.0, horizon, count * max(1, int(np.ceil(wanted / count))) + 1)
+
+
+def _largest(q: np.ndarray, stiffness: np.ndarray) -> float:
+    """Return max sqrt(q' K q) of coordinates (..., N)."""
+    squares = np.sum((q @ stiffness) * q, axis=-1)
+    return float(np.sqrt(max(squares.max(initial=0.0), 0.0)))
+
+
+# -- how much work simulations may take: attempts that need not succeed end early ----------------
+
+
+class GivenUp(ConvergenceError):
+    """A simulation that no other steps would save: whoever can try others does not."""
+
+
+@dataclass
+class Work:
+    """Newton iterations times time steps.
+
+    Attributes:
+        most: that may be done.
+        done: so far, of all simulations.
+    """
+
+    most: float = np.inf
+    done: float = 0.0
+
+    def add(self, amount: float) -> None:
+        """Count some work.
+
+        Raises:
+            GivenUp: it is more than may be done.
+        """
+        self.done += amount
+        if self.done > self.most:
+            raise GivenUp(
+                f"the simulation takes more than {self.most:.3g} Newton iterations times time "
+                "steps: the arms deform beyond small-deflection theory"
+            )
+
+
+_WORK: ContextVar[Work | None] = ContextVar("work", default=None)
+
+
+@contextmanager
+def counted(most: float = np.inf) -> Iterator[Work]:
+    """Count the work of simulations within, and end them where it is more than `most`."""
+    work = Work(most)
+    token = _WORK.set(work)
+    try:
+        yield work
+    finally:
+        _WORK.reset(token)
+
+
+def spend(amount: float) -> None:
+    """Count work where somebody wants it counted, see `Work.add`."""
+    if (work := _WORK.get()) is not None:
+        work.add(amount)
+
+
+# -- the error of vibrations that steps do not resolve, which one stage more does not see --------
+#
+# Where the prescribed motion sets in, changes its law or ends, loads have breakpoints, and every
+# vibration sets in with an amplitude of its own. Steps much longer than its period damp it out by
+# the method with s stages and with s + 1 alike: the difference of both says nothing about it.
+# Without damping it is there to the end, though. So estimated by the amplitude at each breakpoint,
+# asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
+
+# Numbers of steps, about sixteen of them, after which a free vibration is compared.
+LOOKS = 16
+FASTEST = 1e30  # rad/s: beyond, squares overflow
+ROUNDING = 1e-14  # of R, which grows with the steps
+
+
+@np.errstate(over="ignore")  # of what has no mass
+def unresolved(
+    stages: Stages,
+    single: tuple[np.ndarray, np.ndarray, np.ndarray],
+    states: tuple[np.ndarray, np.ndarray, np.ndarray],
+    rest: np.ndarray,
+    breakpoint_steps: np.ndarray,
+) -> np.ndarray:
+    """Return the error of every coordinate's free vibrations (runs, N), in its units.
+
+    With the load F = m a + d qd + k q that a coordinate feels, and w^2 = k / m, a jump of F, F',
+    F'' excites (F - F'' / w^2) / k and F' / (k w) of cosine and sine.
+
+    Args:
+        stages: of the steps.
+        single: stiffness, damping and mass (runs or 1, N) of every coordinate by itself.
+        states: q, qd, a (n, s, N) at the stages.
+        rest: (runs, N) coordinates before they move.
+        breakpoint_steps: (P,) steps of a run behind which the motion's law changes; the first is 0.
+    """
+    k, d, m = (x[:, None] for x in single)
+    jumps = _jumps(stages, single, states, breakpoint_steps)
+    jumps[0, :, 0] -= k[:, 0] * rest
+    square = np.minimum(k / m, FASTEST**2)
+    amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
+    decay = np.minimum(0.5 * (d / m), FASTEST)
+    rate = -decay + np.sqrt((decay * decay - square).astype(complex))
+    h = stages.h.reshape(stages.runs, -1, 1)[:, breakpoint_steps]
+    lost = _lost(radau_iia(len(stages.method.c) + 1), rate * h, stages.length - breakpoint_steps)
+    return np.sqrt(np.square(amplitude * lost).sum(axis=1))
+
+
+def _jumps(
+    stages: Stages,
+    single: tuple[np.ndarray, np.ndarray, np.ndarray],
+    states: tuple[np.ndarray, np.ndarray, np.ndarray],
+    breakpoint_steps: np.ndarray,
+) -> np.ndarray:
+    """Return the jumps of F, F', F'' (3, runs, P, N) at breakpoints, from zero at first."""
+    k, d, m = (x[:, None, None] for x in single)
+    ends = lagrange_derivatives(stages.method.c, np.array([0.0, 1.0]))  # (3, 2, s)
+    shape = (stages.runs, stages.length, *states[0].shape[1:])
+    h = stages.h.reshape(shape[:2])
+    sides = []
+    for end, steps in zip(
+        ends.swapaxes(0, 1), (breakpoint_steps, breakpoint_steps[1:] - 1), strict=True
+    ):
+        q, qd, a = (x.reshape(shape)[:, steps] for x in states)
+        load = m * a + d * qd + k * q
+        power = h[:, steps, None] ** -np.arange(3.0)[:, None, None, None]
+        sides.append(np.einsum("ij,rpjk->irpk", end, load) * power)
+    after, before = sides
+    after[:, :, 1:] -= before
+    return after
+
+
+def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the largest |exp(j z) - R(z)^j| of free vibrations, j steps on.
+
+    R is the method's stability function, 1 + z b' (1 - z A)^-1 1.
+
+    Args:
+        method: collocation.
+        z: (runs, P, N) eigenvalues times step.
+        steps: (P,) that follow.
+    """
+    values, X = np.linalg.eig(method.A)
+    weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
+    R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)
+    j = np.unique(np.geomspace(1.0, steps.max(), LOOKS).round())
+    apart = np.abs(np.exp(z[..., None] * j) - R[..., None] ** j)
+    seen = (j <= steps[:, None, None]) & (apart > ROUNDING * j)
+    return np.where(seen, apart, 0.0).max(axis=-1)

@@ -18,10 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from dolfinopt.dynamics.patience import GivenUp, spend
-from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.collocation import GivenUp, Solution, even_steps, first_num_steps, spend
 from dolfinopt.dynamics.system import Instants, System, relative_error
-from dolfinopt.dynamics.time_grid import even_steps, first_num_steps
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.profiling import Profile
 

@@ -17,19 +17,15 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.modal_coordinates import Modes
+from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.system import Linearisation, State, Unchanged
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.body_gradient import body_gradient
-from dolfinopt.multibody.drives import Closure, Drives
-from dolfinopt.multibody.instants import FEW, repeated
-from dolfinopt.multibody.interface_jacobian import interface_place, place_gradient
+from dolfinopt.multibody.end_effector import interface_place, place_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import FEW, Closure, Drives, Mechanism, repeated
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, padded, rigid_part
-from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
 ROUNDING = 1e-13  # of a step of that iteration, beside the coordinates

@@ -11,23 +11,355 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.blas import dtbsv
 
 from dolfinopt.dynamics.collocation import (
+    Collocation,
     Stages,
     at_stages,
+    end_gain,
+    lagrange_integrals,
     residual_at,
+    spend,
+    stage_values,
     step_beginnings,
+    step_ends,
+    tangent_at,
+    vector_jacobian_product,
 )
-from dolfinopt.dynamics.newton_matrix import (
-    LIMITS,
-    NewtonMatrix,
-    factorise,
-    next_slow_coordinates,
-    windows,
-)
-from dolfinopt.dynamics.patience import spend
-from dolfinopt.dynamics.simplified_newton import simplified_newton_matrix
-from dolfinopt.dynamics.system import State
+from dolfinopt.dynamics.system import Linearisation, State
+
+# -- Newton's matrix over a run of steps: dense in the slow coordinates, diagonal in the fast ----
+#
+# In modal coordinates (`modes`) a coordinate whose vibration is much faster than the steps follows
+# its loads almost quasi-statically: what the rest of its row holds, mass times acceleration, is
+# small beside the stiffness. Newton's matrix keeps of its row the diagonal and what the slow
+# coordinates do to it; the slow rows keep all of their slow columns,
+#     [ P_ss   0   ]
+#     [ J_fs  p_ff ],
+# each of them block lower bidiagonal over the steps. The residual itself stays exact, so that the
+# matrix decides about the number of iterations alone; with every coordinate slow it is exact.
+# Without J_fs, which costs a tenth of an iteration, it takes two to three times as many.
+
+BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
+# Angles w h up to which coordinates are slow, tried in turn: 6 Newton iterations with 30 and 40, 10
+# with 20, in an optimisation of the paper's example.
+LIMITS = (40.0, 120.0, np.inf)
+# As long as not all must be, the slowest so many are, or fewer that have room: on short steps
+# nearly all would.
+MOST = 24
+SMALL = 12  # coordinates up to which the exact matrix costs less than more iterations
+MEMORY_BYTES = 256e6  # of the factors of steps that are solved together
+
+
+def limits_for(stages: Stages) -> tuple[float, ...]:
+    """Return the limits to try where an exact matrix saves repetitions: of few coordinates, it."""
+    return LIMITS if stages.preconditioner.system.num_coordinates > SMALL else LIMITS[-1:]
+
+
+def next_slow_coordinates(
+    stages: Stages, limits: tuple[float, ...], more_than: int
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return the first larger set of slow coordinates, ascending, and the limits beyond.
+
+    A coordinate is slow up to an angle w h in a median step; the slowest one always is. No limits
+    are left when all are.
+    """
+    angles = stages.angles
+    if not stages.preconditioner.guided:
+        return np.arange(len(angles)), ()
+    limit, *beyond = limits
+    slow = np.flatnonzero(angles <= max(limit, angles.min()))
+    most = max(1, min(MOST, int(np.sqrt(MEMORY_BYTES / _bytes(stages)))))
+    if limit < np.inf and len(slow) > most:
+        slow = np.sort(np.argsort(angles, kind="stable")[:most])
+    if len(slow) <= more_than and beyond:
+        return next_slow_coordinates(stages, tuple(beyond), more_than)
+    return slow, tuple(beyond) if len(slow) < len(angles) else ()
+
+
+def _bytes(stages: Stages) -> int:
+    """Return the memory that factors take, over the square of the number of slow coordinates."""
+    s = len(stages.method.c)
+    return 8 * len(stages.h) * (s * s + 2 * s + 8)
+
+
+def windows(stages: Stages, slow: np.ndarray) -> list[slice]:
+    """Return runs of steps whose factors fit in `MEMORY_BYTES`: mostly one."""
+    size, count = len(slow), len(stages.h)
+    length = max(1, int(MEMORY_BYTES * count / (_bytes(stages) * size * size + 1)))
+    return [slice(i, min(i + length, count)) for i in range(0, count, length)]
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonMatrix:
+    """Newton's matrix at some iterate, ready to be solved with.
+
+    Attributes:
+        stages: the steps.
+        tangent: of all rows by the slow coordinates at the stages.
+        slow, fast: ascending coordinates (S,), (F,).
+        inverse: (n, s S, s S) of the slow blocks.
+        answer: (n, s, S, 2 S) change of their a by their state at the step's beginning.
+        transfer: (n, 2 S, 2 S) change of that state over a step by that before it.
+        band: the same for `bidiagonal_solve`.
+        fast_inverse: (s, s, n, F).
+        fast_loads: (2, n, s, F) change of the fast rows by their state at the beginning.
+        fast_transfer: (n, 2, 2, F).
+        fast_band: the same for `bidiagonal_solve`, coordinate after coordinate.
+    """
+
+    stages: Stages
+    tangent: Linearisation
+    slow: np.ndarray
+    fast: np.ndarray
+    inverse: np.ndarray
+    answer: np.ndarray
+    transfer: np.ndarray
+    band: np.ndarray
+    fast_inverse: np.ndarray
+    fast_loads: np.ndarray
+    fast_transfer: np.ndarray
+    fast_band: np.ndarray
+
+    def solve(self, residual: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the change of a that takes `residual` away, and that of q, both (n, s, N).
+
+        Args:
+            residual: (n, s, N).
+            before: (2, N) change of q, qd at the beginning of the first step of every run.
+        """
+        step, shift = np.empty_like(residual), np.empty_like(residual)
+        slow = self._solve_slow(residual[:, :, self.slow], before[:, self.slow])
+        step[:, :, self.slow], shift[:, :, self.slow] = slow[0], slow[1]
+        if len(self.fast):
+            a, q, qd = (x.reshape(-1, len(self.slow)) for x in slow)
+            change = self.tangent.times(q, qd, a, self.fast)
+            left = residual[:, :, self.fast] + change.reshape(*residual.shape[:2], -1)
+            step[:, :, self.fast], shift[:, :, self.fast] = self._solve_fast(
+                left, before[:, self.fast]
+            )
+        return step, shift
+
+    def _solve_slow(
+        self, residual: np.ndarray, before: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the changes of a, q, qd (n, s, S)."""
+        count, s, size = residual.shape
+        forced = -(self.inverse @ residual.reshape(count, s * size, 1)).reshape(residual.shape)
+        y = np.empty((count, 2 * size))
+        y[1:] = end_gain(self.stages, forced[..., None])[:-1, :, 0]
+        y[:: self.stages.length] = before.ravel()
+        y = bidiagonal_solve(self.band, y)
+        answer = self.answer.reshape(count, s * size, -1)
+        step = forced + (answer @ y[:, :, None]).reshape(residual.shape)
+        return step, *stage_values(self.stages, y[:, :size], y[:, size:], step)
+
+    def _solve_fast(
+        self, residual: np.ndarray, before: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the changes of a and q (n, s, F)."""
+        forced = -_diagonal(self.fast_inverse, residual)
+        count, _, size = residual.shape
+        y = np.empty((count, 2, size))
+        y[1:] = end_gain(self.stages, forced[..., None])[:-1].reshape(-1, 2, size)
+        y[:: self.stages.length] = before
+        # Coordinate by coordinate, one after the other.
+        y = bidiagonal_solve(self.fast_band, _in_turn(y))
+        y = y.reshape(size, count, 2).transpose(1, 2, 0)
+        loads = y[:, None, 0] * self.fast_loads[0] + y[:, None, 1] * self.fast_loads[1]
+        step = forced - _diagonal(self.fast_inverse, loads)
+        return step, stage_values(self.stages, y[:, 0], y[:, 1], step)[0]
+
+    def solve_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return multipliers (n, s, N): J + sum multipliers . residual, by this matrix, rests.
+
+        Args:
+            by_a: (n, s, N) gradient of J by the accelerations.
+            by_y: (n, 2, N) by the states (q, qd) at the steps' beginnings.
+            after: (2, N) by the state at the end of the last.
+        """
+        multipliers = np.zeros_like(by_a)
+        by_a_s, by_y_s = by_a[:, :, self.slow], by_y[:, :, self.slow]
+        if len(self.fast):
+            multipliers[:, :, self.fast] = self._fast_transposed(
+                by_a[:, :, self.fast], by_y[:, :, self.fast], after[:, self.fast]
+            )
+            shape = (*by_a.shape[:2], len(self.slow))
+            slow = self.tangent.transposed(multipliers.reshape(-1, by_a.shape[2]))
+            more_a, more_y = vector_jacobian_product(self.stages, *(x.reshape(shape) for x in slow))
+            by_a_s, by_y_s = by_a_s + more_a, by_y_s + more_y
+        multipliers[:, :, self.slow] = self._slow_transposed(by_a_s, by_y_s, after[:, self.slow])
+        return multipliers
+
+    def _slow_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        count, s, size = by_a.shape
+        # dJ by the state before a step if the accelerations answer it: y -> a = answer y.
+        answer = self.answer.reshape(count, s * size, -1)
+        flat = by_a.reshape(count, -1, 1)
+        direct = (by_y.reshape(count, -1, 1) + answer.swapaxes(1, 2) @ flat)[:, :, 0]
+        direct[-1] += after.ravel() @ self.transfer[-1]
+        p = np.concatenate([bidiagonal_solve(self.band, direct, 1)[1:], after.reshape(1, -1)])
+        flat = flat + _end_gradient(self.stages, p).reshape(flat.shape)
+        return -(self.inverse.swapaxes(1, 2) @ flat).reshape(by_a.shape)
+
+    def _fast_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        inverse = self.fast_inverse.swapaxes(0, 1)
+        answered = _diagonal(inverse, by_a)
+        direct = by_y - np.einsum("injk,njk->nik", self.fast_loads, answered)
+        direct[-1] += np.einsum("ik,ijk->jk", after, self.fast_transfer[-1])
+        count, _, size = direct.shape
+        p = bidiagonal_solve(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
+        p = np.concatenate([p.transpose(1, 2, 0)[1:], after[None]])
+        return -_diagonal(inverse, by_a + _end_gradient(self.stages, p.reshape(len(p), -1)))
+
+
+def band_of(transfer: np.ndarray, length: int) -> np.ndarray:
+    """Return the matrix of y_n+1 - T_n y_n, transfer T (n, m, m), as BLAS wants its lower bands.
+
+    The end of a run of `length` steps is not the beginning of the next.
+    """
+    count, m, _ = transfer.shape
+    bands = np.zeros((count, m, 2 * m))  # of column j: rows j to j + 2 m - 1
+    i, j = np.indices((m, m))
+    bands[:, j, m + i - j] = -transfer
+    bands[length - 1 :: length] = 0.0
+    return bands.reshape(count * m, 2 * m).T
+
+
+def bidiagonal_solve(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
+    """Return y_n+1 = T_n y_n + gain_n (n, m) from y_0 and the gains (n, m), or the transposed.
+
+    One call of BLAS instead of a loop over the steps.
+    """
+    k = len(band) - 1
+    return dtbsv(k, band, y.ravel(), lower=1, trans=transposed, diag=1).reshape(y.shape)
+
+
+def _in_turn(y: np.ndarray) -> np.ndarray:
+    """Return states (n, 2, F) of uncoupled coordinates one after the other, (F n, 2)."""
+    return y.transpose(2, 0, 1).reshape(-1, 2)
+
+
+def _diagonal(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return, coordinate by coordinate, the products (n, s, F) of matrices (s, s, n, F)."""
+    return np.einsum("ijnk,njk->nik", matrices, x)
+
+
+def _end_gradient(stages: Stages, p: np.ndarray) -> np.ndarray:
+    """Return the gradient by a (n, s, S) from that p (n, 2 S) by the states after each step."""
+    h = stages.h[:, None, None]
+    by_q, by_v = np.split(p[:, None], 2, axis=2)
+    method = stages.method
+    return h * h * method.A2[-1][:, None] * by_q + h * method.A[-1][:, None] * by_v
+
+
+def factorise(
+    stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray, slow: np.ndarray
+) -> NewtonMatrix:
+    """Return Newton's matrix at an iterate, inverted; nan where a block is singular.
+
+    Args:
+        stages: n steps.
+        q, qd, a: (n, s, N) at their stages.
+        slow: coordinates that are treated densely.
+    """
+    count, s, size = a.shape
+    tangent = tangent_at(stages, q, qd, a, slow)
+    fast = np.setdiff1d(np.arange(size), slow)
+    slow_size = len(slow)
+    inverse = np.empty((count, s * slow_size, s * slow_size))
+    answer = np.empty((count, s, slow_size, 2 * slow_size))
+    chunk = max(1, int(BATCH_BYTES / (8 * max(1, s * slow_size) ** 2)))
+    for first in range(0, count, chunk):
+        part = slice(first, min(first + chunk, count))
+        inside = tangent.window(part.start * s, part.stop * s).dense()
+        block, beginning = _blocks(stages.window(part.start, part.stop), inside)
+        try:
+            inverse[part] = np.linalg.inv(block)
+        except np.linalg.LinAlgError:
+            inverse[part] = np.nan  # refused by whoever asked
+        answer[part] = -(inverse[part] @ beginning).reshape(answer[part].shape)
+    transfer = end_gain(stages, answer) + np.eye(2 * slow_size)
+    diagonal = np.arange(slow_size)
+    transfer[:, diagonal, slow_size + diagonal] += stages.h[:, None]
+    dense = (inverse, answer, transfer, band_of(transfer, stages.length))
+    single = diagonal_matrix(stages, *(x[:, fast] for x in stages.uncoupled))
+    return NewtonMatrix(stages, tangent, slow, fast, *dense, *single)
+
+
+def _blocks(stages: Stages, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivative of every step's residual by its accelerations and first state.
+
+    Returns:
+        (n, s S, s S) and (n, s S, 2 S).
+    """
+    method, size = stages.method, jacobian.shape[1]
+    count, s = len(stages.h), len(method.c)
+    by_q, by_v, by_a = np.split(jacobian.reshape(count, s, size, 3 * size), 3, axis=3)
+    h = stages.h[:, None, None]
+    by_stage = np.stack([h * method.A, h * h * method.A2])[:, :, :, None, :, None]
+    block = by_stage[0] * by_v[:, :, :, None]
+    block += by_stage[1] * by_q[:, :, :, None]
+    every = np.arange(s)
+    block[:, every, :, every] += by_a.swapaxes(0, 1)
+    late = by_v + h[..., None] * method.c[:, None, None] * by_q
+    beginning = np.concatenate([by_q, late], axis=3)
+    return block.reshape(count, s * size, -1), beginning.reshape(count, s * size, -1)
+
+
+def diagonal_matrix(
+    stages: Stages, k: np.ndarray, d: np.ndarray, m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return inverse, loads, transfer and its band of the fast coordinates, one by one.
+
+    The rows m a + d qd + k q of all stages, m + h A d + h^2 A^2 k, are diagonal in the
+    eigenvectors of A: no matrix is inverted.
+
+    Args:
+        stages: n steps.
+        k, d, m: (1, F), or (n, F) of every step.
+    """
+    method, h = stages.method, stages.h[:, None]
+    values, X = np.linalg.eig(method.A)
+    s, count = len(values), len(h)
+    ha = h * values[:, None, None]  # (s, n, 1)
+    parts = (X[:, None] * np.linalg.inv(X).T).reshape(s * s, s)
+    each = 1.0 / (m + ha * (d + ha * k))
+    inverse = (parts @ each.reshape(s, -1)).real.reshape(s, s, count, -1)
+    loads = np.empty((2, count, s, k.shape[1]))
+    loads[0] = k[:, None]
+    loads[1] = d[:, None] + h[:, :, None] * method.c[:, None] * k[:, None]
+    transfer = np.empty((count, 2, 2, k.shape[1]))
+    for i in range(2):
+        answer = -_diagonal(inverse, loads[i])[..., None]
+        transfer[:, :, i] = end_gain(stages, answer)[:, :, 0].reshape(count, 2, -1)
+        transfer[:, i, i] += 1.0
+    transfer[:, 0, 1] += h
+    chain = transfer.transpose(3, 0, 1, 2)
+    return inverse, loads, transfer, band_of(chain.reshape(-1, 2, 2), stages.length)
+
+
+def solve_once(
+    stages: Stages,
+    q: np.ndarray,
+    qd: np.ndarray,
+    a: np.ndarray,
+    slow: np.ndarray,
+    residual: np.ndarray,
+) -> np.ndarray:
+    """Return the change of q (n, s, N) as `NewtonMatrix.solve`, factors made window by window."""
+    shift = np.empty_like(a)
+    before = np.zeros((2, a.shape[2]))
+    for part in windows(stages, slow):
+        window = stages.window(part.start, part.stop)
+        matrix = factorise(window, q[part], qd[part], a[part], slow)
+        step, shift[part] = matrix.solve(residual[part], before)
+        before = np.stack([x[-1] for x in step_ends(window, (before[0], before[1]), step)])
+    return shift
+
+
+# -- Newton's method for all stages of all steps at once, of one run of steps or of many ---------
 
 # Relative steps and errors below this that do not fall any more are rounding.
 ROUNDING = 1e-9
@@ -314,3 +646,179 @@ def _left(rate: np.ndarray, tuning: Tuning) -> np.ndarray:
     """Return what a step leaves, over its size, at a contraction; unknown ones count as a half."""
     rate = np.clip(np.where(np.isfinite(rate), rate, 0.5), tuning.least_rate, 0.5)
     return rate / (1.0 - rate)
+
+
+# -- Newton's matrix with the tangent held over every step: cheap for many runs at once ----------
+#
+# With mass M, damping D and stiffness K of the slow coordinates in the middle of a step, its rows 1
+# x M + h A x D + h^2 A A x K come apart in the eigenvectors of A (Butcher's transformation): one
+# matrix M + h l D + h^2 l^2 K for each eigenvalue l, of conjugate ones one. They have no stronger
+# entries than their diagonals, M and K being definite, and are inverted without pivots, in one
+# sweep over all steps. The tangent moves by some percent within a step: so do the iterations
+# contract. Source: Hairer & Wanner (1996), IV.8, doi:10.1007/978-3-642-05221-7.
+
+CHUNK = 512  # matrices that are inverted together: they stay in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class SimplifiedNewtonMatrix(NewtonMatrix):
+    """Newton's matrix with held tangents; its slow blocks are kept in A's eigenvectors.
+
+    Attributes:
+        jacobian: (n, S, 3 S) of the slow rows in the middle of every step, by q, qd, qdd.
+        into: (m, s) complex, stages to eigenvectors, of conjugate ones one.
+        out: (s, 2 m) real, real and imaginary parts there to stages.
+        parts: (m, n, S, S) complex, inverted.
+    """
+
+    jacobian: np.ndarray
+    into: np.ndarray
+    out: np.ndarray
+    parts: np.ndarray
+
+    def _solve_slow(
+        self, residual: np.ndarray, before: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the changes of a, q, qd (n, s, S)."""
+        count, _, size = residual.shape
+        stages = self.stages
+        y = np.empty((count, 2 * size))
+        y[1:] = end_gain(stages, -self._applied(residual)[..., None])[:-1, :, 0]
+        y[:: stages.length] = before.ravel()
+        y = bidiagonal_solve(self.band, y)
+        q, qd = y[:, :size], y[:, size:]
+        # What the state at the beginning does to the residual: K q + (D + c h K) qd.
+        at_once = (self.jacobian[:, :, : 2 * size] @ y[:, :, None])[:, None, :, 0]
+        late = stages.h[:, None] * (self.jacobian[:, :, :size] @ qd[:, :, None])[:, :, 0]
+        residual = residual + at_once + stages.method.c[:, None] * late[:, None]
+        step = -self._applied(residual)
+        return step, *stage_values(stages, q, qd, step)
+
+    def _applied(self, residual: np.ndarray) -> np.ndarray:
+        """Return the inverted blocks times a residual (n, s, S)."""
+        count, s, size = residual.shape
+        by_stage = np.ascontiguousarray(residual.swapaxes(0, 1)).reshape(s, -1)
+        into = (self.into @ by_stage).reshape(-1, count, size, 1)
+        found = (self.parts @ into).reshape(len(self.into), -1)
+        both = np.concatenate([found.real, found.imag])
+        return (self.out @ both).reshape(s, count, size).swapaxes(0, 1)
+
+
+def simplified_newton_matrix(
+    stages: Stages,
+    begin: State,
+    a: np.ndarray,
+    slow: np.ndarray,
+) -> NewtonMatrix:
+    """Return Newton's matrix, inverted; nan where a block is singular.
+
+    Args:
+        stages: n steps.
+        begin: q, qd (n, N) at the steps' beginnings.
+        a: (n, s, N).
+        slow: ascending coordinates (S,) that are treated densely.
+    """
+    fast = np.setdiff1d(np.arange(a.shape[2]), slow)
+    tangent = _tangent(stages, begin, a, slow)
+    jacobian = tangent.dense()
+    method = stages.method
+    into, out = _eigenvectors(method)
+    parts = _parts(method, stages.h, jacobian, stages.preconditioner.definite)
+    transfer = _transfer(stages, jacobian, parts, into, out)
+    none = np.empty(0)  # the blocks of all stages are never formed
+    dense = (none, none, transfer, band_of(transfer, stages.length))
+    single = diagonal_matrix(stages, *(x[:, fast] for x in stages.uncoupled))
+    return SimplifiedNewtonMatrix(
+        stages, tangent, slow, fast, *dense, *single, jacobian, into, out, parts
+    )
+
+
+def _eigenvectors(method: Collocation) -> tuple[np.ndarray, np.ndarray]:
+    """Return what takes stages into A's eigenvectors and back, see `SimplifiedNewtonMatrix`."""
+    values, X = np.linalg.eig(method.A)
+    upper = values.imag >= -1e-12
+    # A conjugate pair is twice the real part of one of them.
+    out = X[:, upper] * np.where(values[upper].imag > 1e-12, 2.0, 1.0)
+    return np.linalg.inv(X)[upper], np.concatenate([out.real, -out.imag], axis=1)
+
+
+def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: bool) -> np.ndarray:
+    """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of the derivative by q, qd, qdd.
+
+    Without pivots where M and K are definite, which takes a third of the time.
+    """
+    values = np.linalg.eigvals(method.A)
+    values = values[values.imag >= -1e-12]
+    count, size = jacobian.shape[:2]
+    parts = np.empty((len(values), count, size, size), dtype=complex)
+    K, D, M = np.split(jacobian.transpose(1, 2, 0), 3, axis=1)
+    for first in range(0, count, CHUNK):
+        part = slice(first, first + CHUNK)
+        hl = values[:, None] * h[part]
+        each_sum = M[:, :, None, part] + hl * (D[:, :, None, part] + hl * K[:, :, None, part])
+        if definite:
+            parts[:, part] = _inverted(each_sum).transpose(2, 3, 0, 1)
+            continue
+        try:
+            parts[:, part] = np.linalg.inv(each_sum.transpose(2, 3, 0, 1))
+        except np.linalg.LinAlgError:
+            parts[:, part] = np.nan  # refused by whoever asked
+    return parts
+
+
+def _transfer(
+    stages: Stages, jacobian: np.ndarray, parts: np.ndarray, into: np.ndarray, out: np.ndarray
+) -> np.ndarray:
+    """Return the change (n, 2 S, 2 S) of the state over a step by that before it."""
+    method, h = stages.method, stages.h[:, None, None]
+    m, count, size, _ = parts.shape
+    both = np.concatenate([parts.real, parts.imag]).reshape(2 * m, -1)
+    # Sums over stages that end a step, of B's columns' sums: of a and of c a, each (n, S, S).
+    ends, begins = (
+        np.stack([method.A2[-1], method.A[-1]]),
+        np.stack([np.ones_like(method.c), method.c]),
+    )
+    left = ends @ out  # (2, 2 m)
+    right = into @ begins.T  # (m, 2) complex
+    real, imaginary = left[:, :m], left[:, m:]
+    weights = np.empty((2, 2, 2 * m))
+    for k in range(2):
+        # (re + i im)(right) of every part: real part re r - im i, imaginary re i + im r.
+        weights[:, k, :m] = real * right[:, k].real + imaginary * right[:, k].imag
+        weights[:, k, m:] = imaginary * right[:, k].real - real * right[:, k].imag
+    sums = (weights.reshape(4, -1) @ both).reshape(2, 2, count, size, size)
+    K = jacobian[:, :, :size]
+    transfer = np.empty((count, 2 * size, 2 * size))
+    for row, power in ((0, h * h), (1, h)):
+        place = slice(row * size, (row + 1) * size)
+        transfer[:, place] = -power * (sums[row, 0] @ jacobian[:, :, : 2 * size])
+        transfer[:, place, size:] -= power * h * (sums[row, 1] @ K)
+    transfer += np.eye(2 * size)
+    diagonal = np.arange(size)
+    transfer[:, diagonal, size + diagonal] += stages.h[:, None]
+    return transfer
+
+
+def _tangent(stages: Stages, begin: State, a: np.ndarray, slow: np.ndarray) -> Linearisation:
+    """Return the residual's derivative by the slow coordinates in the middle of every step."""
+    value, first, second = lagrange_integrals(stages.method.c, np.array([0.5]))
+    h = stages.h[:, None]
+    q = begin[0] + 0.5 * h * begin[1] + h * h * np.einsum("j,njk->nk", second[0], a)
+    qd = begin[1] + h * np.einsum("j,njk->nk", first[0], a)
+    qdd = np.einsum("j,njk->nk", value[0], a)
+    return stages.middle.linearise(q, qd, qdd, slow)
+
+
+def _inverted(A: np.ndarray) -> np.ndarray:
+    """Return the inverses of matrices (S, S, ...), by Gauss's and Jordan's sweep without pivots."""
+    for k in range(len(A)):
+        pivot = 1.0 / A[k, k]
+        A[k, k] = 1.0
+        A[k] *= pivot
+        row, column = A[k].copy(), A[:, k].copy()
+        column[k] = 0.0
+        kept = A[k, k].copy()
+        A[:, k] = 0.0
+        A[k, k] = kept
+        A -= column[:, None] * row
+    return A

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,32 +12,38 @@ import numpy as np
 from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.build import build_system, desired_motion
-from dolfinopt.dynamics.drive_forces import DriveForces
+from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.load_coefficients import load_coefficients
-from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.march import BEYOND, REMEDY, VALID
-from dolfinopt.dynamics.patience import GivenUp
-from dolfinopt.dynamics.solution import Solution
-from dolfinopt.dynamics.time_grid import response_instants
+from dolfinopt.dynamics.machine_system import PLANE, Equations, MachineInstants, MachineSystem
+from dolfinopt.dynamics.radau import BEYOND, REMEDY, VALID
+from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.drives import Closure
 from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
     end_effector_gradient,
+    interface_place,
     lengths,
+    place_gradient,
 )
-from dolfinopt.multibody.interface_jacobian import interface_place
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Mechanism, compliance
+from dolfinopt.multibody.inverse_dynamics import body_loads, inverse_dynamics
+from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import (
+    SPACE,
+    ModalDisplacement,
+    Rates,
+    ShapeIntegrals,
+    add_integrals,
+    in_basis,
+)
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from typing_extensions import Self, TypeAlias
+    from typing import TypeAlias
+
+    from typing_extensions import Self
 
     from dolfinopt.dynamics.spatial_system import SpatialSystem
 
@@ -417,6 +423,345 @@ def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajector
     if not scene.is_spatial:
         assert isinstance(problem, (ElasticSystem, MachineSystem))
         return Trajectory(problem, scene, solution, t)
-    from dolfinopt.dynamics.spatial_trajectory import SpatialTrajectory
+    from dolfinopt.dynamics.spatial_system import SpatialTrajectory
 
     return SpatialTrajectory(problem, scene, solution, t)  # type: ignore[arg-type]
+
+
+# -- derivatives of the drive forces along a trajectory, by its coordinates and by the bodies ----
+#
+# A drive on a prescribed coordinate gives what inverse dynamics asks for, less what the closure's
+# force does; it depends on coordinates, rates and accelerations, on the multipliers of a loop and
+# on every shape integral. A drive of a free coordinate follows its law: u = u_ff + Kp (q_d - q) +
+# Kd (qd_d - qd), of which u_ff is inverse dynamics of the rigid arms of the same bodies.
+
+CHUNK = 512  # instants whose matrices are made at once
+KEPT_BYTES = 64e6  # of matrices that are kept for further functions of the same forces
+
+
+def drive_force_gradient(
+    system: Problem, t: np.ndarray, rates: Rates, weights: np.ndarray
+) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+    """Return what `DriveForces.gradient` does, of a single function."""
+    return DriveForces(system, t, rates).gradient(weights)
+
+
+class DriveForces:
+    """The forces of all drives at some instants, to be differentiated.
+
+    Attributes:
+        system: with prescribed or free rigid coordinates.
+        t: (n,) instants, s.
+        rates: its S coordinates, their rates and accelerations there, each (n, S).
+    """
+
+    def __init__(self, system: Problem, t: np.ndarray, rates: Rates) -> None:
+        """Take the motion."""
+        self.system, self.t, self.rates = system, t, rates
+        self._kept: list[_Prescribed | _Machine] = []
+
+    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return the derivative of sum_n weights_n . forces_n, instants and coordinates held apart.
+
+        Args:
+            weights: (n, 1 + arms) of the forces of cart and joints, see `Trajectory.joint_forces`.
+
+        Returns:
+            By coordinates, rates and accelerations (3, n, S); and by every body's integrals, the
+            coordinates held.
+        """
+        parts = [slice(i, i + CHUNK) for i in range(0, len(self.t), CHUNK)]
+        by_rates, total = [], None
+        for chunk, part in zip(self._chunks(parts), parts, strict=True):
+            by, bodies = chunk.gradient(weights[part])
+            by_rates.append(by)
+            total = bodies if total is None else [a + b for a, b in zip(total, bodies, strict=True)]
+        assert total is not None, "no instants"
+        return np.concatenate(by_rates, axis=1), total
+
+    def _chunks(self, parts: list[slice]) -> Iterable[_Prescribed | _Machine]:
+        """Return the parts' own; the same ones every time unless they take too much memory."""
+        bodies, columns = len(self.system.mechanism.bodies), 3 * self.rates[0].shape[1]
+        if 8 * len(self.t) * (1 + 8 * bodies) * columns > KEPT_BYTES:
+            return map(self._chunk, parts)
+        self._kept = self._kept or [self._chunk(part) for part in parts]
+        return self._kept
+
+    def _chunk(self, part: slice) -> _Prescribed | _Machine:
+        y, yd, ydd = (x[part] for x in self.rates)
+        system, t = self.system, self.t[part]
+        if isinstance(system, ElasticSystem):
+            return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
+        if isinstance(system, MachineSystem):
+            return _Machine(system.at(t), (y, yd, ydd))
+        from dolfinopt.dynamics.spatial_system import SPACE
+
+        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), SPACE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prescribed:
+    """Forces of inverse dynamics along a given motion; q, qd, qdd (n, N) are elastic."""
+
+    mechanism: ElasticBodies
+    motion: Any  # RigidMotion, in space JointMotion
+    rates: Rates
+    equations: Equations = PLANE
+
+    @cached_property
+    def tangent(self) -> Linearisation:
+        """By rigid and elastic coordinates."""
+        every = np.arange(self.motion.q.shape[1])
+        return self.equations.linearise(self.mechanism, self.motion, *self.rates, None, every)
+
+    def by_all(self, weights: np.ndarray) -> np.ndarray:
+        """Return the derivatives (3, n, 1 + arms + N) by rigid and elastic coordinates."""
+        rows = np.concatenate([weights, np.zeros_like(self.rates[0])], axis=1)
+        return np.stack(self.tangent.transposed(rows))
+
+    def by_bodies(self, weights: np.ndarray) -> list[ShapeIntegrals]:
+        """Return those by every body, all coordinates held."""
+        none = np.zeros_like(self.rates[0])
+        motion = self.motion
+        return self.equations.body_gradient(self.mechanism, motion, *self.rates, none, weights)
+
+    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return `DriveForces.gradient`; rigid coordinates do not change."""
+        return self.by_all(weights)[:, :, weights.shape[1] :], self.by_bodies(weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Machine:
+    """Forces of drives by their law, and of those on a given motion; rates (n, S)."""
+
+    instants: MachineInstants
+    rates: Rates
+
+    @cached_property
+    def prescribed(self) -> _Prescribed:
+        """What a given motion along which the machine moves would ask for."""
+        instants, (y, yd, ydd) = self.instants, self.rates
+        q, qd, qdd = (instants.split(x)[1] for x in self.rates)
+        motion, machine = instants.motion(y, yd, ydd), instants.machine
+        return _Prescribed(machine.mechanism, motion, (q, qd, qdd), machine.equations)
+
+    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return `DriveForces.gradient`."""
+        instants, (y, yd, _) = self.instants, self.rates
+        system = instants.machine
+        drives = system.drives
+        given = weights.copy()
+        given[:, drives.free] = 0.0
+        by, bodies = self._of_prescribed(given)
+        passing = drives.passing(instants.ahead, instants.at_drives(y), instants.at_drives(yd))
+        passed = passing * weights[:, drives.free]
+        by[0][:, system.drive_columns] -= passed * drives.stiffness
+        by[1][:, system.drive_columns] -= passed * drives.damping
+        return by, system.with_feed_forward(bodies, instants.desired, passed)
+
+    def _of_prescribed(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return the part of drives on a given motion: inverse dynamics, less the closure's."""
+        system, by = self.instants.machine, np.zeros((3, *self.rates[0].shape))
+        bodies = self.prescribed.by_bodies(weights)
+        if not weights.any():
+            return by, bodies
+        _, moving, last = system.ends
+        by[:, :, :moving] = self.prescribed.by_all(weights)[:, :, system.columns]
+        if system.closure is None:
+            return by, bodies
+        motion, q, rigid = self.prescribed.motion, self.prescribed.rates[0], weights.shape[1]
+        here = interface_place(system.mechanism, motion, q, second=True)
+        assert here.hessian is not None
+        pull = -system.ground_force(self.instants.split(self.rates[2])[2])
+        turned = np.einsum("ni,nic->nc", weights, here.hessian[:, :rigid, system.columns])
+        by[0][:, :moving] += (np.conj(pull)[:, None] * turned).real
+        J = system.closure.project(here.jacobian[:, :rigid])
+        by[2][:, moving:last] -= np.einsum("nmi,ni->nm", J, weights)
+        moved = np.concatenate([weights, np.zeros_like(q)], axis=1)
+        parts = place_gradient(system.mechanism, motion, q, np.zeros_like(pull), moved, pull)
+        return by, [add_integrals(a, part) for a, part in zip(bodies, parts, strict=True)]
+
+
+# -- what loads every body along a motion: by its frame's acceleration, from outboard, by its
+# modes
+#
+# With the stiffness K u = f of one arm in nodal displacements, the loads of an instant are
+#
+#     f = L c,   L = [M 1_x, M 1_y, M S X, M X, F_x, F_y, T, M V, M S V],
+#     c = -(a_x, a_y, wd, -w^2, F_x, F_y, T, qdd - w^2 q, wd q + 2 w qd),
+#
+# the inertia of the frame's acceleration and rotation, unit force and moment at the outboard
+# interface, and the inertia of the elastic motion, its Coriolis and centrifugal parts included. An
+# elastic coordinate that never moves feels any of them through its own row: it is given that one
+# load alone, and its residual is -c. So c, and its derivatives, follow from the equations of motion
+# as they are, whatever drives or closes the machine.
+
+
+@dataclass(frozen=True)
+class LoadCounts:
+    """How many entries of c a body has, in their order.
+
+    Attributes:
+        frame: of the frame's acceleration and rotation: 4, in space 12.
+        outboard: force and moment at the outboard interfaces: 3, in space 6 of each.
+        elastic: of the inertia of the elastic motion: 2 q, in space 9 q.
+    """
+
+    frame: int
+    outboard: int
+    elastic: int
+
+    @property
+    def total(self) -> int:
+        """All of them: 7 + 2 q, in space 18 + 9 q."""
+        return self.frame + self.outboard + self.elastic
+
+
+def load_counts(body: ShapeIntegrals) -> LoadCounts:
+    """Return the numbers of entries of c of a body."""
+    (d, _), g = body.w.shape, len(body.W)
+    return LoadCounts(d + g, len(body.outboard), g * body.num_modes)
+
+
+def load_coefficients(
+    system: Problem,
+    t: np.ndarray,
+    rates: Rates,
+    motion: RigidMotion | None = None,
+) -> list[np.ndarray]:
+    """Return c (n, 7 + 2 q) of every body, see above; m/s2, 1/s2, N, N m and modes per s2.
+
+    In space they are 18 + 9 q: a, A_ab, force, moment, and A_ab q + 2 Omega_ab qd + delta_ab qdd.
+
+    Args:
+        system: what moves.
+        t: (n,) instants, s.
+        rates: its unknowns and their derivatives there, each (n, S).
+        motion: its rigid coordinates there, if they are known: of prescribed ones a short cut.
+    """
+    if isinstance(system, ElasticSystem) and motion is not None:
+        found = []
+        mechanism = system.mechanism
+        loads = body_loads(mechanism, motion, rates)
+        constants = mechanism.modal_constants
+        for (p, w), part, own in zip(loads, mechanism.slices, constants, strict=True):
+            q, qd, qdd = rates
+            modal = ModalDisplacement(own.L, (q[:, part], qd[:, part], qdd[:, part]))
+            w, wd = w[:, None], p[:, 2, None]
+            radial, around = modal.zdd - w * w * modal.z, wd * modal.z + 2.0 * w * modal.zd
+            found.append(-np.hstack([p, radial, around]))
+        return found
+    probe = _Probe(system)
+    rows = probe.system.at(t).residual(*(probe.spread(x) for x in rates))
+    return [-rows[:, part] for part in probe.places]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadGradient:
+    """Derivatives of a function of the load coefficients.
+
+    Attributes:
+        by_rates: (3, n, S) by the system's unknowns and their derivatives.
+        by_bodies: by the shape integrals of every body, unknowns held.
+    """
+
+    by_rates: np.ndarray
+    by_bodies: list[ShapeIntegrals]
+
+
+def load_gradient(
+    system: Problem,
+    t: np.ndarray,
+    rates: Rates,
+    by_coefficients: Sequence[np.ndarray],
+) -> LoadGradient:
+    """Differentiate a function of `load_coefficients`, given its derivatives by them.
+
+    Args:
+        system, t, rates: as there.
+        by_coefficients: (n, 7 + 2 q or 18 + 9 q) of every body.
+    """
+    probe = _Probe(system)
+    at = tuple(probe.spread(x) for x in rates)
+    multipliers = np.zeros((len(t), probe.system.num_coordinates))
+    for part, by in zip(probe.places, by_coefficients, strict=True):
+        multipliers[:, part] = -by
+    tangent = probe.system.at(t).linearise(*at)
+    by_rates = np.stack(tangent.transposed(multipliers))[:, :, probe.own]
+    y, yd, ydd = at
+    wide = probe.system.body_gradient(t, y, yd, ydd, multipliers)
+    parts = [
+        in_basis(by, np.eye(by.num_modes)[:, : body.num_modes])
+        for by, body in zip(wide, system.mechanism.bodies, strict=True)
+    ]
+    return LoadGradient(by_rates, parts)
+
+
+class _Probe:
+    """A system whose bodies have a coordinate more for every load, which stays at zero.
+
+    Attributes:
+        system: the larger one.
+        own: (S,) places of the system's unknowns among its.
+        places: of the added coordinates of every body.
+    """
+
+    def __init__(self, system: Problem):
+        mechanism: ElasticBodies = system.mechanism
+        first = system.elastic_columns.start or 0
+        own = list(range(first))
+        self.places: list[slice] = []
+        end = first
+        for body in mechanism.bodies:
+            q, more = body.num_modes, load_counts(body).total
+            own += range(end, end + q)
+            self.places.append(slice(end + q, end + q + more))
+            end += q + more
+        rest = system.num_coordinates - first - mechanism.num_coordinates
+        self.own = np.array([*own, *range(end, end + rest)], dtype=int)
+        self._size = end + rest
+        bodies = tuple(map(_with_probes, mechanism.bodies))
+        change: dict[str, Any] = {"mechanism": replace(mechanism, bodies=bodies)}
+        self.system: Any = replace(system, **change)
+
+    def spread(self, x: np.ndarray) -> np.ndarray:
+        """Return the larger system's unknowns (n, S + ...) of the system's (n, S)."""
+        out = np.zeros((len(x), self._size))
+        out[:, self.own] = x
+        return out
+
+
+def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
+    """Return the body with one coordinate more for every entry of c, which alone loads it."""
+    q, more = body.num_modes, load_counts(body).total
+    wide = in_basis(body, np.eye(q, q + more))
+    w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
+    k = 1 + q + np.arange(more)  # beside the reference position and the modes
+    if len(body.W) == len(SPACE):
+        _probe_space(w, W, outboard, k)
+        K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
+        return replace(wide, w=w, W=W, outboard=outboard, K=K)
+    w[0, k[0]] = w[1, k[1]] = 1.0  # C
+    W[1, k[2], 0], W[1, 0, k[2]] = 1.0, -1.0  # r
+    W[0, k[3], 0] = W[0, 0, k[3]] = 1.0  # j
+    outboard[[0, 1, 2], q + np.array([4, 5, 6])] = 1.0
+    modes, radial, around = 1 + np.arange(q), k[7 : 7 + q], k[7 + q :]
+    W[0, radial, modes] = W[0, modes, radial] = 1.0  # M
+    W[1, around, modes], W[1, modes, around] = 1.0, -1.0  # G
+    K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
+    return replace(wide, w=w, W=W, outboard=outboard, K=K)
+
+
+def _probe_space(w: np.ndarray, W: np.ndarray, outboard: np.ndarray, k: np.ndarray) -> None:
+    """Give the coordinates k of a spatial body one load each, in the order of c."""
+    b = len(outboard)
+    q = (len(k) - 12 - b) // 9
+    partners = np.arange(9).reshape(3, 3).T.ravel()  # W_ba = W_ab'
+    w[np.arange(3), k[:3]] = 1.0
+    for ab in range(9):
+        at = k[3 + ab]
+        W[ab, at, 0] = W[partners[ab], 0, at] = 1.0
+        first = 12 + b + ab * q
+        own, modes = k[first : first + q], 1 + np.arange(q)
+        W[ab, own, modes] = W[partners[ab], modes, own] = 1.0
+    outboard[np.arange(b), k[12 : 12 + b] - 1] = 1.0

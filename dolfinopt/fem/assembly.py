@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
+
+from dolfinopt.fem.elements import ElementOperators
 
 
 class AffineMatrix:
@@ -279,3 +284,448 @@ class InteriorMatrix:
         # Forgotten whenever values change; without them MUMPS pivots.
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setOption(PETSc.Mat.Option.SPD, True)
+
+
+# -- nodal fields on cells, and energies cell by cell: derivatives by the material of each cell
+#
+# d is the number of directions.
+
+
+def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
+    """Return the cells' nodal values (n_cells, dn, k) less their mean, which has no energy.
+
+    Rounding is then relative to the differences within a cell, not to its displacement.
+
+    Args:
+        operators: of the arm.
+        field: (n_nodes, d, k).
+    """
+    num_cells, num_nodes = operators.cells.shape
+    flat = field.reshape(len(field), -1)
+    # Node by node: rows are contiguous, which a mean over the nodes' axis is not.
+    corners = [flat[nodes] for nodes in operators.cells.T]
+    mean = corners[0].copy()
+    for corner in corners[1:]:
+        mean += corner
+    mean /= num_nodes
+    values = np.empty((num_cells, num_nodes, flat.shape[1]))
+    for k, corner in enumerate(corners):
+        np.subtract(corner, mean, out=values[:, k])
+    return values.reshape(num_cells, field.shape[1] * num_nodes, field.shape[2])
+
+
+def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return nodal fields (n_nodes, d, k) times coefficients (k, m), as one matrix product."""
+    flat = field.reshape(field.shape[0] * field.shape[1], field.shape[2]) @ coefficients
+    return flat.reshape(*field.shape[:2], coefficients.shape[1])
+
+
+def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
+    """Return the nodal field (n_nodes, d, k) of the cells' forces (n_cells, n, d, k)."""
+    cells, shape = operators.cells, forces.shape[2:]
+    corners = sp.csr_matrix(
+        (np.ones(cells.size), cells.ravel(), np.arange(cells.size + 1)),
+        shape=(cells.size, len(operators.points)),
+    )
+    return (corners.T @ forces.reshape(cells.size, -1)).reshape(-1, *shape)
+
+
+def stiffness_products(
+    operators: ElementOperators, left: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
+    return _products(
+        operators.stiffness, cell_values(operators, left), cell_values(operators, right)
+    )
+
+
+def mass_products(operators: ElementOperators, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
+    cells = operators.cells
+    shape = (*cells.shape, -1)  # all components and columns alike
+    return _products(operators.mass, left[cells].reshape(shape), right[cells].reshape(shape))
+
+
+def _products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return sum_k left' A_e right (n_cells,) for (n_cells, n, n) and (n_cells, n, k)."""
+    return np.einsum("eik,eik->e", left, elements @ right)
+
+
+# -- meshes whose cells are all alike: one element matrix for all, and dense products with it ----
+#
+# Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells;
+# d is the number of directions.
+
+# Largest difference of the cells' matrices from their mean, in its largest entry: rounding of the
+# nodes' places, 1e-16 m in cells of 1 mm, and what Gmsh adds to it in a file's grid.
+ALIKE = 1e-11
+
+
+def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
+    """Return the mean of all ranks' matrices (n_cells, ...) that are the same but for rounding.
+
+    Or None; collective. One of them and the mean difference from it: the rounding of a sum over
+    all cells would resist motions of a rigid cell with up to 1e-11 of its stiffness.
+    """
+    count = comm.allreduce(len(matrices))
+    if count == 0:
+        return None
+    one = len(matrices) == 0 or (len(matrices) > 1 and matrices.strides[0] == 0)
+    if comm.allreduce(one, op=MPI.LAND):  # computed once on every rank already
+        matrices, count = matrices[:1], comm.allreduce(min(len(matrices), 1))
+    some = comm.allgather(matrices[0].copy() if len(matrices) else None)
+    first = next(one for one in some if one is not None)
+    mean = first + comm.allreduce((matrices - first).sum(axis=0)) / count
+    error = comm.allreduce(np.abs(matrices - mean).max(initial=0.0), op=MPI.MAX)
+    return mean if error <= ALIKE * np.abs(mean).max() else None
+
+
+class UniformCells:
+    """The cells of one rank, all alike; n nodes a cell.
+
+    Attributes:
+        operators: of the arm.
+        stiffness: (dn, dn) of any cell, see `ElementOperators`.
+        mass: (n, n).
+    """
+
+    def __init__(self, operators: ElementOperators, stiffness: np.ndarray, mass: np.ndarray):
+        self.operators, self.stiffness, self.mass = operators, stiffness, mass
+        self._corners = np.ascontiguousarray(operators.cells.T)
+        count = self._corners.size
+        self._sum = sp.csr_matrix(
+            (np.ones(count), (self._corners.ravel(), np.arange(count))),
+            shape=(len(operators.points), count),
+        )
+
+    def values(self, field: np.ndarray) -> np.ndarray:
+        """Return the cells' nodal values (n, d, k, n_cells) of a field (n_nodes, d, k)."""
+        nodes, columns = self._corners, field.shape[1] * field.shape[2]
+        flat = np.ascontiguousarray(field.reshape(len(field), columns).T)
+        out = np.empty((len(nodes), columns, nodes.shape[1]))
+        for corner, found in zip(nodes, out, strict=True):
+            np.take(flat, corner, axis=1, out=found, mode="clip")
+        return out.reshape(len(nodes), *field.shape[1:], nodes.shape[1])
+
+    def sum_at_nodes(self, forces: np.ndarray) -> np.ndarray:
+        """Return the nodal field (n_nodes, d, k) of the cells' forces (n, d, k, n_cells)."""
+        n, *shape, count = forces.shape
+        rows = forces.reshape(n, -1, count).swapaxes(1, 2).reshape(n * count, -1)
+        return (self._sum @ rows).reshape(-1, *shape)
+
+    # -- without translations ----------------------------------------------------------------
+
+    @property
+    def num_nodes(self) -> int:
+        """Number n of a cell's nodes."""
+        return len(self._corners)
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return self._corners.shape[1]
+
+    def by_component(self, *fields: np.ndarray) -> np.ndarray:
+        """Return fields (n_nodes, d, k), side by side, as `differences` takes them."""
+        ends = np.cumsum([0, *(field.shape[2] for field in fields)])
+        out = np.empty((fields[0].shape[1], ends[-1], len(fields[0])))
+        for field, first, last in zip(fields, ends, ends[1:], strict=False):
+            out[:, first:last] = field.transpose(1, 2, 0)
+        return out.reshape(-1, len(fields[0]))
+
+    def differences(self, rows: np.ndarray, cells: slice = slice(None)) -> np.ndarray:
+        """Return values of the cells' nodes but the first, less the first's (n - 1, d k, cells).
+
+        They are what strains a cell: rounding is relative to them.
+
+        Args:
+            rows: (d k, n_nodes), see `by_component`.
+            cells: which.
+        """
+        first, *others = self._corners[:, cells]
+        out = np.empty((len(others), len(rows), len(first)))
+        origin = rows.take(first, axis=1, mode="clip")
+        for corner, found in zip(others, out, strict=True):
+            np.take(rows, corner, axis=1, out=found, mode="clip")
+            found -= origin
+        return out
+
+    def cell_rows(self, columns: int) -> np.ndarray:
+        """Return room for derivatives by `differences`, (n - 1, n_cells, columns)."""
+        return np.empty((self.num_nodes - 1, self.count, columns))
+
+    def sum_of_differences(self, rows: np.ndarray) -> np.ndarray:
+        """Return nodal derivatives (n_nodes, columns) of those by `differences`, `cell_rows`."""
+        return self._sum_differences @ rows.reshape(-1, rows.shape[2])
+
+    @cached_property
+    def _sum_differences(self) -> sp.csr_matrix:
+        first = self._sum[:, : self.count]
+        return sp.csr_matrix(self._sum[:, self.count :] - sp.hstack([first] * (self.num_nodes - 1)))
+
+    def difference_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return what `stiffness_products` does, given both fields' `differences`."""
+        dim = self.operators.points.shape[1]
+        stiffness = self.stiffness[dim:, dim:]
+        return _sum_of_products(left, stiffness @ right.reshape(len(stiffness), -1))
+
+    # -- energies ----------------------------------------------------------------------------
+
+    def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
+        values = self.centred(right)
+        products = self.stiffness @ values.reshape(len(self.stiffness), -1)
+        if left is not right:
+            values = self.centred(left)
+        return _sum_of_products(values, products)
+
+    def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
+        values = self.values(right)
+        return _sum_of_products(self.values(left), self.mass @ values.reshape(len(values), -1))
+
+    def energy_matrix(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
+        """Return field' K field (k, k) of this rank's cells."""
+        values = self.centred(field).reshape(-1, field.shape[2], len(young))
+        products = self.stiffness @ values.reshape(len(values), -1)
+        products = products.reshape(values.shape) * young
+        return np.matmul(values, products.swapaxes(1, 2)).sum(axis=0)
+
+    def centred(self, field: np.ndarray) -> np.ndarray:
+        """Return `values` less their mean, which has no energy, see `cells.cell_values`."""
+        values = self.values(field)
+        values -= values.mean(axis=0)
+        return values
+
+
+def uniform_cells(comm: MPI.Comm, operators: ElementOperators) -> UniformCells | None:
+    """Return the cells of this rank, if those of all ranks are alike (collective).
+
+    Their operators then have exactly the same matrices. What is assembled from these knows no
+    rounding of the nodes' places; and the same mean belongs in the other operators of a cell, or
+    rotations of a cell would strain it by that rounding.
+    """
+    stiffness, mass = single(comm, operators.stiffness), single(comm, operators.mass)
+    if stiffness is None or mass is None:
+        return None
+    same = replace(
+        operators,
+        stiffness=np.broadcast_to(stiffness, operators.stiffness.shape),
+        mass=np.broadcast_to(mass, operators.mass.shape),
+    )
+    return UniformCells(same, stiffness, mass)
+
+
+def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the sum of left times right over all axes but the last, the cells'."""
+    rows = left.reshape(-1, left.shape[-1])
+    return np.einsum("ie,ie->e", rows, right.reshape(rows.shape))
+
+
+# -- geometric stiffness of cells that are all alike: one tensor of third order for all of them
+#
+# What strains a cell are the differences of its nodes' displacements from its first node's, n - 1
+# of each component for n nodes. With those a of the modes and u of the fields whose stress stiffens
+#
+#     K0[i, j] = sum_e E_e sum_bcd T[bc, d] u_d (a_ib . a_jc)
+#
+# needs no quadrature points: bilinear cells have 6 products bc of differences where four points
+# have 3 stresses each, and all products with T are dense matrix products over many cells.
+
+# Entries of the products of the modes' differences at a time: they stay in the cache; and the least
+# cells at a time, for more modes.
+CHUNK, LEAST = 120_000, 256
+# NumPy copies factors that it repeats along an axis into buffers, unless rows are longer than
+# these: by default 8192, which takes longer than the products.
+BUFFER = 256
+
+
+class UniformStress:
+    """The tensor T of cells that are all alike; r = n - 1 differences of each component.
+
+    Attributes:
+        cells: which.
+        tensor: (r (r + 1) / 2, d r) T, b <= c; of b < c twice as much, for c and b.
+    """
+
+    def __init__(self, cells: UniformCells, derivatives: np.ndarray, stress: np.ndarray):
+        """Set up from the operators of one cell, see `Quadrature`: (dp, n) and (sp, dn)."""
+        self.cells = cells
+        dim = cells.operators.points.shape[1]
+        kinds = 3 if dim == 2 else 6
+        # Of a translation neither is left: the first node's columns are minus the others' sum.
+        D = derivatives.reshape(-1, dim, derivatives.shape[1])[:, :, 1:]
+        S = stress.reshape(len(D), kinds, -1)[:, :, dim:]
+        products = np.einsum("pxb,pyc->pxybc", D, D)
+        T = np.einsum("pd,pbc->bcd", S[:, 0], products[:, 0, 0])
+        for k in range(1, dim):
+            T += np.einsum("pd,pbc->bcd", S[:, k], products[:, k, k])
+        for k, (x, y) in enumerate(((0, 1), (1, 2), (2, 0))[: kinds - dim], dim):
+            T += np.einsum("pd,pbc->bcd", S[:, k], products[:, x, y] + products[:, y, x])
+        b, c = np.triu_indices(D.shape[2])
+        self.tensor = np.where(b == c, 1.0, 2.0)[:, None] * T[b, c]
+
+    def of(self, fields: np.ndarray, young: np.ndarray, V: np.ndarray) -> StiffenedModes:
+        """Return the geometric stiffness of modes by the stress of fields.
+
+        Args:
+            fields: (n_nodes, d, loads) whose stress stiffens.
+            young: (n_cells,).
+            V: (n_nodes, d, q) modes.
+        """
+        return StiffenedModes(self, fields, young, V)
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """Some of the cells, so many that what is made of them stays in the cache.
+
+    Attributes:
+        cells: which.
+        young: theirs.
+        a: (r, d, q, cells) differences of the modes.
+        u: (r, d, loads, cells) those of the fields.
+        force: (bc, loads, cells) what E times the products of differences is multiplied by.
+    """
+
+    cells: slice
+    young: np.ndarray
+    a: np.ndarray
+    u: np.ndarray
+    force: np.ndarray
+
+
+class StiffenedModes:
+    """K0 of some modes of one design by the stress of some fields, and its derivatives.
+
+    What the value has gathered its derivatives do not gather again.
+    """
+
+    def __init__(self, tensor: UniformStress, fields: np.ndarray, young: np.ndarray, V: np.ndarray):
+        """See `UniformStress.of`."""
+        self._tensor, self._shape = tensor, (V.shape[2], fields.shape[2])
+        cells, count = tensor.cells, len(young)
+        b, c = np.triu_indices(cells.num_nodes - 1)
+        self._pairs = list(zip(b, c, strict=True))
+        step = max(CHUNK // (len(b) * V.shape[2] ** 2), LEAST)
+        runs = [slice(i, min(i + step, count)) for i in range(0, count, step)]
+        rows = cells.by_component(V, fields)
+        self._runs = [self._run(run, rows, young[run]) for run in runs]
+
+    def _run(self, cells: slice, rows: np.ndarray, young: np.ndarray) -> _Run:
+        (q, loads), T = self._shape, self._tensor.tensor
+        values = self._tensor.cells.differences(rows, cells)
+        values = values.reshape(len(values), -1, q + loads, len(young))
+        a, u = values[:, :, :q].copy(), values[:, :, q:].copy()
+        force = T @ u.reshape(T.shape[1], -1)
+        return _Run(cells, young, a, u, force.reshape(len(T), loads, -1))
+
+    def stiffness(self) -> np.ndarray:
+        """Return K0 (loads, q, q) of this rank's cells."""
+        q, loads = self._shape
+        half = np.zeros((loads, q * q))
+        for run, products in self._products():
+            half += np.matmul(run.force, products.swapaxes(1, 2)).sum(axis=0)
+        K0 = half.reshape(loads, q, q)
+        return 0.5 * (K0 + K0.swapaxes(1, 2))
+
+    def gradient(
+        self, by_K0: np.ndarray, compliance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Differentiate a function of K0, given its derivative by K0 (loads, q, q), any symmetry.
+
+        Args:
+            by_K0: the derivative.
+            compliance: C (b, b), where the last b fields are u_F = Psi C with the first b modes
+                Psi: their derivatives are then among those by the modes.
+
+        Returns:
+            Its derivatives by the modes (n_nodes, d, q) and by the fields, or those but the last
+            b, (n_nodes, d, loads), contributions of this rank's cells; by Young's modulus
+            (n_cells,), both held; and Psi' times the derivatives by u_F (b, b), or None.
+        """
+        (q, loads), cells, T = self._shape, self._tensor.cells, self._tensor.tensor
+        symmetric = (0.5 * (by_K0 + by_K0.swapaxes(1, 2))).reshape(loads, -1)
+        # Of b = c both factors are the same.
+        twice = np.array([2.0 if b == c else 1.0 for b, c in self._pairs])
+        weighted = twice[:, None, None] * symmetric.T
+        b = 0 if compliance is None else len(compliance)
+        dim, columns = cells.operators.points.shape[1], q + loads - b
+        rows, by_young = cells.cell_rows(dim * columns), np.empty(cells.count)
+        work = np.zeros((b, b))
+        for run, products in self._products():
+            count = len(run.young)
+            by = np.empty((*run.u.shape[:2], columns, count))
+            by_u = T.T @ np.matmul(symmetric, products).reshape(len(T), -1)
+            by_u = by_u.reshape(run.u.shape)
+            by[:, :, q:] = by_u[:, :, : loads - b]
+            by_a = self._by_modes(run.a, np.matmul(weighted, run.force))
+            # Of second degree in a: a times the derivative by it is twice the value.
+            energy = np.einsum("ie,ie->e", run.a.reshape(-1, count), by_a.reshape(-1, count))
+            by_young[run.cells] = 0.5 * energy
+            np.multiply(by_a, run.young, out=by[:, :, :q])
+            if compliance is not None:
+                outboard = by_u[:, :, loads - b :]
+                by[:, :, :b] += np.matmul(compliance.T, outboard)
+                work += np.matmul(run.a[:, :, :b], outboard.swapaxes(2, 3)).sum(axis=(0, 1))
+            rows[:, run.cells] = by.reshape(len(by), -1, count).swapaxes(1, 2)
+        nodal = cells.sum_of_differences(rows).reshape(-1, dim, columns)
+        return nodal[:, :, :q], nodal[:, :, q:], by_young, work if b else None
+
+    def stiffness_products(self, left: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,) of the first fields.
+
+        Args:
+            left: (n_nodes, d, q).
+            adjoint: (n_nodes, d, k).
+        """
+        cells, k = self._tensor.cells, adjoint.shape[2]
+        rows, out = cells.by_component(left, adjoint), np.empty(cells.count)
+        for run in self._runs:
+            values = cells.differences(rows, run.cells)
+            right = np.concatenate([run.a, -run.u[:, :, :k]], axis=2)
+            out[run.cells] = cells.difference_products(values, right.reshape(values.shape))
+        return out
+
+    def _products(self) -> Iterator[tuple[_Run, np.ndarray]]:
+        """Yield runs of cells, and E a_ib . a_jc there (bc, q q, cells)."""
+        q = self._shape[0]
+        for run in self._runs:
+            count, stiff = len(run.young), run.a * run.young
+            found = np.empty((len(self._pairs), q, q, count))
+            both = np.empty((run.a.shape[1], q, q, count))
+            with short_buffers():
+                for out, (b, c) in zip(found, self._pairs, strict=True):
+                    np.multiply(stiff[b][:, :, None], run.a[c][:, None], out=both)
+                    np.add(both[0], both[1], out=out)
+                    for more in both[2:]:
+                        out += more
+            yield run, found.reshape(len(found), q * q, count)
+
+    def _by_modes(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the derivatives by differences a (r, d, q, cells), given those by products.
+
+        Args:
+            a: of the modes.
+            weights: (bc, q q, cells), symmetric in the modes, doubled for b = c.
+        """
+        q, found, term = a.shape[2], np.empty_like(a), np.empty_like(a[0])
+        each = list(zip(weights.reshape(-1, q, q, a.shape[3]), self._pairs, strict=True))
+        for weight, (b, c) in each:
+            if b == c:
+                np.einsum("ije,xje->xie", weight, a[b], out=found[b])
+        for weight, (b, c) in each:
+            if b != c:
+                found[b] += np.einsum("ije,xje->xie", weight, a[c], out=term)
+                found[c] += np.einsum("ije,xje->xie", weight, a[b], out=term)
+        return found
+
+
+@contextmanager
+def short_buffers() -> Iterator[None]:
+    """Let NumPy multiply rows of more than `BUFFER` entries without copies."""
+    before = np.setbufsize(BUFFER)
+    try:
+        yield
+    finally:
+        np.setbufsize(before)

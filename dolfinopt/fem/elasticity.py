@@ -19,17 +19,28 @@ from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs, UniformMatrix
-from dolfinopt.fem.cells import cell_values, mass_products, stiffness_products
-from dolfinopt.fem.constraint_modes import (
+from dolfinopt.fem.assembly import (
+    AffineMatrix,
+    BlockMatrix,
+    NodePairs,
+    UniformMatrix,
+    UniformStress,
+    cell_values,
+    mass_products,
+    single,
+    stiffness_products,
+    uniform_cells,
+)
+from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
+from dolfinopt.fem.interface import (
+    Connectivity,
     ConstraintModes,
+    InterfaceTransformation,
     StaticFields,
+    joins,
     static_fields,
     static_modes,
 )
-from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
-from dolfinopt.fem.floating import Connectivity, joins
-from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.interior import (
     TETRAHEDRA,
     ExtendedStiffness,
@@ -38,8 +49,6 @@ from dolfinopt.fem.interior import (
     InteriorSystem,
 )
 from dolfinopt.fem.stress import element_centres, stress_operator
-from dolfinopt.fem.uniform import single, uniform_cells
-from dolfinopt.fem.uniform_stress import UniformStress
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together

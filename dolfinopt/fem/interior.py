@@ -33,7 +33,7 @@ from dolfinopt.solver import (
 )
 
 if TYPE_CHECKING:
-    from dolfinopt.fem.block_gradients import BlockConjugateGradients
+    from dolfinopt.fem.multigrid import BlockConjugateGradients
 
 Columns = Callable[[np.ndarray], np.ndarray]
 ITERATIVE = "conjugate gradients"  # name of that solver
@@ -200,7 +200,7 @@ class InteriorSystem:
 
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:
-        from dolfinopt.fem.block_gradients import BlockConjugateGradients
+        from dolfinopt.fem.multigrid import BlockConjugateGradients
 
         self._tell_rigid_motions()
         return BlockConjugateGradients(self._stiffness.mat, self.tolerance)

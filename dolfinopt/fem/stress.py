@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING
 import basix
 import numpy as np
 
-from dolfinopt.fem.cells import sum_at_nodes
-from dolfinopt.fem.elements import ElementOperators, elasticity, gauss_points
-from dolfinopt.fem.elements.geometry import KINDS, by_cells
+from dolfinopt.fem.assembly import sum_at_nodes
+from dolfinopt.fem.elements import KINDS, ElementOperators, by_cells, elasticity, gauss_points
 from dolfinopt.fem.geometric_stiffness import UnitLoads, static_response
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh

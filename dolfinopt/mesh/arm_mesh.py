@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -13,10 +14,9 @@ from scipy.spatial import cKDTree
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.cells import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
+from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import build_model
-from dolfinopt.mesh.gmsh_session import gmsh_on_root, mesh_geo
-from dolfinopt.mesh.groups import FURTHER, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.gmsh_session import FURTHER, INBOARD, OUTBOARD, PASSIVE, gmsh_on_root, mesh_geo
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
 
@@ -133,13 +133,9 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         if pattern is not None:
             ends = like.passive_columns * arm.length / arm.cells[0]
         if len(arm.cells) == 3:
-            from dolfinopt.mesh.box import box_arm
-
             size = arm.length, arm.height, arm.thickness
             mesh = box_arm(comm, arm.name, size, arm.cells, ends)
             if arm.interfaces:
-                from dolfinopt.mesh.interfaces import with_interfaces
-
                 mesh = with_interfaces(mesh, arm, ends)
             return with_regions(mesh, like, scales)
         mesh = structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, ends)
@@ -211,7 +207,7 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
 
 def _solid_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     """Mesh a solid arm from its file, see `file_arm`."""
-    from dolfinopt.mesh.solid_model import build_solid
+    from dolfinopt.mesh.geometry import build_solid
 
     with gmsh_on_root(comm) as gmsh:
         points = on_root(comm, build_solid, gmsh, arm)
@@ -328,3 +324,113 @@ def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
         return first, second, area, distance
     a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
     return first, second, np.linalg.norm(a - b, axis=1), distance
+
+
+# -- solid arms that are boxes: grids of hexahedra -----------------------------------------------
+
+
+def box_arm(
+    comm: MPI.Comm,
+    name: str,
+    size: tuple[float, float, float],
+    cells: tuple[int, int, int],
+    passive: float = 0.0,
+) -> ArmMesh:
+    """Mesh a box with `cells` (along, height, thickness) hexahedra (collective).
+
+    x runs along from the inboard joint axis, y along the height and z along the thickness, both
+    from the middle. The interfaces are the faces x = 0 and x = length.
+
+    Args:
+        comm: ranks that share the arm.
+        name: the arm's name.
+        size: length, height, thickness, m.
+        cells: number in these directions.
+        passive: length kept solid at both ends, m; whole layers of cells whose centre lies within.
+    """
+    length, height, thickness = size
+    low = np.array([0.0, -0.5 * height, -0.5 * thickness])
+    high = np.array([length, 0.5 * height, 0.5 * thickness])
+    mesh = compat.box_mesh(comm, low, high, cells)
+    with together(comm):
+        for k in range(3):
+            snap(mesh.geometry.x[:, k], low[k], size[k] / cells[k])
+    ends = [compat.facets_on(mesh, x, 0.25 * length / cells[0]) for x in (0.0, length)]
+    with together(comm):
+        owned, _ = compat.local_cell_counts(mesh)
+        corners = compat.cell_coordinates(mesh, owned)
+        centroid = corners.mean(axis=1)
+        layers = math.ceil(passive / length * cells[0] - 0.5)  # as in meshes/arm.geo
+        layer = np.floor(centroid[:, 0] / length * cells[0])
+        return ArmMesh(
+            name=name,
+            comm=comm,
+            mesh=mesh,
+            centroid=centroid,
+            area=cell_volumes(corners),
+            passive=(layer < layers) | (layer >= cells[0] - layers),
+            void=np.zeros(owned, dtype=bool),
+            inboard_facets=ends[0],
+            outboard_facets=ends[1],
+            outboard_point=np.array([length, 0.0, 0.0]),
+        )
+
+
+# -- further outboard interfaces of a box: the sides of its cells near a point of its surface ----
+
+NEAR = 1.0 + 1e-9  # of the radius: a side as far from the point as it is long belongs to it
+
+
+def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
+    """Return a box with the arm's interfaces and solid cells around them (collective on it).
+
+    Args:
+        mesh: of the box.
+        arm: has the interfaces.
+        passive: length kept solid around interfaces, m.
+
+    Raises:
+        InputError: an interface has no side of a cell, or one of another interface's.
+    """
+    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
+    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
+    around = np.array(facet_corners(3, corners.shape[1]))
+    sides = corners[:, around]  # (cells, sides, corners, 3)
+    middles, outer = sides.mean(axis=2), _outer(mesh, sides.mean(axis=2), arm)
+    taken = np.isin(facets, np.concatenate([mesh.inboard_facets, mesh.outboard_facets]))
+    found, solid = [], mesh.passive.copy()
+    for one in arm.interfaces:
+        point = np.array(one.point)
+        assert one.radius is not None
+        distance = np.linalg.norm(middles - point, axis=2)
+        own = outer & (distance <= NEAR * one.radius)
+        problem = _problem(mesh.comm, own, own & taken, distance[outer])
+        with together(mesh.comm):
+            if problem:
+                raise InputError(
+                    f"arm {arm.name!r}: interface {one.name!r}: {problem}; change its point "
+                    f"{list(one.point)} or radius {one.radius:g} [m]"
+                )
+        taken |= own
+        found.append(InterfaceFacets(one.name, np.unique(facets[own]), point))
+        places = np.concatenate(mesh.comm.allgather(middles[own]))
+        solid |= cKDTree(places).query(mesh.centroid)[0] < passive
+    return replace(mesh, further=tuple(found), passive=solid)
+
+
+def _outer(mesh: ArmMesh, middles: np.ndarray, arm: scenes.Arm) -> np.ndarray:
+    """Return True (cells, sides) for the sides on the surface of the box."""
+    low = np.array([0.0, -0.5 * arm.height, -0.5 * arm.thickness])
+    high = np.array([arm.length, 0.5 * arm.height, 0.5 * arm.thickness])
+    assert arm.cells is not None
+    size = 1e-3 * (high - low) / np.array(arm.cells)
+    return ((middles - low < size) | (high - middles < size)).any(axis=2)
+
+
+def _problem(comm: MPI.Comm, own: np.ndarray, taken: np.ndarray, distance: np.ndarray) -> str:
+    """Return why the sides cannot be an interface, "" if they can (collective)."""
+    least = comm.allreduce(distance.min(initial=np.inf), op=MPI.MIN)
+    count, other = comm.allreduce(np.array([own.sum(), taken.sum()]))
+    if count == 0:
+        return f"the nearest side of a cell on the arm's surface has its middle {least:.4g} m away"
+    return "it has sides of cells that belong to another interface" if other else ""

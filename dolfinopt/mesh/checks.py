@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.groups import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.scene.tables.arms import Arm
 
 # How far an interface's middle may be off its joint axis and the mesh's height off `height`,
@@ -210,3 +211,179 @@ def remedy(found: float, expected: float, keys: str = "length and height") -> st
     if expected > 0.0 and 900.0 < found / expected < 1100.0:
         return "lengths are in metres, these look like millimetres"
     return f"correct the geometry, or {keys} in the scene"
+
+
+# -- whether cells in space can be a solid: no flat, folded or overlapping ones, one part --------
+
+FLAT = 1e-6  # volume of a cell over the cube of its longest edge, below which it has none
+
+
+def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
+    """Check the cells of a mesh file.
+
+    Args:
+        points: (n_points, 3) m.
+        cells: (n, 4 or 8) points of tetrahedra or hexahedra, in DOLFINx's order.
+
+    Raises:
+        InputError: coordinates that are no numbers; flat, folded or overlapping cells; several
+            parts.
+    """
+    corners = points[cells]
+    _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
+    longest = np.ptp(corners, axis=1).max(axis=1)
+    _refuse(cell_volumes(corners) < FLAT * longest**3, corners, "are flat")
+    if cells.shape[1] == 8:
+        _refuse(_folded(corners, FLAT * longest**3), corners, "are folded")
+    _refuse(
+        _overlapping(corners, facet_keys(cells)),
+        corners,
+        "overlap others (inverted cells, or volumes on top of each other)",
+    )
+    _check_parts(cells)
+
+
+def _refuse(bad: np.ndarray, corners: np.ndarray, what: str) -> None:
+    """Raise InputError if any of the cells (n,) is bad."""
+    if bad.any():
+        place = ", ".join(f"{x:.4g}" for x in corners[bad][0].mean(axis=0))
+        raise InputError(f"{bad.sum()} cells {what}, the first at ({place}) m; repair the mesh")
+
+
+def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
+    """Return (n,) True for hexahedra that turn one way at a corner, the other way at another."""
+    grid = corners.reshape(-1, 2, 2, 2, 3)  # z, y, x
+    edges = [np.diff(grid, axis=axis) for axis in (3, 2, 1)]
+    shape = grid.shape
+    J = np.stack([np.broadcast_to(edge, shape) for edge in edges], axis=4)
+    turn = np.linalg.det(J).reshape(-1, 8)
+    found: np.ndarray = (turn.min(axis=1) < -tiny) & (turn.max(axis=1) > tiny)
+    return found
+
+
+def facet_keys(cells: np.ndarray) -> np.ndarray:
+    """Return numbers (facets, n) that are the same for two cells on both sides of a facet."""
+    sides = facet_corners(3, cells.shape[1])
+    return np.stack([keys_of(cells[:, side], int(cells.max())) for side in sides])
+
+
+def keys_of(facets: np.ndarray, largest: int) -> np.ndarray:
+    """Return a number (n,) for the corners of each facet (n, 3 or 4), in any order.
+
+    The three smallest corners tell facets apart.
+    """
+    first, second, third = np.sort(facets, axis=1)[:, :3].T.astype(np.int64)
+    return np.asarray((first * (largest + 1) + second) * (largest + 1) + third)
+
+
+def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """Return (n,) True for cells that lie on one side of a facet with a neighbour.
+
+    Args:
+        corners: (n, 4 or 8, 3) m.
+        keys: (facets, n) of the cells' facets.
+    """
+    count, bad = len(corners), np.zeros(len(corners), dtype=bool)
+    order = np.argsort(keys.ravel(), kind="stable")
+    known = keys.ravel()[order]
+    same = known[1:] == known[:-1]
+    first, second = order[:-1][same], order[1:][same]
+    sides = np.array(facet_corners(3, corners.shape[1]))
+    facets = corners[(first % count)[:, None], sides[first // count]]
+    normal, middle = facet_areas(facets), facets.mean(axis=1)
+    centre = corners.mean(axis=1)
+    heights = [
+        np.einsum("ij,ij->i", normal, centre[one % count] - middle) for one in (first, second)
+    ]
+    one_side = heights[0] * heights[1] >= 0.0
+    for which in (first, second):
+        bad[which[one_side] % count] = True
+    bad[order[2:][known[2:] == known[:-2]] % count] = True  # three cells at one facet
+    return bad
+
+
+def _check_parts(cells: np.ndarray) -> None:
+    count, width = cells.shape
+    start = np.arange(0, count * width + 1, width)
+    incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), start))
+    pieces = connected_components(incidence @ incidence.T, directed=False)[0]
+    if pieces > 1:
+        raise InputError(
+            f"it consists of {pieces} separate parts; neighbouring volumes must share their faces "
+            "and nodes"
+        )
+
+
+# -- cells with straight edges: which corners their facets have, areas and volumes ---------------
+
+GAUSS = 0.5 + 0.5 / np.sqrt(3.0) * np.array([-1.0, 1.0])  # of two points on [0, 1], weights 1/2
+
+
+def facet_corners(dim: int, corners: int) -> tuple[tuple[int, ...], ...]:
+    """Return the corners of every facet of a cell with so many corners, in DOLFINx's order.
+
+    Corners of quadrilaterals and hexahedra are numbered as a tensor product, x fastest.
+    """
+    if dim == 2:
+        return ((0, 1), (0, 2), (1, 2)) if corners == 3 else ((0, 1), (0, 2), (1, 3), (2, 3))
+    if corners == 4:
+        return (1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)
+    return (
+        (0, 1, 2, 3), (0, 1, 4, 5), (0, 2, 4, 6), (1, 3, 5, 7), (2, 3, 6, 7), (4, 5, 6, 7),
+    )  # fmt: skip
+
+
+def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
+    """Return the lengths (m,) of all edges of cells of dimension `dim`, in DOLFINx's corner order.
+
+    Args:
+        dim: 2 or 3.
+        corners: (n, corners, d) m.
+    """
+    count = corners.shape[1]
+    pairs = list(combinations(range(count), 2))
+    if count != dim + 1:  # corners of a tensor product differ in one bit along an edge
+        pairs = [(i, j) for i, j in pairs if (i ^ j).bit_count() == 1]
+    first, second = np.array(pairs).T
+    return np.linalg.norm(corners[:, first] - corners[:, second], axis=2).ravel()
+
+
+def cell_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the area (n,) of straight triangles or quadrilaterals in DOLFINx's corner order."""
+    if corners.shape[1] == 3:
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    else:  # tensor-product order: 0-3 and 1-2 are the diagonals
+        first, second = corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]
+    return 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+
+def cell_volumes(corners: np.ndarray) -> np.ndarray:
+    """Return the volume (n,) of tetrahedra or trilinear hexahedra in DOLFINx's corner order."""
+    if corners.shape[1] == 4:
+        return np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
+    grid = corners.reshape(-1, 2, 2, 2, 3)  # z, y, x
+    edges = [np.diff(grid, axis=axis).squeeze(axis) for axis in (3, 2, 1)]
+    volume = np.zeros(len(corners))
+    for x in GAUSS:  # exact: the Jacobian is of second degree in each direction
+        for y in GAUSS:
+            for z in GAUSS:
+                places = (z, y), (z, x), (y, x)
+                J = np.stack([_bilinear(e, *at) for e, at in zip(edges, places, strict=True)], 1)
+                volume += np.abs(np.linalg.det(J)) / 8.0
+    return volume
+
+
+def _bilinear(values: np.ndarray, first: float, second: float) -> np.ndarray:
+    """Interpolate values (n, 2, 2, 3) at a place of the unit square."""
+    rows = (1.0 - first) * values[:, 0] + first * values[:, 1]
+    return np.asarray((1.0 - second) * rows[:, 0] + second * rows[:, 1])
+
+
+def facet_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the area vectors (n, 3) of facets (n, 3 or 4, 3) of cells in space, of either sense.
+
+    Exact of bilinear quadrilaterals, whose corners are numbered as a tensor product.
+    """
+    if corners.shape[1] == 3:
+        return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1])

@@ -6,19 +6,49 @@ Reads .geo (parametric or not), .msh and .step. The model leaves here with the p
 
 from __future__ import annotations
 
+import math
 import re
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import check_mesh, flatten
-from dolfinopt.mesh.file_check import open_file
-from dolfinopt.mesh.gmsh_session import mesh_surfaces, silent_terminal
-from dolfinopt.mesh.groups import find_groups, rename_groups, unknown_names
-from dolfinopt.mesh.step_model import read_step
+from dolfinopt.mesh.checks import (
+    FRAME_TOLERANCE,
+    check_cells,
+    check_mesh,
+    facet_keys,
+    flatten,
+    keys_of,
+    remedy,
+)
+from dolfinopt.mesh.file_check import check_start, open_file
+from dolfinopt.mesh.gmsh_session import (
+    DESIGN,
+    FURTHER,
+    INBOARD,
+    NAMES,
+    OUTBOARD,
+    PASSIVE,
+    QUADRILATERAL,
+    TRIANGLE,
+    find_groups,
+    gmsh_on_root,
+    group_named,
+    mesh_surfaces,
+    rename_groups,
+    silent_terminal,
+    unknown_names,
+)
 from dolfinopt.scene.tables.arms import SIZE_PARAMETER, Arm
+
+if TYPE_CHECKING:
+    from dolfinopt.exchange.urdf.geometry import LinkCells
 
 # ONELAB parameters of meshes/*.geo, without the number that orders them.
 LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (m)"
@@ -90,3 +120,743 @@ def _read_msh(gmsh: Any, arm: Arm, _: list[str]) -> bool:
     assert arm.mesh is not None
     open_file(gmsh, arm.mesh)
     return False
+
+
+# -- STEP files as Gmsh models: the planar face of an arm, or the end face of its solid ----------
+
+UNNAMED = "Open CASCADE STEP translator"  # and numbers: what Open CASCADE calls nameless products
+THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
+NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
+NORMAL = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
+ALONG = 1e-6  # cosine to z of a side face's normal: rounding of splines
+
+
+def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
+    """Mesh the planar faces of a STEP file, whatever its unit, and find the groups.
+
+    Of a prismatic solid that is the end face nearest to z = 0, moved there. Faces are named
+    themselves or by the product they belong to. Few programs name edges: where none bears the name
+    of an interface, `_joint_curves` finds it.
+    """
+    path = Path(str(arm.mesh))
+    check_start(path)
+    named_edges, named_faces = read_shapes(path.read_bytes().decode("latin-1"))
+    gmsh.option.setString("Geometry.OCCTargetUnit", "M")
+    open_file(gmsh, path)
+    model = gmsh.model
+    everywhere = _ends(model, model.getEntities(1))
+    faces, owners, level = model.getEntities(2), model.getEntities(2), 0.0
+    if model.getEntities(3):
+        faces, owners, level = _prism_faces(model, arm)
+    if not faces:
+        raise InputError("it holds no face; export the planar face in z = 0, not its outline")
+    labels, products = [], []
+    for face, owner in zip(faces, owners, strict=True):
+        outline = model.getBoundary([face], combined=False, oriented=False)
+        product = model.getEntityName(*owner).rpartition("/")[2].strip()
+        products.append("" if product.startswith(UNNAMED) else product)
+        names = {products[-1]} | named_faces.names_at(_ends(model, outline), everywhere)
+        labels.append({group_named(name, PASSIVE, DESIGN) for name in names})
+    if len(set(products)) > 1:  # a single one bears the name of the part
+        unknown += [p for p, groups in zip(products, labels, strict=True) if groups == {None} and p]
+    if level or model.getEntities(3):
+        _keep_faces(model, faces, level)
+    # Faces of different products do not share their common curves unless glued.
+    children = model.occ.fragment(faces, [])[1] if len(faces) > 1 else [[face] for face in faces]
+    loose = [curve for curve in model.getEntities(1) if not len(model.getAdjacencies(*curve)[0])]
+    model.occ.remove(loose, recursive=True)
+    model.occ.synchronize()
+    model.removePhysicalGroups()
+    lift = np.array([0.0, 0.0, level])  # to where the file has them
+    curves = {
+        curve[1]: named_edges.names_at(_ends(model, [curve]) + lift, everywhere)
+        for curve in model.getEntities(1)
+    }
+    for tag, x in ((INBOARD, 0.0), (OUTBOARD, arm.length)):
+        own = [c for c, names in curves.items() if any(group_named(n, tag) for n in names)]
+        if any(group_named(name, tag) for name in named_edges.names) and not own:
+            raise InputError(f'the edges named "{NAMES[tag]}" are not where the file says')
+        model.addPhysicalGroup(1, own or _joint_curves(model, x, arm.height), tag)
+        model.setPhysicalName(1, tag, NAMES[tag])
+    passive = [f[1] for found, group in zip(labels, children) for f in group if PASSIVE in found]
+    model.addPhysicalGroup(2, passive, PASSIVE)
+    model.setPhysicalName(2, PASSIVE, NAMES[PASSIVE])
+    gmsh.option.setNumber("Mesh.MeshSizeMax", arm.cell_size)
+    mesh_surfaces(gmsh, arm.cell_shape or "quadrilateral")
+    return False
+
+
+def _prism_faces(
+    model: Any, arm: Arm
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]], float]:
+    """Return the end faces of prismatic solids nearest to z = 0, the solid of each, and their z, m.
+
+    Raises:
+        InputError: a solid whose section is not constant along z, or not `arm.thickness` thick.
+    """
+    near = NEAR * arm.height
+    found: list[tuple[float, float, list[tuple[tuple[int, int], float]], tuple[int, int]]] = []
+    for solid in model.getEntities(3):
+        flat = []
+        for face in model.getBoundary([solid], oriented=False):
+            low, high = model.getParametrizationBounds(*face)
+            grid = np.stack(np.meshgrid(*np.linspace(low, high, 5).T), axis=2).ravel()
+            points = np.reshape(model.getValue(*face, grid), (-1, 3))
+            upright = np.abs(np.reshape(model.getNormal(face[1], grid), (-1, 3))[:, 2])
+            if (upright > 1.0 - NORMAL).all():
+                flat.append((face, float(points[:, 2].mean())))
+            elif not (upright < ALONG).all():
+                x, y, z = model.occ.getCenterOfMass(*face)
+                raise InputError(
+                    f"it holds a solid whose face about ({x:.4g}, {y:.4g}, {z:.4g}) m is neither "
+                    "normal to z nor along it; expected a section that is constant along z, or "
+                    "the planar face in z = 0"
+                )
+        levels = [z for _, z in flat]
+        bottom, top = min(levels), max(levels)
+        steps = [z for z in levels if bottom + near < z < top - near]
+        if steps:
+            raise InputError(
+                f"it holds a solid with a step at z = {steps[0]:.6g} m between its end faces at "
+                f"{bottom:.6g} and {top:.6g} m; expected a section that is constant along z, or "
+                "the planar face in z = 0"
+            )
+        if abs(top - bottom - arm.thickness) > THICKNESS_TOLERANCE * arm.thickness:
+            raise InputError(
+                f"its solid is {top - bottom:.6g} m thick along z, expected arms.thickness = "
+                f"{arm.thickness:.6g} m; {remedy(top - bottom, arm.thickness, 'thickness')}"
+            )
+        found.append((bottom, top, flat, solid))
+    bottoms = np.array([bottom for bottom, _, _, _ in found])
+    if np.ptp(bottoms) > near:
+        raise InputError(
+            f"its solids begin at z = {bottoms.min():.6g} to {bottoms.max():.6g} m; expected them "
+            "side by side, in one plane"
+        )
+    level = min(found[0][:2], key=abs)
+    pairs = [
+        (face, solid) for _, _, flat, solid in found for face, z in flat if abs(z - level) < near
+    ]
+    return [face for face, _ in pairs], [solid for _, solid in pairs], level
+
+
+def _keep_faces(model: Any, faces: list[tuple[int, int]], level: float) -> None:
+    """Remove all but `faces` from the model and move them from z = `level` to 0."""
+    model.occ.remove(model.getEntities(3))
+    model.occ.remove([face for face in model.getEntities(2) if face not in faces])
+    model.occ.synchronize()
+    loose = [curve for curve in model.getEntities(1) if not len(model.getAdjacencies(*curve)[0])]
+    model.occ.remove(loose, recursive=True)
+    model.occ.translate(faces, 0.0, 0.0, -level)
+    model.occ.synchronize()
+
+
+def _ends(model: Any, curves: list[tuple[int, int]]) -> np.ndarray:
+    """Return the first and last points (2 n, 3) of curves, m."""
+    ends = [np.empty((0, 3))]
+    for _, tag in curves:
+        low, high = (bound[0] for bound in model.getParametrizationBounds(1, tag))
+        ends.append(np.reshape(model.getValue(1, tag, [low, high]), (-1, 3)))
+    return np.concatenate(ends)
+
+
+def _joint_curves(model: Any, x: float, height: float) -> list[int]:
+    """Return the curves of the interface at the joint axis (x, 0).
+
+    The bore: the smallest full circle about the axis. Where there is none, the end: all straight
+    curves on the upright line through it.
+    """
+    near = NEAR * height
+    arcs: list[tuple[float, float, int]] = []  # radius, angle, curve
+    upright = []
+    for _, tag in model.getEntities(1):
+        low, high = (bound[0] for bound in model.getParametrizationBounds(1, tag))
+        points = np.reshape(model.getValue(1, tag, np.linspace(low, high, 65)), (-1, 3))[:, :2]
+        radius = np.linalg.norm(points - [x, 0.0], axis=1)
+        if np.ptp(radius) < near:
+            length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+            arcs.append((float(radius.mean()), float(length / radius.mean()), tag))
+        if np.abs(points[:, 0] - x).max() < near:
+            upright.append(tag)
+    arcs.sort()
+    smallest: list[tuple[float, float, int]] = []
+    for arc in arcs:
+        # Arcs of one circle by a tolerance: their radii differ by rounding.
+        smallest = [*smallest, arc] if smallest and arc[0] - smallest[0][0] < near else [arc]
+        if sum(angle for _, angle, _ in smallest) > 6.2:  # chords of 2 pi
+            return [tag for _, _, tag in smallest]
+    if upright:
+        return upright
+    raise InputError(
+        f"no interface at ({x:g}, 0) m: expected a circular bore about it or a straight end "
+        f"on x = {x:g} m; the origin is the inboard joint axis, +x points to the outboard one at "
+        "(length, 0)"
+    )
+
+
+# -- names of edges and faces in a STEP file, which Gmsh does not read ---------------------------
+#
+# A STEP file (ISO 10303-21) holds one instance a statement, `#21 = EDGE_CURVE('name', #22, ...);`.
+# Shapes are told by their vertices: what bears a name is found again among Gmsh's shapes by place.
+
+TOLERANCE = 1e-6  # distance of vertices relative to the extent of all: digits of a file
+
+_STATEMENT = re.compile(r"#(\d+)\s*=\s*([A-Z0-9_]+)\s*\(((?:'[^']*'|[^';])*)\)\s*;")
+_EDGES = ("EDGE_CURVE",)
+_FACES = ("ADVANCED_FACE", "FACE_SURFACE")
+# From a face down to its vertices; the geometry of curves and surfaces is left aside.
+_PATH = {*_EDGES, *_FACES, "FACE_BOUND", "FACE_OUTER_BOUND", "EDGE_LOOP", "ORIENTED_EDGE"}
+
+
+@dataclass(frozen=True, eq=False)
+class StepShapes:
+    """Edges or faces that bear a name.
+
+    Attributes:
+        names: one a shape, in small letters.
+        vertices: (n, 3) of each shape, in the file's unit.
+        everywhere: (n, 3) all vertices of the file.
+    """
+
+    names: list[str]
+    vertices: list[np.ndarray]
+    everywhere: np.ndarray
+
+    def names_at(self, points: np.ndarray, everywhere: np.ndarray) -> set[str]:
+        """Return the names of the shapes with vertices at `points` (n, 3).
+
+        Args:
+            points: of a shape in Gmsh, any number of times each.
+            everywhere: all points of the model in Gmsh; their extent gives the unit.
+        """
+        extent, there = _extent(self.everywhere), _extent(everywhere)
+        scale = there / extent if extent > 0.0 else 1.0
+        return {
+            name
+            for name, vertices in zip(self.names, self.vertices, strict=True)
+            if _same_places(vertices * scale, points, TOLERANCE * there)
+        }
+
+
+def read_shapes(text: str) -> tuple[StepShapes, StepShapes]:
+    """Return the edges and the faces that bear a name in the text of a STEP file."""
+    instances = {int(n): (kind, rest) for n, kind, rest in _STATEMENT.findall(text)}
+    points = {
+        n: _point(instances, rest)
+        for n, (kind, rest) in instances.items()
+        if kind == "VERTEX_POINT"
+    }
+    everywhere = np.reshape(list(points.values()), (-1, 3))
+
+    def shapes(kinds: tuple[str, ...]) -> StepShapes:
+        names, vertices = [], []
+        for n, (kind, rest) in instances.items():
+            name = re.match(r"\s*'([^']*)'", rest)
+            if kind in kinds and name and name[1].strip():
+                names.append(name[1].strip().casefold())
+                found = sorted(_reach(instances, n))
+                vertices.append(np.reshape([points[k] for k in found], (-1, 3)))
+        return StepShapes(names, vertices, everywhere)
+
+    return shapes(_EDGES), shapes(_FACES)
+
+
+def _references(rest: str) -> list[int]:
+    return [int(n) for n in re.findall(r"#(\d+)", re.sub(r"'[^']*'", "", rest))]
+
+
+def _point(instances: dict[int, tuple[str, str]], rest: str) -> list[float]:
+    """Return the coordinates that a vertex refers to."""
+    _, coordinates = instances[_references(rest)[0]]
+    numbers = re.findall(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", re.sub(r"'[^']*'", "", coordinates))
+    return [float(number) for number in numbers]
+
+
+def _reach(instances: dict[int, tuple[str, str]], start: int) -> set[int]:
+    """Return the vertices below a shape."""
+    found, ahead = set(), [start]
+    while ahead:
+        n = ahead.pop()
+        kind, rest = instances.get(n, ("", ""))
+        if kind == "VERTEX_POINT":
+            found.add(n)
+        elif kind in _PATH:
+            ahead += _references(rest)
+    return found
+
+
+def _extent(points: np.ndarray) -> float:
+    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+
+
+def _same_places(a: np.ndarray, b: np.ndarray, tolerance: float) -> bool:
+    distance = np.linalg.norm(a[:, None] - b, axis=2)
+    near = max(distance.min(axis=0).max(), distance.min(axis=1).max())
+    return bool(near < tolerance)
+
+
+# -- geometry and mesh files of solid arms -> a Gmsh model with the groups this program knows ----
+#
+# Reads .step, .msh and .geo. Interfaces are faces named inboard and outboard, further ones as in
+# `arms.interfaces`; in a STEP file without such names they are the bores about the joint axes, or
+# the flat ends there. Volumes, or STEP products, whose names begin with passive stay solid.
+
+TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
+FACE_NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
+# From Gmsh's order of a hexahedron's corners to that of a tensor product.
+TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+Entities = dict[int, list[int]]
+ENDS = (INBOARD, OUTBOARD)
+
+
+def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
+    """Make the Gmsh model of a solid arm with a mesh file: read, mesh, name the groups, check.
+
+    Returns:
+        Corners and middles (n, 3) of the interfaces' facets, m, from which `arm.solid_ends` is
+        still to be measured.
+
+    Raises:
+        InputError: one line that names file, arm and remedy.
+    """
+    where = f"{arm.mesh}: mesh of arm {arm.name!r}"
+    try:
+        with silent_terminal():
+            groups = (_read_step if _is_step(arm) else _read_groups)(gmsh, arm)
+        _set_groups(gmsh, groups, arm)
+        return _checked(gmsh, groups, arm)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except Exception as error:
+        if type(error) is not Exception:  # Gmsh raises no other
+            raise
+        text = " ".join(str(error).split()) or "Gmsh failed"
+        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
+
+
+def _is_step(arm: Arm) -> bool:
+    return Path(str(arm.mesh)).suffix.lower() in (".step", ".stp")
+
+
+def _mesh(gmsh: Any, arm: Arm) -> None:
+    """Mesh the volumes: tetrahedra, or hexahedra by cutting each into four."""
+    size = arm.cell_size
+    halves = arm.cell_shape == "hexahedron"
+    if halves:
+        gmsh.option.setNumber("Mesh.SubdivisionAlgorithm", 2)
+    if size is not None:
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 2.0 * size if halves else size)
+    gmsh.model.mesh.generate(3)
+
+
+def _read_groups(gmsh: Any, arm: Arm) -> Entities:
+    """Read a .msh or .geo file and return the entities of our groups by their names there."""
+    open_file(gmsh, str(arm.mesh))
+    if Path(str(arm.mesh)).suffix.lower() == ".geo":
+        _mesh(gmsh, arm)
+    model, found = gmsh.model, _none(arm)
+    for dim, tag in model.getPhysicalGroups():
+        if dim < 2:
+            continue
+        kinds = (INBOARD, OUTBOARD) if dim == 2 else (PASSIVE, DESIGN)
+        name = model.getPhysicalName(dim, tag)
+        group = _further(arm).get(name.strip().casefold()) if dim == 2 else None
+        group = group or group_named(name, *kinds)
+        if group is not None:
+            found[group] += model.getEntitiesForPhysicalGroup(dim, tag).tolist()
+    names = _interface_names(arm)
+    for tag, name in names.items():
+        if not found[tag]:
+            raise InputError(
+                f'no faces in a group "{name}"; name the interface\'s faces so: '
+                f'Physical Surface("{name}") = {{...}}'
+            )
+    if not found[DESIGN]:
+        volumes = [volume for _, volume in model.getEntities(3)]
+        found[DESIGN] = [volume for volume in volumes if volume not in found[PASSIVE]]
+    return found
+
+
+def _none(arm: Arm) -> Entities:
+    return {tag: [] for tag in (*NAMES, *_further(arm).values())}
+
+
+def _further(arm: Arm) -> dict[str, int]:
+    """Return the groups of the arm's further interfaces by their names, small letters."""
+    return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
+
+
+def _interface_names(arm: Arm) -> dict[int, str]:
+    """Return the names of all interfaces by their groups."""
+    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.interfaces)}
+    return {INBOARD: NAMES[INBOARD], OUTBOARD: NAMES[OUTBOARD], **more}
+
+
+def _read_step(gmsh: Any, arm: Arm) -> Entities:
+    """Read the solids of a STEP file, find their interfaces and mesh them."""
+    path = Path(str(arm.mesh))
+    check_start(path)
+    faces_named = read_shapes(path.read_bytes().decode("latin-1"))[1]
+    gmsh.option.setString("Geometry.OCCTargetUnit", "M")
+    open_file(gmsh, path)
+    model, found = gmsh.model, _none(arm)
+    solids = model.getEntities(3)
+    if not solids:
+        raise InputError("it holds no solid; export the body as one")
+    names = [model.getEntityName(*solid).rpartition("/")[2] for solid in solids]
+    everywhere = _vertices(model, model.getEntities(2))
+    children = [[solid] for solid in solids]
+    if len(solids) > 1:  # solids do not share their common faces unless glued
+        children = model.occ.fragment(solids, [])[1][: len(solids)]
+        model.occ.synchronize()
+    for name, parts in zip(names, children, strict=True):
+        group = group_named(name, PASSIVE) or DESIGN
+        found[group] += [tag for _, tag in parts]
+    places = ((0.0, 0.0), *(point[:2] for point in arm.interface_points))
+    for tag, place in zip(_interface_names(arm), places, strict=True):
+        named = _named(model, faces_named, tag, everywhere, arm)
+        found[tag] = named or _joint_faces(model, tag, place, arm)
+    model.removePhysicalGroups()
+    _mesh(gmsh, arm)
+    return found
+
+
+def _vertices(model: Any, faces: Iterable[tuple[int, int]]) -> np.ndarray:
+    """Return the vertices (n, 3) of faces, m."""
+    points = model.getBoundary(list(faces), combined=False, oriented=False, recursive=True)
+    corners = [model.getValue(0, tag, []) for _, tag in points]
+    return np.reshape(np.concatenate(corners), (-1, 3)) if corners else np.empty((0, 3))
+
+
+def _named(
+    model: Any, shapes: StepShapes, group: int, everywhere: np.ndarray, arm: Arm
+) -> list[int]:
+    """Return the faces that a STEP file names as the group's."""
+    further = _further(arm)
+
+    def belongs(name: str) -> bool:
+        return (further.get(name) or group_named(name, INBOARD, OUTBOARD)) == group
+
+    if not any(map(belongs, shapes.names)):
+        return []
+    found = [
+        face[1]
+        for face in model.getEntities(2)
+        if any(map(belongs, shapes.names_at(_vertices(model, [face]), everywhere)))
+    ]
+    if not found:
+        raise InputError(
+            f'the faces named "{_interface_names(arm)[group]}" are not where the file says'
+        )
+    return found
+
+
+def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -> list[int]:
+    """Return the faces of the interface at the joint axis (x, y), which runs along z.
+
+    The bore: the cylinder about the axis with the smallest radius, in one or more faces; where
+    there is none, the flat end in the plane through it, of the arm's two ends.
+    """
+    x, y = place
+    near = FACE_NEAR * arm.height
+    bores: list[tuple[float, int]] = []
+    ends = []
+    for _, tag in model.getEntities(2):
+        low, high = model.getParametrizationBounds(2, tag)
+        grid = np.stack(np.meshgrid(*np.linspace(low, high, 9).T), axis=2).ravel()
+        points = np.reshape(model.getValue(2, tag, grid), (-1, 3))
+        radius = np.linalg.norm(points[:, :2] - [x, y], axis=1)
+        if np.ptp(radius) < near:
+            bores.append((float(radius.mean()), tag))
+        if group < FURTHER and np.abs(points[:, 0] - x).max() < near:
+            ends.append(tag)
+    if bores:
+        smallest = min(bores)[0]
+        return [tag for radius, tag in bores if radius - smallest < near]
+    if ends:
+        return ends
+    if group >= FURTHER:
+        name = _interface_names(arm)[group]
+        raise InputError(
+            f'no faces of interface "{name}": expected a face named so, or a bore about the line '
+            f"along z through its point ({x:g}, {y:g}) m"
+        )
+    raise InputError(
+        f"no interface at x = {x:g} m: expected a face named so, a bore about the line along z "
+        f"through ({x:g}, 0) m, or a flat end in x = {x:g} m; the origin is the inboard joint "
+        "axis, +x points to the outboard one at (length, 0, 0)"
+    )
+
+
+def _set_groups(gmsh: Any, groups: Entities, arm: Arm) -> None:
+    """Put our groups in place of the file's, after a look at the kinds of cells."""
+    model = gmsh.model
+    solids = groups[DESIGN] + groups[PASSIVE]
+    kinds = {int(kind) for solid in solids for kind in model.mesh.getElements(3, solid)[0]}
+    if not kinds:
+        raise InputError("it has no cells in space; mesh its volumes in 3D")
+    if len(kinds) > 1 or not kinds <= {TETRAHEDRON, HEXAHEDRON}:
+        names = ", ".join(model.mesh.getElementProperties(kind)[0] for kind in sorted(kinds))
+        raise InputError(
+            f"it has cells of kind {names}; expected straight tetrahedra or hexahedra alone "
+            "(Mesh.ElementOrder = 1)"
+        )
+    shape = "tetrahedron" if kinds == {TETRAHEDRON} else "hexahedron"
+    if arm.cell_shape != shape:
+        raise InputError(
+            f'its cells are not what arms.cell_shape = "{arm.cell_shape}" says; expected '
+            f'cell_shape = "{shape}"'
+        )
+    model.removePhysicalGroups()
+    for tag, entities in groups.items():
+        if entities:
+            dim = 2 if tag in ENDS or tag >= FURTHER else 3
+            model.addPhysicalGroup(dim, entities, tag)
+            model.setPhysicalName(dim, tag, NAMES.get(tag, f"interface {tag}"))
+    model.mesh.renumberNodes()  # DOLFINx wants 1, 2, ...
+
+
+def _checked(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
+    """Check that a mesh can be the arm of a scene, and return points of its interfaces.
+
+    Raises:
+        InputError: flat, folded or overlapping cells; several parts; an interface that is no face
+            of cells, or is not at its joint; another height or thickness than the arm's.
+    """
+    tags, places, _ = gmsh.model.mesh.getNodes()
+    points = np.zeros((int(tags.max()) + 1, 3))
+    points[tags.astype(int)] = places.reshape(-1, 3)
+    cells = _elements(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
+    cells = cells[:, TENSOR[cells.shape[1]]]
+    check_cells(points, cells)
+    known, largest = facet_keys(cells), int(cells.max())
+    used, found = points[np.unique(cells)], []
+    for tag, name in _interface_names(arm).items():
+        facets = _elements(gmsh, 2, groups[tag])
+        if facets.max() > largest or not np.isin(keys_of(facets, largest), known).all():
+            raise InputError(f'group "{name}" has facets of no cells; repair the mesh')
+        if tag in ENDS:  # the reference point of another may lie anywhere
+            x = 0.0 if tag == INBOARD else arm.length
+            _check_place(points[facets].reshape(-1, 3), name, x, arm)
+        found += [points[facets].reshape(-1, 3), points[facets].mean(axis=1)]
+    for k, (key, size) in enumerate((("height", arm.height), ("thickness", arm.thickness)), 1):
+        wide = float(np.ptp(used[:, k]))
+        if abs(wide - size) > FRAME_TOLERANCE * size:
+            raise InputError(
+                f"its {key} is {wide:.6g} m along {'xyz'[k]}, expected {key} = {size:.6g} m within "
+                f"{FRAME_TOLERANCE * size:.3g} m; {remedy(wide, size, key)}"
+            )
+    return np.concatenate(found)
+
+
+def _elements(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
+    """Return the nodes (n, corners) of the elements of entities, in Gmsh's order."""
+    rows = []
+    for entity in entities:
+        for ids, nodes in zip(*gmsh.model.mesh.getElements(dim, entity)[1:], strict=True):
+            rows.append(nodes.reshape(len(ids), -1).astype(int))
+    if not rows or len({row.shape[1] for row in rows}) > 1:
+        kind = "faces" if dim == 2 else "volumes"
+        raise InputError(f"its {kind} carry no elements of one kind; save the mesh of all of them")
+    return np.concatenate(rows)
+
+
+def _check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    tolerance = arm.interface_offset or FRAME_TOLERANCE * max(arm.height, arm.thickness)
+    if np.linalg.norm(middle - [x, 0.0, 0.0]) > tolerance:
+        place = ", ".join(f"{value:.6g}" for value in middle)
+        expected = "(0, 0, 0)" if name == "inboard" else f"(length, 0, 0) = ({x:.6g}, 0, 0)"
+        raise InputError(
+            f'group "{name}" has its middle at ({place}) m, expected {expected} m within '
+            f"{tolerance:.3g} m; {remedy(middle[0], x, 'length and interface_offset')}"
+        )
+
+
+# -- A closed surface of triangles, meshed with tetrahedra; cells as a solid arm's .msh file -----
+
+EDGE = math.radians(40.0)  # between triangles, from which on there is an edge between faces
+LOST = 0.1  # largest share of the volume that flat cells may miss at curved faces
+INSIDE = 0.5  # share of a face's area that is an interface's, from which on the face is the latter
+
+
+@dataclass(frozen=True, eq=False)
+class Tetrahedra:
+    """A solid arm's mesh.
+
+    Attributes:
+        points: (n, 3) in the arm's frame, m.
+        cells: (m, 4) of positive volume.
+        inboard, outboard: (k, 3) nodes of the interfaces' facets.
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    inboard: np.ndarray
+    outboard: np.ndarray
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Volumes (m,) of the cells, m3; negative of those turned over."""
+        a, *rest = self.points[self.cells].swapaxes(0, 1)
+        b, c, d = (one - a for one in rest)
+        return np.asarray(np.einsum("na,na->n", b, np.cross(c, d)) / 6.0)
+
+    @property
+    def quality(self) -> np.ndarray:
+        """Shape (m,) of the cells: 12 (3 V)^(2/3) / (sum of squared edges), 1 of a regular one.
+
+        Source: Liu & Joe (1994), doi:10.1007/BF01955874.
+        """
+        corners = self.points[self.cells]
+        pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+        edges = corners[:, pairs[:, 0]] - corners[:, pairs[:, 1]]
+        volume = np.maximum(self.volumes, 0.0)
+        return np.asarray(12.0 * (3.0 * volume) ** (2.0 / 3.0) / np.square(edges).sum(axis=(1, 2)))
+
+    @property
+    def boundary(self) -> np.ndarray:
+        """Facets (k, 3) that only one cell has, counterclockwise from outside."""
+        sides = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
+        facets = np.concatenate([self.cells[:, side] for side in sides])
+        order = np.sort(facets, axis=1)
+        _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
+        return np.asarray(facets[count[which.ravel()] == 1])
+
+
+def tetrahedra_of(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    size: float,
+    interfaces: tuple[np.ndarray, np.ndarray],
+    edge: float = EDGE,
+) -> Tetrahedra:
+    """Mesh the solid within a closed surface, on this process alone.
+
+    Faces are found by their edges and meshed anew.
+
+    Args:
+        points: (n, 3) corners of the surface in the arm's frame, m.
+        triangles: (m, 3) their indices, counterclockwise from outside.
+        size: of the cells, m.
+        interfaces: (m,) True of the triangles of the inboard and the outboard interface.
+        edge: between triangles, from which on there is an edge between faces, rad.
+
+    Raises:
+        InputError: Gmsh cannot mesh it; says why.
+    """
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        try:
+            with silent_terminal():
+                return _meshed(gmsh, points, triangles, size, interfaces, edge)
+        except InputError:
+            raise
+        except Exception as error:
+            if type(error) is not Exception:  # Gmsh raises no other
+                raise
+            text = " ".join(str(error).split()) or "Gmsh failed"
+            raise InputError(f"its surface cannot be meshed ({text})") from None
+
+
+def _meshed(
+    gmsh: Any,
+    points: np.ndarray,
+    triangles: np.ndarray,
+    size: float,
+    interfaces: tuple[np.ndarray, np.ndarray],
+    edge: float,
+) -> Tetrahedra:
+    model = gmsh.model
+    model.add("surface")
+    model.addDiscreteEntity(2, 1)
+    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
+    model.mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
+    model.mesh.classifySurfaces(edge, True, True, math.pi)
+    model.mesh.createGeometry()
+    faces = [tag for _, tag in model.getEntities(2)]
+    chosen = {}
+    for group, mark in zip((INBOARD, OUTBOARD), interfaces, strict=True):
+        chosen[group] = _faces_of(model, faces, points, triangles, mark)
+    solid = model.geo.addVolume([model.geo.addSurfaceLoop(faces)])
+    model.geo.synchronize()
+    for key in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
+        gmsh.option.setNumber(key, size)
+    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+    model.mesh.generate(3)
+    for group, own in chosen.items():
+        if not own:
+            raise InputError(f"the {NAMES[group]} interface is lost in its faces")
+    found = _cells(model, solid, chosen)
+    volumes = found.volumes
+    expected = np.einsum("na,na->", *_fans(points[triangles])) / 6.0
+    if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST * expected:
+        raise InputError("its cells do not fill it")
+    return found
+
+
+def _faces_of(
+    model: Any, faces: list[int], points: np.ndarray, triangles: np.ndarray, mark: np.ndarray
+) -> list[int]:
+    """Return the faces made of an interface's triangles (m,)."""
+    own = {tuple(row) for row in np.sort(triangles[mark], axis=1) + 1}
+    found = []
+    for face in faces:
+        nodes = model.mesh.getElementsByType(TRIANGLE, face)[1].reshape(-1, 3).astype(int)
+        inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
+        a, b, c = points[nodes - 1].swapaxes(0, 1)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        if area[inside].sum() > INSIDE * area.sum():
+            found.append(face)
+    return found
+
+
+def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
+    """Return the cells of a meshed solid with the facets of its interfaces' faces."""
+    tags, places, _ = model.mesh.getNodes()
+    nodes = model.mesh.getElementsByType(TETRAHEDRON, solid)[1].reshape(-1, 4).astype(int)
+    if not len(nodes):
+        raise InputError("its volume has no cells")
+    used, cells = np.unique(nodes, return_inverse=True)
+    number = np.full(int(tags.max()) + 1, -1)
+    number[used] = np.arange(len(used))
+    points = np.empty((len(number), 3))
+    points[tags.astype(int)] = places.reshape(-1, 3)
+    facets = [
+        np.concatenate(
+            [
+                number[model.mesh.getElementsByType(TRIANGLE, face)[1].astype(int)].reshape(-1, 3)
+                for face in interfaces[group]
+            ]
+        )
+        for group in (INBOARD, OUTBOARD)
+    ]
+    return Tetrahedra(points[used], cells.reshape(-1, 4), *facets)
+
+
+def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a and b x c of triangles, whose products are six times the volume within."""
+    return corners[:, 0], np.cross(corners[:, 1], corners[:, 2])
+
+
+def msh_bytes(mesh: Tetrahedra | LinkCells) -> bytes:
+    """Return the .msh file that `arms.mesh` reads back, on this process alone."""
+    is_tetrahedron = mesh.cells.shape[1] == 4
+    cell, side = (TETRAHEDRON, TRIANGLE) if is_tetrahedron else (HEXAHEDRON, QUADRILATERAL)
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
+        model = gmsh.model
+        model.add("solid")
+        solid = model.addDiscreteEntity(3)
+        model.mesh.addNodes(3, solid, np.arange(1, len(mesh.points) + 1), mesh.points.ravel())
+        model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
+        model.addPhysicalGroup(3, [solid], DESIGN)
+        model.setPhysicalName(3, DESIGN, NAMES[DESIGN])
+        for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
+            face = model.addDiscreteEntity(2)
+            model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
+            model.addPhysicalGroup(2, [face], group)
+            model.setPhysicalName(2, group, NAMES[group])
+        gmsh.option.setNumber("Mesh.Binary", 1)
+        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
+        path = Path(folder) / "solid.msh"
+        gmsh.write(str(path))
+        return path.read_bytes()

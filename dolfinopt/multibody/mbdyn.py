@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.exchange.mbdyn import ModalElement
-from dolfinopt.multibody.plate_moments import SpatialMoments
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, SpatialMoments
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm

@@ -38,8 +38,12 @@ from dolfinopt.exchange.sid import (
     structure_of,
     taylor,
 )
-from dolfinopt.multibody.plate_moments import SpatialMoments, slender_moments
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    SpatialMoments,
+    plane_body,
+    slender_moments,
+)
 from dolfinopt.multibody.sid_checks import (
     CENTRIFUGAL,
     SMALL,

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.patterns import uniform_design
-from dolfinopt.dynamics.patience import counted
+from dolfinopt.arms.arm import uniform_design
+from dolfinopt.dynamics.collocation import counted
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator

@@ -25,7 +25,7 @@ from dolfinopt.reduction import METHODS
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.responses import freezes
+from dolfinopt.scene.tables.objective import freezes
 
 # Variables nearer to a bound than this part of their range count as held by it.
 AT_BOUND = 1e-3

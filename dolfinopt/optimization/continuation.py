@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import PhysicalDesign
-from dolfinopt.arms.patterns import Patterns
+from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.solution import Solution
 from dolfinopt.optimization.continuation import Continuation
 from dolfinopt.optimization.problem import EvaluatedDesign
 from dolfinopt.optimization.variables import Variables

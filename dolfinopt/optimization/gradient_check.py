@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.patterns import Patterns
+from dolfinopt.arms.arm import Patterns
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
@@ -19,7 +19,7 @@ from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.motion import MotionResponse
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.responses import EXACT_ONLY
+from dolfinopt.scene.tables.objective import EXACT_ONLY
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm

@@ -24,7 +24,7 @@ from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.responses.constraints import tightest, violated
-from dolfinopt.responses.volume_fraction import cell_volumes
+from dolfinopt.responses.mass import cell_volumes
 
 # A step that leads astray is repeated so many times, with a move limit so much shorter where
 # its forecast was worth nothing at all.

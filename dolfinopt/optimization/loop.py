@@ -24,9 +24,9 @@ from dolfinopt.optimization.result import Result
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import violated
+from dolfinopt.responses.evaluation import reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
-from dolfinopt.responses.stiffening import reconsider_stiffening
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
-from dolfinopt.multibody.stiffening import Stiffening
+from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.responses.order_selection import OrderSelection
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import constraints_of, objective_of
-from dolfinopt.responses.scenarios import worst_of
+from dolfinopt.responses.response import constraints_of, objective_of, worst_of
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:

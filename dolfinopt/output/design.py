@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.disk import read_arrays, write_arrays
+from dolfinopt.disk import (
+    append_text,
+    open_input,
+    read_arrays,
+    write_arrays,
+    write_atomically,
+    write_text,
+)
 from dolfinopt.errors import InputError
+from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.response import objective_of
@@ -19,7 +29,6 @@ from dolfinopt.scene.load import Scene
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
     from dolfinopt.mesh.arm_mesh import ArmMesh
-
 
 # Of the arrays of design.npz.
 UNITS = {"centroid": "m", "density": "-", "filtered": "-"}
@@ -219,3 +228,186 @@ def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.n
 
 def _box(low: np.ndarray, high: np.ndarray) -> str:
     return ", ".join(f"{axis} {a:.4g}..{b:.4g} m" for axis, a, b in zip("xyz", low, high))
+
+
+# -- design.vtu and design.xdmf: density, arm and largest stress by cell, for ParaView -----------
+
+# Cells by dimension and corners: triangle, quadrilateral, tetrahedron, hexahedron.
+VTK_CELLS = {(2, 3): 5, (2, 4): 9, (3, 4): 10, (3, 8): 12}
+XDMF_CELLS = {(2, 3): 4, (2, 4): 5, (3, 4): 6, (3, 8): 9}
+XDMF_NAMES = {
+    (2, 3): "Triangle",
+    (2, 4): "Quadrilateral",
+    (3, 4): "Tetrahedron",
+    (3, 8): "Hexahedron",
+}
+
+
+def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
+    """Write design.vtu and design.xdmf: density, arm and, if known, stress by cell, see `_Sheet`.
+
+    One grid, because few programs read collections. ParaView and PyVista read both, meshio the
+    former: it takes no XDMF with the instant without which PyVista takes none.
+    """
+    sheet = _sheet(views)
+    _write_vtu(folder / "design.vtu", sheet)
+    _write_xdmf(folder / "design.xdmf", sheet)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sheet:
+    """All designed arms as one grid, one below the other, in m.
+
+    Attributes:
+        points: (n_points, 3).
+        cells: (n_cells, corners) points around each cell, an array an arm.
+        dimension: of the cells, 2 or 3.
+        density: (all cells,).
+        arm: (all cells,) number of the arm, from 0 in the scene's order.
+        stress: (all cells,) largest von Mises stress along the motion, Pa, or None.
+    """
+
+    points: np.ndarray
+    cells: list[np.ndarray]
+    density: np.ndarray
+    arm: np.ndarray
+    stress: np.ndarray | None = None
+    dimension: int = 2
+
+    @property
+    def fields(self) -> dict[str, np.ndarray]:
+        """What every cell has, by name."""
+        found = {"density": self.density, "arm": self.arm}
+        return found if self.stress is None else found | {"stress": self.stress}
+
+
+def _sheet(views: Sequence[ArmView]) -> _Sheet:
+    points, cells, arm = [], [], []
+    offset, count = 0.0, 0
+    for index, view in enumerate(views):
+        if view.designed:
+            own, corners = _merge_corners(view.corners)
+            depth = own[:, 2] if own.shape[1] == 3 else np.zeros(len(own))
+            points.append(np.column_stack([own[:, 0], own[:, 1] + offset, depth]))
+            cells.append(corners + count)
+            arm.append(np.full(len(corners), index))
+            offset -= 2.0 * np.ptp(own[:, 1])
+            count += len(own)
+    density = np.concatenate([view.density for view in designed(views)])
+    stresses = [view.stress for view in designed(views) if view.stress is not None]
+    whole = np.concatenate(stresses) if len(stresses) == len(cells) else None
+    dimension = designed(views)[0].corners.shape[2]
+    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm), whole, dimension)
+
+
+def _write_vtu(path: Path, sheet: _Sheet) -> None:
+    from xml.etree import ElementTree as Xml
+
+    root = Xml.Element("VTKFile", type="UnstructuredGrid", version="0.1")
+    piece = Xml.SubElement(Xml.SubElement(root, "UnstructuredGrid"), "Piece")
+    piece.set("NumberOfPoints", str(len(sheet.points)))
+    piece.set("NumberOfCells", str(len(sheet.density)))
+
+    def add(parent: Any, name: str, values: np.ndarray) -> None:
+        whole = values.dtype.kind == "i"
+        item = Xml.SubElement(parent, "DataArray", Name=name, format="ascii")
+        item.set("type", "Int64" if whole else "Float64")
+        if values.ndim == 2:
+            item.set("NumberOfComponents", str(values.shape[1]))
+        item.text = _text_of(values, "%d" if whole else "%.10g")
+
+    corners = np.concatenate([np.full(len(part), part.shape[1]) for part in sheet.cells])
+    add(Xml.SubElement(piece, "Points"), "Points", sheet.points)
+    cells = Xml.SubElement(piece, "Cells")
+    add(cells, "connectivity", np.concatenate([part.ravel() for part in sheet.cells]))
+    add(cells, "offsets", np.cumsum(corners))
+    types = [np.full(len(part), VTK_CELLS[sheet.dimension, part.shape[1]]) for part in sheet.cells]
+    add(cells, "types", np.concatenate(types))
+    data = Xml.SubElement(piece, "CellData", Scalars="density")
+    for name, values in sheet.fields.items():
+        add(data, name, values)
+    write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
+
+
+def _write_xdmf(path: Path, sheet: _Sheet) -> None:
+    from xml.etree import ElementTree as Xml
+
+    root = Xml.Element("Xdmf", Version="3.0")
+    grid = Xml.SubElement(Xml.SubElement(root, "Domain"), "Grid", Name="arms", GridType="Uniform")
+    Xml.SubElement(grid, "Time", Value="0")
+    topology = Xml.SubElement(grid, "Topology")
+    topology.set("NumberOfElements", str(len(sheet.density)))
+    shapes = {(sheet.dimension, part.shape[1]) for part in sheet.cells}
+    if len(shapes) == 1:
+        topology.set("TopologyType", XDMF_NAMES[next(iter(shapes))])
+        _data_item(topology, np.vstack(sheet.cells), "Int")
+    else:
+        topology.set("TopologyType", "Mixed")
+        numbers = [XDMF_CELLS[sheet.dimension, part.shape[1]] for part in sheet.cells]
+        parts = [np.insert(c, 0, k, axis=1) for c, k in zip(sheet.cells, numbers, strict=True)]
+        _data_item(topology, np.concatenate([part.ravel() for part in parts]), "Int")
+    geometry = Xml.SubElement(grid, "Geometry", GeometryType="XYZ")
+    _data_item(geometry, sheet.points, "Float")
+    for name, values in sheet.fields.items():
+        kind = "Int" if values.dtype.kind == "i" else "Float"
+        attribute = Xml.SubElement(grid, "Attribute", Name=name, Center="Cell")
+        attribute.set("AttributeType", "Scalar")
+        _data_item(attribute, values, kind)
+    write_atomically(path, lambda stream: Xml.ElementTree(root).write(stream))
+
+
+def _data_item(parent: Any, values: np.ndarray, number_type: str) -> None:
+    from xml.etree import ElementTree as Xml
+
+    item = Xml.SubElement(parent, "DataItem", Format="XML", NumberType=number_type)
+    item.set("Dimensions", " ".join(map(str, values.shape)))
+    if number_type == "Float":
+        item.set("Precision", "8")
+    item.text = _text_of(values, "%d" if number_type == "Int" else "%.10g")
+
+
+def _text_of(values: np.ndarray, form: str) -> str:
+    """Return numbers as text, a line a row."""
+    rows = values if values.ndim == 2 else values[:, None]
+    line = " ".join([form] * rows.shape[1]) + "\n"
+    return "\n" + line * len(rows) % tuple(rows.ravel().tolist())
+
+
+def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, d) and cells (n_cells, corners) of cells that share their corners."""
+    flat = corners.reshape(-1, corners.shape[2])
+    rounded = np.round(flat / (1e-9 * np.ptp(flat, axis=0).max()))
+    _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    return flat[kept], place.reshape(corners.shape[:2])
+
+
+# -- history.csv: a line an iteration, written as it happens and read back -----------------------
+
+
+class HistoryWriter:
+    """history.csv, a line an iteration as it happens."""
+
+    def __init__(self, path: Path, rows: Sequence[HistoryRow]):
+        """Begin the file anew with the rows known so far."""
+        self.path = path
+        self.begun = bool(rows)
+        write_text(path, _csv_lines(rows[0].columns, [row.values for row in rows]) if rows else "")
+
+    def append(self, row: HistoryRow) -> None:
+        """Add one line; the first row brings the header, too."""
+        line = _csv_lines([] if self.begun else row.columns, [row.values]).lstrip("\n")
+        self.begun = True
+        append_text(self.path, line)
+
+
+def read_history(path: Path) -> list[HistoryRow]:
+    """Read history.csv back."""
+    with open_input(path) as stream:
+        rows = list(csv.reader(stream.read().decode().splitlines()))
+        return [HistoryRow.from_values(rows[0], list(map(float, row))) for row in rows[1:]]
+
+
+def _csv_lines(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    lines = [",".join(header)]
+    lines += [",".join(str(v) if isinstance(v, int) else f"{v:.10g}" for v in row) for row in rows]
+    return "\n".join(lines) + "\n"

@@ -17,10 +17,10 @@ from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.spatial_trajectory import JointLimit, SpatialTrajectory
+from dolfinopt.dynamics.spatial_system import JointLimit, SpatialTrajectory
 from dolfinopt.mesh import compat
+from dolfinopt.multibody.inverse_dynamics import WARN, Stiffening
 from dolfinopt.multibody.shape_integrals import first_frequency
-from dolfinopt.multibody.stiffening import WARN, Stiffening
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -35,7 +35,7 @@ from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.plausibility import implausible
+from dolfinopt.scene.messages import implausible
 from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
 from dolfinopt.version import __version__
 

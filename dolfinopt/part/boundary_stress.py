@@ -22,8 +22,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.part.body_mesh import CORNER
 from dolfinopt.part.curves import direction
 from dolfinopt.part.shape import Shape
-from dolfinopt.responses.screening import every, maxima, screen
-from dolfinopt.responses.stress_loads import arm_loads, motions_of
+from dolfinopt.responses.stress import arm_loads, every, maxima, motions_of, screen
 from dolfinopt.responses.stress_report import ArmStress, Peak
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.patience import counted
+from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.body_mesh import BodyMesh

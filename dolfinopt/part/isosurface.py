@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.cells import cell_volumes
+from dolfinopt.mesh.checks import cell_volumes
 
 HALVINGS = 40  # of the interval in which the level lies
 BELOW = 0.98  # the highest level, over the highest density

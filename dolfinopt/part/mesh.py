@@ -17,8 +17,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
-from dolfinopt.mesh.groups import DESIGN, INBOARD, NAMES, OUTBOARD
+from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, NAMES, OUTBOARD, TRIANGLE, gmsh_on_root
 from dolfinopt.part.body_mesh import BodyMesh, normals, triangle_areas
 from dolfinopt.part.curves import Arc, Curve, Line, Spline, curvature
 from dolfinopt.part.part import Part

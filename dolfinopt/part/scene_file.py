@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.part.part import Part
-from dolfinopt.scene.contents import with_relative_paths
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import with_relative_paths
 
 if TYPE_CHECKING:
     from dolfinopt.part.solid_part import SolidPart

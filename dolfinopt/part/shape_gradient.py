@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from dolfinopt.fem.elements.lagrange import LagrangeElement
+from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh import compat
 from dolfinopt.part.body_mesh import BodyMesh
 from dolfinopt.part.forms import STRESS, Simulated

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from dolfinopt.disk import write_atomically
-from dolfinopt.mesh.surface_solid import Tetrahedra, msh_bytes
+from dolfinopt.mesh.geometry import Tetrahedra, msh_bytes
 from dolfinopt.output.views import gather_views
 from dolfinopt.part.boundary_stress import PartStress
 from dolfinopt.part.check import Check, relative_change

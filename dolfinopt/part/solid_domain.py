@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.mesh.cells import cell_volumes, facet_corners
+from dolfinopt.mesh.checks import cell_volumes, facet_corners
 from dolfinopt.part.domain import Domain, domain_of
 from dolfinopt.scene.load import Arm, Scene
 

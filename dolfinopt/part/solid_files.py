@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from dolfinopt.disk import write_atomically, write_text
-from dolfinopt.mesh.surface_solid import Tetrahedra
+from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.drawings import dxf_text
 from dolfinopt.part.files import FIGURES, PICTURES, SCENE, publish
 from dolfinopt.part.scene_file import solid_scene_text

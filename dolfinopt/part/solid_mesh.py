@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.surface_solid import Tetrahedra, tetrahedra_of
+from dolfinopt.mesh.geometry import Tetrahedra, tetrahedra_of
 from dolfinopt.part.isosurface import Surface
 from dolfinopt.part.part import Part
 from dolfinopt.part.smooth_surface import distance_to_faces, with_volume
@@ -112,8 +112,7 @@ def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
     """Return prisms over the triangles of a plate, each cut in three."""
     from mpi4py import MPI
 
-    from dolfinopt.mesh.gmsh_session import gmsh_on_root
-    from dolfinopt.mesh.groups import INBOARD, NAMES, OUTBOARD
+    from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, gmsh_on_root
     from dolfinopt.part.mesh import body_mesh
 
     cell = flat.domain.cell

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.fem.stress import stress_operator
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.cells import facet_corners
+from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.part.boundary_stress import PartStress, stress_of_parts
 from dolfinopt.part.smooth_surface import distance_to_faces
 

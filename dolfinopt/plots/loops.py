@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.multibody.drives import Closure
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.plots.shapes import base_corners, chain
 from dolfinopt.plots.style import GREY
 

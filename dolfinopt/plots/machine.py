@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.multibody.drives import Closure
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots.loops import BASE, block_corners, close_loop, draw_ground, ground_points
 from dolfinopt.plots.shapes import (

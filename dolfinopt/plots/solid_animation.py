@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.disk import write_atomically
 from dolfinopt.multibody.shape_integrals import linear_part
-from dolfinopt.multibody.spatial.frames import Frames, body_frames
+from dolfinopt.multibody.spatial.kinematics import Frames, body_frames
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots.animation import FILM_SECONDS, FRAMES, common_colours, round_magnification

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.mesh.cells import cell_volumes
+from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.output.views import AROUND, ArmView
 from dolfinopt.part.isosurface import Surface
 from dolfinopt.plots.solids import (

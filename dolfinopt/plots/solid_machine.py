@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from dolfinopt.multibody.spatial.frames import Frames, body_frames
+from dolfinopt.multibody.spatial.kinematics import Frames, body_frames
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.part.isosurface import Surface

@@ -9,12 +9,11 @@ import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
-from dolfinopt.reduction.compare import BasisErrors, basis_errors, mac
-from dolfinopt.reduction.craig_bampton import craig_bampton, craig_bampton_adjoint
 from dolfinopt.reduction.free_arm import frame_fields
 from dolfinopt.reduction.gramian import balanced
 from dolfinopt.reduction.krylov import krylov, krylov_adjoint
-from dolfinopt.reduction.modal import modal, modal_adjoint
+from dolfinopt.reduction.modal import craig_bampton, craig_bampton_adjoint, modal, modal_adjoint
+from dolfinopt.reduction.subspace import BasisErrors, basis_errors, mac
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,268 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
-from dolfinopt.reduction.lobpcg import Operators, interior_operators, lowest_without_factor
 from dolfinopt.solver import has_options, obeying_options
+
+# -- the linear systems of the modes' derivatives ------------------------------------------------
+
+# Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
+# which leaves more digits than an optimiser can use.
+ADJOINT_TOLERANCE = 1e-8
+MAX_ADJOINT = 500  # steps of conjugate gradients for one mode
+
+
+def complement_solve(
+    pencil: Pencil, modes: np.ndarray, values: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    """Solve (K - lambda_k M) mu_k = right_k in the M-complement of the modes, for every k.
+
+    The adjoint of the eigenproblem, less its part within the modes' span. A reduced model depends
+    on nothing but that span, so what the modes do among themselves has no influence: neither close
+    nor repeated eigenvalues divide by zero. In the complement K - lambda_k M is positive definite,
+    and conjugate gradients with the factor of K converge as 1 - lambda_k / lambda_next allows.
+    K times a direction follows from the residual that the direction was solved for. Where no factor
+    is at hand, multigrid cycles take its place, for all modes at once.
+
+    Args:
+        pencil: K and M.
+        modes: (rows, k) all modes below the complement, M-orthonormal.
+        values: (k,) their eigenvalues, rad2/s2.
+        right: (rows, k).
+
+    Returns:
+        mu (rows, k).
+
+    Raises:
+        ConvergenceError: the next eigenvalue is too close to the last.
+    """
+    if pencil.operators is not None:
+        return _without_factor(pencil, pencil.operators, modes, values, right)
+    weighted = np.column_stack([pencil.mass(mode) for mode in modes.T])
+
+    def conditioned(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return z = K^-1 r less its part in the modes, K z, and z . r."""
+        z = pencil.inverse(residual)
+        part = pencil.total(weighted.T @ z)
+        z -= modes @ part
+        return z, residual - weighted @ (values * part), float(pencil.total(residual @ z))
+
+    out = np.zeros_like(right)
+    for k, value in enumerate(values):
+        residual = right[:, k] - weighted @ pencil.total(modes.T @ right[:, k])
+        step, K_step, energy = conditioned(residual)
+        image = K_step - value * pencil.mass(step)
+        goal = ADJOINT_TOLERANCE**2 * energy
+        for _ in range(MAX_ADJOINT):
+            if energy <= goal:
+                break
+            if not np.isfinite(energy):
+                raise _too_close(pencil, k)
+            length = energy / float(pencil.total(step @ image))
+            out[:, k] += length * step
+            residual -= length * image
+            previous = energy
+            z, K_z, energy = conditioned(residual)
+            image = K_z - value * pencil.mass(z) + (energy / previous) * image
+            step = z + (energy / previous) * step
+        else:
+            raise _too_close(pencil, k)
+    return out
+
+
+def _without_factor(
+    pencil: Pencil, operators: Operators, modes: np.ndarray, values: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    """Do what `complement_solve` does with an approximation of K^-1 alone.
+
+    Conjugate gradients for each mode's own matrix; products and cycles work on all of them.
+    """
+    weighted = operators.mass(modes)
+
+    def lengths(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return operators.total(np.einsum("nk,nk->k", one, other))
+
+    def conditioned(R: np.ndarray) -> np.ndarray:
+        """Return P B P' r, with P the projection into the complement; r becomes P' r."""
+        R -= weighted @ operators.total(modes.T @ R)
+        Z = operators.precondition(R)
+        return Z - modes @ operators.total(weighted.T @ Z)
+
+    out, here = np.zeros_like(right), np.arange(len(values))
+    R = right.copy(order="F")
+    Z = conditioned(R)
+    P, energy = Z, lengths(R, Z)
+    goal = ADJOINT_TOLERANCE**2 * energy
+    for _ in range(MAX_ADJOINT):
+        if not np.isfinite(energy).all():
+            break
+        more = energy > goal[here]
+        if not more.any():
+            return out
+        if not more.all():
+            here, energy = here[more], energy[more]
+            R, P = R[:, more], P[:, more]
+        image = operators.stiffness(P) - operators.mass(P) * values[here]
+        step = energy / lengths(P, image)
+        out[:, here] += P * step
+        R -= image * step
+        Z = conditioned(R)
+        before, energy = energy, lengths(R, Z)
+        P = Z + P * (energy / before)
+    raise _too_close(pencil, int(here[np.argmin(np.isfinite(energy))]))
+
+
+def _too_close(pencil: Pencil, k: int) -> ConvergenceError:
+    return ConvergenceError(
+        f"arm {pencil.arm.mesh.name!r}: the derivatives of mode {k + 1} do not converge, "
+        "the next mode's frequency is too close; change reduction.coordinates by one"
+    )
+
+
+# -- the lowest modes where no factor is at hand: locally optimal block conjugate gradients ------
+#
+# Source: Knyazev, SIAM J. Sci. Comput. 23 (2001) 517-541, doi:10.1137/S1064827500366124; bases made
+# orthonormal as in Hetmaniuk & Lehoucq, J. Comput. Phys. 218 (2006) 324-332,
+# doi:10.1016/j.jcp.2006.02.007.
+
+Columns = Callable[[np.ndarray], np.ndarray]
+GUARDS = 3  # vectors beyond those that are wanted: the last ones converge slowly
+MAX_STEPS = 200
+TOLERANCE = 1e-8  # of the vectors in energy
+INDEPENDENT = 1e-12  # share of a direction's length, squared, below which it is the others'
+
+
+@dataclass(frozen=True, eq=False)
+class Operators:
+    """What a search needs: products with columns (rows, k) of this rank.
+
+    Attributes:
+        rows: of this rank.
+        stiffness, mass, precondition: K, M, and an approximation of K^-1.
+        total: sum over the ranks.
+        comm: the ranks that share the rows.
+    """
+
+    rows: int
+    stiffness: Columns
+    mass: Columns
+    precondition: Columns
+    total: Columns
+    comm: MPI.Comm
+
+
+def interior_operators(arm: ElasticArm) -> Operators:
+    """Return those of the interior of an arm whose systems are solved iteratively."""
+    arm.factorise()
+    stiffness, cycle = arm.substructure.interior.multigrid(arm.K.matrix)
+    return Operators(
+        arm.num_interior,
+        stiffness,
+        lambda V: by_column(arm.interior_mass_times, V),
+        cycle,
+        lambda part: part if arm.comm.size == 1 else arm.comm.allreduce(part),
+        arm.comm,
+    )
+
+
+def by_column(times: Columns, V: np.ndarray) -> np.ndarray:
+    """Return the products of a matrix with the columns of V (rows, k), one after the other."""
+    return np.column_stack([times(vector) for vector in V.T]) if V.shape[1] else V.copy()
+
+
+def lowest_without_factor(
+    arm: ElasticArm, operators: Operators, count: int, start: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the lowest eigenvalues and vectors, None if that fails (collective).
+
+    Args:
+        arm: for its communicator.
+        operators: of the interior, or of the clamped-free arm.
+        count: number of eigenpairs.
+        start: (rows, k) vectors of a nearby design, or None.
+    """
+    rows, size = operators.rows, count + GUARDS
+    known = np.empty((rows, 0)) if start is None else start[:, :size]
+    first = 0 if arm.comm.size == 1 else arm.comm.exscan(rows) or 0
+    columns = 12.9898 + np.arange(size - known.shape[1])
+    noise = np.sin(np.outer(np.arange(first + 1.0, first + rows + 1.0), columns))
+    noise = np.modf(np.abs(noise) * 43758.5453)[0] - 0.5
+    smooth = operators.precondition(operators.precondition(noise))
+    found = lobpcg(operators, np.hstack([known, smooth]), count, TOLERANCE)
+    return None if found is None else found[:2]
+
+
+def lobpcg(
+    operators: Operators, start: np.ndarray, count: int, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Return the lowest eigenvalues (count,), M-orthonormal vectors, and steps; None if it fails.
+
+    A pair is found once its residual, in the norm of the preconditioner, is below the tolerance
+    times the square root of its eigenvalue: about the error of the vector in energy.
+
+    Args:
+        operators: symmetric positive definite.
+        start: (rows, m) independent vectors, m > count.
+        count: number of eigenpairs.
+        tolerance: relative.
+    """
+    m = start.shape[1]
+    S = _products(operators, start)
+    C, values = _ritz(operators, S)
+    X, KX, MX = (part @ C[:, :m] for part in S)
+    values, P = values[:m], [np.empty((len(start), 0))] * 3
+    for step in range(MAX_STEPS):
+        R = KX - MX * values
+        W = operators.precondition(R)
+        size = operators.total(np.einsum("nk,nk->k", R, W))
+        if not np.isfinite(size).all():
+            return None
+        if (np.sqrt(np.maximum(size, 0.0)) <= tolerance * np.sqrt(values))[:count].all():
+            return values[:count], X[:, :count], step
+        W -= X @ operators.total(MX.T @ W)
+        new = _products(operators, W)
+        S = [np.concatenate(parts, axis=1) for parts in zip((X, KX, MX), new, P, strict=True)]
+        C, values = _ritz(operators, S)
+        C, values = C[:, :m], values[:m]
+        # The next directions: what the new vectors have of the last residuals and directions.
+        P = [part[:, m:] @ C[m:] for part in S]
+        X = S[0] @ C
+        _, KX, MX = _products(operators, X)  # combined ones drift by rounding
+    return None
+
+
+def _products(operators: Operators, V: np.ndarray) -> list[np.ndarray]:
+    """Return V, K V, M V."""
+    return [V, operators.stiffness(V), operators.mass(V)]
+
+
+def _ritz(operators: Operators, space: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return coefficients of all Ritz vectors of S, given S, K S and M S, and their values."""
+    S, KS, MS = space
+    k = S.shape[1]
+    both = operators.total(S.T @ np.concatenate([KS, MS], axis=1))
+    K, M = 0.5 * (both[:, :k] + both[:, :k].T), 0.5 * (both[:, k:] + both[:, k:].T)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
+
+    def solved() -> tuple[np.ndarray, np.ndarray]:
+        lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
+        kept = lengths > INDEPENDENT * lengths[-1]
+        T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
+        values, vectors = np.linalg.eigh(T.T @ K @ T)
+        return T @ vectors, values
+
+    # One rank decides how many vectors are independent, and when the search ends.
+    found: tuple[np.ndarray, np.ndarray] = on_root(operators.comm, solved)
+    return found
+
+
+# -- the lowest modes of an arm ------------------------------------------------------------------
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs

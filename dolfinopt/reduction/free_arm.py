@@ -9,8 +9,7 @@ from petsc4py import PETSc
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import rigid_motions
-from dolfinopt.reduction.eigenproblem import Pencil
-from dolfinopt.reduction.lobpcg import Operators, by_column, interior_operators
+from dolfinopt.reduction.eigenproblem import Operators, Pencil, by_column, interior_operators
 
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 

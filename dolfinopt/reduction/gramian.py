@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.cells import combine
+from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
 from dolfinopt.reduction.basis import Basis, Options

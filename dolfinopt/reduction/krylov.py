@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.cells import combine
+from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
 from dolfinopt.reduction.free_arm import (

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import constraints_of, find_limited
+from dolfinopt.responses.motion import LoadCases, MotionResponse
+from dolfinopt.responses.response import constraints_of, find_limited, objective_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.constraints import Constraints
+from dolfinopt.scene.tables.objective import Constraints
 
 # Relative violation of the true value up to which a constraint counts as met: MMA meets an active
 # one to a fraction of its last change, which optimizer.tolerance leaves at 1e-3.
@@ -175,3 +177,23 @@ def tightest(limits: Sequence[Limit]) -> str:
 def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:
     """Return the constraints by name, for summary.json."""
     return {one.name: one.to_dict() for one in limits}
+
+
+# -- the objective of a scene, where it is one of the motion -------------------------------------
+
+
+def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
+    """Return the instants that make up the scene's objective."""
+    return _of_motion(scene).load_cases(trajectory)
+
+
+def objective(trajectory: Trajectory, scene: Scene, cases: LoadCases | None = None) -> float:
+    """Return the scene's objective, at the instants that it chooses or at given ones."""
+    response = _of_motion(scene)
+    return response.value(trajectory, response.load_cases(trajectory) if cases is None else cases)
+
+
+def _of_motion(scene: Scene) -> MotionResponse:
+    response = objective_of(scene)
+    assert isinstance(response, MotionResponse), "an objective without a motion"
+    return response

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from dolfinopt.arms.arm import fixed_body
+from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import on_root, sum_over_arms, together
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
     Response,
+    occurrences,
     register,
 )
-from dolfinopt.responses.volume_fraction import cell_volumes
-from dolfinopt.scene.tables.responses import NEEDS
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.objective import NEEDS
 
 
 @register
@@ -49,3 +53,67 @@ class Mass(Response):
         designs = analysis.designs
         volumes = cell_volumes(analysis.scene, {k: one.mesh for k, one in designs.items()})
         return [{k: designs[k].density_slope * volume for k, volume in volumes.items()}]
+
+
+# -- volume of every design, or of all together --------------------------------------------------
+
+
+@register
+class VolumeFraction(Response):
+    """sum_e V_e x_e of every design times the arms that have it, m3; its true value over sum V_e.
+
+    With `design.shared_volume` one value, of all designs together.
+    """
+
+    name, label, unit = "volume_fraction", "volume", "m3"
+    limit_unit = "-"
+    of_nominal = True
+
+    def measure(self, analysis: Analysis) -> Measured:
+        """Return volumes and their fractions (collective)."""
+        filled, full = self._volumes(analysis).T
+        scene = analysis.scene
+        designed = tuple(scene.arms[k].name for k in scene.designed)
+        names = ("",) if scene.design.shared_volume else designed
+        return Measured(self.name, names, tuple((filled / full).tolist()), tuple(filled.tolist()))
+
+    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+        """Return the volumes of the cells that belong to each value."""
+        volumes, rows = _of_cells(analysis), _rows(analysis)
+        return [
+            {k: one for k, one in volumes.items() if rows[k] == row}
+            for row in range(1 + max(rows.values()))
+        ]
+
+    def smooth_limits(
+        self, analysis: Analysis, measured: Measured, limits: np.ndarray
+    ) -> np.ndarray:
+        """Return the volumes of designs filled to the limits, m3 (collective)."""
+        return limits * self._volumes(analysis)[:, 1]
+
+    def _volumes(self, analysis: Analysis) -> np.ndarray:
+        """Return the volume of the design and of its solid arms (values, 2), m3 (collective)."""
+        rows, parts = _rows(analysis), {}
+        with together(analysis.partition.world):
+            for k, volume in _of_cells(analysis).items():
+                x = analysis.designs[k].x_phys
+                parts[k] = np.zeros((1 + max(rows.values()), 2))
+                parts[k][rows[k]] = volume @ x, volume @ np.ones_like(x)
+        return sum_over_arms(analysis.partition, parts)
+
+
+def cell_volumes(scene: Scene, meshes: Mapping[int, ArmMesh]) -> dict[int, np.ndarray]:
+    """Return the volume (n_cells,) of every arm's cells times the arms that have them, m3."""
+    uses = occurrences(scene)
+    return {k: uses[k] * scene.arms[k].depth * mesh.area for k, mesh in meshes.items()}
+
+
+def _of_cells(analysis: Analysis) -> dict[int, np.ndarray]:
+    return cell_volumes(analysis.scene, {k: one.mesh for k, one in analysis.designs.items()})
+
+
+def _rows(analysis: Analysis) -> dict[int, int]:
+    """Return to which value every arm's cells belong: that of the arm whose design it has."""
+    scene = analysis.scene
+    row = {k: 0 if scene.design.shared_volume else row for row, k in enumerate(scene.designed)}
+    return {k: row[scene.patterns.get(k, k)] for k in scene.cell_counts}

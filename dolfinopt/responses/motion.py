@@ -18,12 +18,17 @@ from dolfinopt.responses.response import (
     Measured,
     Response,
     by_owner,
+    combined,
+    cotangents_of_scene,
+    factors,
     find,
+    p_norm_of_lengths,
+    register,
+    worst_of,
 )
-from dolfinopt.responses.scenarios import combined, cotangents_of_scene, factors, worst_of
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
 from dolfinopt.scene.load import Scene, WorstBy
-from dolfinopt.scene.tables.responses import EXACT_ONLY, MOTION, Need
+from dolfinopt.scene.tables.objective import EXACT_ONLY, MOTION, Need
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,3 +273,109 @@ def motion_objective(trajectory: Trajectory) -> MotionResponse | None:
     options = trajectory.scene.objective
     response = find(options.kind)(options)
     return response if isinstance(response, MotionResponse) else None
+
+
+# -- deviation of the end-effector from its rigid path -------------------------------------------
+
+
+@register
+class Deviation(MotionResponse):
+    """(1/T int |e|^p dt)^(1/p), m: close to the largest deviation, and smooth.
+
+    With e from eq. (6) of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
+    """
+
+    name, label, unit = "deviation", "p-mean of the deviation", "m"
+
+    def extreme(self, trajectory: Trajectory) -> float:
+        """Return the largest deviation of all instants, m."""
+        return trajectory.max_deviation[0]
+
+    def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
+        """Return the p-mean."""
+        return self._mean(trajectory, cases)[0]
+
+    def derivatives(
+        self, trajectory: Trajectory, cases: LoadCases
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return its derivatives through the outboard interfaces' modes."""
+        _, by_deviation = self._mean(trajectory, cases)
+        return trajectory.by_end_effector(cases.indices, by_deviation)
+
+    def _mean(self, trajectory: Trajectory, cases: LoadCases) -> tuple[float, np.ndarray]:
+        weights = cases.weights / cases.weights.sum()
+        deviation = trajectory.deviation[cases.indices]
+        return p_norm_of_lengths(deviation, self.options.exponent, weights)
+
+
+# -- deviation of the end-effector after the motion has ended ------------------------------------
+
+
+@register
+class Settling(Deviation):
+    """The p-mean of the deviation from `motion.duration` on, m; its true value the largest."""
+
+    name, label = "settling", "p-mean of the deviation after the motion"
+
+    @property
+    def guarded(self) -> bool:
+        """Whether its gradient is the derivative, from which a forecast follows."""
+        return self.options.gradient == "exact"
+
+    def load_cases(self, trajectory: Trajectory) -> LoadCases:
+        """Return the instants of the vibration that is left."""
+        indices = np.flatnonzero(trajectory.after_motion)
+        weights = all_instants(trajectory).weights[indices]
+        return LoadCases(indices, weights)
+
+    def extreme(self, trajectory: Trajectory) -> float:
+        """Return the largest of these deviations, m."""
+        return trajectory.settling
+
+
+# -- compliance over the whole horizon -----------------------------------------------------------
+
+
+@register
+class IntegralCompliance(ComplianceResponse):
+    """Integral of q' K q over the horizon, trapezoidal rule, N m s."""
+
+    name, label, unit = "compliance", "integral of the compliance", "N m s"
+
+
+# -- compliance under the equivalent static loads of the worst instants: the paper's objective ---
+
+
+@register
+class EquivalentStaticLoads(ComplianceResponse):
+    """Sum of q' K q over the worst instant of each of `objective.load_cases` intervals, N m.
+
+    Source: Seifried, Moghadasi & Held (2015), eq. (9), doi:10.1016/j.piutam.2015.01.018.
+    """
+
+    name, label, unit = "esl", "compliance of the load cases", "N m"
+
+    def load_cases(self, trajectory: Trajectory) -> LoadCases:
+        """Return the worst instant of each interval."""
+        indices = worst_instants(trajectory, self.options.load_cases, self.worst)
+        return LoadCases(indices, np.ones(len(indices)))
+
+    @property
+    def worst(self) -> WorstBy:
+        """What decides which instant is the worst."""
+        return self.options.worst
+
+
+# -- compliance of the load cases, as every summary has it ---------------------------------------
+
+
+@register
+class LoadCaseCompliance(EquivalentStaticLoads):
+    """The instants are the worst by compliance whatever `objective.worst`: a limit's, N m."""
+
+    name = "load_case_compliance"
+
+    @property
+    def worst(self) -> WorstBy:
+        """The compliance decides."""
+        return "compliance"

@@ -20,8 +20,8 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis
-from dolfinopt.responses.scenarios import bodies_in, factors
-from dolfinopt.responses.stiffening import decide_stiffening
+from dolfinopt.responses.evaluation import decide_stiffening
+from dolfinopt.responses.response import bodies_in, factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:

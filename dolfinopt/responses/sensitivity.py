@@ -8,8 +8,10 @@ import numpy as np
 
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
-from dolfinopt.fem.cells import combine
+from dolfinopt.fem.assembly import combine
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
+from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     by_modal_loads,
@@ -17,7 +19,7 @@ from dolfinopt.multibody.shape_integrals import (
     rigid_body,
 )
 from dolfinopt.reduction import METHODS, frame_fields
-from dolfinopt.responses.statics import StaticResponse
+from dolfinopt.responses.response import p_norm_of_lengths
 
 # Directions of A below this share of its largest are the rounding of its sums.
 RANK_TOLERANCE = 1e-14
@@ -188,3 +190,62 @@ def rigid_gradient(state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals
     partners = mass_partners(points, np.empty((*points.shape, 0)), by)
     masses = state.elastic.cell_mass_products(partners.left, partners.right)
     return state.density_slope * masses
+
+
+# -- one arm under static loads of its outboard interface: compliance and deflection -------------
+
+
+@dataclass(frozen=True, eq=False)
+class StaticResponse:
+    """What static loads do to one arm whose inboard interface is clamped; k load cases.
+
+    Attributes:
+        loads: (3, k) force (N) and moment (N m) at the outboard interface; of solids (6, k), of
+            those with several interfaces (b, k), zero at the others.
+        tip: likewise displacements (m) and rotations (rad).
+    """
+
+    loads: np.ndarray
+    tip: np.ndarray
+
+    @property
+    def compliance(self) -> float:
+        """Sum over the cases of load . displacement, N m."""
+        return float(np.sum(self.loads * self.tip))
+
+    @property
+    def largest(self) -> float:
+        """Largest |u_k| of the outboard point, m."""
+        return float(lengths(self.displacement).max())
+
+    @property
+    def displacement(self) -> np.ndarray:
+        """Displacement of the first outboard point (k, d), m."""
+        return self.tip[: 2 if len(self.tip) == 3 else 3].T
+
+    def deflection(self, exponent: float) -> float:
+        """Return (sum_k |u_k|^p)^(1/p) of the outboard point, m: at least the largest |u_k|."""
+        return p_norm_of_lengths(self.displacement, exponent)[0]
+
+    def deflection_gradient(self, exponent: float) -> np.ndarray:
+        """Return the derivative (3, k), or (6, k), of `deflection` by the displacements."""
+        _, by_displacement = p_norm_of_lengths(self.displacement, exponent)
+        out = np.zeros_like(self.tip)
+        out[: by_displacement.shape[1]] = by_displacement.T
+        return out
+
+
+def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
+    """Load the outboard interface of one arm (collective on its ranks).
+
+    By `ElasticArm.static_fields`; neither the mass matrix nor a reduced model is needed.
+
+    Args:
+        arm: of the design.
+        loads: (k, 3) F_x, F_y (N) and moment (N m) of every case; of a solid arm (k, 6).
+    """
+    columns = np.array(loads, dtype=float).T
+    free = arm.rigid.shape[2] - len(columns)  # further interfaces are
+    columns = np.concatenate([columns, np.zeros((free, columns.shape[1]))])
+    fields = arm.static_fields(columns)
+    return StaticResponse(columns, fields.tip @ fields.amplitudes(columns))

@@ -3,31 +3,273 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
+from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.fem.cells import combine
+from dolfinopt.dynamics.adjoint import add_gradients
+from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
+from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.geometric_stiffness import static_response
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
-from dolfinopt.responses.cell_stress import CellStress, cell_stress
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
     Response,
+    by_owner,
+    cotangents_of_scene,
+    factors,
     register,
 )
-from dolfinopt.responses.screening import every, screen
 from dolfinopt.responses.sensitivity import exact_gradient
-from dolfinopt.responses.stress_loads import ArmLoads, arm_loads, loads_gradient, motions_of
-from dolfinopt.scene.tables.responses import NEEDS
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.objective import NEEDS
 
-if TYPE_CHECKING:
-    from dolfinopt.dynamics.simulation import Trajectory
+# -- von Mises stress at the element centres of one design, relaxed for intermediate density -----
+#
+# s_en = x_e^(1/2) |A_e a_n| of cell e at instant n: stress of the solid material under the strain
+# of the cell, less the less there is of it, so that void has none (qp relaxation). Source: Bruggi
+# (2008), doi:10.1007/s00158-007-0203-6; Le, Norato, Bruns, Ha & Tortorelli (2010),
+# doi:10.1007/s00158-009-0440-y.
+
+INSTANTS_AT_ONCE = 64  # looked at together, so that they stay in the cache
+
+
+@dataclass(frozen=True, eq=False)
+class CellStress:
+    """Relaxed stress of one design by the coefficients of its load fields.
+
+    Attributes:
+        state: the design.
+        A: (3, n_cells, m) components whose length is the relaxed stress, Pa per coefficient; zero
+            in cells that do not count.
+        weights: (n_cells,) area of those that count, m2.
+        root: (n_cells,) x^(1/2).
+    """
+
+    state: DesignState
+    A: np.ndarray
+    weights: np.ndarray
+    root: np.ndarray
+
+    def power_sum(self, a: np.ndarray, unit: float, exponent: float) -> float:
+        """Return sum_n sum_e weight_e (s_en / unit)^p over this rank's cells; a is (n, m)."""
+        total = 0.0
+        for part in _runs(len(a)):
+            squares = np.square(self.A @ (a[part] / unit).T).sum(axis=0)
+            total += float(np.sum(self.weights @ _power(squares, 0.5 * exponent)))
+        return total
+
+    def power_sum_gradient(
+        self, a: np.ndarray, unit: float, exponent: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Differentiate `power_sum` over p, times unit: sum weight (s / unit)^(p-1) ds.
+
+        Returns:
+            By the coefficients (n, m); by A of full density (3, n_cells, m); by x (n_cells,), all
+            of them over this rank's cells.
+        """
+        by_a, by_A = np.empty_like(a), np.zeros_like(self.A)
+        squared = np.zeros(len(self.weights))  # dJ . s
+        for part in _runs(len(a)):
+            e = self.A @ (a[part] / unit).T
+            squares = np.square(e).sum(axis=0)
+            factor = self.weights[:, None] * _power(squares, 0.5 * exponent - 1.0)
+            squared += unit * np.sum(factor * squares, axis=1)
+            e *= factor
+            flat = e.reshape(-1, e.shape[2])
+            by_a[part] = flat.T @ self.A.reshape(len(flat), -1)
+            by_A += e @ a[part]
+        x = self.state.x_phys
+        by_x = np.divide(0.5 * squared, x, out=np.zeros_like(x), where=x > 0.0)
+        return by_a, by_A * self.root[:, None], by_x
+
+    def by_columns(self, by_A: np.ndarray) -> np.ndarray:
+        """Return the derivatives by `LoadFields.columns` (n_nodes, 2, m) from those by A."""
+        operator = self.state.elastic.substructure.stress_operator
+        young = self.state.solid.young_modulus
+        return self.state.load_fields.stress_transposed(operator, young * by_A)
+
+
+def cell_stress(state: DesignState, margin: float = 0.0) -> CellStress:
+    """Return the stress of a design at its element centres (collective on the arm's ranks).
+
+    Args:
+        state: of the arm.
+        margin: cells closer than this to an interface do not count, m.
+    """
+    fields, substructure = state.load_fields, state.elastic.substructure
+    with state.elastic.profile.phase("stress"):
+        root, weights = np.sqrt(state.x_phys), state.mesh.area.copy()
+        if margin > 0.0:
+            weights[substructure.interface_distance < margin] = 0.0
+        A = fields.stress(state.solid.young_modulus * substructure.stress_operator)
+        A *= (root * (weights > 0.0))[:, None]
+        return CellStress(state, A, weights, root)
+
+
+def _power(x: np.ndarray, exponent: float) -> np.ndarray:
+    """Return x^exponent of x >= 0; small whole exponents by multiplication, ten times as fast."""
+    if exponent != int(exponent) or not 1 <= exponent <= 32:
+        return x**exponent
+    out, square, left = None, x, int(exponent)
+    while left:
+        if left & 1:
+            out = square if out is None else out * square
+        left >>= 1
+        if left:
+            square = square * square
+    assert out is not None
+    return out
+
+
+def _runs(count: int) -> list[slice]:
+    return [slice(first, first + INSTANTS_AT_ONCE) for first in range(0, count, INSTANTS_AT_ONCE)]
+
+
+# -- along a motion: the coefficients of every arm's static fields, whose sum is its
+# displacement
+#
+# u = V (q - K_r^-1 P c) + Z c, see `fem.stress`. In a scenario with another material, stiffness
+# times k, mass times m and Young's modulus times e, what belongs to the arm's own inertia is m / k
+# times as large, what comes from outboard 1 / k times, and stress e times that.
+
+
+@dataclass(frozen=True, eq=False)
+class ArmLoads:
+    """What loads one arm of the chain along one motion.
+
+    Attributes:
+        place: of the arm in the chain.
+        motion: number among `motions_of`.
+        coefficients: (n, q + 7 + 2 q) of `LoadFields.columns`.
+    """
+
+    place: int
+    motion: int
+    coefficients: np.ndarray
+
+
+def motions_of(trajectory: Trajectory) -> tuple[Trajectory, ...]:
+    """Return what a limit holds for: the scenarios, or the motion where there are none."""
+    return trajectory.scenarios or (trajectory,)
+
+
+def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[ArmLoads]]:
+    """Return the loads of every arm with a design, by the index of the arm that owns it."""
+    found: dict[int, list[ArmLoads]] = {owner: [] for owner in scene.cell_counts}
+    for number, motion in enumerate(motions):
+        for place, owner in enumerate(scene.owners):
+            if owner is not None:
+                found[owner].append(ArmLoads(place, number, _coefficients(scene, motion, place)))
+    return found
+
+
+def load_matrix(body: ShapeIntegrals) -> np.ndarray:
+    """Return P = V' L (q, 7 + 2 q), in space (q, 18 + 9 q): every load's part in the modes."""
+    if len(body.W) == len(SPACE):
+        q, (of_X, of_modes) = body.num_modes, (body.W[:, 1:, 0], body.W[:, 1:, 1:])
+        elastic = of_modes.swapaxes(0, 1).reshape(q, -1)
+        return np.hstack([body.C.T, of_X.T, body.outboard.T, elastic])
+    columns = [body.C.T, body.r[:, None], body.j[:, None], body.outboard.T, body.M, body.G]
+    return np.hstack(columns)
+
+
+def loads_gradient(
+    scene: Scene, motion: Trajectory, by_arm: Mapping[int, tuple[np.ndarray, np.ndarray]]
+) -> dict[int, ShapeIntegrals]:
+    """Differentiate a function of one motion's `ArmLoads.coefficients` by all designs' bodies.
+
+    Args:
+        scene: nominal, whose bodies the derivatives are by.
+        motion: of it, or of one of its scenarios.
+        by_arm: by place in the chain, instants (k,) and derivatives (k, q + 7 + 2 q) there.
+
+    Returns:
+        By the index of the arm that owns the design.
+    """
+    mechanism, problem = motion.mechanism, motion.problem
+    instants = np.unique(np.concatenate([where for where, _ in by_arm.values()]))
+    by_q = np.zeros((len(instants), mechanism.num_coordinates))
+    by_c, own = [], []
+    for place, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        by_loads = np.zeros((len(instants), load_counts(body).total))
+        by_P, by_K = np.zeros((body.num_modes, by_loads.shape[1])), np.zeros_like(body.K)
+        if place in by_arm:
+            where, by = by_arm[place]
+            rows, q = np.searchsorted(instants, where), body.num_modes
+            by = by * _scale(scene, motion.scene, place, body)
+            c, P = motion.load_coefficients[place][where], load_matrix(body)
+            z = -np.linalg.solve(body.K, by[:, :q].T)
+            by_q[rows, part] = by[:, :q]
+            by_loads[rows] = by[:, q:] + z.T @ P
+            by_P, by_K = z @ c, -z @ np.linalg.solve(body.K, P @ c.T).T
+        by_c.append(by_loads)
+        own.append(_integrals(body, by_P, by_K))
+    t = motion.t[instants]
+    rates = (motion.unknowns[0][instants], motion.unknowns[1][instants])
+    through = load_gradient(problem, t, (*rates, motion.unknowns[2][instants]), by_c)
+    through.by_rates[0] += motion.by_unknowns(by_q)
+    followed = motion.adjoint.gradient(t, through.by_rates)
+    total = add_gradients(add_gradients(followed, through.by_bodies), own)
+    if motion.scene is not scene:
+        total = [
+            cotangents_of_scene(by, factors(scene, motion.scene, index), 1.0)
+            for index, by in enumerate(total)
+        ]
+    return by_owner(scene, total)
+
+
+def _coefficients(scene: Scene, motion: Trajectory, place: int) -> np.ndarray:
+    mechanism = motion.mechanism
+    body, c = mechanism.bodies[place], motion.load_coefficients[place]
+    modal = motion.q_e[:, mechanism.slices[place]]
+    modal = modal - np.linalg.solve(body.K, load_matrix(body) @ c.T).T
+    return np.hstack([modal, c]) * _scale(scene, motion.scene, place, body)
+
+
+def _scale(scene: Scene, other: Scene, place: int, body: ShapeIntegrals) -> np.ndarray:
+    """Return what an arm's columns are multiplied by in another scene (q + 7 + 2 q,)."""
+    counts, q = load_counts(body), body.num_modes
+    scale = np.ones(q + counts.total)
+    if other is scene:
+        return scale
+    owner = scene.owners[place]
+    assert owner is not None
+    f = factors(scene, other, owner)
+    scale[q:] = f.mass / f.stiffness
+    outboard = q + counts.frame
+    scale[outboard : outboard + counts.outboard] = 1.0 / f.stiffness
+    young = other.material_of(owner).young_modulus / scene.material_of(owner).young_modulus
+    return young * scale
+
+
+def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> ShapeIntegrals:
+    """Return the derivatives by a body from those by P and K."""
+    q = body.num_modes
+    w, W = np.zeros_like(body.w), np.zeros_like(body.W)
+    if len(W) == len(SPACE):
+        b = len(body.outboard)
+        outboard = by_P[:, 12 : 12 + b].T
+        w[:, 1:], W[:, 1:, 0] = by_P[:, :3].T, by_P[:, 3:12].T
+        W[:, 1:, 1:] = by_P[:, 12 + b :].reshape(q, 9, q).swapaxes(0, 1)
+    else:
+        outboard = by_P[:, 4:7].T
+        w[:, 1:] = by_P[:, :2].T
+        W[1, 1:, 0], W[0, 0, 1:] = by_P[:, 2], by_P[:, 3]
+        W[0, 1:, 1:], W[1, 1:, 1:] = by_P[:, 7 : 7 + q], by_P[:, 7 + q :]
+    zero = {
+        key: np.zeros_like(getattr(body, key))
+        for key in ("D", "outboard_point", "further_points", *STIFFENING)
+    }
+    return replace(body, mass=0.0, w=w, W=W, K=by_K, outboard=outboard, **zero)
+
+
+# -- von Mises stress of the arms along the motion -----------------------------------------------
 
 # Instants whose largest stress to the power p is below this part of the largest one's are left out
 # of the p-mean.
@@ -288,3 +530,233 @@ def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
     with arm.profile.phase("gradient"):
         adjoint = static_response(arm, *arm.restrict(right))
         return part.by_x - state.young_slope * arm.cell_stiffness_products(adjoint, left)
+
+
+# -- the largest of very many lengths |A_e a_n| over points e and instants n, looking at few
+# instants
+#
+# A_e are three rows at a point, the columns' stress there, and a_n the columns' coefficients along
+# a motion. |A_e a| is a convex function of a and even, so what lies between two instants is bounded
+# by them: with a_n = (1 - s) a_i + s a_j + d
+#
+#     |A_e a_n| <= (1 - s) |A_e a_i| + s |A_e a_j| + sum_k |d_k| max_e |A_e,k|,
+#
+# and of a smooth motion d is small. Only where this bound exceeds the largest value found so far
+# are further instants looked at; so none that is larger is missed, whatever the motion.
+
+# Part of the largest length up to which directions in which the coefficients hardly vary are
+# bounded, not computed.
+NEGLIGIBLE_DIRECTION = 1e-4
+SINGULAR = 1e-13  # relative square below which a combination of columns counts as none
+MAPPED = 1e-3  # of the largest length, the error of a map of all points
+COARSE = 200  # instants, at most, at which all points are looked at first
+POINTS, INSTANTS = 2048, 64  # of one block, so that it stays in the cache
+BATCH = 16  # instants that are looked at before the bound is compared again
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """What was found at the instants that were looked at.
+
+    Attributes:
+        largest: max |A_e a_n| over all points and all instants.
+        instant: n where it is.
+        point: e where it is, on this rank; -1 where another rank has it.
+        coarse: instants of the first pass, evenly spaced.
+        values: (len(coarse),) largest length over all points of all ranks at each of them.
+        looked_at: number of instants that were looked at.
+    """
+
+    largest: float
+    instant: int
+    point: int
+    coarse: np.ndarray
+    values: np.ndarray
+    looked_at: int
+
+
+def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> Screened:
+    """Find the largest |A_e a_n| (collective on `comm`).
+
+    Args:
+        comm: ranks that share the points.
+        A: (3, n_points, m) of this rank's points, in space (5, ...); there may be none.
+        a: (n, m) the same on all ranks.
+        coarse: ascending instants to begin with, the first and the last one among them.
+    """
+    few = _condense(comm, A, a)
+    values = np.full(len(a), -np.inf)
+    values[coarse] = few.lengths(comm, coarse)
+    bounds = few.between(coarse, values)
+    open_ = np.setdiff1d(np.arange(len(a)), coarse)
+    open_ = open_[np.argsort(-bounds[open_], kind="stable")]
+    best = float(np.max(values[coarse]))
+    done = 0
+    while done < len(open_) and bounds[open_[done]] > best:
+        batch = open_[done : done + BATCH]
+        values[batch] = few.lengths(comm, batch)
+        best = max(best, float(np.max(values[batch])))
+        done += len(batch)
+    # Of those whose bounds overlap within what was neglected the largest is found in full.
+    close = np.flatnonzero(values + few.rest >= np.max(values - few.rest))
+    full = _largest_by_instant(comm, A, a[close])
+    instant = int(close[np.argmax(full)])
+    return Screened(
+        float(full.max()),
+        instant,
+        _point_of(comm, A, a[instant]),
+        coarse,
+        values[coarse],
+        len(coarse) + done,
+    )
+
+
+def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`).
+
+    Right to `MAPPED` times the largest of all; of instants no more are looked at than that takes.
+    """
+    few, count = _condense(comm, A, a), A.shape[1]
+    instants = every(len(a))
+    enough = MAPPED * float(few.lengths(comm, instants).max(initial=0.0))
+    while True:
+        apart = few.apart(instants)
+        crowded = np.unique(np.searchsorted(instants, np.flatnonzero(apart > enough)))
+        halves = (instants[crowded - 1] + instants[crowded]) // 2
+        wider = np.union1d(instants, halves)
+        if len(wider) == len(instants):
+            break
+        instants = wider
+    by_point, when = np.full(count, -1.0), np.zeros(count, dtype=int)
+    for first in range(0, len(instants), INSTANTS):
+        part = instants[first : first + INSTANTS]
+        for start in range(0, count, POINTS):
+            here = slice(start, start + POINTS)
+            squares = _squares(few.B[:, here], few.y[part])
+            worst = squares.argmax(axis=1)
+            values = squares[np.arange(len(worst)), worst]
+            larger = values > by_point[here]
+            by_point[here][larger], when[here][larger] = values[larger], part[worst[larger]]
+    return np.sqrt(np.maximum(by_point, 0.0)), when
+
+
+def every(count: int, most: int = COARSE) -> np.ndarray:
+    """Return at most about `most` instants of `count`, evenly spaced, and the last one."""
+    step = max(1, -(-count // most))
+    return np.unique(np.append(np.arange(0, count, step), count - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Condensed:
+    """|A_e a_n| is |B_e y_n| but for `rest`.
+
+    Attributes:
+        B: (3, n_points, r).
+        y: (n, r).
+        rest: (n,) at most what is left out.
+        norms: (r,) max_e |B_e,k|.
+    """
+
+    B: np.ndarray
+    y: np.ndarray
+    rest: np.ndarray
+    norms: np.ndarray
+
+    def lengths(self, comm: MPI.Comm, instants: np.ndarray) -> np.ndarray:
+        """Return the largest length over all points at these instants (collective)."""
+        return _largest_by_instant(comm, self.B, self.y[instants])
+
+    def between(self, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return upper bounds (n,) from the values at the instants `known`, ends included."""
+        i, j, s = self._beside(known)
+        ends = (1.0 - s) * (values[i] + self.rest[i]) + s * (values[j] + self.rest[j])
+        return ends + self.apart(known) + self.rest
+
+    def apart(self, known: np.ndarray) -> np.ndarray:
+        """Return sum_k |d_k| max_e |B_e,k| (n,) of what is not linear between the known."""
+        i, j, s = self._beside(known)
+        apart = self.y - (1.0 - s)[:, None] * self.y[i] - s[:, None] * self.y[j]
+        return np.abs(apart) @ self.norms
+
+    def _beside(self, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the known instants before and after every one, and where between them it is."""
+        n = np.arange(len(self.y))
+        right = np.minimum(np.maximum(np.searchsorted(known, n), 1), len(known) - 1)
+        i, j = known[np.maximum(right - 1, 0)], known[right]
+        return i, j, (n - i) / np.maximum(j - i, 1)
+
+
+def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
+    """Return the directions in which A a_n varies along the motion, the strongest first.
+
+    By the singular values of a in the metric of A'A, so that columns that cancel do no harm.
+    """
+    flat = A.reshape(-1, A.shape[2])
+    gram = comm.allreduce(flat.T @ flat)
+    scale = np.sqrt(np.diagonal(gram))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    gram /= np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(0.5 * (gram + gram.T))
+    if comm.size > 1:  # processors may round differently
+        values, vectors = comm.bcast((values, vectors), root=0)
+    kept = values > SINGULAR * values[-1]
+    root = np.sqrt(values[kept])
+    inside = (a * scale) @ vectors
+    _, _, directions = np.linalg.svd(inside[:, kept] * root, full_matrices=False)
+    if comm.size > 1:
+        directions = comm.bcast(directions, root=0)
+    y = (inside[:, kept] * root) @ directions.T
+    B = A @ ((vectors[:, kept] / root) @ directions.T / scale[:, None])
+    norms = _norms(comm, B)
+    sizes = np.abs(y) * norms
+    behind = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1]  # of a direction and all behind it
+    enough = NEGLIGIBLE_DIRECTION * behind.max(initial=0.0)
+    few = int(np.count_nonzero(behind.max(axis=0, initial=0.0) > enough))
+    # No point has more than the sum over all points.
+    rest = np.abs(inside[:, ~kept]) @ np.sqrt(np.maximum(values[~kept], 0.0))
+    if few < sizes.shape[1]:
+        rest = rest + behind[:, few]
+    return _Condensed(np.ascontiguousarray(B[:, :, :few]), y[:, :few], rest, norms[:few])
+
+
+def _norms(comm: MPI.Comm, A: np.ndarray) -> np.ndarray:
+    """Return max_e |A_e,k| (m,) of every column (collective)."""
+    squares = np.einsum("cek,cek->ek", A, A)
+    return _max(comm, np.sqrt(squares.max(axis=0, initial=0.0)))
+
+
+def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return max_e |A_e a_n| (n,) (collective)."""
+    out = np.zeros(len(a))
+    for first in range(0, len(a), INSTANTS):
+        part = slice(first, first + INSTANTS)
+        for start in range(0, A.shape[1], POINTS):
+            squares = _squares(A[:, start : start + POINTS], a[part])
+            np.maximum(out[part], squares.max(axis=0), out=out[part])
+    return np.sqrt(_max(comm, out))
+
+
+def _squares(A: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return |A_e a_n|^2 (n_points, n)."""
+    parts = A @ a.T
+    np.multiply(parts, parts, out=parts)
+    for part in parts[1:]:
+        parts[0] += part
+    return parts[0]
+
+
+def _point_of(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> int:
+    """Return the point where |A_e a| is largest, -1 on ranks that do not have it (collective)."""
+    lengths = np.square(A @ a).sum(axis=0)
+    own = float(lengths.max(initial=-1.0))
+    if comm.size > 1:
+        owner = comm.allreduce((own, -comm.rank), op=MPI.MAX)
+        if -owner[1] != comm.rank:
+            return -1
+    return int(np.argmax(lengths))
+
+
+def _max(comm: MPI.Comm, values: np.ndarray) -> np.ndarray:
+    if comm.size > 1:
+        comm.Allreduce(MPI.IN_PLACE, values, op=MPI.MAX)
+    return values

@@ -11,9 +11,15 @@ import numpy as np
 from dolfinopt.fem.stress import places_of, stress_operator, stress_points
 from dolfinopt.mesh import compat
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
-from dolfinopt.responses.cell_stress import CellStress, cell_stress
-from dolfinopt.responses.screening import every, maxima, screen
-from dolfinopt.responses.stress_loads import ArmLoads, arm_loads
+from dolfinopt.responses.stress import (
+    ArmLoads,
+    CellStress,
+    arm_loads,
+    cell_stress,
+    every,
+    maxima,
+    screen,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm

@@ -16,12 +16,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, get_origin
 
+import numpy as np
 from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.disk import check_regular
 from dolfinopt.errors import InputError
-from dolfinopt.scene.completion import complete
+from dolfinopt.paths.tables import TIME, column_names, last_instant, read_table
+from dolfinopt.paths.time_laws import Law as TimeLaw
+from dolfinopt.paths.time_laws import Limits, law_for
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.messages import (
     Override,
@@ -36,8 +39,8 @@ from dolfinopt.scene.messages import (
     unknown_key,
 )
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
-from dolfinopt.scene.spelling import cut, input_error, shown
 from dolfinopt.scene.tables.arms import (
+    MATERIAL_VALUES,
     MAX_ARMS,
     MAX_CELLS,
     MESH_KEYS,
@@ -49,22 +52,12 @@ from dolfinopt.scene.tables.arms import (
     SOLID_SHAPES,
     Arm,
 )
-from dolfinopt.scene.tables.base import Loc, Refusal, Table, without_none
-from dolfinopt.scene.tables.interpolation import Law
-from dolfinopt.scene.tables.joints import Joint
-from dolfinopt.scene.tables.material import MATERIAL_VALUES
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
+from dolfinopt.scene.tables.design import Law
+from dolfinopt.scene.tables.machine import Joint
 from dolfinopt.scene.tables.motion import Motion
-from dolfinopt.scene.tables.objective import WorstBy
-from dolfinopt.scene.tables.reduction import Reduction
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-# Arrays of tables of which --set knows single ones by their name.
-NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint}
-DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
+from dolfinopt.scene.tables.objective import NEEDS, Objective, WorstBy
+from dolfinopt.scene.tables.simulation import Reduction
 
 __all__ = [
     "FILE_KEYS",
@@ -81,6 +74,15 @@ __all__ = [
     "resolve_file",
     "scene_from_dict",
 ]
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+# Arrays of tables of which --set knows single ones by their name.
+NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint}
+DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
@@ -508,3 +510,222 @@ def _store(tree: dict[str, Any], loc: Loc, value: Any) -> None:
             node = node[part]
     if isinstance(node, dict) or (isinstance(node, list) and isinstance(loc[-1], int)):
         node[loc[-1]] = value
+
+
+# -- values of a scene that are not stated and follow from others --------------------------------
+#
+# The tree is the scene as read, before it is validated: values of any type may stand in it.
+
+Keys = tuple[tuple[str, str], ...]
+
+
+def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
+    """Complete times of the motion, number of coordinates, limit of the volume and gradient.
+
+    Returns:
+        The keys that follow from others, as (table, key).
+
+    Raises:
+        InputError: a stated duration is too short for the limits.
+    """
+    timed = _time_motion(tree, source, changes)
+    return *timed, *_count_coordinates(tree), *_limit_volume(tree), *_freeze_loads(tree)
+
+
+def _count_coordinates(tree: dict[str, Any]) -> Keys:
+    """Give solid arms as many elastic coordinates as their interfaces need, six each.
+
+    Returns:
+        Its key, as (table, key), where it is not stated.
+    """
+    reduction, arms = tree.get("reduction", {}), tree.get("arms")
+    if not (isinstance(reduction, dict) and isinstance(arms, list)):
+        return ()
+    usual = Reduction.model_fields["method"].default
+    if "coordinates" in reduction or reduction.get("method", usual) != usual:
+        return ()
+    counts = [6 * (1 + _length(arm.get("interfaces"))) for arm in arms if _is_solid(arm)]
+    if not counts:
+        return ()
+    tree["reduction"] = {**reduction, "coordinates": max(counts)}
+    return (("reduction", "coordinates"),)
+
+
+def _is_solid(arm: Any) -> bool:
+    if not isinstance(arm, dict) or arm.get("rigid") is True or arm.get("sid") is not None:
+        return False
+    return _length(arm.get("cells")) == 3 or arm.get("cell_shape") in SOLID_SHAPES
+
+
+def _length(value: Any) -> int:
+    return len(value) if isinstance(value, list | tuple) else 0
+
+
+def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
+    """Complete duration and horizon of the motion where they follow from other values.
+
+    Returns:
+        The keys that do, as (table, key).
+
+    Raises:
+        InputError: a stated duration is too short for the limits.
+    """
+    motion = tree.get("motion")
+    if not isinstance(motion, dict):
+        return ()
+    asked = ("file", "max_speed", "max_acceleration", "max_jerk")
+    derived: list[tuple[str, str]] = []
+    if any(motion.get(key) is not None for key in asked):
+        rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
+        try:
+            least, limited = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
+        except (ValidationError, InputError):  # told where the scene is checked, or its motion
+            least, limited = None, False
+        stated = motion.get("duration")
+        if stated is None and least:  # of a table with one row the motion tells
+            motion["duration"] = least
+            derived.append(("motion", "duration"))
+        if not (limited and isinstance(stated, (int, float)) and least is not None):
+            pass  # what the duration is, validation will say
+        elif stated < least * (1.0 - SAME_TIME):
+            where = blamed(source, changes, (("motion", "duration"),))
+            keys = ", ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
+            raise input_error(
+                where,
+                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s] by the "
+                f"limits ({keys}); leave it out to use this value, or raise the limits",
+            )
+    duration = motion.get("duration")
+    default = Motion.model_fields["horizon"].default
+    if "horizon" not in motion and isinstance(duration, (int, float)) and duration > default:
+        motion["horizon"] = duration
+        derived.append(("motion", "horizon"))
+    return tuple(derived)
+
+
+def _limit_volume(tree: dict[str, Any]) -> Keys:
+    """Leave out the limit of the volume where mass is asked for and none is stated.
+
+    Returns:
+        Its key, as (table, key), where it is not stated.
+    """
+    tables = {key: tree.get(key) for key in ("design", "objective", "constraints")}
+    design, objective, limits = (one if isinstance(one, dict) else {} for one in tables.values())
+    if design.get("volume_fraction") is not None:
+        return ()
+    design.pop("volume_fraction", None)
+    if objective.get("kind") == "mass" or limits.get("mass") is not None:
+        if tables["design"] is None:
+            tree["design"] = design
+        design["volume_fraction"] = None
+    return (("design", "volume_fraction"),)
+
+
+def _freeze_loads(tree: dict[str, Any]) -> Keys:
+    """Hold the loads in the gradient of `kind = "esl"`, unless a limit follows the motion.
+
+    Returns:
+        Its key, as (table, key), where it is not stated.
+    """
+    objective, limits = tree.get("objective", {}), tree.get("constraints", {})
+    if not (isinstance(objective, dict) and isinstance(limits, dict)) or "gradient" in objective:
+        return ()
+    limited = [key for key, limit in limits.items() if limit is not None]
+    if objective.get("kind", Objective.model_fields["kind"].default) != "esl" or any(
+        "motion" in NEEDS.get(key, ()) for key in limited
+    ):
+        return ()
+    tree["objective"] = {**objective, "gradient": "esl"}
+    return (("objective", "gradient"),)
+
+
+# -- how long the scene's motion takes: as stated, by its table, or by limits of speed -----------
+
+POINT = ("x", "y")  # columns of a table of points
+SPACE_POINT = ("x", "y", "z")
+SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
+
+
+def time_law(motion: Motion) -> TimeLaw:
+    """Return the law by which the scene runs along its path.
+
+    Raises:
+        InputError: the table cannot be used, or the limits need more time than there is.
+    """
+    length = path_length(motion) if limits_of(motion).any else 1.0
+    law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
+    if motion.duration < law.least * (1.0 - SAME_TIME):
+        raise InputError(f"motion.duration = {motion.duration:g}: {too_short(law)}")
+    return law
+
+
+known_law = lru_cache(maxsize=64)(law_for)
+
+
+def limits_of(motion: Motion) -> Limits:
+    """Return the scene's limits along the path."""
+    values = (motion.max_speed, motion.max_acceleration, motion.max_jerk)
+    return Limits(*(np.inf if value is None else value for value in values))
+
+
+def too_short(law: TimeLaw) -> str:
+    """Return what is wrong with a duration that the limits do not allow."""
+    return (
+        f"expected at least {law.least:.6g} [s], which motion.max_speed, max_acceleration and "
+        "max_jerk need; leave it out, or raise the limits"
+    )
+
+
+def least_duration(motion: Motion) -> tuple[float | None, bool]:
+    """Return the duration that a table's last row or else the limits ask for, s, if any does.
+
+    Returns:
+        The duration, s, or None; whether the limits ask for it.
+
+    Raises:
+        InputError: the table cannot be read.
+    """
+    if motion.path in ("points", "joints"):
+        last = last_instant(motion.file or "")
+        if last is not None:
+            return last, False
+    limits = limits_of(motion)
+    if not limits.any:
+        return None, False
+    return known_law(motion.law, path_length(motion), limits, motion.acceleration_share).least, True
+
+
+def path_length(motion: Motion) -> float:
+    """Return the length that the limits refer to, m: of the semicircle, the line, the chords."""
+    if motion.path == "arc":
+        return np.pi * motion.radius
+    if motion.path == "line":
+        way = np.subtract(motion.end, motion.start)
+        return float(np.hypot(*way) if len(way) == 2 else np.linalg.norm(way))
+    assert motion.file is not None
+    return _chords(motion.file, file_stamp(motion))
+
+
+@lru_cache(maxsize=64)
+def _chords(file: str, stamp: int) -> float:
+    """Return the length of the straight lines through a table of points, m."""
+    names = [name for name in column_names(file) if name != TIME]
+    if "z" not in names:
+        rows = read_table(file, POINT).rows
+    else:
+        known = names if {*SPACE_POINT} <= {*names} else SPACE_POINT  # or told what is missing
+        rows = read_table(file, known).rows[:, [known.index(name) for name in SPACE_POINT]]
+    return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
+
+
+def file_stamp(motion: Motion) -> int:
+    """Return when the scene's table was last written: a changed one is read anew."""
+    return stamp(motion.file or "")
+
+
+def stamp(file: str) -> int:
+    """Return when a file was last written, ns; 0 where there is none."""
+    try:
+        return os.stat(file).st_mtime_ns
+    except (OSError, ValueError):
+        return 0

@@ -6,29 +6,26 @@ brackets, "[-]" where there is none.
 
 from __future__ import annotations
 
+import copy
+import hashlib
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
 
+from dolfinopt import version
+from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.tables.arms import Arm
+from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material, interface_number
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
-from dolfinopt.scene.tables.closure import Closure
-from dolfinopt.scene.tables.constraints import Constraints
-from dolfinopt.scene.tables.control import Control
-from dolfinopt.scene.tables.damping import Damping
-from dolfinopt.scene.tables.design import Design
-from dolfinopt.scene.tables.interfaces import interface_number
-from dolfinopt.scene.tables.interpolation import Interpolation
-from dolfinopt.scene.tables.joints import Joint
-from dolfinopt.scene.tables.material import MATERIAL_VALUES, Material
+from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer
+from dolfinopt.scene.tables.machine import Closure, Control, Damping, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion
-from dolfinopt.scene.tables.objective import Objective
-from dolfinopt.scene.tables.optimizer import Optimizer
-from dolfinopt.scene.tables.payload import Payload
-from dolfinopt.scene.tables.reduction import Reduction
-from dolfinopt.scene.tables.scenarios import Scenario
-from dolfinopt.scene.tables.simulation import Simulation
+from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
+from dolfinopt.scene.tables.simulation import Reduction, Simulation
 
 
 def check_scene_name(name: str) -> str:
@@ -239,3 +236,133 @@ FILE_KEYS = tuple(
     for key, value in getattr(table_in(field.annotation), "model_fields", {}).items()
     if NAMES_FILE in getattr(without_none(value.annotation), "__metadata__", ())
 )
+
+
+# -- the keys of a scene as JSON schema, from which editors complete and check scene files -------
+
+SCHEMA_FILE = "dolfinopt.schema.json"
+
+
+def scene_schema() -> dict[str, Any]:
+    """Return the JSON schema (draft 7, which editors of TOML know) of a scene file.
+
+    It knows keys, types and ranges; what depends on several keys is checked when a scene is read.
+    """
+    schema = _plain(Scene.model_json_schema())
+    schema["definitions"] = schema.pop("$defs")
+    schema["required"].remove("name")  # by default the file's
+    schema["properties"]["arms"]["minItems"] = 1
+    # An arm takes what it leaves out from the one before, and --set may supply what all lack.
+    schema["definitions"]["Arm"]["required"] = ["name"]
+    for name, table in schema["properties"].items():
+        if "$ref" in table:  # tables complete as tables; their defaults stand at their keys
+            schema["properties"][name] = {"$ref": table["$ref"]}
+    # A name in place of the table, or in it, stands for its values.
+    table = schema["definitions"]["Material"]
+    table["anyOf"] = [{"required": ["name"]}, {"required": table.pop("required")}]
+    schema["properties"]["material"] = {
+        "anyOf": [{"type": "string", "enum": list(CATALOGUE)}, schema["properties"]["material"]]
+    }
+    head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "scene of dolfinopt"}
+    return head | {key: value for key, value in schema.items() if key != "title"}
+
+
+def _plain(node: Any) -> Any:
+    """Return a part of pydantic's schema without null, which TOML lacks, and in draft 7's words."""
+    if isinstance(node, list):
+        return [_plain(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    if "anyOf" in node:
+        kinds = [kind for kind in node["anyOf"] if kind != {"type": "null"}]
+        rest = {key: value for key, value in node.items() if key != "anyOf"}
+        node = rest | (kinds[0] if len(kinds) == 1 else {"anyOf": kinds})
+    found = {}
+    for key, value in node.items():
+        if key == "properties":
+            found[key] = {name: _plain(item) for name, item in value.items()}
+        elif key == "prefixItems":
+            found["items"] = _plain(value)
+        elif key == "$ref":
+            found[key] = value.replace("#/$defs/", "#/definitions/")
+        elif key != "title" and (key, value) != ("default", None):
+            found[key] = _plain(value)
+    return found
+
+
+# -- files that a scene names: known by their content, and found again where a project has moved
+
+DIGEST = "sha256:"  # what a digest in place of a path begins with
+
+
+def program() -> list[str | int]:
+    """Return what stands for this program: results that others kept are not its own."""
+    return [version.__version__, version.NUMERICS]
+
+
+def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Yield dotted key, table and key of every file that a scene's data names."""
+    for table, key in FILE_KEYS:
+        node = data.get(table)
+        rows = node if isinstance(node, list) else [node]
+        for k, row in enumerate(rows):
+            if isinstance(row, dict) and isinstance(row.get(key), str):
+                name = f"{table}.{k}.{key}" if isinstance(node, list) else f"{table}.{key}"
+                yield name, row, key
+
+
+def with_digests(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a scene's data with digests of the files' content in place of their paths.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    tree = copy.deepcopy(dict(data))
+    for _, row, key in named_files(tree):
+        row[key] = DIGEST + file_digest(Path(row[key]))
+    return tree
+
+
+def with_relative_paths(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a scene's data with paths from `folder`; the package's own meshes keep their name."""
+    tree, own = copy.deepcopy(dict(data)), mesh_folder()
+    for _, row, key in named_files(tree):
+        path = Path(row[key])
+        if path.parent == own:
+            row[key] = f"{own.name}/{path.name}"
+        else:
+            row[key] = Path(os.path.relpath(path, folder.absolute())).as_posix()
+    return tree
+
+
+def found_again(
+    data: Mapping[str, Any], folder: Path, absolute: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return data of `with_relative_paths` with absolute paths where nothing lies at the relative.
+
+    So a folder is read where the whole project has moved, and where it alone has.
+
+    Args:
+        data: of a scene, paths from `folder`.
+        folder: of the file that held them.
+        absolute: paths at the time of writing by dotted key.
+    """
+    tree = copy.deepcopy(dict(data))
+    for name, row, key in named_files(tree):
+        known = absolute.get(name)
+        if known and not (folder / row[key]).is_file() and Path(known).is_file():
+            row[key] = known
+    return tree
+
+
+def file_digest(path: Path) -> str:
+    """Hash a file's content.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    return hashlib.sha256(content).hexdigest()

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from dolfinopt.multibody.end_effector import lengths
-from dolfinopt.scene.contents import file_digest, program, with_digests
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import file_digest, program, with_digests
 from dolfinopt.study import variants
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ class Outcome:
 
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""
-        from dolfinopt.output.history import read_history
+        from dolfinopt.output.design import read_history
 
         return read_history(self.folder / "history.csv")
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.responses import need_of
+from dolfinopt.scene.tables.objective import need_of
 from dolfinopt.study.cases import Case, Outcome
 from dolfinopt.study.plans import (
     COMPLIANCE,

@@ -14,7 +14,7 @@ import numpy as np
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.scenarios import bodies_in
+from dolfinopt.responses.response import bodies_in
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import variants
 
@@ -208,8 +208,7 @@ def _posed(
     """Build the arms on this rank; return them with the physical densities of the design."""
     from mpi4py import MPI
 
-    from dolfinopt.arms.arm import build_arms
-    from dolfinopt.arms.patterns import uniform_design
+    from dolfinopt.arms.arm import build_arms, uniform_design
     from dolfinopt.output.design import read_design
     from dolfinopt.parallel import partition_arms
 

@@ -267,7 +267,7 @@ def _optimise(case: Case, place: _Place, progress: Progress) -> None:
     from mpi4py import MPI
 
     from dolfinopt.output import checkpoint
-    from dolfinopt.output.history import read_history
+    from dolfinopt.output.design import read_history
     from dolfinopt.output.run import optimize
     from dolfinopt.output.run_folder import write_result
 

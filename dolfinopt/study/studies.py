@@ -71,7 +71,7 @@ def carry_out(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) 
         world: all ranks.
         shown: draw progress.
     """
-    from dolfinopt.output.folders import prepare_folder
+    from dolfinopt.output.run_folder import prepare_folder
     from dolfinopt.parallel import on_root, together
 
     on_root(world, prepare_folder, folder)

@@ -12,7 +12,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
-from dolfinopt.scene.tables.responses import LIGHTER, unused_options
+from dolfinopt.scene.tables.objective import LIGHTER, unused_options
 
 # Label, kind, and the settings that make it.
 OBJECTIVES = (

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from runs import STATED, TWO_ARM, overrides, run
 
 import dolfinopt as do
-from dolfinopt.arms.patterns import Patterns, uniform_design
+from dolfinopt.arms.arm import Patterns, uniform_design
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import taylor_test

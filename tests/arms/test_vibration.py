@@ -24,7 +24,7 @@ from dolfinopt.arms.vibration import (
 )
 from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.multibody.spatial.frozen import CarriedInertia
-from dolfinopt.responses.eigenfrequency import squared_period
+from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient
 
 Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]

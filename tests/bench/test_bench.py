@@ -15,9 +15,8 @@ from dolfinopt.bench.common import Diagram, Goal, curves, fitted_exponent
 from dolfinopt.bench.statics import StaticArm, dolfinx_iteration, pymoto_iteration
 from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics.build import build_mechanism
-from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.time_grid import even_steps
+from dolfinopt.dynamics.collocation import even_steps
+from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import breakpoints, rigid_motion

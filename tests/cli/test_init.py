@@ -10,13 +10,13 @@ import pytest
 from runs import ROOT, run, shell
 
 import dolfinopt
-from dolfinopt.cli.init import TEMPLATES
+from dolfinopt.cli.main import TEMPLATES
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import check_motion
-from dolfinopt.scene.json_schema import scene_schema
 from dolfinopt.scene.load import describe_keys, load_scene
-from dolfinopt.scene.plausibility import implausible
+from dolfinopt.scene.messages import implausible
+from dolfinopt.scene.schema import scene_schema
 
 if sys.version_info >= (3, 11):
     import tomllib

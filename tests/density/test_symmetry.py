@@ -12,7 +12,7 @@ from mpi4py import MPI
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.data import mesh_folder
-from dolfinopt.density.symmetry import AxisSymmetry
+from dolfinopt.density.filter import AxisSymmetry
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh, structured_arm
 from dolfinopt.scene.load import Arm as Entry

@@ -11,23 +11,20 @@ from bodies import beam, random_cloud
 from dolfinopt.dynamics import batch, radau
 from dolfinopt.dynamics.adjoint import trajectory_gradient
 from dolfinopt.dynamics.collocation import (
+    Solution,
+    even_steps,
     radau_iia,
     residual_at,
     stages_of,
     step_beginnings,
     step_ends,
 )
-from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.modal_coordinates import modes_of
-from dolfinopt.dynamics.newton_matrix import factorise
-from dolfinopt.dynamics.simplified_newton import simplified_newton_matrix
-from dolfinopt.dynamics.solution import Solution
+from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
+from dolfinopt.dynamics.newton import factorise, simplified_newton_matrix
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.instants import Scale
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism, Scale
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.multibody.tangent import linearise

@@ -25,8 +25,7 @@ from reference_machines import (
 from rigid_loops import Bar, four_bar_forces, slider_crank_forces
 
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.interface_jacobian import _frames
+from dolfinopt.multibody.end_effector import _frames, end_effector
 from dolfinopt.multibody.tangent import linearise
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank

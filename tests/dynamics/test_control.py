@@ -20,8 +20,8 @@ from reference_machines import (
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.model import SimulationResult
-from dolfinopt.multibody.drives import LINEAR, saturated
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.mechanism import LINEAR, saturated
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 

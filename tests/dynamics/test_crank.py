@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
-from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import State, Unchanged
-from dolfinopt.multibody.drives import Drives, slider
 from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Drives, Mechanism, slider
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
 

@@ -12,10 +12,9 @@ from bodies import CONSTANTS, changed, derivative, unit_changes
 from machines import controlled, loop
 
 from dolfinopt import Model
-from dolfinopt.dynamics.drive_forces import drive_force_gradient
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.simulation import Trajectory, drive_force_gradient
 from dolfinopt.multibody.inverse_dynamics import Rates, inverse_dynamics
 from dolfinopt.scene.load import Scene
 

@@ -15,8 +15,7 @@ from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.spatial_system import SpatialMachineSystem, SpatialSystem
-from dolfinopt.multibody.drives import Drives
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.end_effector import deviation, end_effector_gradient
 from dolfinopt.profiling import Profile

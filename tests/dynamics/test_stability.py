@@ -22,19 +22,20 @@ from runs import TWO_ARM
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.cli import commands
-from dolfinopt.dynamics import march, newton, radau
+from dolfinopt.dynamics import newton, radau
+from dolfinopt.dynamics import radau as march
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.fem.constraint_modes import MOST_ROUNDING, floats, rounding_error
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.interface import MOST_ROUNDING, floats, rounding_error
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.reduction.eigenproblem import interior_pencil, lowest_eigenpairs
-from dolfinopt.responses.objective import load_cases, objective
+from dolfinopt.responses.constraints import load_cases, objective
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 

@@ -10,11 +10,9 @@ from bodies import beam
 from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import generalized_alpha, radau
-from dolfinopt.dynamics.collocation import radau_iia, stage_values, stages_of
+from dolfinopt.dynamics.collocation import Solution, even_steps, radau_iia, stage_values, stages_of
 from dolfinopt.dynamics.elastic_system import static_equilibrium
-from dolfinopt.dynamics.solution import Solution
 from dolfinopt.dynamics.system import State, Unchanged
-from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion

@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dolfinopt.dynamics.collocation import Stages, radau_iia
+from dolfinopt.dynamics.collocation import (
+    Stages,
+    _lost,
+    lagrange_derivatives,
+    radau_iia,
+    unresolved,
+)
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.solution import lagrange_derivatives
 from dolfinopt.dynamics.system import Unchanged
-from dolfinopt.dynamics.unresolved import _lost, unresolved
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 

@@ -19,20 +19,23 @@ from robots import (
 )
 from runs import run
 
-from dolfinopt.arms.arm import build_arms
-from dolfinopt.arms.patterns import uniform_design
-from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
+from dolfinopt.arms.arm import build_arms, uniform_design
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
 from dolfinopt.exchange.urdf.read import read_robot
-from dolfinopt.exchange.urdf.robot import MASSLESS, Robot, roll_pitch_yaw_of
+from dolfinopt.exchange.urdf.robot import (
+    MASSLESS,
+    Robot,
+    default_tool,
+    roll_pitch_yaw_of,
+    scene_bodies,
+)
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.mesh.solid_checks import check_cells
-from dolfinopt.mesh.solid_model import TENSOR
+from dolfinopt.mesh.checks import check_cells
+from dolfinopt.mesh.geometry import TENSOR
 from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import exponential, roll_pitch_yaw
+from dolfinopt.multibody.spatial.mechanism import JointMotion, exponential, roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile

@@ -14,13 +14,11 @@ from runs import ROOT, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
-from dolfinopt.cli.export_robot import _check_robot, link_inertia
+from dolfinopt.cli.robots import _check_robot, link_inertia
 from dolfinopt.cli.shared import _minimised
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.bodies import default_tool, scene_bodies
-from dolfinopt.exchange.urdf.checks import implausible_inertias
-from dolfinopt.exchange.urdf.read import read_robot
-from dolfinopt.exchange.urdf.robot import Inertia, Robot
+from dolfinopt.exchange.urdf.read import implausible_inertias, read_robot
+from dolfinopt.exchange.urdf.robot import Inertia, Robot, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import read_origin
 from dolfinopt.exchange.urdf.write import NewLink, robot_text
 from dolfinopt.plots.style import new_figure

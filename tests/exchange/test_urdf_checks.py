@@ -12,9 +12,8 @@ from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 from runs import ROOT, run
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.bodies import scene_bodies
-from dolfinopt.exchange.urdf.checks import implausible_inertias
-from dolfinopt.exchange.urdf.read import read_robot
+from dolfinopt.exchange.urdf.read import implausible_inertias, read_robot
+from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.scene.load import load_scene
 
 yourdfpy = pytest.importorskip("yourdfpy")

@@ -13,7 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.fem.cells import cell_values
+from dolfinopt.fem.assembly import cell_values
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.mesh import compat

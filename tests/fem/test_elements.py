@@ -14,12 +14,13 @@ from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import (
     ELEMENTS,
     LagrangeElement,
+    cell_corners,
     element_of,
     gauss_points,
+    jacobian,
     plane_stress,
     strains,
 )
-from dolfinopt.fem.elements.geometry import cell_corners, jacobian
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import arm_mesh, structured_arm
 from dolfinopt.profiling import Profile

@@ -9,11 +9,11 @@ from petsc4py import PETSc
 from solids import solid_arm, solid_scene
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.fem import block_gradients, interior
+from dolfinopt.fem import interior, multigrid
 from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
 from dolfinopt.fem.multigrid import Level, Multigrid
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
-from dolfinopt.reduction import lobpcg
+from dolfinopt.reduction import eigenproblem
 from dolfinopt.responses.sensitivity import exact_gradient
 
 COMM = MPI.COMM_WORLD
@@ -109,7 +109,7 @@ def test_smaller_aggregates(iterative, monkeypatch):
     solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
     iterative.state(x).elastic.constraint_modes()
     cold = solver._iterative.steps
-    monkeypatch.setattr(block_gradients, "SLOW", 0.0)
+    monkeypatch.setattr(multigrid, "SLOW", 0.0)
     solver._solutions.clear()
     iterative.state(0.99 * x).elastic.constraint_modes()
     grid = solver._iterative.grid
@@ -141,8 +141,8 @@ def test_modes_without_a_factor(monkeypatch):
         for void in (0.1, 0.09):
             bodies.append(arm.state(hollow(arm, void)).body)
             if width == 0:
-                found = lobpcg.interior_operators(arm.elastic)
-                steps.append(lobpcg.lobpcg(found, arm.initial.basis, 3, 1e-6)[2])
+                found = eigenproblem.interior_operators(arm.elastic)
+                steps.append(eigenproblem.lobpcg(found, arm.initial.basis, 3, 1e-6)[2])
     assert difference(bodies[0], bodies[2]) < 1e-6
     assert difference(bodies[1], bodies[3]) < 1e-6
     assert steps == [0, 0]

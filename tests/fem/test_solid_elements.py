@@ -13,13 +13,10 @@ from scipy.sparse.linalg import eigsh
 from solids import DENSITY, HEIGHT, LENGTH, POISSON, THICKNESS, YOUNG
 
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.fem.elements.base import isotropic
-from dolfinopt.fem.elements.solid import _condensed, _full, _recovery
+from dolfinopt.fem.elements import ELEMENTS, _condensed, _full, _recovery, isotropic
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh
-from dolfinopt.mesh.box import box_arm
-from dolfinopt.mesh.cells import cell_volumes
+from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
+from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.profiling import Profile
 
 COMM = MPI.COMM_WORLD

@@ -17,7 +17,7 @@ from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import UnitLoads, unit_loads
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.box import box_arm
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dolfinopt.fem import uniform_stress
+from dolfinopt.fem import assembly
 from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
@@ -72,8 +72,8 @@ def test_one_tensor_for_all_cells(
     monkeypatch: pytest.MonkeyPatch, element: str, static: bool
 ) -> None:
     """Geometric stiffness and its derivatives, without the quadrature points, 7 cells at a time."""
-    monkeypatch.setattr(uniform_stress, "CHUNK", 1)
-    monkeypatch.setattr(uniform_stress, "LEAST", 7)
+    monkeypatch.setattr(assembly, "CHUNK", 1)
+    monkeypatch.setattr(assembly, "LEAST", 7)
     arm = make_arm(element)
     other = cell_by_cell(arm)
     assert arm.substructure.uniform_stress is not None

@@ -14,8 +14,7 @@ from dolfinopt import Model
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.model import SimulationResult
-from dolfinopt.multibody.end_effector import outboard
-from dolfinopt.multibody.interface_jacobian import _frames, interface_place
+from dolfinopt.multibody.end_effector import _frames, interface_place, outboard
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise

@@ -10,9 +10,14 @@ from typing import Any
 import numpy as np
 from runs import ROOT, run
 
-from dolfinopt.multibody.spatial.links import build_spatial_mechanism, rigid_link
-from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism, rigid_spatial_body
-from dolfinopt.multibody.spatial.rotations import about
+from dolfinopt.multibody.spatial.mechanism import (
+    GROUND,
+    SpatialMechanism,
+    about,
+    build_spatial_mechanism,
+    rigid_link,
+    rigid_spatial_body,
+)
 from dolfinopt.scene.load import load_scene
 
 if sys.version_info >= (3, 11):

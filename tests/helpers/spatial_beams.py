@@ -13,11 +13,12 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
+    JointMotion,
     SpatialMechanism,
     rigid_spatial_body,
+    roll_pitch_yaw,
+    skew,
 )
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import roll_pitch_yaw, skew
 
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # Pa, -, kg/m3
 HEIGHT, THICKNESS = 0.04, 0.02  # m

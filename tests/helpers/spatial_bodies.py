@@ -14,11 +14,12 @@ from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
+    JointMotion,
     SpatialMechanism,
+    exponential,
     rigid_spatial_body,
+    skew,
 )
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import exponential, skew
 
 STEP = 1e-30  # of a complex step
 

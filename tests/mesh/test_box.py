@@ -7,9 +7,8 @@ import pytest
 from mpi4py import MPI
 
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import interior_facets
-from dolfinopt.mesh.box import box_arm
-from dolfinopt.mesh.cells import cell_volumes, facet_areas
+from dolfinopt.mesh.arm_mesh import box_arm, interior_facets
+from dolfinopt.mesh.checks import cell_volumes, facet_areas
 
 COMM = MPI.COMM_WORLD
 SIZE, CELLS = (0.5, 0.04, 0.02), (10, 4, 2)

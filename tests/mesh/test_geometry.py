@@ -13,9 +13,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import checks, compat, geometry
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import FlatMesh, check_mesh
+from dolfinopt.mesh.geometry import _joint_curves, read_shapes
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
-from dolfinopt.mesh.step_model import _joint_curves
-from dolfinopt.mesh.step_names import read_shapes
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD

@@ -19,7 +19,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import interior_facets, structured_arm
-from dolfinopt.mesh.groups import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD
@@ -179,7 +179,7 @@ def _centroids(mesh):
 
 def test_area_of_distorted_cells():
     # Against the boundary: twice the area is the sum of x dy - y dx around the polygon.
-    from dolfinopt.mesh.cells import cell_areas
+    from dolfinopt.mesh.checks import cell_areas
 
     rng = np.random.default_rng(1)
     quad = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])

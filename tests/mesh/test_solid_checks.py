@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.solid_checks import check_cells
+from dolfinopt.mesh.checks import check_cells
 
 pytestmark = pytest.mark.serial
 # Five tetrahedra in a hexahedron whose corners are numbered as a tensor product.

@@ -13,11 +13,11 @@ from dolfinopt.arms.arm import Arm as Flexible
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
-from dolfinopt.mesh.cells import facet_corners
+from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
-from dolfinopt.scene.tables.interfaces import Interface
+from dolfinopt.scene.tables.arms import Interface
 
 COMM = MPI.COMM_WORLD
 KEYS = {"name": "a", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": None}

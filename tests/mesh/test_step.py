@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dolfinopt.mesh.step_names import read_shapes
+from dolfinopt.mesh.geometry import read_shapes
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 

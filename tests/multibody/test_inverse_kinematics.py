@@ -12,11 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import breakpoints, check_motion
-from dolfinopt.multibody.spatial.end_path import end_path, relative_vectors
-from dolfinopt.multibody.spatial.inverse_kinematics import Follower
-from dolfinopt.multibody.spatial.links import end_chain
-from dolfinopt.multibody.spatial.motion import joint_motion
-from dolfinopt.multibody.spatial.rotations import exponential
+from dolfinopt.multibody.spatial.end_effector import Follower, end_path, relative_vectors
+from dolfinopt.multibody.spatial.mechanism import end_chain, exponential, joint_motion
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

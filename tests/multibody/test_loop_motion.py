@@ -7,7 +7,7 @@ import pytest
 from bodies import derivative
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.loop_motion import Loop, assembled, closed, rotation
+from dolfinopt.multibody.motion import Loop, assembled, closed, rotation
 from dolfinopt.paths.time_laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # ranks have no part in it

@@ -22,8 +22,7 @@ from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
-from dolfinopt.multibody.plate_moments import spatial_moments
-from dolfinopt.multibody.shape_integrals import shape_integrals
+from dolfinopt.multibody.shape_integrals import shape_integrals, spatial_moments
 from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton

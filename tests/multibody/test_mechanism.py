@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from bodies import BentChain, Chain, assert_close, derivative, random_cloud
 
-from dolfinopt.multibody.body_gradient import body_gradient
-from dolfinopt.multibody.end_effector import deviation, end_effector, end_effector_gradient
-from dolfinopt.multibody.interface_jacobian import (
+from dolfinopt.multibody.end_effector import (
     InterfacePlace,
+    deviation,
+    end_effector,
+    end_effector_gradient,
     interface_place,
     place_gradient,
 )
@@ -20,7 +21,7 @@ from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynam
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import STIFFENING, ShapeIntegrals, plane_body
-from dolfinopt.multibody.tangent import Tangent, linearise
+from dolfinopt.multibody.tangent import Tangent, body_gradient, linearise
 from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

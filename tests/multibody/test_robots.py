@@ -9,12 +9,12 @@ from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
+    JointMotion,
     SpatialMechanism,
     inertia_tensor,
     rigid_spatial_body,
+    roll_pitch_yaw,
 )
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import roll_pitch_yaw
 
 pin = pytest.importorskip("pinocchio")
 pytestmark = pytest.mark.serial

@@ -14,13 +14,11 @@ from dolfinopt.errors import InputError
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement, fem_text, read_fem, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, write_sid, write_sid_npz
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
-from dolfinopt.multibody.spatial.body_motion import BodyMotion
 from dolfinopt.multibody.spatial.body_of_sid import from_sid, load_body
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.spatial.kinematics import Interface
+from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface
 from dolfinopt.multibody.spatial.mbdyn import modal_element
-from dolfinopt.multibody.spatial.mechanism import constants_of
-from dolfinopt.multibody.spatial.motion import JointMotion
+from dolfinopt.multibody.spatial.mechanism import JointMotion, constants_of
 from dolfinopt.multibody.spatial.standard_input import to_sid
 
 pytestmark = pytest.mark.serial  # ranks have no part in it

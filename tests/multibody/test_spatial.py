@@ -24,24 +24,23 @@ from dolfinopt.multibody import inverse_dynamics as plane
 from dolfinopt.multibody.mechanism import JointHardware
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import rigid_part
-from dolfinopt.multibody.spatial.body_gradient import body_gradient
-from dolfinopt.multibody.spatial.end_effector import (
-    deviation,
-    end_effector,
-    end_effector_gradient,
-)
+from dolfinopt.multibody.spatial.end_effector import deviation, end_effector, end_effector_gradient
 from dolfinopt.multibody.spatial.frozen import FrozenTree
-from dolfinopt.multibody.spatial.inverse_dynamics import elastic_residual, inverse_dynamics
-from dolfinopt.multibody.spatial.mechanism import TRANSPOSED
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import (
+from dolfinopt.multibody.spatial.inverse_dynamics import (
+    body_gradient,
+    elastic_residual,
+    inverse_dynamics,
+    linearise,
+)
+from dolfinopt.multibody.spatial.mechanism import (
+    TRANSPOSED,
+    JointMotion,
     Turning,
     exponential,
     roll_pitch_yaw,
     skew,
     transposed_times,
 )
-from dolfinopt.multibody.spatial.tangent import linearise
 
 pytestmark = pytest.mark.serial
 ROUNDING = 1e-12

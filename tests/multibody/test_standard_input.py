@@ -20,12 +20,14 @@ from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.plate_moments import SpatialMoments, slender_moments, spatial_moments
 from dolfinopt.multibody.shape_integrals import (
     TABLE,
     ShapeIntegrals,
+    SpatialMoments,
     linear_part,
     shape_integrals,
+    slender_moments,
+    spatial_moments,
 )
 from dolfinopt.multibody.standard_input import PlaneNode, from_sid, load_body, to_sid
 from dolfinopt.profiling import Profile

@@ -11,11 +11,10 @@ from scipy.integrate import trapezoid
 
 import dolfinopt as do
 from dolfinopt.optimization.optimality import kkt_residual
-from dolfinopt.output.fields import write_fields
-from dolfinopt.output.history import read_history
+from dolfinopt.output.design import read_history, write_fields
 from dolfinopt.output.views import ArmView
 from dolfinopt.parallel import Partition, on_root, sum_over_arms
-from dolfinopt.responses import scenarios
+from dolfinopt.responses import response
 from dolfinopt.responses.constraints import Limit, distinct, violated, worst_limits
 
 WORLD = MPI.COMM_WORLD
@@ -213,7 +212,7 @@ def test_sentences_tell_a_value_from_its_limit():
 def test_robust_designs_take_the_scene_s_exponent(monkeypatch):
     """Eroded, nominal and dilated are combined with objective.exponent."""
     asked = []
-    original = scenarios.worst_of
+    original = response.worst_of
 
     def noted(values, exponent, least):
         asked.append((len(values), exponent))

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.box import box_arm
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.part.isosurface import design_surface
 from dolfinopt.part.solid import triangle_bytes
 

@@ -13,9 +13,8 @@ from PIL import Image
 from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.multibody.drives import Closure, pin, slider
 from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism, pin, slider
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.history import HistoryRow

@@ -10,9 +10,9 @@ import pytest
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.mesh.cells import cell_volumes
+from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.multibody.spatial.end_effector import end_effector
-from dolfinopt.multibody.spatial.frames import body_frames
+from dolfinopt.multibody.spatial.kinematics import body_frames
 from dolfinopt.output.views import AROUND, ArmView, designed
 from dolfinopt.part.isosurface import surface_at
 

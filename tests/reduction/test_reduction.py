@@ -34,10 +34,14 @@ from dolfinopt.reduction import (
     mac,
     modal,
 )
-from dolfinopt.reduction.complement import complement_solve
-from dolfinopt.reduction.eigenproblem import Pencil, interior_pencil, lowest_eigenpairs
+from dolfinopt.reduction.eigenproblem import (
+    Operators,
+    Pencil,
+    complement_solve,
+    interior_pencil,
+    lowest_eigenpairs,
+)
 from dolfinopt.reduction.gramian import quadrature
-from dolfinopt.reduction.lobpcg import Operators
 from dolfinopt.reduction.subspace import ritz
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF

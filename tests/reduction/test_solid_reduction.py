@@ -10,10 +10,10 @@ from runs import ROOT
 from solids import DENSITY, HEIGHT, LENGTH, POISSON, THICKNESS, YOUNG
 
 import dolfinopt as do
-from dolfinopt.arms.patterns import uniform_design
+from dolfinopt.arms.arm import uniform_design
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.mesh.box import box_arm
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis, Options, frame_fields
 

@@ -14,19 +14,12 @@ from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm, chain_of
-from dolfinopt.dynamics.collocation import radau_iia
-from dolfinopt.dynamics.solution import Solution
-from dolfinopt.dynamics.time_grid import response_instants
+from dolfinopt.dynamics.collocation import Solution, radau_iia, response_instants
 from dolfinopt.multibody.end_effector import deviation
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
-from dolfinopt.responses.evaluation import (
-    constraint_gradients,
-    evaluate,
-    evaluate_batch,
-    gradient,
-)
-from dolfinopt.responses.objective import load_cases, objective
+from dolfinopt.responses.constraints import load_cases, objective
+from dolfinopt.responses.evaluation import constraint_gradients, evaluate, evaluate_batch, gradient
 
 WORLD = MPI.COMM_WORLD
 

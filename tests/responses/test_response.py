@@ -15,7 +15,6 @@ from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses import response as registry
 from dolfinopt.responses.motion import LoadCases, MotionResponse
-from dolfinopt.responses.p_norm import p_norm, p_norm_of_lengths
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -26,11 +25,12 @@ from dolfinopt.responses.response import (
     find_limited,
     needs,
     objective_of,
+    p_norm,
+    p_norm_of_lengths,
+    worst_of,
 )
-from dolfinopt.responses.scenarios import worst_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.constraints import Constraints
-from dolfinopt.scene.tables.responses import NEEDS
+from dolfinopt.scene.tables.objective import NEEDS, Constraints
 
 
 class Roughness(Response):

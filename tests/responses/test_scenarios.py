@@ -14,7 +14,7 @@ import dolfinopt as do
 from dolfinopt.multibody.shape_integrals import TABLE, of_material
 from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import on_root
-from dolfinopt.responses.scenarios import bodies_in, combined, worst_of
+from dolfinopt.responses.response import bodies_in, combined, worst_of
 from dolfinopt.scene.load import pose_scenarios, scene_from_dict
 
 WORLD = MPI.COMM_WORLD

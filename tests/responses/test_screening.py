@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dolfinopt.responses.screening import every, maxima, screen
+from dolfinopt.responses.stress import every, maxima, screen
 
 
 def lengths(A: np.ndarray, a: np.ndarray) -> np.ndarray:

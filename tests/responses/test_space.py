@@ -10,7 +10,7 @@ from mpi4py import MPI
 from runs import ROOT, overrides, run
 
 import dolfinopt as do
-from dolfinopt.arms.patterns import uniform_design
+from dolfinopt.arms.arm import uniform_design
 from dolfinopt.optimization.gradient_check import taylor_test
 
 pytestmark = pytest.mark.serial

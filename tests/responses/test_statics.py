@@ -18,9 +18,13 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem import interior
 from dolfinopt.responses.response import Measured
-from dolfinopt.responses.sensitivity import deflection_gradient, static_gradient
-from dolfinopt.responses.statics import StaticResponse, static_response
-from dolfinopt.scene.tables.interfaces import Interface
+from dolfinopt.responses.sensitivity import (
+    StaticResponse,
+    deflection_gradient,
+    static_gradient,
+    static_response,
+)
+from dolfinopt.scene.tables.arms import Interface
 
 YOUNG, LENGTH, HEIGHT, THICKNESS = 70e9, 1.0, 0.06, 0.01  # of the scene
 AREA, INERTIA = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0

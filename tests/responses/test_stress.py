@@ -19,14 +19,13 @@ from remainders import (
 from runs import TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.dynamics.load_coefficients import load_coefficients
+from dolfinopt.dynamics.simulation import load_coefficients
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import rotated
 from dolfinopt.multibody.inverse_dynamics import outward_pass
 from dolfinopt.responses import stress as module
-from dolfinopt.responses.cell_stress import CellStress, cell_stress
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
-from dolfinopt.responses.stress_loads import arm_loads, motions_of
+from dolfinopt.responses.stress import CellStress, arm_loads, cell_stress, motions_of
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import scene_from_dict
 

@@ -15,7 +15,7 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.fem.stress import places_of, stress_operator
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.stress_loads import arm_loads
+from dolfinopt.responses.stress import arm_loads
 from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial

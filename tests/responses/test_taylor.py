@@ -7,8 +7,7 @@ import pytest
 from remainders import build, wave
 
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.scene.tables.constraints import Constraints
-from dolfinopt.scene.tables.responses import EXACT_ONLY, NEEDS
+from dolfinopt.scene.tables.objective import EXACT_ONLY, NEEDS, Constraints
 
 QUICK = (
     "simulation.sample=0.01",

@@ -9,7 +9,7 @@ import pytest
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import check_motion
-from dolfinopt.multibody.spatial.links import build_spatial_mechanism, rigid_link
+from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

@@ -8,10 +8,10 @@ import pytest
 from runs import TWO_ARM, run
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.json_schema import scene_schema
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.plausibility import implausible
+from dolfinopt.scene.messages import implausible
+from dolfinopt.scene.schema import scene_schema
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -11,7 +11,7 @@ import pytest
 from runs import TWO_ARM
 
 from dolfinopt.scene.load import load_scene
-from dolfinopt.scene.plausibility import implausible
+from dolfinopt.scene.messages import implausible
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 

@@ -30,9 +30,7 @@ from dolfinopt.scene.load import (
     resolve_file,
     scene_from_dict,
 )
-from dolfinopt.scene.tables.constraints import Constraints
-from dolfinopt.scene.tables.objective import Objective, ObjectiveKind
-from dolfinopt.scene.tables.responses import OPTIONS
+from dolfinopt.scene.tables.objective import OPTIONS, Constraints, Objective, ObjectiveKind
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

@@ -20,8 +20,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from dolfinopt.exchange.urdf.bodies import SceneBody
-from dolfinopt.exchange.urdf.robot import inverse
+from dolfinopt.exchange.urdf.robot import SceneBody, inverse
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

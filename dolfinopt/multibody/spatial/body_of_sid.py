@@ -27,8 +27,8 @@ from dolfinopt.multibody.sid_checks import (
     is_stiffened,
     scales,
 )
-from dolfinopt.multibody.spatial.body_motion import PERMUTATION
-from dolfinopt.multibody.spatial.rotations import ONE
+from dolfinopt.multibody.spatial.kinematics import PERMUTATION
+from dolfinopt.multibody.spatial.mechanism import ONE
 from dolfinopt.multibody.spatial.standard_input import PRODUCTS
 
 Place = tuple[float, float, float]

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
-from dolfinopt.multibody.spatial.body_motion import BodyMotion
-from dolfinopt.multibody.spatial.kinematics import Interface, MovingJoint
-from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import cross, times, transposed_times
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.motion import along_curve, curve_through
+from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface, MovingJoint
+from dolfinopt.multibody.spatial.mechanism import (
+    JointMotion,
+    Pose,
+    RigidChain,
+    SpatialMechanism,
+    Turning,
+    cross,
+    end_chain,
+    roll_pitch_yaw,
+    times,
+    transposed_times,
+)
+from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
+from dolfinopt.scene.load import SPACE_POINT, Scene, file_stamp
 
 
 class _Chain:
@@ -107,3 +125,495 @@ def end_effector_gradient(
             by_bodies[i]["K0_outboard"] = np.zeros_like(K0)
             by_bodies[i]["K0_outboard"][interface.rows_of] = bent
     return by_q, by_joints, by_bodies
+
+
+# -- path of an end-effector in space: its points, orientation, and joints that a table
+# prescribes
+#
+# The rows of a table are joined like those of joint coordinates. An orientation is interpolated as
+# the rotation vector theta against that of the first row, R = R_0 exp(theta~), whose angular
+# velocity and acceleration `rotations.Turning` knows.
+
+RPY = ("roll", "pitch", "yaw")
+VECTOR = ("rx", "ry", "rz")
+
+
+@dataclass(frozen=True, eq=False)
+class EndPath:
+    """What the end-effector is to do at n instants; world's components.
+
+    Attributes:
+        p, v, a: (n, 3) place, velocity, acceleration; m.
+        turning: (R, w, wd), each of n, orientation (n, 3, 3), angular velocity and acceleration
+            (n, 3); None where the orientation is free.
+        joints: (q, qd, qdd), (n, k) each, of the joints that the table prescribes.
+    """
+
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    turning: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    joints: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    def __getitem__(self, part: slice | np.ndarray) -> EndPath:
+        """Return it at some of the instants."""
+        turning = None if self.turning is None else tuple(x[part] for x in self.turning)
+        joints = tuple(x[part] for x in self.joints)
+        return EndPath(self.p[part], self.v[part], self.a[part], turning, joints)  # type: ignore
+
+    @property
+    def rows(self) -> int:
+        """Number of coordinates that the path prescribes: 3, with an orientation 6."""
+        return 3 if self.turning is None else 6
+
+
+def end_path(t: np.ndarray, scene: Scene) -> EndPath:
+    """Return the scene's path of the end-effector at instants t (n,), s.
+
+    Raises:
+        InputError: the table cannot be used; names file and line.
+    """
+    found = _rows_of(scene)
+    values = along_curve(t, scene.motion, *end_curve(scene))
+    (p, v, a), first = (x[:, :3] for x in values), 3
+    turning = None
+    if found.start is not None:
+        one = Turning(*(x[:, 3:6] for x in values))
+        R0, first = found.start, 6
+        turning = R0 @ one.R, one.velocity @ R0.T, one.acceleration @ R0.T
+    q, qd, qdd = (x[:, first:] for x in values)
+    return EndPath(p, v, a, turning, (q, qd, qdd))
+
+
+def end_curve(scene: Scene) -> tuple[Curve, bool]:
+    """Return the curve through points, rotation vectors and joints; whether it runs in time."""
+    return _curve(scene, file_stamp(scene.motion))
+
+
+def prescribed_joints(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the joints that are columns of the scene's table."""
+    if scene.motion.path == "line":
+        return ()
+    assert scene.motion.file is not None
+    names = column_names(scene.motion.file)
+    return tuple(name for name in scene.driven if name in names)
+
+
+def num_rows(scene: Scene) -> int:
+    """Return the number of rows through which the path leads."""
+    return len(_rows_of(scene).table.rows)
+
+
+# -- rows ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of points, rotation vectors and joints; the first row's orientation (3, 3), or None."""
+
+    table: Table
+    start: np.ndarray | None
+
+
+def _rows_of(scene: Scene) -> _Rows:
+    return _read(scene, file_stamp(scene.motion))
+
+
+@lru_cache(maxsize=64)
+def _curve(scene: Scene, stamp: int) -> tuple[Curve, bool]:
+    return curve_through(_rows_of(scene).table, scene.motion, measured=3)
+
+
+@lru_cache(maxsize=64)
+def _read(scene: Scene, stamp: int) -> _Rows:
+    motion = scene.motion
+    if motion.path == "line":
+        rows = np.array([motion.start, motion.end], dtype=float)
+        start = None if motion.rpy is None else roll_pitch_yaw(motion.rpy)
+        if start is not None:
+            rows = np.hstack([rows, np.zeros((2, 3))])
+        return _Rows(Table(scene.source, (1, 2), None, rows), start)
+    assert motion.file is not None
+    names = column_names(motion.file)
+    orientation: tuple[str, ...] = ()
+    for kind in (RPY, VECTOR):
+        # A joint may be called roll: the whole group must be there, and none of them a joint.
+        if {*kind} & {*names} and not {*kind} & {*scene.driven}:
+            orientation = kind
+            break
+    joints = prescribed_joints(scene)
+    known = {TIME, *SPACE_POINT, *orientation, *joints}
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"{motion.file}: unknown column {name!r}; expected {','.join(SPACE_POINT)}, with "
+                f"{TIME}, {','.join(RPY)} or {','.join(VECTOR)}, and joints that the table "
+                f"prescribes ({', '.join(scene.driven)})"
+            )
+    table = read_table(motion.file, (*SPACE_POINT, *orientation, *joints))
+    if not orientation:
+        return _Rows(table, None)
+    place = slice(3, 6)
+    found = _orientations(orientation, table.rows[:, place])
+    rows = table.rows.copy()
+    rows[:, place] = relative_vectors(found)
+    return _Rows(replace(table, rows=rows), found[0])
+
+
+def _orientations(kind: Sequence[str], rows: np.ndarray) -> np.ndarray:
+    """Return the rotations (n, 3, 3) of rows of angles or of rotation vectors (n, 3)."""
+    if kind == VECTOR:
+        return Rotation.from_rotvec(rows).as_matrix()
+    return np.stack([roll_pitch_yaw((r, p, y)) for r, p, y in rows.tolist()])
+
+
+def relative_vectors(R: np.ndarray) -> np.ndarray:
+    """Return rotation vectors (n, 3) against the first of the rotations (n, 3, 3).
+
+    Of the vectors whole turns apart each is the one nearest to that before it.
+    """
+    vectors: np.ndarray = Rotation.from_matrix(R[0].T @ R).as_rotvec()
+    for k in range(1, len(vectors)):
+        before, angle = vectors[k - 1], float(np.linalg.norm(vectors[k]))
+        axis = vectors[k] / angle if angle > 1e-12 else before
+        if angle <= 1e-12:
+            length = float(np.linalg.norm(before))
+            if length == 0.0:
+                continue
+            axis, angle = before / length, 0.0
+        turns = np.round((axis @ before - angle) / (2.0 * np.pi))
+        vectors[k] = (angle + 2.0 * np.pi * turns) * axis
+    return vectors
+
+
+# -- joint coordinates of an end-effector's path in space, links rigid ---------------------------
+#
+# At the start damped least squares (Levenberg-Marquardt) leads from `motion.initial_joints` to the
+# solution that is meant; from there the path is followed, the tangent of the last instant before
+# the next one, to a dense table. At any instant Newton's method sets out from this table; rates and
+# accelerations are solutions of the differentiated equations J q' = v and J q'' = a - J' q', exact
+# to rounding. Source: Siciliano, Sciavicco, Villani & Oriolo, Robotics (2009), ch. 3,
+# doi:10.1007/978-1-84628-642-1; Nakamura & Hanafusa (1986), doi:10.1115/1.3143764.
+
+REACHED = 1e-11  # residual over the reach that rounding leaves
+FOLLOWED = 1e-9  # residual over the reach, above which a pose is not reached
+# Singular values of the Jacobian, rotations times the reach, over the largest: below it the joints'
+# rates lose their digits.
+SINGULAR = 1e-6
+STEPS, STEPS_A_ROW = 50, 2  # of the dense table, cut where Newton's method needs it
+LEAST_STEP = 1e-7  # over the duration
+FAR = 0.3  # rad, or shares of the reach: a Newton step that may lead to another solution
+NEWTON = 3  # iterations from the dense table, right to 1e-5: the last one leaves rounding
+DAMPED = 200  # iterations at the start
+STALLED = 1e-9  # part by which the distance falls in one of them, below which it is the least
+GUESSES = 10  # at the start: the first as stated, the others around it at random
+MOST = 6  # joints that a pose determines
+KEPT = 16  # sets of instants whose joints are kept: the integrator asks for the same ones again
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """Joints that make the end-effector follow the scene's path.
+
+    Attributes:
+        scene: with a path of the end-effector in space.
+        chain: its rigid links.
+        unknown: (k,) rigid coordinates to be found.
+        given: (m,) those that the table prescribes.
+    """
+
+    scene: Scene
+    chain: RigidChain
+    unknown: np.ndarray
+    given: np.ndarray
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        """Places of the unknown joints in the chain's Jacobian."""
+        places = list(self.chain.coordinates)
+        return np.array([places.index(k) for k in self.unknown.tolist()], dtype=int)
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        """Weights (6,) of a pose's rows: rotations as lengths."""
+        return np.array([1.0, 1.0, 1.0, *(self.chain.reach,) * 3])
+
+    @cached_property
+    def _slides(self) -> np.ndarray:
+        """Which of the unknowns (k,) are displacements."""
+        kinds = {joint.coordinate: joint.kind for joint in self.chain.joints}
+        return np.array([kinds[k] == "prismatic" for k in self.unknown.tolist()], dtype=bool)
+
+    @cached_property
+    def _units(self) -> np.ndarray:
+        """Unit (k,) of every unknown: 1 rad, or the reach."""
+        return np.where(self._slides, self.chain.reach, 1.0)
+
+    # -- equations ---------------------------------------------------------------------------
+
+    def spread(self, unknown: np.ndarray, given: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return all rigid coordinates (n, joints), or rates, of the unknown and given ones."""
+        out = np.zeros((len(unknown), len(self.scene.movable)))
+        out[:, self.unknown], out[:, self.given] = unknown, given
+        return out
+
+    def residual(self, pose: Pose, path: EndPath) -> np.ndarray:
+        """Return how far a pose is off (n, 3 or 6), rotation vectors times the reach; m."""
+        away = path.p - pose.place
+        if path.turning is None:
+            return away
+        turn = Rotation.from_matrix(path.turning[0] @ pose.rotation.swapaxes(1, 2)).as_rotvec()
+        return np.hstack([away, self.chain.reach * turn])
+
+    def jacobian(self, pose: Pose, rows: int) -> np.ndarray:
+        """Return the derivative of a pose by the unknowns in their units (n, 3 or 6, k), m."""
+        J = pose.jacobian[:, :rows, self._columns] * self._weights[:rows, None]
+        return J * self._units
+
+    def _solve(self, J: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return J^+ right (n, k), the unknowns' units taken out."""
+        if J.shape[1] == J.shape[2]:
+            found = np.linalg.solve(J, right[:, :, None])[:, :, 0]
+        else:
+            found = (np.linalg.pinv(J) @ right[:, :, None])[:, :, 0]
+        return found * self._units
+
+    def rates(self, q: np.ndarray, path: EndPath) -> tuple[np.ndarray, np.ndarray]:
+        """Return rates and accelerations (n, joints) of joints q (n, joints) on the path."""
+        rows, columns = path.rows, list(self.chain.coordinates)
+        v, a = path.v, path.a
+        if path.turning is not None:
+            v, a = np.hstack([v, path.turning[1]]), np.hstack([a, path.turning[2]])
+        pose, none = self.chain.at(q), np.zeros((len(q), len(self.unknown)))
+        J, every = self.jacobian(pose, rows), pose.jacobian[:, :rows]
+
+        def solved(wanted: np.ndarray, given: np.ndarray) -> np.ndarray:
+            known = self.spread(none, given)
+            left = wanted - np.einsum("nij,nj->ni", every, known[:, columns])
+            return known + self.spread(self._solve(J, self._weights[:rows] * left))
+
+        qd = solved(v, path.joints[1])
+        return qd, solved(a - self.chain.at(q, qd).bias[:, :rows], path.joints[2])
+
+    # -- solutions ---------------------------------------------------------------------------
+
+    def newton(self, q: np.ndarray, path: EndPath, steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return joints (n, joints) after Newton steps from q, and how far off (n,) they are, m."""
+        for _ in range(steps):
+            pose = self.chain.at(q)
+            step = self._solve(self.jacobian(pose, path.rows), self.residual(pose, path))
+            q = q + self.spread(step)
+        return q, np.linalg.norm(self.residual(self.chain.at(q), path), axis=1)
+
+    def nearest(self, q: np.ndarray, path: EndPath) -> tuple[np.ndarray, float]:
+        """Return joints (1, joints) of the nearest pose by damped least squares, how far off, m."""
+        reach, damping, pose = self.chain.reach, 1e-3, self.chain.at(q)
+        error = self.residual(pose, path)
+        for _ in range(DAMPED):
+            far = float(np.linalg.norm(error))
+            if far <= REACHED * reach:
+                break
+            J = self.jacobian(pose, path.rows)[0]
+            normal = J.T @ J + damping * reach**2 * np.eye(len(self.unknown))
+            step = np.linalg.solve(normal, J.T @ error[0])
+            other = q + self.spread((step * self._units)[None])
+            moved = self.chain.at(other)
+            new = self.residual(moved, path)
+            gain = 1.0 - float(np.linalg.norm(new)) / far
+            if gain > 0.0:
+                q, pose, error = other, moved, new
+            damping = max(0.1 * damping, 1e-15) if gain > 0.0 else 10.0 * damping
+            if np.abs(step).max() < 1e-13 or 0.0 < gain < STALLED:
+                break
+        return q, float(np.linalg.norm(error))
+
+    def start(self) -> np.ndarray:
+        """Return the joints (1, joints) at t = 0 that lie near `motion.initial_joints`.
+
+        Raises:
+            InputError: none reach the path's start.
+        """
+        path = end_path(np.zeros(1), self.scene)
+        stated = self.scene.motion.initial_joints
+        guess = np.zeros(len(self.scene.movable)) if stated is None else np.array(stated)
+        guess[self.given] = path.joints[0][0]
+        random, best, far = np.random.default_rng(0), guess[None], np.inf
+        width = 1.5 if stated is None else 0.1
+        for k in range(GUESSES):
+            shift = random.uniform(-width, width, size=(1, len(self.unknown))) * (k > 0)
+            q, distance = self.nearest(guess + self.spread(shift * self._units), path)
+            if distance < far:
+                best, far = q, distance
+            if far <= REACHED * self.chain.reach:
+                break
+        else:
+            raise self._unreachable(0.0, best, path)
+        turned = self.unknown[~self._slides]
+        best[0, turned] -= 2.0 * np.pi * np.round((best[0, turned] - guess[turned]) / (2.0 * np.pi))
+        self._check_singular(0.0, best, path)
+        return best
+
+    @cached_property
+    def table(self) -> CubicHermiteSpline:
+        """The joints' way through dense instants, to some 1e-5.
+
+        Raises:
+            InputError: the path leaves the reach or passes a singular position.
+        """
+        end = self.scene.motion.duration
+        longest = end / max(STEPS, STEPS_A_ROW * num_rows(self.scene))
+        t, step = 0.0, longest
+        q = self.start()
+        qd = self.rates(q, end_path(np.zeros(1), self.scene))[0]
+        known = [(t, q[0], qd[0])]
+        while t < end * (1.0 - 1e-12):
+            ahead = min(t + step, end)
+            path = end_path(np.array([ahead]), self.scene)
+            guess = q + (ahead - t) * qd
+            guess[:, self.given] = path.joints[0]
+            other, distance = self._corrected(guess, path)
+            if not distance <= FOLLOWED * self.chain.reach:  # not a number included
+                if step < LEAST_STEP * end:
+                    raise self._lost(min(t + longest, end), q, ahead)
+                step *= 0.25
+                continue
+            self._check_singular(ahead, other, path)
+            t, q, qd = ahead, other, self.rates(other, path)[0]
+            known.append((t, q[0], qd[0]))
+            step = min(2.0 * step, longest)
+        times, values, rates = (np.array(one) for one in zip(*known, strict=True))
+        return CubicHermiteSpline(times, values, rates)
+
+    def _corrected(self, guess: np.ndarray, path: EndPath) -> tuple[np.ndarray, float]:
+        """Return joints after Newton steps and their distance, inf where they went astray; m."""
+        try:
+            q, distance = self.newton(guess, path, 3)
+        except np.linalg.LinAlgError:
+            return guess, np.inf
+        moved = np.abs((q - guess)[:, self.unknown] / self._units).max()
+        return q, np.inf if not moved <= FAR else float(distance[0])
+
+    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return joints and two derivatives (n, joints) at instants t (n,), s.
+
+        Raises:
+            InputError: the path leaves the reach or passes a singular position.
+        """
+        key = t.tobytes()
+        if key not in self._kept:
+            while len(self._kept) >= KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = self._solved(t)
+        return self._kept[key]
+
+    @cached_property
+    def _kept(self) -> dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        return {}
+
+    def _solved(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        path = end_path(t, self.scene)
+        q = self.table(np.clip(t, 0.0, self.scene.motion.duration))
+        q[:, self.given] = path.joints[0]
+        q, distance = self.newton(q, path, NEWTON)
+        wrong = np.flatnonzero(~(distance <= FOLLOWED * self.chain.reach))
+        if wrong.size:
+            raise self._lost(float(t[wrong[0]]), q[wrong[:1]])
+        qd, qdd = self.rates(q, path)
+        return q, qd, qdd
+
+    # -- errors ------------------------------------------------------------------------------
+
+    def _check_singular(self, t: float, q: np.ndarray, path: EndPath) -> None:
+        J = self.jacobian(self.chain.at(q), path.rows)[0]
+        sizes = np.linalg.svd(J, compute_uv=False)
+        if sizes[-1] < SINGULAR * sizes[0]:
+            raise self._singular(t)
+
+    def _lost(self, t: float, q: np.ndarray, first: float | None = None) -> InputError:
+        """Return why the path cannot be followed to t: out of reach, or through a singularity.
+
+        Args:
+            t: an instant that is not reached, s.
+            q: (1, joints) shortly before.
+            first: the first instant that is not; default: t.
+        """
+        for instant in (t, t if first is None else first):
+            path = end_path(np.array([instant]), self.scene)
+            guess = self.spread(q[:, self.unknown], path.joints[0])
+            best, far = self.nearest(guess, path)
+            if far > FOLLOWED * self.chain.reach:
+                return self._unreachable(instant, best, path)
+        return self._singular(t if first is None else first)
+
+    def _unreachable(self, t: float, q: np.ndarray, path: EndPath) -> InputError:
+        error = self.residual(self.chain.at(q), path)[0]
+        place = ", ".join(f"{x:.6g}" for x in path.p[0])
+        off, turned = f"{np.linalg.norm(error[:3]):.4g} m", ""
+        if path.rows == 6:
+            turned = " turned as it is to be"
+            off += f" and {np.linalg.norm(error[3:]) / self.chain.reach:.4g} rad"
+        more = " or motion.initial_joints" if t == 0.0 else ""
+        return InputError(
+            f"{self.scene.source}: motion: at t = {t:.4g} s the end-effector cannot be at "
+            f"({place}) m{turned}: the joints that follow the path ({self._names}) leave it {off} "
+            f"off at best; change {self._key}{more}"
+        )
+
+    def _singular(self, t: float) -> InputError:
+        return InputError(
+            f"{self.scene.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
+            f"where rates of joints ({self._names}) have no bounds; change {self._key}, or "
+            'prescribe the joints, motion.path = "joints"'
+        )
+
+    @property
+    def _names(self) -> str:
+        return ", ".join(self.scene.driven[k] for k in self.unknown)
+
+    @property
+    def _key(self) -> str:
+        motion = self.scene.motion
+        return "motion.start, motion.end" if motion.path == "line" else "the table motion.file"
+
+
+# -- which joints follow, and which the path's table prescribes ---------------------------------
+
+
+def follower(scene: Scene) -> Follower:
+    """Return what follows the scene's path in space.
+
+    Raises:
+        InputError: the path does not determine the joints; names them and the remedy.
+    """
+    return _follower(scene, file_stamp(scene.motion))
+
+
+@lru_cache(maxsize=16)
+def _follower(scene: Scene, stamp: int) -> Follower:
+    chain, names = end_chain(scene), scene.driven
+    given = np.array([names.index(name) for name in prescribed_joints(scene)], dtype=int)
+    unknown = np.array([k for k in range(len(names)) if k not in given], dtype=int)
+    where = f'{scene.source}: motion.path = "{scene.motion.path}"'
+    column = 'columns of joints in the table of motion.path = "points"'
+    tables = 'joint tables, motion.path = "joints"'
+    idle = ", ".join(names[k] for k in unknown if k not in chain.coordinates)
+    if idle:
+        raise InputError(
+            f"{where}: joints that do not move the end-effector ({idle}) have no motion; give them "
+            f"{column}, or {tables}"
+        )
+    rows = end_path(np.zeros(1), scene).rows
+    moving = ", ".join(names[k] for k in unknown)
+    if len(unknown) == 0:
+        raise InputError(f"{where}: its table prescribes all joints; give {tables}, instead")
+    if len(unknown) > rows:
+        what, more = "a pose determines", ""
+        if rows == 3:
+            what = "x, y and z determine"
+            turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
+            more = f"the orientation ({turn}), " if len(unknown) <= MOST else ""
+        raise InputError(
+            f"{where}: expected at most {rows} joints, which {what}, found {len(unknown)} "
+            f"({moving}); give {more}{column}, or {tables}"
+        )
+    return Follower(scene, chain, unknown, given)

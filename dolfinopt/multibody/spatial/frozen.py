@@ -12,9 +12,13 @@ import numpy as np
 
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.kinematics import MovingJoint
-from dolfinopt.multibody.spatial.mechanism import SpatialMechanism, rigid_spatial_body
-from dolfinopt.multibody.spatial.motion import JointMotion
-from dolfinopt.multibody.spatial.rotations import ONE, skew
+from dolfinopt.multibody.spatial.mechanism import (
+    ONE,
+    JointMotion,
+    SpatialMechanism,
+    rigid_spatial_body,
+    skew,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm

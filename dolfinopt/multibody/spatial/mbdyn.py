@@ -10,9 +10,8 @@ import numpy as np
 
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.body_motion import PERMUTATION
-from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
-from dolfinopt.multibody.spatial.rotations import ONE
+from dolfinopt.multibody.spatial.kinematics import PERMUTATION
+from dolfinopt.multibody.spatial.mechanism import ONE, inertia_about_centre
 from dolfinopt.multibody.spatial.standard_input import (
     centrifugal,
     outboard_interfaces,

@@ -34,8 +34,8 @@ from dolfinopt.exchange.sid import (
     taylor,
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.body_motion import PERMUTATION
-from dolfinopt.multibody.spatial.rotations import ONE, skew
+from dolfinopt.multibody.spatial.kinematics import PERMUTATION
+from dolfinopt.multibody.spatial.mechanism import ONE, skew
 from dolfinopt.multibody.standard_input import coordinate_names
 
 # Entries of J, and products of the angular velocity in the columns of Oe.

@@ -7,23 +7,184 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
-from dolfinopt.scene.spelling import shown
-from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table
-from dolfinopt.scene.tables.inertia import Moment, Tensor, tensor_problem
-from dolfinopt.scene.tables.interfaces import Interface, check_interfaces
-from dolfinopt.scene.tables.material import (
-    CatalogueName,
-    MassDensity,
-    PoissonRatio,
-    YieldStrength,
-    YoungModulus,
-)
-from dolfinopt.scene.tables.regions import Region, check_regions
+from dolfinopt.scene.materials import CATALOGUE, unknown_material
+from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.design import Region, check_regions
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
+
+
+# -- `[[arms.interfaces]]`: where further joints or the payload sit on an arm in space -----------
+
+INBOARD, OUTBOARD = "inboard", "outboard"
+
+
+def _check_name(name: str) -> str:
+    """Return `name` if it can name a group of faces besides those of the arm's ends."""
+    if not name.strip() or len(name) > 64 or not name.isprintable():
+        raise Refusal("expected 1 to 64 printable characters")
+    if name.strip().casefold() in (INBOARD, OUTBOARD):
+        raise Refusal(f'expected another name: "{INBOARD}" and "{OUTBOARD}" are the arm\'s ends')
+    return name
+
+
+class Interface(Table):
+    """A rigid part of an arm's surface besides its outboard interface."""
+
+    name: Annotated[str, AfterValidator(_check_name)] = Field(
+        description="unique name of the arm's interface, also that of its faces in a mesh file and "
+        "of its node in a SID file [-]"
+    )
+    point: tuple[Position, Position, Position] = Field(
+        description="its reference point in the arm's frame [m]"
+    )
+    radius: Length | None = Field(
+        default=None,
+        description="of an arm made of cells: the sides of cells on its surface whose middle is "
+        "at most so far from the point are the interface [m]",
+    )
+
+
+def interface_number(arm: Arm, name: str) -> int | None:
+    """Return 0 for the outboard interface, 1 ... for `arms.interfaces`; None for another name."""
+    names = [OUTBOARD, *(one.name.casefold() for one in arm.interfaces)]
+    return names.index(name.casefold()) if name.casefold() in names else None
+
+
+def refuse_unknown(arm: Arm, name: str, at: Loc) -> None:
+    """Refuse a name that none of an arm's interfaces has."""
+    if interface_number(arm, name) is None:
+        allowed = " | ".join(shown(one) for one in (OUTBOARD, *(x.name for x in arm.interfaces)))
+        raise Refusal(f"expected the name of an interface of {arm.name}: {allowed}", at)
+
+
+def check_interfaces(scene: Scene, index: int) -> None:
+    """Refuse interfaces that an arm cannot have, or on which nothing sits."""
+    arm, at = scene.arms[index], ("arms", index)
+    if not arm.interfaces:
+        return
+    if not scene.is_spatial:
+        raise Refusal(
+            "expected none without [[joints]]: an arm in the plane carries the next one at its end",
+            (*at, "interfaces"),
+        )
+    if arm.pattern is not None:
+        raise Refusal("expected none with pattern", (*at, "interfaces"), (*at, "pattern"))
+    meshed = arm.flexible and arm.cells is not None
+    known = [one.name.casefold() for one in arm.interfaces]
+    for k, one in enumerate(arm.interfaces):
+        here = (*at, "interfaces", k)
+        if one.name.casefold() in known[:k]:
+            raise Refusal("expected a name that no other interface of the arm has", (*here, "name"))
+        if (one.radius is None) == meshed:
+            made = "a rigid arm" if arm.rigid else "an arm made of cells"
+            if arm.sid is not None:
+                made = f'a body from a file, which has a node "{one.name}"'
+            elif not arm.rigid and arm.cells is None:
+                made = f'a mesh file, which has faces in a group "{one.name}"'
+            expected = "a number > 0 [m]" if one.radius is None else "none"
+            raise Refusal(f"expected {expected} with {made}", (*here, "radius"))
+
+
+def check_used(scene: Scene) -> None:
+    """Refuse interfaces on which nothing sits; those of arms of one design are the same."""
+    for index, arm in enumerate(scene.arms):
+        if arm.design is not None:
+            continue
+        sharing = [index, *(k for k, one in enumerate(scene.arms) if one.design == arm.name)]
+        for number, one in enumerate(arm.interfaces, start=1):
+            if not scene.used_interfaces & {(k, number) for k in sharing}:
+                raise Refusal(
+                    f'expected a joint with parent_interface = "{one.name}", or the payload '
+                    "there: nothing sits on it",
+                    ("arms", index, "interfaces", number - 1, "name"),
+                    ("joints",),
+                )
+
+
+# -- inertia of rigid bodies in space, as URDF states it -----------------------------------------
+
+Moment = Annotated[float, Field(ge=0, le=1e9)]  # kg m2
+Product = Annotated[float, Field(ge=-1e9, le=1e9)]
+Tensor = tuple[Product, Product, Product, Product, Product, Product]  # xx, yy, zz, xy, xz, yz
+# By how much, over the largest, rounded moments may miss the triangle inequality.
+ROUNDED = 1e-6
+
+
+def tensor_problem(inertia: float | tuple[float, ...] | None) -> str:
+    """Return why no body has this inertia tensor, "" for one that a body may have.
+
+    Its principal moments are int y^2 + z^2 and so on: none is negative, or more than the sum of
+    the two others.
+    """
+    if not isinstance(inertia, tuple) or not any(inertia):
+        return ""
+    import numpy as np  # which scenes in the plane do not need
+
+    xx, yy, zz, xy, xz, yz = inertia
+    low, middle, high = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    moments = f"its principal moments are {low:.4g}, {middle:.4g} and {high:.4g} kg m2"
+    if low < -ROUNDED * max(abs(low), high):
+        return f"expected the inertia of a body: {moments}, and none can be negative"
+    if low + middle < (1.0 - ROUNDED) * high:
+        return (
+            f"expected the inertia of a body: {moments}, and none can exceed the sum of the two "
+            "others"
+        )
+    return ""
+
+
+# -- `[material]` --------------------------------------------------------------------------------
+
+YoungModulus = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
+PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
+MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
+YieldStrength = Annotated[float, Field(ge=1e-3, le=1e15)]  # Pa
+
+
+def check_material(name: str) -> str:
+    """Return `name` if the catalogue has it."""
+    if name not in CATALOGUE:
+        raise Refusal(unknown_material(name))
+    return name
+
+
+CatalogueName = Annotated[
+    str,
+    AfterValidator(check_material),
+    WithJsonSchema({"type": "string", "enum": list(CATALOGUE)}),
+]
+
+
+class Material(Table):
+    """The solid material, linear elastic and isotropic, in plane stress.
+
+    `material = "NAME"` in place of the table takes all values from the catalogue; so does
+    `name = "NAME"` in it, for those that are not stated.
+    """
+
+    name: CatalogueName | None = Field(
+        default=None,
+        description='name in the catalogue, e.g. "aluminium 7075-T6", from which values not stated '
+        'are taken; material = "NAME" in place of the table is short for it [-]',
+    )
+    young_modulus: YoungModulus = Field(description="Young's modulus of the solid material [Pa]")
+    poisson_ratio: PoissonRatio = Field(description="Poisson's ratio [-]")
+    density: MassDensity = Field(description="mass density of the solid material [kg/m3]")
+    yield_strength: YieldStrength | None = Field(
+        default=None,
+        description="stress up to which the solid material is elastic; for reports alone [Pa]",
+    )
+
+
+# What a catalogue name stands for.
+MATERIAL_VALUES = tuple(key for key in Material.model_fields if key != "name")
+
+
+# -- `[[arms]]` ----------------------------------------------------------------------------------
 
 CellShape = Literal["quadrilateral", "triangle", "hexahedron", "tetrahedron"]
 ElementName = Literal["incompatible", "linear", "quadratic"]

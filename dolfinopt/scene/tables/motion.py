@@ -6,8 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from dolfinopt.scene.spelling import shown
-from dolfinopt.scene.tables.base import Duration, FileName, Length, Loc, Position, Refusal, Table
+from dolfinopt.scene.tables.base import (
+    Duration,
+    FileName,
+    Length,
+    Loc,
+    Position,
+    Refusal,
+    Table,
+    shown,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+import math
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import Field, field_validator
 
-from dolfinopt.scene.spelling import shown
-from dolfinopt.scene.tables.base import Loc, Refusal, Table
-from dolfinopt.scene.tables.responses import (
-    EXACT_ONLY,
-    LIGHTER,
-    NEEDS,
-    OPTIONS,
-    Need,
-    need_of,
-    unused_options,
-)
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -296,3 +288,203 @@ class Objective(Table):
                     ("arms", i, "passive"),
                     ("objective", "attached"),
                 )
+
+
+# -- `[constraints]` -----------------------------------------------------------------------------
+
+Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
+Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
+Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
+Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
+Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
+Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
+Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
+Limit = float | tuple[float | None, ...]
+
+
+class Constraints(Table):
+    """Limits of a design besides its volume: true extremes, of the worst scenario."""
+
+    mass: Mass | None = Field(
+        default=None, description="upper limit of the mass of all arms together [kg]"
+    )
+    compliance: Energy | None = Field(
+        default=None,
+        description="upper limit of the compliance of the load cases, as summary.json has it [N m]",
+    )
+    esl: Energy | None = Field(
+        default=None,
+        description="the same for the instants that objective.worst chooses [N m]",
+    )
+    deviation: Distance | None = Field(
+        default=None,
+        description="upper limit of the largest deviation of the end-effector [m]",
+    )
+    settling: Distance | None = Field(
+        default=None,
+        description="upper limit of the largest deviation from motion.duration on [m]",
+    )
+    stress: Pressure | None = Field(
+        default=None,
+        description="upper limit of the largest von Mises stress of all arms along the motion, "
+        "relaxed for intermediate density [Pa]",
+    )
+    effort: Effort | None = Field(
+        default=None,
+        description="upper limit of the weighted root mean square of the drives' forces, see "
+        "objective.effort_weights [-]",
+    )
+    peak_force: tuple[Force | None, ...] | None = Field(
+        default=None,
+        description="upper limits of the largest force of every drive, the cart's first, then the "
+        "joints' from the base outwards; inf leaves one without limit [N, N m]",
+    )
+    first_frequency: Frequency | tuple[Frequency, ...] | None = Field(
+        default=None,
+        description="lower limit of the first natural frequency of every flexible arm with what "
+        "it carries (objective.attached), one for all or one for each [Hz]",
+    )
+    tip_deflection: Distance | tuple[Distance, ...] | None = Field(
+        default=None,
+        description="upper limit of the static deflection of the outboard interface of every "
+        "designed arm under objective.loads, one for all or one for each [m]",
+    )
+
+    @field_validator("peak_force", mode="before")
+    @classmethod
+    def _leave_free(cls, value: Any) -> Any:
+        """Take None for inf, which JSON does not know."""
+        if not isinstance(value, list | tuple):
+            return value
+        free = tuple(None if one == math.inf else one for one in value)
+        if free and all(one is None for one in free):
+            raise Refusal("expected a limit for one drive at least")
+        return free
+
+    @property
+    def limits(self) -> dict[str, Limit]:
+        """What is limited, in the order of the keys."""
+        return {key: limit for key, limit in vars(self).items() if limit is not None}
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse arrays that are not one limit for everything that has a value."""
+        owners = {
+            "peak_force": scene.driven,
+            "first_frequency": [arm.name for arm in scene.arms if arm.flexible],
+            "tip_deflection": [scene.arms[i].name for i in scene.cell_counts],
+        }
+        for key, limit in self.limits.items():
+            names = owners.get(key, [])
+            if isinstance(limit, tuple) and len(limit) != len(names):
+                number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
+                raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
+
+
+# -- what the responses that a scene can name need; `dolfinopt.responses` computes them ----------
+
+# What must be known beside the densities.
+Need = Literal["stiffness", "mass", "motion", "eigenproblem"]
+MOTION: frozenset[Need] = frozenset({"stiffness", "mass", "motion"})
+VIBRATION: frozenset[Need] = frozenset({"stiffness", "mass", "eigenproblem"})
+STATICS: frozenset[Need] = frozenset({"stiffness"})
+NEEDS: Mapping[str, frozenset[Need]] = {
+    "mass": frozenset(),
+    "esl": MOTION,
+    "compliance": MOTION,
+    "deviation": MOTION,
+    "settling": MOTION,
+    "stress": MOTION,
+    "static": STATICS,
+    "eigenfrequency": VIBRATION,
+    "first_frequency": VIBRATION,
+    "tip_deflection": STATICS,
+    "effort": MOTION,
+    "peak_force": MOTION,
+}
+# Those that no equivalent static load tells anything of: their gradient is always the exact one.
+EXACT_ONLY = frozenset({"effort", "peak_force"})
+# What uses an option of [objective]: as objective, and under [constraints].
+OPTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "worst": (("esl",), ("esl",)),
+    "stress_exponent": (("stress",), ("stress",)),
+    "loads": (("static", "tip_deflection"), ("tip_deflection",)),
+    "effort_weights": (("effort", "peak_force"), ("effort",)),
+    "attached": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
+    "elbow_angle": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
+    "modes": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
+    "follow": (("eigenfrequency",), ()),
+}
+# Those that fall with the mass, down to that of no arm at all.
+LIGHTER = frozenset({"mass", "effort", "peak_force"})
+
+
+def asked(scene: Scene) -> list[str]:
+    """Return the words of the objective and of everything under [constraints]."""
+    return [scene.objective.kind, *scene.constraints.limits]
+
+
+def unused_options(kind: str, limited: Collection[str]) -> list[str]:
+    """Return the options of [objective] that nothing uses.
+
+    Args:
+        kind: the objective.
+        limited: keys under [constraints].
+    """
+    return [
+        key
+        for key, (objectives, limits) in OPTIONS.items()
+        if kind not in objectives and not set(limits) & set(limited)
+    ]
+
+
+def freezes(scene: Scene) -> bool:
+    """Return whether a gradient of the scene differs with frozen loads from the exact one."""
+    return bool(set(need_of(scene, "motion")) - EXACT_ONLY)
+
+
+def needs_alone(scene: Scene, what: Collection[Need]) -> bool:
+    """Return whether nothing of `asked` needs anything else; of unknown words nothing is known."""
+    known = [NEEDS.get(name) for name in asked(scene)]
+    return all(needs is not None and needs <= frozenset(what) for needs in known)
+
+
+def need_of(scene: Scene, what: Need) -> list[str]:
+    """Return those of `asked` that need that; of words that are no scene's nothing is known."""
+    return [name for name in asked(scene) if what in NEEDS.get(name, ())]
+
+
+# -- `[[scenarios]]` -----------------------------------------------------------------------------
+
+# What may differ between scenarios: not the arms, which are one design, reduced once.
+TABLES = ("motion", "control", "closure", "payload", "damping", "material")
+
+
+class Scenario(Table):
+    """A scenario: another use of the same design, part of the objective."""
+
+    changes: tuple[str, ...] = Field(
+        description='changes to the scene as "key=value", of motion, control, closure, payload, '
+        "damping or material [-]"
+    )
+    weight: float = Field(
+        default=1.0, ge=1e-9, le=1e9, description="weight in the sum of the scenarios [-]"
+    )
+
+    @field_validator("changes")
+    @classmethod
+    def _check_changes(cls, changes: tuple[str, ...]) -> tuple[str, ...]:
+        for change in changes:
+            key = change.partition("=")[0].strip()
+            table = key.partition(".")[0]
+            if table not in TABLES:
+                raise Refusal(
+                    f"expected keys of {', '.join(TABLES[:-1])} or {TABLES[-1]}, found {shown(key)}"
+                )
+            if key == "material.poisson_ratio":
+                raise Refusal("expected no material.poisson_ratio: the reduced basis depends on it")
+            if key in ("material", "material.name"):
+                raise Refusal(
+                    "expected single values, e.g. material.young_modulus, not another material: "
+                    "the reduced basis depends on its Poisson's ratio"
+                )
+        return changes

@@ -12,18 +12,18 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.parallel import on_all_ranks, on_root, together
-from dolfinopt.responses.p_norm import p_norm
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
     Response,
     by_owner,
+    p_norm,
     register,
 )
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.responses import NEEDS
+from dolfinopt.scene.tables.objective import NEEDS
 
 if TYPE_CHECKING:
     from dolfinopt.multibody.spatial.frozen import FrozenTree
@@ -159,8 +159,7 @@ def _chain(analysis: Analysis) -> Chain | FrozenTree:
 def _tree(analysis: Analysis) -> FrozenTree:
     """Freeze the machine in space in the pose at the middle of its motion (collective)."""
     from dolfinopt.multibody.spatial.frozen import FrozenTree, rigid_integrals_in_space
-    from dolfinopt.multibody.spatial.links import build_spatial_mechanism
-    from dolfinopt.multibody.spatial.motion import joint_motion
+    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, joint_motion
 
     scene, partition = analysis.scene, analysis.partition
     with together(partition.world):
@@ -191,3 +190,18 @@ def _modes(designs: Mapping[int, DesignState], chain: Chain | FrozenTree) -> dic
     """Return the loaded modes of arms by their place in the chain; within `together`."""
     carried = chain.carried()
     return {place: one.loaded_modes(place, carried[place]) for place, one in designs.items()}
+
+
+# -- first natural frequency of every flexible arm, whichever mode it belongs to -----------------
+
+
+@register
+class FirstFrequency(Eigenfrequency):
+    """The longest period even where `objective.follow` follows a mode: a limit is for all."""
+
+    name = "first_frequency"
+
+    @property
+    def follow(self) -> bool:
+        """False: the lowest mode counts."""
+        return False

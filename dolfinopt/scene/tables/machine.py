@@ -1,0 +1,458 @@
+"""`[[joints]]`: with this table the machine moves in space."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from dolfinopt.scene.tables.arms import (
+    OUTBOARD,
+    Moment,
+    Tensor,
+    check_arm_name,
+    check_used,
+    refuse_unknown,
+    tensor_problem,
+)
+from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, shown
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+JointType = Literal["revolute", "prismatic", "fixed"]
+Component = Annotated[float, Field(ge=-1e6, le=1e6)]
+Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
+Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
+Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
+LIMITS = ("position_limits", "velocity_limit", "effort_limit")
+GROUND = "ground"
+TIME = "t"  # column of a table of joint coordinates
+PATHS = ("joints", "points", "line")  # of machines in space
+# What a machine in the plane has instead of joints.
+PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
+
+
+def _check_name(name: str) -> str:
+    """Return `name` if it can be the column of a table."""
+    if name == TIME:
+        raise Refusal('expected another name: a column "t" means the time')
+    return check_arm_name(name)
+
+
+class Joint(Table):
+    """A joint between the ground or an arm's outboard interface and the arm that it holds."""
+
+    name: Annotated[str, AfterValidator(_check_name)] = Field(
+        description="unique name, the column of its coordinate in tables [-]"
+    )
+    type: JointType = Field(description="what moves: an angle, a distance, or nothing [-]")
+    parent: str = Field(
+        description='name of the arm whose outboard interface it sits on, or "ground" [-]'
+    )
+    parent_interface: str = Field(
+        default=OUTBOARD,
+        description="name of the parent's interface that it sits on, one of arms.interfaces [-]",
+    )
+    child: str = Field(description="name of the arm that it holds, whose frame is the joint's [-]")
+    axis: tuple[Component, Component, Component] | None = Field(
+        default=None,
+        description="axis in the joint's frame, of any length; of revolute and prismatic ones [-]",
+    )
+    origin: tuple[Position, Position, Position] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="origin of the joint's frame in the parent's interface frame, or in the "
+        "world's [m]",
+    )
+    rpy: tuple[Angle, Angle, Angle] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
+        "frame, as in URDF [rad]",
+    )
+
+    position_limits: tuple[Coordinate, Coordinate] | None = Field(
+        default=None,
+        description="least and largest coordinate, as in URDF; told where the motion exceeds them "
+        "[rad, m]",
+    )
+    velocity_limit: Limit | None = Field(
+        default=None,
+        description="largest rate of the coordinate either way, as in URDF; told where the motion "
+        "exceeds it [rad/s, m/s]",
+    )
+    effort_limit: Limit | None = Field(
+        default=None,
+        description="largest torque or force of the drive either way, as in URDF; told where the "
+        "motion asks for more. The optimiser minds control.limits and constraints.peak_force "
+        "[N m, N]",
+    )
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a coordinate."""
+        return self.type != "fixed"
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Joint:
+        for key in LIMITS:
+            if getattr(self, key) is not None and not self.moves:
+                raise Refusal("expected none with a fixed joint", (key,), ("type",))
+        if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
+            raise Refusal("expected the least first, then the largest", ("position_limits",))
+        return self
+
+    @model_validator(mode="after")
+    def _check_axis(self) -> Joint:
+        if self.axis is None and self.moves:
+            raise Refusal(
+                f"expected an array of three numbers with a {self.type} joint", ("axis",), ("type",)
+            )
+        if self.axis is not None and not self.moves:
+            raise Refusal("expected none with a fixed joint", ("axis",), ("type",))
+        if self.axis is not None and math.hypot(*self.axis) < 1e-9:
+            raise Refusal("expected a direction, not of length zero", ("axis",))
+        return self
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse names that are taken or unknown; with the first joint, all that joints rule out.
+
+        Raises:
+            Refusal: its keys are paths from the scene.
+        """
+        before = scene.joints[: at[-1]]
+        if self.name.casefold() in (joint.name.casefold() for joint in before):
+            raise Refusal("expected a name that no other joint has", (*at, "name"))
+        names = [arm.name for arm in scene.arms]
+        if self.child not in names:
+            allowed = " | ".join(map(shown, names))
+            raise Refusal(f"expected the name of an arm: {allowed}", (*at, "child"))
+        if self.parent not in (GROUND, *names):
+            allowed = " | ".join(map(shown, (GROUND, *names)))
+            raise Refusal(f"expected the ground or the name of an arm: {allowed}", (*at, "parent"))
+        self._check_interface(scene, at)
+        for other in before:
+            if other.child == self.child:
+                raise Refusal(
+                    f"expected an arm that no other joint holds: {self.child} hangs on "
+                    f"{other.name}; closed loops in space are not simulated",
+                    (*at, "child"),
+                )
+        if len(before) == len(scene.joints) - 1:
+            _check_tree(scene)
+            _check_machine(scene)
+
+    def _check_interface(self, scene: Scene, at: Loc) -> None:
+        """Refuse an interface that the parent does not have."""
+        if self.parent != GROUND:
+            parent = next(arm for arm in scene.arms if arm.name == self.parent)
+            refuse_unknown(parent, self.parent_interface, (*at, "parent_interface"))
+        elif self.parent_interface != OUTBOARD:
+            raise Refusal("expected none on the ground", (*at, "parent_interface"), (*at, "parent"))
+
+
+def _check_tree(scene: Scene) -> None:
+    """Refuse arms without a joint, and joints that do not lead to the ground."""
+    parents = {joint.child: joint.parent for joint in scene.joints}
+    for k, arm in enumerate(scene.arms):
+        if arm.name == GROUND:
+            raise Refusal(
+                'expected another name: with [[joints]] "ground" is what the machine stands on',
+                ("arms", k, "name"),
+            )
+        if arm.name not in parents:
+            raise Refusal(
+                "expected one of [[joints]] whose child it is", ("arms", k, "name"), ("joints",)
+            )
+    for i, joint in enumerate(scene.joints):
+        passed, above = [joint.child], joint.parent
+        while above != GROUND and above not in passed:
+            passed.append(above)
+            above = parents[above]
+        if above != GROUND:
+            raise Refusal(
+                f"expected a tree that stands on the ground: from {joint.child} its parents lead "
+                f"to {above} again",
+                ("joints", i, "parent"),
+            )
+    if not any(joint.moves for joint in scene.joints):
+        raise Refusal(
+            'expected a "revolute" or "prismatic" joint: nothing moves', ("joints", 0, "type")
+        )
+
+
+def _check_machine(scene: Scene) -> None:
+    """Refuse what only a machine in the plane has, or what has no equations in space yet."""
+    motion = scene.motion
+    if motion.path not in PATHS:
+        allowed = " | ".join(map(shown, PATHS))
+        raise Refusal(f"expected {allowed} with [[joints]]", ("motion", "path"), ("joints",))
+    for key in ("start", "end"):
+        if motion.path == "line" and len(getattr(motion, key)) == 2:
+            raise Refusal(
+                "expected an array of three numbers with [[joints]]", ("motion", key), ("joints",)
+            )
+    movable = scene.movable
+    if motion.initial_joints is not None and len(motion.initial_joints) != len(movable):
+        names = ", ".join(joint.name for joint in movable)
+        raise Refusal(f"expected {len(movable)} numbers, of {names}", ("motion", "initial_joints"))
+    for key in PLANE_KEYS:
+        default = type(motion).model_fields[key].default
+        if getattr(motion, key) != default:
+            raise Refusal(
+                f"expected {shown(default)}, the default, with [[joints]], which say where the "
+                "machine stands",
+                ("motion", key),
+                ("joints",),
+            )
+    if len(motion.gravity) == 2 and any(motion.gravity):
+        raise Refusal(
+            "expected an array of three numbers with [[joints]]", ("motion", "gravity"), ("joints",)
+        )
+    if scene.objective.elbow_angle is not None:
+        raise Refusal(
+            "expected none with [[joints]]: links vibrate in the pose at the middle of the motion",
+            ("objective", "elbow_angle"),
+            ("joints",),
+        )
+    for k, arm in enumerate(scene.arms):
+        if arm.joint_stiffness > 0.0:
+            raise Refusal(
+                "expected 0 with [[joints]]: springs of drives are simulated in the plane; leave "
+                "it out, [control] has stiffness and damping of the drives",
+                ("arms", k, "joint_stiffness"),
+                ("joints",),
+            )
+        if arm.flexible and not arm.is_solid:
+            raise Refusal(
+                "expected three integers (along, over the height, over the thickness) with "
+                "[[joints]]: an arm that moves in space is a solid, or rigid = true",
+                ("arms", k, "cells"),
+                ("joints",),
+            )
+
+
+# -- `[closure]` ---------------------------------------------------------------------------------
+
+ClosureKind = Literal["slider", "pin"]
+# Responses of the deviation at the end of the chain, which a pin leaves none.
+OF_THE_END = ("deviation", "settling")
+DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the last ones
+
+
+class Closure(Table):
+    """What holds the outboard interface of the last arm, whose rotation stays free."""
+
+    kind: ClosureKind = Field(
+        description="the interface slides on a line, or turns about a fixed point [-]"
+    )
+    point: tuple[Position, Position] = Field(
+        default=(0.0, 0.0), description="a point of the line, or the pin [m]"
+    )
+    direction: tuple[Component, Component] = Field(
+        default=(1.0, 0.0), description="direction of the line, of any length [-]"
+    )
+    side: Literal[-1, 1] = Field(
+        default=1,
+        description="which way the loop is assembled: sign of the last joint's angle at the start; "
+        "where that is zero, the stretched way [-]",
+    )
+    force: float = Field(
+        default=0.0,
+        ge=-1e12,
+        le=1e12,
+        description="constant force on the slider along the direction [N]",
+    )
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Closure:
+        self.refuse_unused(self.kind == "slider", "kind", "direction", "force")
+        if self.direction == (0.0, 0.0):
+            raise Refusal("expected a direction other than zero", ("direction",))
+        return self
+
+    @property
+    def dependent(self) -> int:
+        """Number of joints that follow from the others: the last ones."""
+        return DEPENDENT[self.kind]
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse a loop of too few arms, and what a closed loop cannot be combined with."""
+        if scene.is_spatial:
+            raise Refusal(
+                "expected no [closure] with [[joints]]: closed loops are simulated in the plane; "
+                "leave the table out, and prescribe the joints that would follow",
+                (*at, "kind"),
+                ("joints",),
+            )
+        if len(scene.arms) <= self.dependent:
+            raise Refusal(
+                f'expected kind = "{self.kind}" with at least {self.dependent + 1} arms, found '
+                f"{len(scene.arms)}",
+                (*at, "kind"),
+                ("arms",),
+            )
+        if scene.motion.base != "fixed":
+            raise Refusal('expected "fixed" with [closure]', ("motion", "base"), (*at, "kind"))
+        if scene.motion.path not in ("rotation", "joints"):
+            raise Refusal(
+                'expected "rotation" or "joints" with [closure]: the motion prescribes the '
+                "joints that are independent",
+                ("motion", "path"),
+                (*at, "kind"),
+            )
+        if scene.simulation.integrator != "radau":
+            raise Refusal(
+                'expected "radau" with [closure]: its stages keep the loop closed',
+                ("simulation", "integrator"),
+                (*at, "kind"),
+            )
+        self._check_springs(scene, at)
+        if self.kind == "pin":
+            self._check_end(scene, at)
+
+    def _check_springs(self, scene: Scene, at: Loc) -> None:
+        """Refuse springs between drive and arm at joints that have no drive."""
+        first = len(scene.arms) - self.dependent
+        for index in range(first, len(scene.arms)):
+            if scene.arms[index].joint_stiffness > 0.0:
+                raise Refusal(
+                    f"expected 0: the joint of {scene.arms[index].name} follows from the others in "
+                    "the closed loop and has no drive",
+                    ("arms", index, "joint_stiffness"),
+                    (*at, "kind"),
+                )
+
+    def _check_end(self, scene: Scene, at: Loc) -> None:
+        """Refuse responses of the deviation of an end that a pin holds."""
+        for key in OF_THE_END:
+            if scene.objective.kind == key or getattr(scene.constraints, key, None) is not None:
+                where = (
+                    ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
+                )
+                raise Refusal(
+                    'expected another response with closure.kind = "pin": the end of the last arm '
+                    "is held, it deviates from nothing; take the compliance",
+                    where,
+                    (*at, "kind"),
+                )
+
+
+# -- `[control]` ---------------------------------------------------------------------------------
+
+FeedForward = Literal["rigid", "none"]
+Gain = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; N s/m, N m s/rad
+Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
+Factor = Annotated[float, Field(ge=0, le=1e6)]
+
+
+class Control(Table):
+    """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
+
+    feed_forward: FeedForward = Field(
+        default="rigid",
+        description="forces known in advance: inverse dynamics of the machine with rigid arms of "
+        "the current design, or none [-]",
+    )
+    stiffness: tuple[Gain, ...] = Field(
+        description="proportional gain of every driven coordinate, the cart first, then the joints "
+        "from the base outwards [N/m, N m/rad]"
+    )
+    damping: tuple[Gain, ...] = Field(
+        description="derivative gain of every driven coordinate [N s/m, N m s/rad]"
+    )
+    stiffness_factor: Factor = Field(
+        default=1.0, description="factor on all of control.stiffness, to be varied in studies [-]"
+    )
+    damping_factor: Factor = Field(default=1.0, description="factor on all of control.damping [-]")
+    limits: tuple[Force, ...] | None = Field(
+        default=None,
+        description="largest force of every drive: up to 95 % of its limit a drive gives what the "
+        "control asks for, from 105 % on the limit, with a smooth transition between them "
+        "(three times continuously differentiable); default: none [N, N m]",
+    )
+    forces: FileName | None = Field(
+        default=None,
+        description="table (CSV) of forces that are added, with columns t, cart and the arms' "
+        "names; zero behind its last row [N, N m]",
+    )
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse gains and limits that are not one for every driven coordinate."""
+        names = scene.driven
+        for key in ("stiffness", "damping", "limits"):
+            values = getattr(self, key)
+            if values is not None and len(values) != len(names):
+                number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
+                raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
+
+
+# -- `[damping]` ---------------------------------------------------------------------------------
+
+
+class Damping(Table):
+    """Structural damping D = stiffness_proportional * K."""
+
+    stiffness_proportional: float = Field(
+        default=2e-4, ge=0, le=1e3, description="factor d of the damping matrix D = d K [s]"
+    )
+
+
+# -- `[payload]` ---------------------------------------------------------------------------------
+
+
+class Payload(Table):
+    """What the end-effector carries."""
+
+    mass: float = Field(ge=0, le=1e9, description="point mass at the end-effector [kg]")
+    inertia: Moment | Tensor = Field(
+        default=0.0,
+        description="moment of inertia about its centre; in space about every axis, or the tensor "
+        "xx, yy, zz, xy, xz, yz [kg m2]",
+    )
+    offset: tuple[Position, Position, Position] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="its centre in the frame of the end-effector's interface; in space [m]",
+    )
+    arm: str | None = Field(
+        default=None,
+        description="name of the arm that carries it and is the end-effector, whose deviation "
+        "and path count; default: the last one; in space [-]",
+    )
+    interface: str = Field(
+        default=OUTBOARD,
+        description="name of that arm's interface where it sits, one of arms.interfaces [-]",
+    )
+
+    @property
+    def moment(self) -> float:
+        """Moment of inertia in the plane, about z, kg m2."""
+        return self.inertia[2] if isinstance(self.inertia, tuple) else self.inertia
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse a tensor that no body has, and what a payload in the plane does not have."""
+        if not scene.is_spatial:
+            if isinstance(self.inertia, tuple):
+                raise Refusal(
+                    "expected a number without [[joints]]: the machine moves in the plane",
+                    (*at, "inertia"),
+                )
+            if any(self.offset):
+                raise Refusal(
+                    "expected [0, 0, 0], the default, without [[joints]]", (*at, "offset")
+                )
+            for key in ("arm", "interface"):
+                if getattr(self, key) != type(self).model_fields[key].default:
+                    raise Refusal(
+                        "expected none without [[joints]]: the last arm carries it", (*at, key)
+                    )
+            return
+        if problem := tensor_problem(self.inertia):
+            raise Refusal(problem, (*at, "inertia"))
+        names = [arm.name for arm in scene.arms]
+        if self.arm is not None and self.arm not in names:
+            allowed = " | ".join(map(shown, names))
+            raise Refusal(f"expected the name of an arm: {allowed}", (*at, "arm"))
+        carrier = scene.arms[-1 if self.arm is None else names.index(self.arm)]
+        refuse_unknown(carrier, self.interface, (*at, "interface"))
+        check_used(scene)
