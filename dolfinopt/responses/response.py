@@ -196,7 +196,9 @@ LIMITED = {"compliance": "load_case_compliance"}
 
 # Files of responses whose names are not theirs.
 FILES = {
-    **dict.fromkeys(("compliance", "deviation", "esl", "load_case_compliance", "settling"), "motion"),
+    **dict.fromkeys(
+        ("compliance", "deviation", "esl", "load_case_compliance", "settling"), "motion"
+    ),
     **dict.fromkeys(("effort", "peak_force"), "drives"),
     **dict.fromkeys(("eigenfrequency", "first_frequency"), "frequency"),
     "tip_deflection": "static",
