@@ -7,6 +7,7 @@ usage() {
 usage: ./dolfinopt.sh [-n RANKS] COMMAND ...               run a command, with -n under mpirun
        ./dolfinopt.sh [-n RANKS] python FILE ...           run a script with the same interpreter
        ./dolfinopt.sh [-n RANKS] test [PYTEST ARGUMENTS]   ruff, mypy, pytest on one rank and on RANKS (2)
+       ./dolfinopt.sh test --all [PYTEST ARGUMENTS]        the same with the slow tests
        ./dolfinopt.sh --help                               list the commands
 
 The first call sets up what is missing: on Debian 12 or 13 DOLFINx and its libraries with apt
@@ -235,7 +236,9 @@ run_tests() {
   check "imports" "$venv/bin/lint-imports" --no-cache
   # Types, and tests on several ranks, which are never busy all the time, beside the tests on one
   # rank; they are told of afterwards. Ranks that wait for others let the processors to other tests.
-  # What takes long need not take it twice; a -m among the arguments wins.
+  # A -m among the arguments wins. What takes long need not take it twice.
+  local asked=(-m "not slow")
+  [ -z "$all" ] || asked=()
   beside "$folder/types" "$python" -m mypy &
   types=$!
   OMPI_MCA_mpi_yield_when_idle=1 beside "$folder/several" \
@@ -243,7 +246,7 @@ run_tests() {
   several=$!
   trap "kill $types $several 2>/dev/null; rm -rf '$folder'" EXIT
   # One rank a test, in as many processes; the tests of a file share what they build.
-  check "pytest" "$python" -m pytest -n "$ranks" --dist loadfile "$@"
+  check "pytest" "$python" -m pytest -n "$ranks" --dist loadfile "${asked[@]}" "$@"
   told "mypy" "$types" "$folder/types"
   told "pytest, $ranks ranks" "$several" "$folder/several"
   printf '== summary\n%s' "$summary"
@@ -273,7 +276,11 @@ case ${1-} in
     ;;
   test)
     shift
-    ranks=${ranks:-2}
+    ranks=${ranks:-2} all=""
+    if [ "${1-}" = --all ]; then
+      all=1
+      shift
+    fi
     ensure ready-dev "${here}[dev]"
     run_tests "$@"
     ;;
