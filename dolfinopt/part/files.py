@@ -7,11 +7,10 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import write_atomically, write_text, writing
+from dolfinopt.disk import write_bytes, write_text, writing
 from dolfinopt.locks import working_in
 from dolfinopt.output.run_folder import PARTS_LIST, record_of_parts, remove_stale
 from dolfinopt.part.body_mesh import BodyMesh
@@ -155,11 +154,7 @@ def _write_drawings(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> No
         write_text(folder / f"{name}_r12.dxf", r12_text(shape, 0.5 * part.tolerance))
         write_text(folder / f"{name}.svg", svg_text(shape, title))
         data = stl_bytes(shape, part.domain.thickness, 0.5 * part.tolerance, title)
-        write_atomically(folder / f"{name}.stl", partial(_copy, data))
-
-
-def _copy(data: bytes, stream: IO[bytes]) -> None:
-    stream.write(data)
+        write_bytes(folder / f"{name}.stl", data)
 
 
 def _write_steps(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> None:

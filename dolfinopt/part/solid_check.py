@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import IO
 
-from dolfinopt.disk import write_atomically
+from dolfinopt.disk import write_bytes
 from dolfinopt.mesh.geometry import Tetrahedra, msh_bytes
 from dolfinopt.output.views import gather_views
 from dolfinopt.part.boundary_stress import PartStress
@@ -98,8 +96,4 @@ def write_solid_meshes(folder: Path, scene: Scene, meshes: Mapping[int, Tetrahed
     data = {k: msh_bytes(mesh) for k, mesh in meshes.items()}
     for arm, owner in zip(scene.arms, scene.owners, strict=True):
         if owner is not None:
-            write_atomically(folder / f"{arm.name}.msh", partial(_put, data[owner]))
-
-
-def _put(data: bytes, stream: IO[bytes]) -> None:
-    stream.write(data)
+            write_bytes(folder / f"{arm.name}.msh", data[owner])

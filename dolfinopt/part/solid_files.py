@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import write_atomically, write_text
+from dolfinopt.disk import write_bytes, write_text
 from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.drawings import dxf_text
 from dolfinopt.part.files import FIGURES, PICTURES, SCENE, publish
@@ -106,13 +105,9 @@ def write_solid_parts(
 
 def _write_part(folder: Path, name: str, part: SolidPart, title: str) -> None:
     stl = triangle_bytes(MM * part.surface.corners, f"{title}, mm")
-    write_atomically(folder / f"{name}.stl", partial(_put, stl))
-    write_atomically(folder / f"{name}.3mf", partial(_put, three_mf_bytes(part.surface, name)))
+    write_bytes(folder / f"{name}.stl", stl)
+    write_bytes(folder / f"{name}.3mf", three_mf_bytes(part.surface, name))
     if part.flat is not None:
         shape, t = part.flat.shape, part.flat.domain.thickness
         write_text(folder / f"{name}.step", solid_text(shape, t, name, -0.5 * t))
         write_text(folder / f"{name}.dxf", dxf_text(shape))
-
-
-def _put(data: bytes, stream: IO[bytes]) -> None:
-    stream.write(data)
