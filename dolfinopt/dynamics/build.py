@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -12,9 +12,11 @@ from scipy.interpolate import make_interp_spline
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.equations import PLANE
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
+    ElasticBodies,
     JointHardware,
     Mechanism,
     Springs,
@@ -25,9 +27,6 @@ from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.load import Arm, Scene, stamp
-
-if TYPE_CHECKING:
-    from dolfinopt.dynamics.spatial_system import SpatialSystem
 
 MAX_ROWS = 50  # of a table of forces whose rows begin steps; more are fine as a curve
 SAME_TIME = 1e-6  # share of the horizon within which two instants are one
@@ -83,7 +82,7 @@ def desired_motion(scene: Scene) -> Callable[[np.ndarray], Any]:
 
 def build_system(
     scene: Scene, bodies: list[ShapeIntegrals], motion: Callable[[np.ndarray], Any] | None = None
-) -> ElasticSystem | MachineSystem | SpatialSystem:
+) -> ElasticSystem | MachineSystem:
     """Return the equations of a scene.
 
     Args:
@@ -93,28 +92,19 @@ def build_system(
     """
     if motion is None:
         motion = desired_motion(scene)
+    mechanism: ElasticBodies
     if scene.is_spatial:
-        return _spatial_system(scene, bodies, motion)
-    mechanism = build_mechanism(scene, bodies)
-    elastic = ElasticSystem(mechanism, motion, breakpoints(scene))
+        from dolfinopt.multibody.spatial.equations import SPACE
+        from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
+
+        mechanism, equations = build_spatial_mechanism(scene, bodies), SPACE
+    else:
+        mechanism, equations = build_mechanism(scene, bodies), PLANE
+    instants = breakpoints(scene)
     if not is_machine(scene):
-        return elastic
-    closure = closure_of(scene)
-    instants = _with_rows(elastic.breakpoints, scene)
-    return MachineSystem(mechanism, motion, instants, _drives(scene), closure)
-
-
-def _spatial_system(
-    scene: Scene, bodies: list[ShapeIntegrals], motion: Callable[[np.ndarray], Any]
-) -> MachineSystem | SpatialSystem:
-    """Return the equations of a scene in space: joints prescribed, or controlled."""
-    from dolfinopt.dynamics.spatial_system import SpatialMachineSystem, SpatialSystem
-    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
-
-    tree, instants = build_spatial_mechanism(scene, bodies), breakpoints(scene)
-    if scene.control is None:
-        return SpatialSystem(tree, motion, instants)
-    return SpatialMachineSystem(tree, motion, _with_rows(instants, scene), _drives(scene))
+        return ElasticSystem(mechanism, motion, instants, equations)
+    instants, closure = _with_rows(instants, scene), closure_of(scene)
+    return MachineSystem(mechanism, motion, instants, _drives(scene), closure, equations)
 
 
 def closure_of(scene: Scene) -> Closure | None:

@@ -10,13 +10,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 
-from dolfinopt.dynamics.system import Instants, State, System, relative_errors
+from dolfinopt.dynamics.system import Linearisation, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.inverse_dynamics import body_loads, elastic_residual
-from dolfinopt.multibody.mechanism import ElasticBodies, Mechanism
+from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
-from dolfinopt.multibody.tangent import Tangent, body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
 ROUNDING = 1e-14  # a step below it changes nothing
@@ -26,10 +24,11 @@ STALLED = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ElasticInstants:
-    """A mechanism and its prescribed motion at n instants."""
+    """A mechanism, its prescribed motion at n instants, and its equations."""
 
-    mechanism: Mechanism
+    mechanism: Any
     motion: RigidMotion
+    equations: Equations
 
     def __len__(self) -> int:
         """Return n."""
@@ -37,35 +36,35 @@ class ElasticInstants:
 
     def __getitem__(self, part: slice | np.ndarray) -> ElasticInstants:
         """Return it at some of the instants."""
-        return ElasticInstants(self.mechanism[part], self.motion[part])
+        return ElasticInstants(self.mechanism[part], self.motion[part], self.equations)
 
     def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the elastic residual (n, N)."""
-        return elastic_residual(self.mechanism, self.motion, q, qd, qdd)
+        return self.equations.residual(self.mechanism, self.motion, q, qd, qdd)
 
     def linearise(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, keep: np.ndarray | None = None
-    ) -> Tangent:
+    ) -> Linearisation:
         """Return its derivative by the coordinates `keep`, or all."""
-        return linearise(self.mechanism, self.motion, q, qd, qdd, keep)
+        return self.equations.linearise(self.mechanism, self.motion, q, qd, qdd, keep)
 
 
 @dataclass(frozen=True)
-class PrescribedSystem:
+class ElasticSystem:
     """Elastic residual of a mechanism = 0 over a horizon, rigid coordinates prescribed.
 
-    What plane and space have in common; of them know `at`, `describe` and `body_gradient`.
-
     Attributes:
-        mechanism: N elastic coordinates.
+        mechanism: a `Mechanism`, in space a `SpatialMechanism`; N elastic coordinates.
         motion: rigid coordinates at given instants (n,) s.
         breakpoints: ascending instants, first 0 and last the horizon, between which the
             prescribed motion is smooth; steps end there. s.
+        equations: of the mechanism, in the plane or in space.
     """
 
-    mechanism: ElasticBodies
-    motion: Callable[[np.ndarray], Any]
+    mechanism: Any
+    motion: Callable[[np.ndarray], RigidMotion]
     breakpoints: tuple[float, ...]
+    equations: Equations = PLANE
 
     @property
     def num_coordinates(self) -> int:
@@ -133,15 +132,16 @@ class PrescribedSystem:
 
     def is_loaded_at_rest(self) -> bool:
         """Return whether anything may load the bodies at t = 0, while they are not deformed."""
-        return True
+        return self.equations.is_loaded_at_rest(self.mechanism, self.motion(np.zeros(1)))
 
-    def at(self, t: np.ndarray) -> Instants:
+    def at(self, t: np.ndarray) -> ElasticInstants:
         """Return mechanism and motion at instants t (n,), s."""
-        raise NotImplementedError
+        return ElasticInstants(self.mechanism, self.motion(t), self.equations)
 
     def describe(self, q: np.ndarray) -> str:
-        """Say how far the bodies' ends turn in a motion q (n, N)."""
-        raise NotImplementedError
+        """Say how far the arms' ends turn in a motion q (n, N)."""
+        angle = self.equations.rotations(self.mechanism, q).max(initial=0.0)
+        return f"the arms' ends turn by {angle:.2g} rad"
 
     def deflection(self, q: np.ndarray) -> float:
         """Return the largest deflection of a body in a motion q (n, N), over its length."""
@@ -156,43 +156,8 @@ class PrescribedSystem:
         multipliers: np.ndarray,
     ) -> list[ShapeIntegrals]:
         """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class ElasticSystem(PrescribedSystem):
-    """That of a chain in the plane."""
-
-    mechanism: Mechanism
-    motion: Callable[[np.ndarray], RigidMotion]
-
-    def at(self, t: np.ndarray) -> ElasticInstants:
-        """Return mechanism and motion at instants t (n,), s."""
-        return ElasticInstants(self.mechanism, self.motion(t))
-
-    def describe(self, q: np.ndarray) -> str:
-        """Say how far the arms' ends turn in a motion q (n, N)."""
-        angle = 0.0
-        for part, body in zip(self.mechanism.slices, self.mechanism.bodies, strict=True):
-            angle = max(angle, float(np.abs(q[:, part] @ body.outboard[2]).max(initial=0.0)))
-        return f"the arms' ends turn by {angle:.2g} rad"
-
-    def body_gradient(
-        self,
-        t: np.ndarray,
-        q: np.ndarray,
-        qd: np.ndarray,
-        qdd: np.ndarray,
-        multipliers: np.ndarray,
-    ) -> list[ShapeIntegrals]:
-        """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
-        return body_gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
-
-    def is_loaded_at_rest(self) -> bool:
-        """Return whether anything loads the arms at t = 0, while they are not deformed."""
-        rest = np.zeros((1, self.num_coordinates))
-        loads = body_loads(self.mechanism, self.motion(np.zeros(1)), (rest, rest, rest))
-        return any(p.any() for p, _ in loads)
+        gradient = self.equations.body_gradient
+        return gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
 
 
 def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
@@ -224,7 +189,7 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
 # The preconditioner of elastic systems, see `system.Preconditioner`: it takes stiffness and mass
 # for definite.
 
-Own = TypeVar("Own", bound="PrescribedSystem")
+Own = TypeVar("Own", bound="ElasticSystem")
 
 # What T'KT may be away from the identity, and is still taken for it.
 MODE_ROUNDING = 1e-9

@@ -14,33 +14,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
-from dolfinopt.dynamics.system import Linearisation, State, Unchanged
+from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import FEW, Closure, Drives, Mechanism, repeated
+from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.mechanism import FEW, Closure, Drives, ElasticBodies, repeated
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, padded, rigid_part
-from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
 ROUNDING = 1e-13  # of a step of that iteration, beside the coordinates
-
-
-@dataclass(frozen=True)
-class Equations:
-    """Inverse dynamics of a kind of mechanism, its tangent and its gradient by the bodies."""
-
-    forces: Callable[..., tuple[np.ndarray, np.ndarray]]
-    linearise: Callable[..., Linearisation]
-    body_gradient: Callable[..., list[ShapeIntegrals]]
-
-
-PLANE = Equations(inverse_dynamics, linearise, body_gradient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,18 +224,20 @@ class MachineSystem:
     """See the module.
 
     Attributes:
-        mechanism: N elastic coordinates.
+        mechanism: a `Mechanism`, in space a `SpatialMechanism`; N elastic coordinates.
         motion: desired rigid coordinates at given instants (n,) s.
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
-        closure: of the last outboard interface, or None.
+        closure: of the last outboard interface, or None; in the plane.
+        equations: of the mechanism, in the plane or in space.
     """
 
-    mechanism: Mechanism
+    mechanism: Any
     motion: Callable[[np.ndarray], RigidMotion]
     breakpoints: tuple[float, ...]
     drives: Drives
     closure: Closure | None = None
+    equations: Equations = PLANE
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
@@ -259,18 +249,8 @@ class MachineSystem:
     @cached_property
     def columns(self) -> np.ndarray:
         """Places of the free and the elastic coordinates among all of the mechanism's."""
-        rigid = self.num_rigid
+        rigid = self.mechanism.num_rigid
         return np.concatenate([self.drives.free, rigid + np.arange(self.mechanism.num_coordinates)])
-
-    @property
-    def equations(self) -> Equations:
-        """The mechanism's: those of a chain in the plane."""
-        return PLANE
-
-    @property
-    def num_rigid(self) -> int:
-        """Number of rigid coordinates, free or not."""
-        return 1 + len(self.mechanism.bodies)
 
     @cached_property
     def drive_columns(self) -> np.ndarray:
@@ -297,7 +277,7 @@ class MachineSystem:
     @cached_property
     def elastic(self) -> ElasticSystem:
         """The same machine, its rigid coordinates on the desired motion exactly."""
-        return ElasticSystem(self.mechanism, self.motion, self.breakpoints)
+        return ElasticSystem(self.mechanism, self.motion, self.breakpoints, self.equations)
 
     @cached_property
     def gap_scale(self) -> float:
@@ -306,18 +286,7 @@ class MachineSystem:
 
     @cached_property
     def _softness(self) -> float:
-        """The largest static deflection of an arm by a unit force across it, m/N.
-
-        That of its end; or a third of the arm's length squared times the end's rotation by a unit
-        moment, which is the same of a cantilever, and not zero of an arm whose frame is its chord.
-        """
-        found = [0.0]
-        for body in self.mechanism.bodies:
-            if body.num_modes:
-                soft = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
-                square = float(body.outboard_point @ body.outboard_point)
-                found += [float(soft[1, 1]), float(soft[2, 2]) * square / 3.0]
-        return max(found) or 1e-6
+        return self.equations.softness(self.mechanism.bodies) or 1e-6
 
     @cached_property
     def rigid_scale(self) -> np.ndarray:
@@ -326,9 +295,7 @@ class MachineSystem:
         The energy that a deflection of the same size as the coordinate's at the chain's end would
         store in the softest arm.
         """
-        reach = sum(float(np.hypot(*body.outboard_point)) for body in self.mechanism.bodies)
-        lever = np.where(self.drives.free == 0, 1.0, reach)
-        return lever / np.sqrt(self._softness)
+        return self.equations.levers(self.mechanism)[self.drives.free] / np.sqrt(self._softness)
 
     def ground_force(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the force (n,) on the interface, complex, N, by the multipliers (n, m)."""
@@ -350,10 +317,10 @@ class MachineSystem:
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.rigid, desired, self.drives, self.closure)
+        return feed_forward(self.equations, self.rigid, desired, self.drives, self.closure)
 
     @cached_property
-    def rigid(self) -> Mechanism:
+    def rigid(self) -> ElasticBodies:
         """The mechanism with rigid arms of the same mass and inertia."""
         return replace(self.mechanism, bodies=tuple(map(rigid_part, self.mechanism.bodies)))
 
@@ -572,7 +539,11 @@ class MachineModes:
 
 
 def feed_forward(
-    rigid: Mechanism, desired: RigidMotion, drives: Drives, closure: Closure | None
+    equations: Equations,
+    rigid: Any,
+    desired: RigidMotion,
+    drives: Drives,
+    closure: Closure | None,
 ) -> np.ndarray:
     """Return the forces (n, R) that move the machine with rigid arms on the desired motion.
 
@@ -580,7 +551,7 @@ def feed_forward(
     ground gives through the constraint.
     """
     none = np.zeros((len(desired.q), 0))
-    forces = inverse_dynamics(rigid, desired, none, none, none)[1]
+    forces = equations.forces(rigid, desired, none, none, none)[1]
     if closure is not None:
         place = interface_place(rigid, desired, none)
         forces = forces - (np.conj(closure.force) * place.jacobian).real
@@ -589,7 +560,7 @@ def feed_forward(
 
 
 def feed_forward_weights(
-    rigid: Mechanism,
+    rigid: Any,
     desired: RigidMotion,
     drives: Drives,
     closure: Closure | None,

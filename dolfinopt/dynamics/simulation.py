@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,24 +14,20 @@ from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.machine_system import PLANE, Equations, MachineInstants, MachineSystem
+from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
 from dolfinopt.dynamics.radau import BEYOND, REMEDY, VALID
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import (
-    deviation,
-    end_effector,
-    end_effector_gradient,
     interface_place,
     lengths,
     place_gradient,
 )
-from dolfinopt.multibody.inverse_dynamics import body_loads, inverse_dynamics
-from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism, compliance
+from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.mechanism import Closure, ElasticBodies, compliance
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
-    ModalDisplacement,
     Rates,
     ShapeIntegrals,
     add_integrals,
@@ -45,9 +41,33 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
-    from dolfinopt.dynamics.spatial_system import SpatialSystem
+    Problem: TypeAlias = ElasticSystem | MachineSystem
 
-    Problem: TypeAlias = ElasticSystem | MachineSystem | SpatialSystem
+
+LIMIT_ROUNDING = 1e-6  # of a limit, which files round
+
+
+@dataclass(frozen=True)
+class JointLimit:
+    """How near a motion comes to one of a joint's limits.
+
+    Attributes:
+        joint: its name.
+        quantity: "position", "velocity" or "effort".
+        limit: of the coordinate, or of the absolute value.
+        value: where it is nearest to the limit or farthest beyond it.
+        instant: of that, s.
+        unit: of limit and value.
+        met: whether it stays within the limit.
+    """
+
+    joint: str
+    quantity: str
+    limit: float
+    value: float
+    instant: float
+    unit: str
+    met: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +107,14 @@ class Trajectory:
         return (self.solution, *(one.solution for one in self.scenarios))
 
     @property
-    def mechanism(self) -> Mechanism:
-        """What moved."""
+    def mechanism(self) -> Any:
+        """What moved: a `Mechanism`, in space a `SpatialMechanism`."""
         return self.problem.mechanism
+
+    @property
+    def equations(self) -> Equations:
+        """Those of the mechanism."""
+        return self.problem.equations
 
     @cached_property
     def adjoint(self) -> Adjoint:
@@ -125,9 +150,9 @@ class Trajectory:
         a slider along its line; of a pinned end none but the integrator's error.
         """
         if isinstance(self.problem, ElasticSystem):
-            return deviation(self.mechanism, self.motion, self.q_e)
-        wanted = end_effector(self.mechanism, self.desired, np.zeros_like(self.q_e))
-        return self.end - wanted
+            return self.equations.deviation(self.mechanism, self.motion, self.q_e)
+        none = np.zeros_like(self.q_e)
+        return self.end - self.equations.end_effector(self.mechanism, self.desired, none)
 
     @property
     def distance(self) -> np.ndarray:
@@ -147,8 +172,7 @@ class Trajectory:
     @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
-        parts = zip(self.mechanism.slices, self.mechanism.bodies, strict=True)
-        return np.array([np.abs(self.q_e[:, s] @ body.outboard[2]).max() for s, body in parts])
+        return self.equations.rotations(self.mechanism, self.q_e)
 
     @cached_property
     def joint_forces(self) -> np.ndarray:
@@ -160,12 +184,15 @@ class Trajectory:
         if isinstance(self.problem, MachineSystem):
             return self.problem.at(self.t).forces(*self.unknowns)
         qd, qdd = self.unknowns[1:]
-        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+        return self.equations.forces(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
-        """What loads every body (n, 7 + 2 q), see the function of this name."""
-        return load_coefficients(self.problem, self.t, self.unknowns, self.motion)
+        """What loads every body (n, 7 + 2 q), in space (n, 18 + 9 q), see the function."""
+        if self.closure is not None:
+            return load_coefficients(self.problem, self.t, self.unknowns)
+        q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
+        return self.equations.load_coefficients(self.mechanism, self.motion, (q, qd, qdd))
 
     @property
     def is_machine(self) -> bool:
@@ -191,7 +218,7 @@ class Trajectory:
     @cached_property
     def end(self) -> np.ndarray:
         """Place of the end-effector (n, 2), m, as it moves."""
-        return end_effector(self.mechanism, self.motion, self.q_e)
+        return self.equations.end_effector(self.mechanism, self.motion, self.q_e)
 
     @cached_property
     def slider_position(self) -> np.ndarray | None:
@@ -249,14 +276,45 @@ class Trajectory:
             By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
         """
         motion, q = self.motion[indices], self.q_e[indices]
-        by_q, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
+        free = self.problem.drives.free if isinstance(self.problem, MachineSystem) else ()
+        gradient = self.equations.end_effector_gradient
+        by_q, by_rigid, by_bodies = gradient(self.mechanism, motion, q, weights, len(free) > 0)
         by = self.by_unknowns(by_q)
-        if isinstance(self.problem, MachineSystem) and self.problem.ends[0]:
-            free = self.problem.drives.free
-            jacobian = interface_place(self.mechanism, motion, q).jacobian[:, free]
-            w = weights[:, 0] - 1j * weights[:, 1]
-            by[:, : len(free)] = (w[:, None] * jacobian).real
+        if len(free):
+            assert by_rigid is not None
+            by[:, : len(free)] = by_rigid[:, free]
         return by, by_bodies
+
+    @property
+    def joint_limits(self) -> tuple[JointLimit, ...]:
+        """How the motion stands to the limits that the scene states of its joints."""
+        return tuple(self._joint_limits())
+
+    def _joint_limits(self) -> Iterator[JointLimit]:
+        for k, joint in enumerate(self.scene.movable):
+            slides = joint.type == "prismatic"
+            length, force = ("m", "N") if slides else ("rad", "N m")
+            if joint.position_limits is not None:
+                q = self.motion.q[:, k]
+                width = joint.position_limits[1] - joint.position_limits[0]
+                ends = zip(joint.position_limits, (-1.0, 1.0), strict=True)
+                beyond = [(sign * (q - limit), limit) for limit, sign in ends]
+                over, limit = max(beyond, key=lambda one: float(one[0].max()))
+                at = int(np.argmax(over))
+                met = bool(over[at] <= LIMIT_ROUNDING * max(width, abs(limit)))
+                value, instant = float(q[at]), float(self.t[at])
+                yield JointLimit(joint.name, "position", limit, value, instant, length, met)
+            for quantity, limit, values, unit in (
+                ("velocity", joint.velocity_limit, self.motion.qd, f"{length}/s"),
+                ("effort", joint.effort_limit, self.joint_forces, force),
+            ):
+                if limit is None:
+                    continue
+                size = np.abs(values[:, k])
+                at = int(np.argmax(size))
+                value, met = float(size[at]), bool(size[at] <= (1.0 + LIMIT_ROUNDING) * limit)
+                instant = float(self.t[at])
+                yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)
 
     @property
     def settling(self) -> float:
@@ -374,10 +432,10 @@ def _by_radau(
     goal: float,
 ) -> list[Solution | ConvergenceError]:
     """Return the solutions in their order: chains on prescribed motions together, others alone."""
-    together = [i for i, one in enumerate(problems) if isinstance(one, ElasticSystem)]
-    own = [one for one in problems if isinstance(one, ElasticSystem)]
-    begun = [starts[i] for i in together]
-    solved = batch.integrate(own, tolerance, stages, profile, begun, goal) if own else []
+    alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
+    own = {i: one for i, one in alike.items() if one.equations is PLANE}
+    together, begun = list(own), [starts[i] for i in own]
+    solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
     found = dict(zip(together, solved, strict=True))
     for i, one in enumerate(problems):
         if i not in found:
@@ -420,12 +478,7 @@ def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajector
         scene.motion.horizon,
         scene.objective.load_cases,
     )
-    if not scene.is_spatial:
-        assert isinstance(problem, (ElasticSystem, MachineSystem))
-        return Trajectory(problem, scene, solution, t)
-    from dolfinopt.dynamics.spatial_system import SpatialTrajectory
-
-    return SpatialTrajectory(problem, scene, solution, t)  # type: ignore[arg-type]
+    return Trajectory(problem, scene, solution, t)
 
 
 # -- derivatives of the drive forces along a trajectory, by its coordinates and by the bodies ----
@@ -490,13 +543,9 @@ class DriveForces:
     def _chunk(self, part: slice) -> _Prescribed | _Machine:
         y, yd, ydd = (x[part] for x in self.rates)
         system, t = self.system, self.t[part]
-        if isinstance(system, ElasticSystem):
-            return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
         if isinstance(system, MachineSystem):
             return _Machine(system.at(t), (y, yd, ydd))
-        from dolfinopt.dynamics.spatial_system import SPACE
-
-        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), SPACE)
+        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), system.equations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -504,9 +553,9 @@ class _Prescribed:
     """Forces of inverse dynamics along a given motion; q, qd, qdd (n, N) are elastic."""
 
     mechanism: ElasticBodies
-    motion: Any  # RigidMotion, in space JointMotion
+    motion: RigidMotion
     rates: Rates
-    equations: Equations = PLANE
+    equations: Equations
 
     @cached_property
     def tangent(self) -> Linearisation:
@@ -623,12 +672,7 @@ def load_counts(body: ShapeIntegrals) -> LoadCounts:
     return LoadCounts(d + g, len(body.outboard), g * body.num_modes)
 
 
-def load_coefficients(
-    system: Problem,
-    t: np.ndarray,
-    rates: Rates,
-    motion: RigidMotion | None = None,
-) -> list[np.ndarray]:
+def load_coefficients(system: Problem, t: np.ndarray, rates: Rates) -> list[np.ndarray]:
     """Return c (n, 7 + 2 q) of every body, see above; m/s2, 1/s2, N, N m and modes per s2.
 
     In space they are 18 + 9 q: a, A_ab, force, moment, and A_ab q + 2 Omega_ab qd + delta_ab qdd.
@@ -637,20 +681,7 @@ def load_coefficients(
         system: what moves.
         t: (n,) instants, s.
         rates: its unknowns and their derivatives there, each (n, S).
-        motion: its rigid coordinates there, if they are known: of prescribed ones a short cut.
     """
-    if isinstance(system, ElasticSystem) and motion is not None:
-        found = []
-        mechanism = system.mechanism
-        loads = body_loads(mechanism, motion, rates)
-        constants = mechanism.modal_constants
-        for (p, w), part, own in zip(loads, mechanism.slices, constants, strict=True):
-            q, qd, qdd = rates
-            modal = ModalDisplacement(own.L, (q[:, part], qd[:, part], qdd[:, part]))
-            w, wd = w[:, None], p[:, 2, None]
-            radial, around = modal.zdd - w * w * modal.z, wd * modal.z + 2.0 * w * modal.zd
-            found.append(-np.hstack([p, radial, around]))
-        return found
     probe = _Probe(system)
     rows = probe.system.at(t).residual(*(probe.spread(x) for x in rates))
     return [-rows[:, part] for part in probe.places]

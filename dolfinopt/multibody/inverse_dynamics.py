@@ -295,6 +295,22 @@ def body_loads(
     return loads
 
 
+def load_coefficients(mechanism: Mechanism, motion: RigidMotion, rates: Rates) -> list[np.ndarray]:
+    """Return c (n, 7 + 2 q) of every body, what loads it: see `dynamics.simulation`.
+
+    Of a machine whose last interface is free. m/s2, 1/s2, N, N m and modes per s2.
+    """
+    found = []
+    loads, (q, qd, qdd) = body_loads(mechanism, motion, rates), rates
+    constants = mechanism.modal_constants
+    for (p, w), part, own in zip(loads, mechanism.slices, constants, strict=True):
+        modal = ModalDisplacement(own.L, (q[:, part], qd[:, part], qdd[:, part]))
+        w, wd = w[:, None], p[:, 2, None]
+        radial, around = modal.zdd - w * w * modal.z, wd * modal.z + 2.0 * w * modal.zd
+        found.append(-np.hstack([p, radial, around]))
+    return found
+
+
 def inward_pass(
     mechanism: Mechanism,
     motion: RigidMotion,

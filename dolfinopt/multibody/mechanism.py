@@ -322,6 +322,15 @@ class ElasticBodies:
 
     bodies: tuple[ShapeIntegrals, ...]
 
+    @property
+    def num_rigid(self) -> int:
+        """Number of rigid coordinates."""
+        raise NotImplementedError
+
+    def __getitem__(self, part: slice | np.ndarray) -> ElasticBodies:
+        """Return it at some of the instants."""
+        raise NotImplementedError
+
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Each body's place in the vector of all elastic coordinates."""
@@ -403,6 +412,11 @@ class Mechanism(ElasticBodies):
     def modal_constants(self) -> tuple[ModalConstants, ...]:
         """Every body's constants as the equations of motion use them."""
         return tuple(_modal_constants(body) for body in self.bodies)
+
+    @property
+    def num_rigid(self) -> int:
+        """Number of rigid coordinates, of cart and joints."""
+        return 1 + len(self.bodies)
 
     def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
         """Return it at some of the instants."""

@@ -16,8 +16,7 @@ from mpi4py import MPI
 from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
-from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.spatial_system import JointLimit, SpatialTrajectory
+from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import WARN, Stiffening
 from dolfinopt.multibody.shape_integrals import first_frequency
@@ -239,7 +238,7 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         "drive_peak": by_drive(peak),
         "drive_rms": by_drive(rms),
     }
-    if isinstance(trajectory, SpatialTrajectory) and trajectory.joint_limits:
+    if trajectory.joint_limits:
         found["joint_limits"] = _by_joint(trajectory.joint_limits)
     if free := free_drives(scene):
         errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
@@ -266,7 +265,7 @@ def _by_joint(limits: Iterable[JointLimit]) -> dict[str, dict[str, Any]]:
 
 def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
     """Return a sentence that names the limits of joints beyond which the motion goes."""
-    if not isinstance(trajectory, SpatialTrajectory):
+    if trajectory is None:
         return []
     beyond = [
         f"{one.joint} {one.value:.4g} of {one.limit:.4g} {one.unit} at {one.instant:.3g} s"

@@ -14,10 +14,10 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.spatial_system import SpatialMachineSystem, SpatialSystem
 from dolfinopt.multibody.mechanism import Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.end_effector import deviation, end_effector_gradient
+from dolfinopt.multibody.spatial.equations import SPACE
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial
@@ -46,14 +46,14 @@ def test_plane_machine_in_space(controlled):
     def joints(t):
         return posed_motion(plane_motion(t))
 
-    systems = [ElasticSystem(plane, plane_motion, ends), SpatialSystem(tree, joints, ends)]
+    systems = [ElasticSystem(plane, plane_motion, ends), ElasticSystem(tree, joints, ends, SPACE)]
     if controlled:
         gains = np.array([2e3, 400.0, 200.0])
         limits, driven = np.full(3, np.inf), np.ones(3, dtype=bool)
         drives = Drives(np.arange(3), gains, 0.05 * gains, limits, driven, True)
         systems = [
             MachineSystem(plane, plane_motion, ends, drives),
-            SpatialMachineSystem(tree, joints, ends, drives),
+            MachineSystem(tree, joints, ends, drives, equations=SPACE),
         ]
     grid = radau.integrate(systems[0], TOLERANCE, 4, Profile()).time_grid
     expected, found = (radau.on_grid(one, grid, TOLERANCE, 4) for one in systems)
@@ -69,7 +69,7 @@ def test_plane_machine_in_space(controlled):
 @pytest.fixture(scope="module")
 def chain():
     """The reference chain, simulated."""
-    system = SpatialSystem(reference_chain(2), quintic_motion, (0.0, DURATION))
+    system = ElasticSystem(reference_chain(2), quintic_motion, (0.0, DURATION), SPACE)
     return system, radau.integrate(system, TOLERANCE, 4, Profile())
 
 

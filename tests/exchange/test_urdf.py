@@ -33,9 +33,10 @@ from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
 from dolfinopt.mesh.geometry import TENSOR
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.spatial.mechanism import JointMotion, exponential, roll_pitch_yaw
+from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -90,7 +91,7 @@ def test_the_scene_moves_as_the_robot(imported):
     q = random_joints(robot, np.random.default_rng(1))
     rows = in_scene(robot, mechanism, q)
     none = np.zeros_like(rows)
-    ends = end_effector(mechanism, JointMotion(rows, none, none), np.zeros((MOVED, 0)))
+    ends = end_effector(mechanism, RigidMotion(rows, none, none), np.zeros((MOVED, 0)))
     model = yourdfpy.URDF.load(str(file), load_meshes=False)
     for k in range(MOVED):
         own_q = {name: values[k] for name, values in q.items() if name != "other"}
@@ -144,7 +145,7 @@ def test_drive_forces_against_pinocchio(imported):
     q, qd, qdd = (random_joints(robot, rng) for _ in range(3))
     rows = [in_scene(robot, mechanism, one) for one in (q, qd, qdd)]
     none = np.zeros((MOVED, 0))
-    found = inverse_dynamics(mechanism, JointMotion(*rows), none, none, none)[1]
+    found = inverse_dynamics(mechanism, RigidMotion(*rows), none, none, none)[1]
     names = [mechanism.joints[i].name for i in mechanism.movable]
     for k in range(MOVED):
         x, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
@@ -233,7 +234,7 @@ def test_the_end_effector_is_the_last_arm(tmp_path):
         mechanism = mechanism_of(
             tmp_path / tool / "uneven.toml", {"upper": (1, (0, 0, 0), [1] * 6)}
         )
-        motion_now = JointMotion(row, 0 * row, 0 * row)
+        motion_now = RigidMotion(row, 0 * row, 0 * row)
         end = end_effector(mechanism, motion_now, np.zeros((1, 0)))[0]
         assert np.abs(end - read_robot(file).poses(q)[tool][:3, 3]).max() < 1e-12
 

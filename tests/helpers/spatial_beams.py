@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import eigh
 
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
-    JointMotion,
     SpatialMechanism,
     rigid_spatial_body,
     roll_pitch_yaw,
@@ -106,11 +106,11 @@ def reference_chain(normal_modes: int = 6, payload: float = 4.0) -> SpatialMecha
     return SpatialMechanism(bodies, joints, (None, None, load), np.array([0.0, 0.0, -9.81]), 2)
 
 
-def quintic_motion(t: np.ndarray) -> JointMotion:
+def quintic_motion(t: np.ndarray) -> RigidMotion:
     """Return the chain's joints by quintics."""
     u = np.clip(t / DURATION, 0.0, 1.0)
     s = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     sd = 30.0 * u**2 * (1.0 - u) ** 2 / DURATION
     sdd = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / DURATION**2
     step = END - START
-    return JointMotion(START + np.outer(s, step), np.outer(sd, step), np.outer(sdd, step))
+    return RigidMotion(START + np.outer(s, step), np.outer(sd, step), np.outer(sdd, step))

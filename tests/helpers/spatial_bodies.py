@@ -14,7 +14,6 @@ from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
-    JointMotion,
     SpatialMechanism,
     exponential,
     rigid_spatial_body,
@@ -289,6 +288,6 @@ def posed_machine(plane: Mechanism) -> SpatialMechanism:
     return SpatialMechanism(bodies, tuple(joints), tuple(carried), gravity, len(plane.bodies))
 
 
-def posed_motion(motion: RigidMotion) -> JointMotion:
+def posed_motion(motion: RigidMotion) -> RigidMotion:
     """Return a plane machine's motion as that of the joints in space."""
-    return JointMotion(motion.q, motion.qd, motion.qdd)
+    return RigidMotion(motion.q, motion.qd, motion.qdd)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
-    JointMotion,
     SpatialMechanism,
     inertia_tensor,
     rigid_spatial_body,
@@ -87,7 +87,7 @@ def test_rigid_robot(name):
     )
     q, qd, qdd = rng.normal(size=(3, 20, movable))
     none = np.zeros((20, 0))
-    found = inverse_dynamics(machine, JointMotion(q, qd, qdd), none, none, none)[1]
+    found = inverse_dynamics(machine, RigidMotion(q, qd, qdd), none, none, none)[1]
     data = model.createData()
     expected = np.array([pin.rnea(model, data, *row) for row in zip(q, qd, qdd)])
     assert np.abs(found - expected).max() < 1e-10

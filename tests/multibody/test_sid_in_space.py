@@ -13,12 +13,13 @@ from standard_input import State, forces_of_sid, random_state
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement, fem_text, read_fem, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, write_sid, write_sid_npz
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.multibody.spatial.body_of_sid import from_sid, load_body
 from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface
 from dolfinopt.multibody.spatial.mbdyn import modal_element
-from dolfinopt.multibody.spatial.mechanism import JointMotion, constants_of
+from dolfinopt.multibody.spatial.mechanism import constants_of
 from dolfinopt.multibody.spatial.standard_input import to_sid
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
@@ -108,7 +109,7 @@ def test_body_of_a_file(tmp_path, body, kind):
     assert_close(again.M, body.M)
     rng = np.random.default_rng(7)
     tree = random_tree(rng).mechanism()
-    motion, rates = JointMotion(*rng.normal(size=(3, 5, 4))), 0.3 * rng.normal(size=(3, 5, 9))
+    motion, rates = RigidMotion(*rng.normal(size=(3, 5, 4))), 0.3 * rng.normal(size=(3, 5, 9))
 
     def forces(one):
         bodies = (*tree.bodies[:1], one, *tree.bodies[2:])

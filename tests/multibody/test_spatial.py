@@ -34,7 +34,6 @@ from dolfinopt.multibody.spatial.inverse_dynamics import (
 )
 from dolfinopt.multibody.spatial.mechanism import (
     TRANSPOSED,
-    JointMotion,
     Turning,
     exponential,
     roll_pitch_yaw,
@@ -103,7 +102,7 @@ def tree():
     rng = np.random.default_rng(7)
     found = random_tree(rng, interfaces=2)
     joints, elastic = rng.normal(size=(3, 3, 4)), 0.4 * rng.normal(size=(3, 3, 8))
-    return found, JointMotion(*joints), tuple(elastic)
+    return found, RigidMotion(*joints), tuple(elastic)
 
 
 def test_forces_of_point_masses(tree):
@@ -172,7 +171,7 @@ def machine(request, tree):
 def jacobian(machine):
     """Derivative of [forces, residual] by joints and elastic coordinates and rates (n, S, 3 S)."""
     mechanism, motion, rates = machine
-    J, S = mechanism.num_joints, mechanism.num_joints + mechanism.num_coordinates
+    J, S = mechanism.num_rigid, mechanism.num_rigid + mechanism.num_coordinates
     columns = []
     for k in range(3):
         for j in range(S):
@@ -181,7 +180,7 @@ def jacobian(machine):
                 joints = [x + 0j for x in (motion.q, motion.qd, motion.qdd)]
                 elastic = [x + 0j for x in rates]
                 (joints if j < J else elastic)[k][:, j if j < J else j - J] += h
-                rows, drives = inverse_dynamics(mechanism, JointMotion(*joints), *elastic)
+                rows, drives = inverse_dynamics(mechanism, RigidMotion(*joints), *elastic)
                 return np.hstack([drives, rows])
 
             columns.append(derivative(forces))
@@ -194,7 +193,7 @@ def jacobian(machine):
 def test_tangent(machine, jacobian, rigid, keep):
     """All that a linearisation is asked for, to rounding of complex steps."""
     mechanism, motion, rates = machine
-    J, N = mechanism.num_joints, mechanism.num_coordinates
+    J, N = mechanism.num_rigid, mechanism.num_coordinates
     keep_array = None if keep is None else np.array(keep)
     rigid_array = None if rigid is None else np.array(rigid)
     tangent = linearise(mechanism, motion, *rates, keep_array, rigid_array)
@@ -220,7 +219,7 @@ def test_tangent(machine, jacobian, rigid, keep):
 
 def test_mass_matrix_is_symmetric(machine):
     mechanism, motion, rates = machine
-    S = mechanism.num_joints + mechanism.num_coordinates
+    S = mechanism.num_rigid + mechanism.num_coordinates
     matrix = linearise(mechanism, motion, *rates, None, np.arange(4)).dense()[:, :, 2 * S :]
     assert np.abs(matrix - matrix.swapaxes(1, 2)).max() < ROUNDING * np.abs(matrix).max()
 
@@ -281,7 +280,7 @@ def test_end_effector_gradient(machine):
     step, turn = rng.normal(size=q.shape), rng.normal(size=motion.q.shape)
 
     def along(h):
-        moved = JointMotion(motion.q + h * turn, motion.qd, motion.qdd)
+        moved = RigidMotion(motion.q + h * turn, motion.qd, motion.qdd)
         return np.sum(weights * end_effector(mechanism, moved, q + h * step))
 
     expected = np.sum(by_q * step) + np.sum(by_joints * turn)

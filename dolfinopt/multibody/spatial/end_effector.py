@@ -11,10 +11,9 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import along_curve, curve_through
+from dolfinopt.multibody.motion import RigidMotion, along_curve, curve_through
 from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface, MovingJoint
 from dolfinopt.multibody.spatial.mechanism import (
-    JointMotion,
     Pose,
     RigidChain,
     SpatialMechanism,
@@ -42,7 +41,7 @@ class _Chain:
         end: (n, 3) the end-effector, m.
     """
 
-    def __init__(self, mechanism: SpatialMechanism, motion: JointMotion, q: np.ndarray) -> None:
+    def __init__(self, mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray) -> None:
         count = len(motion.q)
         self.bodies = mechanism.chain
         outer = [mechanism.joints[i].interface for i in self.bodies[1:]]
@@ -76,19 +75,19 @@ class _Chain:
         ]
 
 
-def end_effector(mechanism: SpatialMechanism, motion: JointMotion, q: np.ndarray) -> np.ndarray:
+def end_effector(mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the end-effector's position (n, 3), m, of the flexible machine."""
     return _Chain(mechanism, motion, q).end
 
 
-def deviation(mechanism: SpatialMechanism, motion: JointMotion, q: np.ndarray) -> np.ndarray:
+def deviation(mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the flexible minus the equivalent rigid end-effector (n, 3), m."""
     rigid = end_effector(mechanism, motion, np.zeros_like(q))
     return end_effector(mechanism, motion, q) - rigid
 
 
 def end_effector_gradient(
-    mechanism: SpatialMechanism, motion: JointMotion, q: np.ndarray, weights: np.ndarray
+    mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
     """Return the gradient of sum_n weights_n . end_effector_n.
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.kinematics import MovingJoint
 from dolfinopt.multibody.spatial.mechanism import (
     ONE,
-    JointMotion,
     SpatialMechanism,
     rigid_spatial_body,
     skew,
@@ -76,7 +76,7 @@ class FrozenTree:
     """
 
     mechanism: SpatialMechanism
-    motion: JointMotion
+    motion: RigidMotion
     kind: str
 
     @cached_property

@@ -11,6 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.spatial.kinematics import (
     BodyMotion,
@@ -24,7 +25,6 @@ from dolfinopt.multibody.spatial.kinematics import (
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     ONE,
-    JointMotion,
     Site,
     SpatialMechanism,
     cross,
@@ -50,7 +50,7 @@ class Link:
     carried: dict[int, BodyMotion]
 
 
-def outward_pass(mechanism: SpatialMechanism, motion: JointMotion, rates: Rates) -> list[Link]:
+def outward_pass(mechanism: SpatialMechanism, motion: RigidMotion, rates: Rates) -> list[Link]:
     """Return all bodies as they move, in the mechanism's order."""
     count = len(motion.q)
     none = np.zeros((count, 0))
@@ -124,7 +124,7 @@ def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
 
 def inverse_dynamics(
     mechanism: SpatialMechanism,
-    motion: JointMotion,
+    motion: RigidMotion,
     q: np.ndarray,
     qd: np.ndarray,
     qdd: np.ndarray,
@@ -150,7 +150,7 @@ def inverse_dynamics(
 
 def elastic_residual(
     mechanism: SpatialMechanism,
-    motion: JointMotion,
+    motion: RigidMotion,
     q: np.ndarray,
     qd: np.ndarray,
     qdd: np.ndarray,
@@ -182,7 +182,7 @@ def body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.nd
 
 
 def load_coefficients(
-    mechanism: SpatialMechanism, motion: JointMotion, rates: Rates
+    mechanism: SpatialMechanism, motion: RigidMotion, rates: Rates
 ) -> list[np.ndarray]:
     """Return c (n, 18 + 9 q) of every body: what loads its nodes, as inertia acts.
 
@@ -358,7 +358,7 @@ def _places(
 
 def linearise(
     mechanism: SpatialMechanism,
-    motion: JointMotion,
+    motion: RigidMotion,
     q: np.ndarray,
     qd: np.ndarray,
     qdd: np.ndarray,
@@ -552,7 +552,7 @@ def _cross(u: np.ndarray, V: np.ndarray) -> np.ndarray:
 
 def body_gradient(
     mechanism: SpatialMechanism,
-    motion: JointMotion,
+    motion: RigidMotion,
     q: np.ndarray,
     qd: np.ndarray,
     qdd: np.ndarray,
@@ -570,7 +570,7 @@ def body_gradient(
         The derivative by every body's integrals.
     """
     if of_forces is None:
-        of_forces = np.zeros((len(q), mechanism.num_joints))
+        of_forces = np.zeros((len(q), mechanism.num_rigid))
     links = outward_pass(mechanism, motion, (q, qd, qdd))
     loads = inward_pass(mechanism, links)
     moves, ends = _virtual_motion(mechanism, links, multipliers, of_forces)

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from dolfinopt.multibody.mechanism import ElasticBodies
-from dolfinopt.multibody.motion import along_table, columns_of
+from dolfinopt.multibody.motion import RigidMotion, along_table, columns_of
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
@@ -202,9 +202,13 @@ class SpatialMechanism(ElasticBodies):
         return tuple(i for _, i in sorted(found))
 
     @property
-    def num_joints(self) -> int:
+    def num_rigid(self) -> int:
         """Number of rigid coordinates."""
         return len(self.movable)
+
+    def __getitem__(self, part: slice | np.ndarray) -> SpatialMechanism:
+        """Return itself: it is the same at all instants."""
+        return self
 
     @cached_property
     def rotors(self) -> np.ndarray:
@@ -675,24 +679,7 @@ def _carried(scene: Scene, k: int) -> ShapeIntegrals | None:
 # -- motion of a spatial machine's joints at given instants --------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class JointMotion:
-    """Joint coordinates at n instants, with derivatives.
-
-    Attributes:
-        q, qd, qdd: (n, joints); rad or m, per s, per s2.
-    """
-
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-
-    def __getitem__(self, part: slice | np.ndarray) -> JointMotion:
-        """Return it at some of the instants."""
-        return JointMotion(self.q[part], self.qd[part], self.qdd[part])
-
-
-def joint_motion(t: np.ndarray, scene: Scene) -> JointMotion:
+def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     """Return the joints at instants t (n,), s: of the scene's table, or of the end-effector's path.
 
     Raises:
@@ -701,5 +688,5 @@ def joint_motion(t: np.ndarray, scene: Scene) -> JointMotion:
     if scene.motion.path != "joints":
         from dolfinopt.multibody.spatial.end_effector import follower
 
-        return JointMotion(*follower(scene).at(t))
-    return JointMotion(*along_table(t, scene.motion, columns_of(scene)))
+        return RigidMotion(*follower(scene).at(t))
+    return RigidMotion(*along_table(t, scene.motion, columns_of(scene)))
