@@ -8,7 +8,9 @@ from pathlib import Path
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt.plots import figures as plots
+from dolfinopt.plots.curves import deviation_figure, history_figure
+from dolfinopt.plots.design import design_figure
+from dolfinopt.plots.style import save
 
 HERE = Path(__file__).parent
 ITERATIONS = 30
@@ -38,13 +40,11 @@ def main(folder: Path = Path("results/demo_two_arm")) -> do.Result:
     if world.rank == 0:
         folder.mkdir(parents=True, exist_ok=True)
         motion = result.trajectory
-        plots.draw_design(folder / "design.png", views, scene.name)
-        plots.draw_history(
-            folder / "history.png", result.history, "compliance of the load cases [N m]"
-        )
-        plots.draw_deviation(
-            folder / "deviation.png", motion.t, motion.deviation, result.initial_deviation
-        )
+        label = "compliance of the load cases [N m]"
+        save(design_figure(views, scene.name), folder / "design.png")
+        save(history_figure(result.history, label), folder / "history.png")
+        figure = deviation_figure(motion.t, motion.deviation, result.initial_deviation)
+        save(figure, folder / "deviation.png")
         for name, one in (("initial", initial), ("optimised", final)):
             print(
                 f"{name:>9}: compliance {one.objective:6.3f} N m, "

@@ -43,7 +43,6 @@ from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.constraints import limits_by_column
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
@@ -135,44 +134,35 @@ class SimulationResult:
 
     def plot_deviation(self) -> Figure | None:
         """Return the figure of the end-effector's distance from its rigid path over time."""
-        from dolfinopt.plots.curves import deviation_figure, deviation_title
+        from dolfinopt.plots.curves import deviation_of
 
-        if self.trajectory is None:
-            return None
-        one = self.trajectory
-        return deviation_figure(one.t, one.deviation, self._initial(), deviation_title(one))
+        return None if self.trajectory is None else deviation_of(self.trajectory, self._initial())
 
     def plot_design(self) -> Figure | None:
         """Return the figure of the arms' densities; of solids, of what is denser than 0.5."""
         from dolfinopt.plots.design import design_figure
-        from dolfinopt.plots.solid_design import solid_design_figure
 
-        if not (arms := designed(self.views)):
-            return None
-        draw = solid_design_figure if self.scene.is_spatial else design_figure
-        return draw(arms, self.scene.name)
+        arms = designed(self.views)
+        return design_figure(arms, self.scene.name) if arms else None
 
     def plot_stress(self) -> Figure | None:
         """Return the figure of every cell's largest stress; None if not asked for."""
-        from dolfinopt.plots.solid_stress import solid_stress_figure
-        from dolfinopt.plots.stress import stress_figure
+        from dolfinopt.plots.design import stress_figure
 
         known = [view for view in self.views if view.stress is not None]
-        draw = solid_stress_figure if self.scene.is_spatial else stress_figure
-        return draw(known, self.scene.name) if known else None
+        return stress_figure(known, self.scene.name) if known else None
 
     def plot_machine(self) -> Figure | None:
         """Return the figure of the machine in a few poses along its path."""
-        from dolfinopt.plots import machine, solid_machine
+        from dolfinopt.plots.machine import machine_figure
 
         if self.trajectory is None:
             return None
-        draw = (solid_machine if self.scene.is_spatial else machine).figure_of
-        return draw(self.views, self.trajectory, self.scene.name)
+        return machine_figure(self.views, self.trajectory, self.scene.name)
 
     def plot_drives(self) -> Figure | None:
         """Return the figure of the drives' errors and forces, and of what holds a closed loop."""
-        from dolfinopt.plots.drives import drives_figure
+        from dolfinopt.plots.curves import drives_figure
 
         return None if self.trajectory is None else drives_figure(self.trajectory)
 
@@ -234,14 +224,9 @@ class OptimizationResult(SimulationResult):
 
     def plot_history(self) -> Figure | None:
         """Return the figure of the objective and other figures over the iterations."""
-        from dolfinopt.plots.curves import history_figure
+        from dolfinopt.plots.curves import history_of
 
-        minimised = objective_of(self.scene)
-        label = f"{minimised.label} [{minimised.unit}]"
-        if not self.rows:
-            return None
-        limits = limits_by_column(self.scene, self.rows[0].constraints)
-        return history_figure(self.rows, label, limits)
+        return history_of(self.scene, self.rows) if self.rows else None
 
     def _initial(self) -> np.ndarray | None:
         return self.initial_deviation if len(self.initial_deviation) else None

@@ -405,6 +405,15 @@ def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     assert loaded(DRAW | others | {"dolfinx"}, MAIN, *line) == {"dolfinx"}
 
 
+@pytest.mark.serial
+def test_plane_pictures_need_no_renderer(tmp_path: Path) -> None:
+    line = ["simulate", TWO_ARM, "--animation", "--out", tmp_path / "out"]
+    for override in QUICK:
+        line += ["--set", override]
+    assert loaded(DRAW, MAIN, *line) == {"matplotlib", "PIL"}
+    assert (tmp_path / "out" / "motion.gif").exists()
+
+
 def test_nothing_is_drawn_exported_or_gathered_unless_asked(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,6 +24,7 @@ from dolfinopt.cli.shared import (
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from mpi4py import MPI
 
     from dolfinopt.part.check import Check
@@ -155,12 +156,10 @@ def _write(
     from dolfinopt.part.files import write_parts
 
     def pictures(folder: Path) -> None:
-        from dolfinopt.plots.part_check import draw_check
-        from dolfinopt.plots.parts import draw_parts
+        from dolfinopt.plots.design import parts_figure
 
-        draw_parts(folder / "part.png", [parts[k] for k in sorted(parts)], scene.name)
-        if check is not None:
-            draw_check(folder, check, scene)
+        made = [parts[k] for k in sorted(parts)]
+        draw_pictures(folder, parts_figure(made, scene.name), check, scene)
 
     prepare_folder(target)
     drawn = pictures if plots else None
@@ -284,14 +283,11 @@ def _write_solid(
     from dolfinopt.part.solid_files import write_solid_parts
 
     def pictures(folder: Path) -> None:
-        from dolfinopt.plots.part_check import draw_check
-        from dolfinopt.plots.solid_parts import draw_solid_parts
+        from dolfinopt.plots.solid_design import solid_parts_figure
 
         made = [parts[k] for k in sorted(parts)]
         masses = [scene.material_of(k).density * parts[k].volume for k in sorted(parts)]
-        draw_solid_parts(folder / "part.png", made, scene.name, masses)
-        if check is not None:
-            draw_check(folder, check, scene)
+        draw_pictures(folder, solid_parts_figure(made, scene.name, masses), check, scene)
 
     prepare_folder(target)
     fine = None if meshes is None else meshes.fine
@@ -339,7 +335,21 @@ def _widths(part: SolidPart) -> str:
     return ", ".join(found) or "nothing thin"
 
 
-# -- the table of a part's check on the screen ---------------------------------------------------
+# -- what `dolfinopt part` shows: pictures in the folder, and the table of the check -------------
+
+
+def draw_pictures(folder: Path, parts: Figure, check: Check | None, scene: Scene) -> None:
+    """Write the picture of the parts, and those of what they do if that is known."""
+    from dolfinopt.output.views import designed
+    from dolfinopt.plots.curves import check_figure
+    from dolfinopt.plots.design import stress_figure
+    from dolfinopt.plots.style import save
+
+    save(parts, folder / "part.png")
+    if check is not None:
+        save(check_figure(check, scene), folder / "deviation.png")
+        stress = stress_figure(designed(check.views), f"{scene.name}: stress of the parts")
+        save(stress, folder / "stress.png")
 
 
 def tell(check: Check) -> None:

@@ -20,7 +20,7 @@ from functools import partial
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
     from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.responses.order_selection import OrderSelection
@@ -212,70 +211,29 @@ def draw(
     animation: bool = False,
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
-    from dolfinopt.plots.curves import deviation_title, draw_deviation, draw_history
-    from dolfinopt.plots.drives import draw_drives
-    from dolfinopt.responses.constraints import deviation_limits, limits_by_column
-    from dolfinopt.responses.response import objective_of
+    from dolfinopt.output.views import designed
+    from dolfinopt.plots.curves import deviation_of, drives_figure, history_of
+    from dolfinopt.plots.design import design_figure, stress_figure
+    from dolfinopt.plots.machine import machine_figure
+    from dolfinopt.plots.style import save
 
-    minimised = objective_of(scene)
-    label = f"{minimised.label} [{minimised.unit}]"
-    (_draw_in_space if scene.is_spatial else _draw_in_plane)(folder, scene, views, trajectory)
+    title, closure, bodies = scene.name, trajectory.closure, trajectory.mechanism.bodies
+    if arms := designed(views):
+        masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
+        save(design_figure(arms, title, masses), folder / "design.png")
+    if stressed := [view for view in views if view.stress is not None]:
+        save(stress_figure(stressed, title), folder / "stress.png")
+    save(machine_figure(views, trajectory, title), folder / "machine.png")
     if history:
-        limits = limits_by_column(scene, history[0].constraints)
-        draw_history(folder / "history.png", history, label, limits)
-    mechanism, t, q_r = trajectory.mechanism, trajectory.t, trajectory.q_r
-    desired, closure = trajectory.desired.q if trajectory.is_machine else None, trajectory.closure
+        save(history_of(scene, history), folder / "history.png")
     if closure is None or closure.count == 1:  # a pinned end stays where it is
-        title = deviation_title(trajectory)
-        of_end = deviation_limits(scene)
-        draw_deviation(folder / "deviation.png", t, trajectory.deviation, initial, title, of_end)
+        save(deviation_of(trajectory, initial), folder / "deviation.png")
     if trajectory.is_machine:
-        draw_drives(folder / "drives.png", trajectory)
+        save(drives_figure(trajectory), folder / "drives.png")
     if animation:
         from dolfinopt.plots.animation import draw_motion
-        from dolfinopt.plots.solid_animation import draw_solid_motion
 
-        film, q_e = folder / "motion.gif", trajectory.q_e
-        if scene.is_spatial:
-            moving = cast("SpatialMechanism", mechanism)
-            draw_solid_motion(film, views, moving, t, q_r, q_e, desired)
-        else:
-            draw_motion(film, views, mechanism, t, q_r, q_e, desired=desired, closure=closure)
-
-
-def _draw_in_plane(
-    folder: Path, scene: Scene, views: list[ArmView], trajectory: Trajectory
-) -> None:
-    """Draw designs, stress and the machine of plane arms."""
-    from dolfinopt.output.views import designed
-    from dolfinopt.plots.design import draw_design
-    from dolfinopt.plots.machine import figure_of
-    from dolfinopt.plots.stress import draw_stress
-    from dolfinopt.plots.style import save
-
-    draw_design(folder / "design.png", designed(views), scene.name)
-    if stressed := [view for view in views if view.stress is not None]:
-        draw_stress(folder / "stress.png", stressed, scene.name)
-    save(figure_of(views, trajectory, scene.name), folder / "machine.png")
-
-
-def _draw_in_space(
-    folder: Path, scene: Scene, views: list[ArmView], trajectory: Trajectory
-) -> None:
-    """Draw designs and the machine of solid arms."""
-    from dolfinopt.output.views import designed
-    from dolfinopt.plots.solid_design import solid_design_figure
-    from dolfinopt.plots.solid_machine import figure_of
-    from dolfinopt.plots.solid_stress import solid_stress_figure
-    from dolfinopt.plots.style import save
-
-    bodies = trajectory.mechanism.bodies
-    masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
-    if links := designed(views):
-        save(solid_design_figure(links, scene.name, masses), folder / "design.png")
-    if stressed := [view for view in views if view.stress is not None]:
-        save(solid_stress_figure(stressed, scene.name), folder / "stress.png")
-    save(figure_of(views, trajectory, scene.name), folder / "machine.png")
+        draw_motion(folder / "motion.gif", views, trajectory)
 
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:

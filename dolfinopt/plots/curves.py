@@ -1,101 +1,119 @@
-"""Pictures of curves: the history of an optimisation, and the deviation against time."""
+"""Pictures of curves: history of an optimisation, deviation, drives, parts beside densities."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.output.trajectory import drive_units, free_drives, rigid_units
 from dolfinopt.plots.style import (
     BLUE,
     INITIAL,
     LINE_WIDTH,
     OPTIMISED,
-    PathLike,
+    ORANGE,
     log_scale,
     look,
     look_numbers,
+    looks,
     new_figure,
-    save,
     spread,
 )
-from dolfinopt.responses.constraints import constraint_label
+from dolfinopt.responses.constraints import constraint_label, deviation_limits, limits_by_column
+from dolfinopt.responses.response import objective_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.part.check import Check
+    from dolfinopt.scene.load import Scene
 
 DEVIATION = "Deviation of the end-effector from the rigid path"
 OF_CONTROL = "Deviation of the end-effector from the desired path"
 OF_SLIDER = "Deviation of the slider from that of rigid arms"
 LIMIT = "0.35"  # colour of limits
 FEW = 40  # points a line that get markers
+MILLI = 1e3
 
 
-def draw_history(
-    path: PathLike,
-    rows: Sequence[HistoryRow],
-    objective_label: str,
-    limits: Mapping[str, float] | None = None,
-) -> Path:
-    """Draw what history.csv holds against the iteration (PNG).
+def panel_grid(used: np.ndarray, title: str, abscissa: str) -> tuple[Figure, np.ndarray]:
+    """Return a figure with panels that share x, and their axes (rows, columns).
 
     Args:
-        path: of the picture.
-        rows: at least one.
-        objective_label: name and unit of the objective.
-        limits: of constraints by their column, see `constraints.limits_by_column`.
-
-    Returns:
-        The path.
+        used: (rows, columns) which panels there are.
+        title: above them.
+        abscissa: label of x, below the last panel of every column.
     """
-    return save(history_figure(rows, objective_label, limits), path)
+    rows, columns = used.shape
+    width, height = 5.0 * columns if columns > 1 else 9.0, 0.9 + 2.1 * rows
+    figure = new_figure(width, height, laid_out=False)
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    # Fixed margins, inches: there is nothing to be found out by drawing twice.
+    figure.subplots_adjust(left=0.85 / width, right=1.0 - 0.25 / width, wspace=0.2, hspace=0.32,
+                           bottom=0.5 / height, top=1.0 - 0.75 / height)  # fmt: skip
+    for axes, there in zip(grid.ravel(), used.ravel(), strict=True):
+        axes.set_visible(there)
+    for column, there in zip(grid.T, used.T, strict=True):
+        for last in column[there][-1:]:
+            last.set_xlabel(abscissa)
+            last.tick_params(labelbottom=True)
+    figure.suptitle(title, x=0.15 / width, y=1.0 - 0.12 / height, va="top", ha="left", fontsize=12)
+    return figure, grid
+
+
+def _head(axes: Axes, label: str, note: str) -> None:
+    """Write what a panel shows above it on the left, and its figures on the right."""
+    axes.set_title(label, loc="left", y=1.0, fontsize=10, parse_math=False)
+    axes.set_title(note, loc="right", y=1.0, fontsize=10)
+    axes.grid(True, alpha=0.3)
+
+
+# -- history ---------------------------------------------------------------------------------
+
+
+def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
+    """Return the picture of `history_figure` of a scene's optimisation, with its limits."""
+    minimised = objective_of(scene)
+    limits = limits_by_column(scene, rows[0].constraints)
+    return history_figure(rows, f"{minimised.label} [{minimised.unit}]", limits)
 
 
 def history_figure(
     rows: Sequence[HistoryRow], objective_label: str, limits: Mapping[str, float] | None = None
 ) -> Figure:
-    """Return the figure of `draw_history`: panels in two columns that share the iteration."""
-    from matplotlib.ticker import MaxNLocator
+    """Return the picture of what history.csv holds against the iteration.
 
+    Args:
+        rows: at least one.
+        objective_label: name and unit of the objective.
+        limits: of constraints by their column, see `constraints.limits_by_column`.
+    """
     panels = history_panels(rows, objective_label)
-    height = -(-len(panels) // 2)
-    total = 0.9 + 2.2 * height
-    figure = new_figure(10.0, total, 110, laid_out=False)
-    grid = figure.subplots(height, 2, sharex=True, squeeze=False)
-    # Fixed margins, inches: there is nothing to be found out by drawing twice.
-    figure.subplots_adjust(left=0.075, right=0.985, wspace=0.17, hspace=0.32,
-                           bottom=0.5 / total, top=1.0 - 0.75 / total)  # fmt: skip
+    used = np.arange(2 * (-(-len(panels) // 2))).reshape(2, -1).T < len(panels)
+    figure, grid = panel_grid(used, "History of the optimisation", "iteration")
     iteration = np.array([row.iteration for row in rows])
     bounds = {}
     for name, limit in (limits or {}).items():
         label, factor = _drawn(name)
         bounds[label] = factor * limit
-    ordered = grid.T.ravel()  # down the first column, then down the second
-    for axes, (label, values) in zip(ordered, panels.items()):
+    # Down the first column, then down the second.
+    for axes, (label, values) in zip(grid.T.ravel(), panels.items(), strict=False):
         _draw_history_panel(axes, iteration, values, label, bounds.get(label))
-    for axes in ordered[len(panels) :]:
-        axes.set_visible(False)
-    for column in (grid[:, 0], grid[:, 1]):
-        last = [axes for axes in column if axes.get_visible()][-1]
-        last.set_xlabel("iteration")
-        last.tick_params(labelbottom=True)
     grid[0, 0].set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
     grid[0, 0].xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
-    figure.suptitle("History of the optimisation", x=0.01, y=1.0 - 0.12 / total, va="top",
-                    ha="left", fontsize=12)  # fmt: skip
     return figure
 
 
 # Columns of the history in the order of their panels: label, factor.
 HISTORY = {
-    "max_deviation": ("maximal deviation [mm]", 1e3),
+    "max_deviation": ("maximal deviation [mm]", MILLI),
     "grayness": ("grayness [-]", 1.0),
     "volume_fraction": ("volume fraction [-]", 1.0),
     "change": ("largest change of the design [-]", 1.0),
@@ -103,7 +121,7 @@ HISTORY = {
 }
 SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
 # Units of constraints in pictures: ending of the label, its replacement, factor.
-DRAWN = ((" [m]", " [mm]", 1e3), (" [Pa]", " [MPa]", 1e-6))
+DRAWN = ((" [m]", " [mm]", MILLI), (" [Pa]", " [MPa]", 1e-6))
 
 
 def _drawn(constraint: str) -> tuple[str, float]:
@@ -150,14 +168,12 @@ def _draw_history_panel(
         values = np.where(positive, values, np.nan) if positive.any() else values
     marker = "o" if len(values) <= FEW else ""
     axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, lw=LINE_WIDTH, clip_on=False)
-    axes.set_title(label, loc="left", y=1.0, fontsize=10, parse_math=False)
-    finite = values[np.isfinite(values)]
+    finite, ends = values[np.isfinite(values)], ""
     if limit is not None:
         axes.axhline(limit, color=LIMIT, ls="--", lw=1.0)
     if len(finite):
         ends = f"{finite[0]:.4g}" if len(finite) == 1 else f"{finite[0]:.4g} → {finite[-1]:.4g}"
-        axes.set_title(ends, loc="right", y=1.0, fontsize=10)
-    axes.grid(True, alpha=0.3)
+    _head(axes, label, ends)
     if limit is not None and len(finite):
         finite = np.append(finite, limit)
     if linear:
@@ -169,28 +185,13 @@ def _draw_history_panel(
             axes.set_ylim(0.5 * middle, 2.0 * middle)
 
 
-def draw_deviation(
-    path: PathLike,
-    t: np.ndarray,
-    deviation: np.ndarray,
-    initial_deviation: np.ndarray | None = None,
-    title: str = DEVIATION,
-    limits: Sequence[tuple[float, float]] = (),
-) -> Path:
-    """Draw the end-effector's distance from its rigid or desired path against time (PNG).
+# -- deviation -------------------------------------------------------------------------------
 
-    Args:
-        path: of the picture.
-        t: (n,) s.
-        deviation: (n, 2) m.
-        initial_deviation: (m, 2) m, of the initial design, evenly over the same time, or None.
-        title: above the picture, of what from what.
-        limits: m, and the instant from which each holds, s.
 
-    Returns:
-        The path.
-    """
-    return save(deviation_figure(t, deviation, initial_deviation, title, limits), path)
+def deviation_of(trajectory: Trajectory, initial: np.ndarray | None) -> Figure:
+    """Return the picture of `deviation_figure` of a motion, with its scene's limits."""
+    title, limits = deviation_title(trajectory), deviation_limits(trajectory.scene)
+    return deviation_figure(trajectory.t, trajectory.deviation, initial, title, limits)
 
 
 def deviation_title(trajectory: Trajectory) -> str:
@@ -203,19 +204,29 @@ def deviation_title(trajectory: Trajectory) -> str:
 def deviation_figure(
     t: np.ndarray,
     deviation: np.ndarray,
-    initial_deviation: np.ndarray | None,
+    initial: np.ndarray | None = None,
     title: str = DEVIATION,
     limits: Sequence[tuple[float, float]] = (),
 ) -> Figure:
-    """Return the figure of `draw_deviation`; what a curve is stands at its peak."""
+    """Return the picture of the end-effector's distance from its rigid or desired path.
+
+    What a curve is stands at its peak.
+
+    Args:
+        t: (n,) s.
+        deviation: (n, d) m.
+        initial: (m, d) m, of the initial design, evenly over the same time, or None.
+        title: above the picture, of what from what.
+        limits: m, and the instant from which each holds, s.
+    """
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
     axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
     curves = [("", t, deviation)]
-    if initial_deviation is not None:
-        times = np.linspace(t[0], t[-1], len(initial_deviation))
-        curves = [(INITIAL, times, initial_deviation), (OPTIMISED, t, deviation)]
-    distances = [1e3 * lengths(vectors) for _, _, vectors in curves]
-    largest = [float(d.max()) for d in distances] + [1e3 * limit for limit, _ in limits]
+    if initial is not None:
+        times = np.linspace(t[0], t[-1], len(initial))
+        curves = [(INITIAL, times, initial), (OPTIMISED, t, deviation)]
+    distances = [MILLI * lengths(vectors) for _, _, vectors in curves]
+    largest = [float(d.max()) for d in distances] + [MILLI * limit for limit, _ in limits]
     top = 1.1 * max(largest) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)
     # A curve alone looks like the optimised design's.
@@ -237,10 +248,107 @@ def deviation_figure(
             color=style["color"],
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
         )
-    for limit, since in limits:
-        axes.hlines(1e3 * limit, since, t[-1], color=LIMIT, ls="--", lw=1.0)
-    axes.set(xlim=(t[0], t[-1]), ylim=(0.0, top), xlabel="time [s]")
-    axes.set_ylabel("deviation [mm]")
+    _over_time(axes, t, "deviation [mm]", limits)
+    axes.set(ylim=(0.0, top), xlabel="time [s]")
     axes.set_title(title, loc="left", fontsize=12)
-    axes.grid(True, alpha=0.3)
     return figure
+
+
+def check_figure(check: Check, scene: Scene) -> Figure:
+    """Return the picture of the deviation over time with every form of the arms, mm.
+
+    Below, by how much that of other forms differs from that of the densities.
+    """
+    figure = new_figure(9.0, 6.4, 120, laid_out=False)
+    upper = figure.add_axes((0.1, 0.42, 0.88, 0.51))
+    lower = figure.add_axes((0.1, 0.09, 0.88, 0.24))
+    first, styles = check.density.trajectory, looks([list(check.columns)])
+    for name, column in check.columns.items():
+        style, own = styles[name] | {"marker": ""}, column.trajectory
+        distance = MILLI * own.distance
+        worst = int(np.argmax(distance))
+        note = f"{name}: largest {distance[worst]:.4g} mm at {own.t[worst]:.3f} s"
+        upper.plot(own.t, distance, label=note, **style)
+        if column is not check.density:
+            base = first if np.array_equal(first.t, own.t) else first.at(own.t)
+            less = distance - MILLI * base.distance
+            lower.plot(own.t, less, label=f"{name} less density", **style)
+    _over_time(upper, first.t, "deviation [mm]", deviation_limits(scene))
+    _over_time(lower, first.t, "difference [mm]")
+    upper.set_title(deviation_title(first), loc="left", fontsize=12)
+    upper.set_ylim(0.0, None)
+    lower.set_xlabel("time [s]")
+    for axes in (upper, lower):
+        axes.legend(fontsize=9, frameon=True, framealpha=0.8, edgecolor="none")
+    figure.align_ylabels([upper, lower])
+    return figure
+
+
+def _over_time(
+    axes: Axes, t: np.ndarray, label: str, limits: Sequence[tuple[float, float]] = ()
+) -> None:
+    """Label lengths over time, and draw their limits as broken lines."""
+    for limit, since in limits:
+        axes.hlines(MILLI * limit, since, t[-1], color=LIMIT, ls="--", lw=1.0)
+    axes.set(xlim=(t[0], t[-1]), ylabel=label)
+    axes.grid(True, alpha=0.3)
+
+
+# -- drives ----------------------------------------------------------------------------------
+
+# Unit of a quantity, its factors in the order of their size: largest value below which each serves.
+SCALES = {
+    "m": ((1e-3, 1e6, "µm"), (1.0, 1e3, "mm"), (np.inf, 1.0, "m")),
+    "rad": ((0.1, 1e3, "mrad"), (np.inf, 1.0, "rad")),
+    "N": ((1e4, 1.0, "N"), (np.inf, 1e-3, "kN")),
+    "N m": ((1e4, 1.0, "N m"), (np.inf, 1e-3, "kN m")),
+}
+
+
+def drives_figure(trajectory: Trajectory) -> Figure:
+    """Return the picture of a machine's drives over time, and of what holds a closed loop.
+
+    A row a drive, its error and its force; then the ground. Errors are q_r - q_r_desired; where no
+    drive can have one, forces stand alone.
+    """
+    panels = drive_panels(trajectory)
+    columns = max(map(len, panels))
+    used = np.array([[k >= columns - len(row) for k in range(columns)] for row in panels])
+    title = "Drives" if trajectory.closure is None else "Drives and what holds the loop"
+    figure, grid = panel_grid(used, title, "time [s]")
+    t = trajectory.t
+    quantities = [quantity for row in panels for quantity in row]
+    for axes, (label, unit, curves) in zip(grid[used], quantities, strict=True):
+        largest = max(float(np.abs(values).max()) for values in curves.values())
+        factor, shown = next((f, name) for limit, f, name in SCALES[unit] if largest < limit)
+        for (name, values), colour in zip(curves.items(), (BLUE, ORANGE), strict=False):
+            axes.plot(t, factor * values, color=colour, lw=LINE_WIDTH, label=name)
+        if len(curves) > 1:
+            axes.legend(loc="best", frameon=False, fontsize=9, ncols=len(curves))
+        axes.axhline(0.0, color="black", lw=0.6, zorder=1.0)
+        axes.set_xlim(t[0], t[-1])
+        _head(axes, f"{label} [{shown}]", f"largest {factor * largest:.3g}")
+    return figure
+
+
+Panel = tuple[str, str, dict[str, np.ndarray]]  # label, SI unit, curves (n,) by name
+
+
+def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
+    """Return the rows of the figure: of every drive error and force, of the ground its force."""
+    scene, rows = trajectory.scene, []
+    places = range(*scene.driven_columns.indices(trajectory.q_r.shape[1]))
+    error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
+    units, loads = rigid_units(scene), drive_units(scene)
+    for name, k in zip(scene.driven, places, strict=True):
+        word = "force" if loads[name] == "N" else "moment"
+        row: list[Panel] = [(f"{name}: {word}", loads[name], {"": trajectory.joint_forces[:, k]})]
+        if name in free:
+            row.insert(0, (f"{name}: error", units[name], {"": error[:, k]}))
+        rows.append(row)
+    forces = trajectory.closure_force
+    if forces is not None:
+        names = ("",) if forces.shape[1] == 1 else ("x", "y")
+        what = "normal force on the slider" if len(names) == 1 else "force of the pin on the arm"
+        rows.append([(what, "N", dict(zip(names, forces.T, strict=True)))])
+    return rows

@@ -1,73 +1,211 @@
-"""Picture of the designs: arms below each other, to one scale."""
+"""Pictures of arms below each other, to one scale: densities, stress, parts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.page import (
-    MARGIN,
-    TEXT,
-    Page,
-    draw_colour_scale,
-    draw_ruler,
-    figure_of_page,
-    page_of_arms,
-    write_page,
+from dolfinopt.plots.shapes import boundary, sides, volume_fraction
+from dolfinopt.plots.style import (
+    BLUE,
+    COLOURS,
+    DENSITY,
+    GREY,
+    ORANGE,
+    Box,
+    colour_scale,
+    round_number,
+    stacked_axes,
 )
-from dolfinopt.plots.shapes import outline, volume_fraction
-from dolfinopt.plots.style import DENSITY, GREY, PathLike
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-REGION = {"solid": "#d55e00", "void": "#0072b2"}  # borders of what stays solid and void
+    from dolfinopt.part.part import Part
+
+REGION = {"solid": ORANGE, "void": BLUE}  # borders of what stays solid and void
+STRESS_COLOURS = "YlOrRd"  # nothing is light, the largest dark
+STRESS = "largest von Mises stress along the motion [MPa]"
+MILLI, MEGA = 1e3, 1e-6
+LOW = 0.45  # inches, least height of an arm's axes
+PLATE = 1.0  # inches, likewise of a plate
+FOOT = 1.35  # inches, for the label of x and the scale of colours
+MARGIN = 0.012  # of the arms' length, around them
+FACE, BRIGHT, DARK = "#b8c4cc", np.array([0.62, 0.68, 0.72]), np.array([0.20, 0.26, 0.31])
+DEPTH = np.array([0.35, 0.35])  # by which a plate's back is moved, of its thickness
+CHORD = 0.02  # of drawn curves, cells
 
 
-def draw_design(path: PathLike, views: Sequence[ArmView], title: str) -> Path:
-    """Draw the densities of all arms to one scale, below each other (PNG).
+def design_figure(
+    views: Sequence[ArmView], title: str, masses: Mapping[str, float] | None = None
+) -> Figure:
+    """Return the picture of the densities of all arms; of solids, of what is denser than 0.5.
 
     Args:
-        path: of the picture.
-        views: from the cart outwards.
+        views: from the cart outwards, all plane or all solid.
         title: above the picture.
-
-    Returns:
-        The path.
+        masses: of solid arms by name, kg, if they are known.
     """
-    return write_page(path, design_page(views, title))
+    if is_solid(views):
+        from dolfinopt.plots.solid_design import solid_design_figure
 
-
-def design_figure(views: Sequence[ArmView], title: str) -> Figure:
-    """Return the picture of `draw_design` as a figure of Matplotlib, pixel for pixel."""
-    return figure_of_page(design_page(views, title))
-
-
-def design_page(views: Sequence[ArmView], title: str) -> Page:
-    """Return the page of `draw_design` before it is rendered; the caller closes it."""
-    page, layout = page_of_arms([view.corners for view in views], title)
-    for index, view in enumerate(views):
-        page.write(_caption(view), MARGIN, layout.tops[index] + 12.0, TEXT)
-        corners = layout.place(index, view.corners)
-        page.fill(corners, view.density)
-        page.lines(outline(corners), GREY)
+        return solid_design_figure(views, title, masses)
+    figure, rows = _arm_rows([view.corners for view in views], title, "m", FOOT)
+    for axes, view in zip(rows, views, strict=True):
+        _fill(axes, view.corners, view.density)
+        _draw_rim(axes, view.corners)
         for kind, border in view.regions:
-            points = layout.place(index, _inside(border, view.corners))
-            page.lines(np.stack([points, np.roll(points, -1, axis=0)], axis=1), REGION[kind])
+            low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
+            axes.fill(*np.clip(border, low, high).T, fc="none", ec=REGION[kind], lw=1.2,
+                      label=f"stays {kind}")  # fmt: skip
         if view.length is not None:
-            page.mark(layout.place(index, np.array([[0.0, 0.0], [view.length, 0.0]])))
-    draw_ruler(page, layout)
-    draw_colour_scale(page, layout, DENSITY, (0.0, 0.25, 0.5, 0.75, 1.0))
-    return page
+            axes.plot([0.0, view.length], [0.0, 0.0], "o", mfc="white", mec="black", ms=5.5,
+                      clip_on=False)  # fmt: skip
+        axes.set_title(_caption(view), loc="left", fontsize=10, parse_math=False)
+    keys = {key: one for axes in rows for one, key in zip(*axes.get_legend_handles_labels())}
+    if keys:
+        figure.legend(list(keys.values()), list(keys), loc="lower left", frameon=False, fontsize=9)
+    colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
+    return figure
 
 
-def _inside(border: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return an outline (n, 2) without what lies beyond the box around the cells, m."""
-    return np.clip(border, corners.min(axis=(0, 1)), corners.max(axis=(0, 1)))
+def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
+    """Return the picture of the largest stress of every cell, the place of the largest ringed.
+
+    Args:
+        views: of arms whose stress is known, from the cart outwards, all plane or all solid.
+        title: above the picture.
+    """
+    if is_solid(views):
+        from dolfinopt.plots.solid_design import solid_stress_figure
+
+        return solid_stress_figure(views, title)
+    figure, rows = _arm_rows([view.corners for view in views], title, "m", FOOT)
+    stresses = [MEGA * known_stress(view)[0] for view in views]
+    largest = max(float(stress.max()) for stress in stresses)
+    marks = scale_marks(largest)
+    for axes, view, stress in zip(rows, views, stresses, strict=True):
+        _fill(axes, view.corners, stress, STRESS_COLOURS, marks[-1])
+        _draw_rim(axes, view.corners)
+        worst = int(np.argmax(stress))
+        (x, y), when = view.centroid[worst], known_stress(view)[1][worst]
+        if stress[worst] == largest > 0.0:
+            draw_ring(axes, x, y)
+        words = f"largest {stress[worst]:.4g} MPa at x = {x:.4g} m, y = {y:.4g} m, t = {when:.4g} s"
+        axes.set_title(f"{view.name}:  {words}", loc="left", fontsize=10, parse_math=False)
+    colour_scale(figure, STRESS, STRESS_COLOURS, marks)
+    return figure
+
+
+def parts_figure(parts: Sequence[Part], title: str) -> Figure:
+    """Return the picture of the parts' outlines over the densities of their arms, mm."""
+    corners = [MILLI * part.domain.corners for part in parts]
+    figure, rows = _arm_rows(corners, f"{title}: part over density", "mm", FOOT)
+    for axes, part, cells in zip(rows, parts, corners, strict=True):
+        _fill(axes, cells, part.domain.x_phys)
+        for loop in _loops(part):
+            axes.plot(*np.vstack([loop, loop[:1]]).T, color=ORANGE, lw=1.3, clip_on=False)
+        shape = part.shape
+        words = (
+            f"{part.domain.name}:  {1e6 * shape.area:.5g} mm\N{SUPERSCRIPT TWO}, "
+            f"{len(shape.loops) - 1} holes, {len(shape.curves)} curves"
+        )
+        axes.set_title(words, loc="left", fontsize=10, parse_math=False)
+    colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
+    return figure
+
+
+def figure_of_plates(parts: Sequence[Part], densities: Sequence[float] = ()) -> Figure:
+    """Return a picture of parts as plates seen from the right and above, to one scale.
+
+    Args:
+        parts: below each other.
+        densities: of their material, kg/m3: captions then tell the masses.
+    """
+    corners = [MILLI * part.domain.corners for part in parts]
+    figure, rows = _arm_rows(corners, "", "mm", 0.2, PLATE)
+    for k, (axes, part) in enumerate(zip(rows, parts, strict=True)):
+        loops, thickness = _loops(part), part.domain.thickness
+        _draw_plate(axes, loops, MILLI * thickness * DEPTH)
+        size = [*np.ptp(loops[0], axis=0), MILLI * thickness]
+        words = " \N{MULTIPLICATION SIGN} ".join(f"{one:.4g}" for one in size) + " mm"
+        if len(densities):
+            words += f", {densities[k] * part.shape.area * thickness:.3g} kg"
+        words += f", {len(loops) - 1} holes, {len(part.shape.curves)} curves"
+        axes.set_title(f"{part.domain.name}:  {words}", loc="left", fontsize=11, parse_math=False)
+        axes.set_axis_off()
+    return figure
+
+
+def is_solid(views: Sequence[ArmView]) -> bool:
+    """Return whether arms have three dimensions."""
+    return bool(views[0].corners.shape[2] == 3)
+
+
+def draw_ring(axes: Axes, x: float, y: float) -> None:
+    """Mark the place of the largest stress."""
+    axes.plot(x, y, "o", mfc="none", mec=BLUE, mew=1.8, ms=13.0, clip_on=False)
+
+
+def scale_marks(largest: float) -> np.ndarray:
+    """Return round numbers from 0 to `largest` or a little beyond, four to six of them."""
+    if largest <= 0.0:
+        return np.array([0.0, 1.0])
+    step = round_number(largest / 5.0)
+    return step * np.arange(int(np.ceil(largest / step - 1e-9)) + 1)
+
+
+def known_stress(view: ArmView) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest stress of every cell, Pa, and its instant, s, of a view that has them."""
+    assert view.stress is not None and view.stress_instant is not None
+    return view.stress, view.stress_instant
+
+
+def _arm_rows(
+    corners: Sequence[np.ndarray], title: str, unit: str, foot: float, least: float = LOW
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes for each arm, inboard joints in one column."""
+    boxes: list[Box] = [(one.min(axis=(0, 1)), one.max(axis=(0, 1))) for one in corners]
+    margin = MARGIN * max(float((high - low)[0]) for low, high in boxes)
+    boxes = [(low - margin, high + margin) for low, high in boxes]
+    figure, rows = stacked_axes(boxes, title, below=0.12, foot=foot, least=least)
+    for axes in rows:
+        axes.set_ylabel(f"y [{unit}]")
+        axes.locator_params(axis="x", nbins=max(2, int(axes.bbox.width / 90.0)))
+        axes.locator_params(axis="y", nbins=max(2, int(axes.bbox.height / 40.0)))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelbottom=axes is rows[-1])
+    rows[-1].set_xlabel(f"x [{unit}]")
+    return figure, rows
+
+
+def _fill(
+    axes: Axes,
+    corners: np.ndarray,
+    values: np.ndarray,
+    colours: str = COLOURS,
+    largest: float = 1.0,
+) -> None:
+    """Draw cells in the colours of their values from 0 to `largest`."""
+    polygons: Any = corners  # as one array: a list would become a path a cell in Python
+    # Blended edges would let the ground shine through between neighbours.
+    cells = PolyCollection(polygons, cmap=colours, antialiaseds=False, lw=0.0, rasterized=True)
+    cells.set_array(values)
+    cells.set_clim(0.0, largest)
+    axes.add_collection(cells, autolim=False)
+
+
+def _draw_rim(axes: Axes, corners: np.ndarray) -> None:
+    """Draw the outline of cells."""
+    rim: Any = sides(corners)[boundary(corners)]
+    axes.add_collection(LineCollection(rim, colors=GREY, linewidths=1.0), autolim=False)
 
 
 def _caption(view: ArmView) -> str:
@@ -76,6 +214,24 @@ def _caption(view: ArmView) -> str:
     long = f"{size[0]:.4g} m long"
     if view.length is not None:
         long = f"axis distance {view.length:.4g} m"
-    return (
-        f"{view.name}   {long}, {size[1]:.4g} m high, volume fraction {volume_fraction(view):.3f}"
-    )
+    share = f"volume fraction {volume_fraction(view):.3f}"
+    return f"{view.name}:  {long}, {size[1]:.4g} m high, {share}"
+
+
+def _loops(part: Part) -> list[np.ndarray]:
+    """Return the closed curves of a part as polygons (n, 2), mm; the outline first."""
+    return [MILLI * loop for loop in part.shape.polygons(CHORD * part.domain.cell)]
+
+
+def _draw_plate(axes: Axes, loops: Sequence[np.ndarray], depth: np.ndarray) -> None:
+    """Draw a plate: its sides, those of the holes above those of the outline, then its face."""
+    for loop in loops:
+        after = np.roll(loop, -1, axis=0)
+        quads: Any = np.stack([loop, after, after + depth, loop + depth], axis=1)
+        along = after - loop
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        light = normal @ [0.6, 0.8] / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+        shade: Any = 0.5 * (1.0 + light[:, None]) * (BRIGHT - DARK) + DARK
+        axes.add_collection(PolyCollection(quads, fc=shade, ec=shade, lw=0.4, clip_on=False))
+    face = Path.make_compound_path(*(Path(np.vstack([one, one[:1]]), closed=True) for one in loops))
+    axes.add_patch(PathPatch(face, fc=FACE, ec="#20303a", lw=0.7, clip_on=False))

@@ -6,25 +6,28 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import TriMesh
+from matplotlib.colors import to_rgba_array
+from matplotlib.patches import Polygon
+from matplotlib.tri import Triangulation
 
-from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.loops import BASE, block_corners, close_loop, draw_ground, ground_points
-from dolfinopt.plots.shapes import (
-    CELLS,
-    Drawing,
-    base_corners,
-    boundary,
-    chain,
+from dolfinopt.plots.shapes import PlaneMotion, chain, close_loop, plane, plane_motion, reach
+from dolfinopt.plots.style import (
+    COLOURS,
+    DENSITY,
+    GREY,
+    ORANGE,
+    SOLID_FROM,
+    cut_to,
     decimals,
-    draw_coarsely,
-    filled,
-    sides,
-    slender,
+    new_figure,
 )
-from dolfinopt.plots.style import DENSITY, GREY, ORANGE, SOLID_FROM, new_figure
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -33,14 +36,140 @@ if TYPE_CHECKING:
 POSES = 5
 LOOP_POSES = 4  # of one turn
 PALE = 0.3  # share of its colour
-LEANING = np.exp(0.25j * np.pi)  # the words lie beside the next arm, which may go straight on
+BASE = "#c9c9c9"  # carts, pedestals and sliders
+UNDESIGNED = "#8a8a8a"  # arms without a design
 
 
-def figure_of(views: Sequence[ArmView], trajectory: Trajectory, title: str) -> Figure:
-    """Return the figure of `machine_figure` of a simulated motion."""
-    one = trajectory
-    known = (one.desired.q, one.end, one.closure) if one.is_machine else (None, None, None)
-    return machine_figure(views, one.mechanism, one.t, one.q_r, title, *known)
+class Cells(TriMesh):
+    """Cells without seams between them, quick to move: polygons take five times as long."""
+
+    def __init__(self, corners: np.ndarray, rgba: np.ndarray) -> None:
+        """Triangulate cells with corners (n, 3 or 4, 2), in order, and colours (n, 4)."""
+        count, around = corners.shape[:2]
+        fans = [[0, k, k + 1] for k in range(1, around - 1)]
+        triangles = (around * np.arange(count)[:, None, None] + fans).reshape(-1, 3)
+        x, y = corners.reshape(-1, 2).T
+        self.grid = Triangulation(x, y, triangles)
+        colours: Any = np.repeat(rgba, around, axis=0)
+        super().__init__(self.grid, facecolors=colours, rasterized=True)
+
+    def move(self, corners: np.ndarray) -> None:
+        """Move the corners."""
+        self.grid.x, self.grid.y = corners.reshape(-1, 2).T
+
+
+class Cast:
+    """The moving artists of a drawn plane machine.
+
+    Attributes:
+        artists: base, slider, arms, joints and end-effector, from the back to the front.
+    """
+
+    def __init__(
+        self,
+        axes: Axes,
+        motion: PlaneMotion,
+        order: float = 2.0,
+        strength: float = 1.0,
+        opaque: bool = False,
+        sizes: tuple[float, float] = (5.0, 5.0),
+    ) -> None:
+        """Add a machine to axes.
+
+        Args:
+            axes: for it.
+            motion: of the machine.
+            order: of its first artist.
+            strength: share of its colours, the rest white.
+            opaque: whether void is drawn, which hides what lies behind.
+            sizes: of joints and end-effector, points.
+        """
+        alpha = None if strength == 1.0 else strength
+        body: Any = {"facecolor": BASE, "edgecolor": "black", "alpha": alpha}
+        self.base = Polygon(np.zeros((4, 2)), **body)
+        self.slider = Polygon(np.zeros((4, 2)), visible=motion.slides, **body)
+        axes.add_patch(self.base)
+        axes.add_patch(self.slider)
+        self.cells, self.rims = [], []
+        for k, view in enumerate(motion.views):
+            rgba = to_rgba_array(UNDESIGNED).repeat(len(view.density), axis=0)
+            if view.designed:
+                rgba = colormaps[COLOURS](view.density)
+            rgba[:, :3] = 1.0 - strength * (1.0 - rgba[:, :3])
+            rgba[(view.density <= SOLID_FROM) & (not opaque), 3] = 0.0
+            self.cells.append(Cells(motion.cells(k, 0), rgba))
+            axes.add_collection(self.cells[-1], autolim=False)
+            rim = axes.plot([], [], color=GREY, lw=0.6, solid_capstyle="butt", alpha=alpha)[0]
+            self.rims.append(rim)
+        dots: Any = {"marker": "o", "ls": "", "mec": "black", "alpha": alpha}
+        self.joints = axes.plot([], [], mfc="white", ms=sizes[0], **dots)[0]
+        self.end = axes.plot([], [], mfc=ORANGE, ms=sizes[1], **dots)[0]
+        arms = [one for pair in zip(self.cells, self.rims, strict=True) for one in pair]
+        self.artists: list[Artist] = [self.base, self.slider, *arms, self.joints, self.end]
+        for artist in self.artists:
+            artist.set_zorder(order)
+
+    def show(self, motion: PlaneMotion, n: int) -> None:
+        """Move the machine to where it is at an instant."""
+        self.base.set_xy(motion.base(n))
+        if motion.slides:
+            self.slider.set_xy(motion.block(n))
+        for k, (cells, rim) in enumerate(zip(self.cells, self.rims, strict=True)):
+            cells.move(motion.cells(k, n))
+            edges = np.pad(motion.outline(k, n), ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+            rim.set_data(*edges.reshape(-1, 2).T)  # of all edges one line with gaps: quick
+        *joints, end = plane(motion.place[n])
+        self.joints.set_data(np.transpose(joints))
+        self.end.set_data([end[0]], [end[1]])
+
+
+def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str) -> Figure:
+    """Return the picture of the assembled machine with its designs in a few poses along the path.
+
+    Arms are undeformed, void is left open; of a closed loop one turn is shown.
+
+    Args:
+        views: of all arms, from the cart outwards.
+        trajectory: how it moves.
+        title: above the picture.
+    """
+    if trajectory.scene.is_spatial:
+        from dolfinopt.plots.solid_machine import solid_machine_figure
+
+        space: Any = trajectory.mechanism
+        return solid_machine_figure(views, space, trajectory.t, trajectory.q_r, title)
+    mechanism, closure, t = trajectory.mechanism, trajectory.closure, trajectory.t
+    q_r, rigid = trajectory.q_r, np.zeros((len(t), mechanism.slices[-1].stop))
+    closed = close_loop(mechanism, closure, q_r, rigid)
+    whole = plane_motion(views, mechanism, closure, q_r if closed is None else closed, rigid)
+    at = poses_along(whole.place[:, -1], POSES)
+    if closure is not None:
+        at = poses_of_turn(whole.place[:, 1], q_r[:, 1], LOOP_POSES)
+    motion, size = whole[at], reach(mechanism)
+    paths = _paths(whole, trajectory)
+    # Room for the instants, which stand beyond ends that may be anywhere.
+    anywhere = closure is not None or trajectory.is_machine
+    low, high = motion.bounds(*paths.values())
+    low = low - size * np.array([0.18, 0.1] if anywhere else [0.12, 0.04])
+    high = high + size * np.array([0.18 if anywhere else 0.12, 0.1])
+    figure, axes = _framed(low, high, 0.8 if paths else 0.55)
+    draw_ground(axes, motion)
+    for (label, path), dashes in zip(paths.items(), ((4, 3), (1, 0)), strict=False):
+        axes.plot(*path.T, color=ORANGE, dashes=dashes, lw=1.2, zorder=1.0, label=label)
+    if paths:
+        figure.legend(loc="lower center", ncols=2, frameon=False, fontsize=9)
+    for n in range(len(at)):
+        # Loops lie on top of each other: but for the first pose they are pale.
+        pale = closure is not None and n > 0
+        front = 2.0 + (len(at) if closure is not None and n == 0 else n)
+        Cast(axes, motion, front, PALE if pale else 1.0).show(motion, n)
+        if len(at) > 1:
+            _name_instant(axes, motion, n, f"{t[at[n]]:.{decimals(t)}f} s")
+    words = cut_to(title, figure.get_figwidth() - 0.75)
+    axes.set_title(words, loc="left", y=1.0, fontsize=12, parse_math=False)
+    bar = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
+    figure.colorbar(ScalarMappable(cmap=COLOURS), cax=bar, label=DENSITY)
+    return figure
 
 
 def poses_along(points: np.ndarray, count: int) -> np.ndarray:
@@ -67,199 +196,74 @@ def poses_of_turn(first_joint: np.ndarray, angles: np.ndarray, count: int) -> np
     return poses_along(turn, 2 * count + 1)[1::2]
 
 
-def machine_figure(
-    views: Sequence[ArmView],
-    mechanism: Mechanism,
-    t: np.ndarray,
-    q_r: np.ndarray,
-    title: str,
-    desired: np.ndarray | None = None,
-    end: np.ndarray | None = None,
-    closure: Closure | None = None,
-) -> Figure:
-    """Draw the assembled machine with its designs in a few poses along the path.
-
-    Arms are undeformed, void is left open.
-
-    Args:
-        views: of all arms, from the cart outwards.
-        mechanism: that moves.
-        t: (n,) s.
-        q_r: (n, 1 + arms) rigid coordinates; m, rad.
-        title: above the picture.
-        desired: (n, 1 + arms) rigid coordinates that q_r may leave; default: q_r.
-        end: (n, 2) m, places of the end-effector as it moves, of which `desired` tells where they
-            should be; default: not drawn.
-        closure: what holds the last interface of a closed loop; of it one turn is shown.
-    """
-    rigid = np.zeros((len(t), mechanism.slices[-1].stop))
-    closed = close_loop(mechanism, closure, q_r, rigid)
-    place, swing = chain(mechanism, q_r if closed is None else closed, rigid)
-    size = sum(float(np.hypot(*body.outboard_point)) for body in mechanism.bodies)
-    at = poses_along(place[:, -1], POSES)
-    if closure is not None:
-        at = poses_of_turn(place[:, 1], q_r[:, 1], LOOP_POSES)
-    stands = bool(np.ptp(place[:, 0].real) == 0.0)
-    drawings = [draw_coarsely(slender(view, size), 2 * CELLS // len(views)) for view in views]
-    rest = [np.zeros(view.modes.shape[-1]) for view in views]
-    frames = [[(place[n, k], swing[n, k], q) for k, q in enumerate(rest)] for n in at]
-    bases = [base_corners(place[n, 0], size, stands) for n in at]
-    paths = _paths(mechanism, place, desired, end, closure)
-    points = [*paths.values(), *bases]
-    points += [one.points(*frame) for pose in frames for one, frame in zip(drawings, pose)]
-    if closure is not None:
-        points.append(ground_points(place[at, -1], size, closure))
-    low, high = (
-        np.min([p.min(axis=0) for p in points], axis=0),
-        np.max([p.max(axis=0) for p in points], axis=0),
-    )
-    # Room for the instants, which stand beyond ends that may be anywhere.
-    anywhere = closure is not None or desired is not None
-    low = low - size * np.array([0.18, 0.1] if anywhere else [0.12, 0.04])
-    high = high + size * np.array([0.18 if anywhere else 0.12, 0.1])
-    figure, axes = _framed(high - low)
-    _draw_ground(axes, bases, stands)
-    if closure is not None:
-        draw_ground(axes, place[at, -1], size, closure)
-    for (label, path), dashes in zip(paths.items(), ((4, 3), (1, 0)), strict=False):
-        axes.plot(*path.T, color=ORANGE, dashes=dashes, lw=1.2, zorder=1.0, label=label)
-    if len(paths) > 1:
-        axes.legend(loc="best", frameon=False, fontsize=9)
-    edges = [boundary(one.view.corners) for one in drawings]
-    for number, (n, pose) in enumerate(zip(at, frames)):
-        # Loops lie on top of each other: but for the first pose they are pale.
-        pale = closure is not None and number > 0
-        order = 2.0 + (len(at) if closure is not None and number == 0 else number)
-        _draw_pose(axes, drawings, edges, pose, place[n], bases[number], order, pale=pale)
-        if closure is not None and closure.count == 1:
-            _draw_slider(axes, block_corners(place[n, -1], size, closure), order, pale=pale)
-        words = f"{t[n]:.{decimals(t)}f} s" if len(at) > 1 else ""
-        # The first arm's end tells poses of a loop apart, a slider's come back.
-        along = np.diff(place[n, -2:] if closure is None else place[n, :2] * LEANING)[0]
-        end = place[n, -1 if closure is None else 1]
-        _name_instant(axes, end, along, words, 3.0 + len(at))
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
-    axes.grid(True, alpha=0.3)
-    axes.set_axisbelow(True)
-    axes.set_title(title, loc="left", y=1.0, fontsize=12, parse_math=False)
-    scale = filled(np.zeros((0, 4, 2)), np.zeros(0))
-    figure.colorbar(scale, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)), label=DENSITY)
-    return figure
+def draw_ground(axes: Axes, motion: PlaneMotion) -> None:
+    """Draw the rail below the cart or the ground below a pedestal, and what holds a loop."""
+    (left, y), (right, _) = motion.base(0)[:2]
+    half = 0.5 * (right - left)
+    if motion.stands:
+        axes.plot([left - half, right + half], [y, y], color=GREY, lw=1.5, zorder=1.4)
+    else:
+        axes.axhline(y, color=GREY, lw=1.5, zorder=1.4)
+    if motion.closure is None:
+        return
+    lines = motion.ground()
+    if motion.slides:
+        axes.plot(*lines.T, color=GREY, lw=1.5, zorder=1.4)
+        return
+    (left, y), (right, _) = lines[0]
+    axes.add_patch(Polygon(lines[:, 0], facecolor=BASE, edgecolor="black", zorder=1.5))
+    axes.plot([left - half, right + half], [y, y], color=GREY, lw=2.0, zorder=1.4)
 
 
-def _paths(
-    mechanism: Mechanism,
-    place: np.ndarray,
-    desired: np.ndarray | None,
-    end: np.ndarray | None,
-    closure: Closure | None,
-) -> dict[str, np.ndarray]:
+def _paths(motion: PlaneMotion, trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Return the paths (n, 2), m, that are worth a line, by what they are.
 
     Of an open chain the end-effector's, desired and, where joints may leave the desired motion, as
     it moves; of a pinned loop that of the joint before the pin.
     """
-    if closure is not None:
-        path = {} if closure.count == 1 else {"last moving joint": place[:, -2]}
-    elif desired is None:
-        path = {"end-effector": place[:, -1]}
-    else:
-        rigid = np.zeros((len(place), mechanism.slices[-1].stop))
-        wanted = chain(mechanism, desired, rigid)[0][:, -1]
-        path = {"desired path": wanted}
-        if end is not None:
-            path["path of the end-effector"] = end[:, 0] + 1j * end[:, 1]
-    return {name: np.stack([z.real, z.imag], axis=1) for name, z in path.items()}
+    if motion.closure is not None:
+        return {} if motion.slides else {"last moving joint": plane(motion.place[:, -2])}
+    if not trajectory.is_machine:
+        return {"path of the end-effector": plane(motion.place[:, -1])}
+    wanted = chain(motion.mechanism, trajectory.desired.q, motion.q_e)[0][:, -1]
+    return {"desired path": plane(wanted), "path of the end-effector": trajectory.end}
 
 
-def _framed(span: np.ndarray) -> tuple[Figure, Axes]:
-    """Return a figure and axes of equal scales for a part of the plane of size `span` (2,), m."""
-    left, right, below, above = 0.75, 0.95, 0.55, 0.4  # inches
-    scale = min(7.5 / span[0], 7.0 / span[1])
-    width, height = scale * span
+def _framed(low: np.ndarray, high: np.ndarray, below: float) -> tuple[Figure, Axes]:
+    """Return a figure and axes of equal scales for a part of the plane, m; room below, inches."""
+    left, right, above = 0.75, 0.95, 0.4  # inches
+    width, height = (high - low) * min(np.array([7.5, 7.0]) / (high - low))
     total = np.array([width + left + right, height + below + above])
-    figure = new_figure(float(total[0]), float(total[1]), 110, laid_out=False)
+    figure = new_figure(float(total[0]), float(total[1]), laid_out=False)
     box = (left / total[0], below / total[1], width / total[0], height / total[1])
-    return figure, figure.add_axes(box)
+    axes = figure.add_axes(box)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
+    axes.grid(True, alpha=0.3)
+    axes.set_axisbelow(True)
+    return figure, axes
 
 
-def _draw_ground(axes: Axes, bases: Sequence[np.ndarray], stands: bool) -> None:
-    """Draw the rail below the carts, or the ground below a pedestal."""
-    y = bases[0][0, 1]
-    if stands:
-        axes.plot(bases[0][:2, 0] + 0.5 * np.diff(bases[0][:2, 0]) * [-1, 1], [y, y], color=GREY)
-    else:
-        axes.axhline(y, color=GREY, lw=1.5, zorder=1.0)
+def _name_instant(axes: Axes, motion: PlaneMotion, n: int, words: str) -> None:
+    """Write the instant beyond the end-effector; of a loop, beyond the first arm's end.
 
-
-def _draw_pose(
-    axes: Axes,
-    drawings: Sequence[Drawing],
-    edges: Sequence[np.ndarray],
-    frames: Sequence[tuple[complex, complex, np.ndarray]],
-    place: np.ndarray,
-    base: np.ndarray,
-    order: float,
-    *,
-    pale: bool = False,
-) -> None:
-    """Draw cart, arms, joints and end-effector in one pose."""
-    from matplotlib.collections import LineCollection
-    from matplotlib.patches import Polygon
-
-    axes.add_patch(Polygon(base, facecolor="#d9d9d9", edgecolor="black", zorder=order))
-    for drawing, outer, frame in zip(drawings, edges, frames, strict=True):
-        view, corners, border = drawing.view, drawing.cells(*frame), drawing.border(*frame)
-        lines = list(sides(corners)[outer]) if border is None else border.to_polygons()
-        rim = LineCollection(lines, colors=GREY, linewidths=0.6)
-        solid = view.density > SOLID_FROM
-        fine = filled(
-            corners[solid],
-            view.density[solid],
-            smooth=True,
-            designed=view.designed,
-            strength=PALE if pale else 1.0,
-        )
-        rim.set_alpha(PALE if pale else None)
-        for drawn in (fine, rim):
-            drawn.set_zorder(order + 0.1)
-            axes.add_collection(drawn, autolim=False)
-        if border is not None:
-            fine.set_clip_path(border, axes.transData)
-    joints = np.stack([place.real, place.imag])
-    style: dict[str, Any] = {
-        "linestyle": "",
-        "marker": "o",
-        "mec": "black",
-        "ms": 5.0,
-        "alpha": PALE if pale else None,
-        "zorder": order + 0.2,
-    }
-    axes.plot(*joints[:, :-1], mfc="white", **style)
-    axes.plot(*joints[:, -1:], mfc=ORANGE, **style)
-
-
-def _draw_slider(axes: Axes, corners: np.ndarray, order: float, *, pale: bool) -> None:
-    """Draw the block that slides, behind the arm that it is on."""
-    from matplotlib.patches import Polygon
-
-    block = Polygon(corners, facecolor=BASE, edgecolor="black", zorder=order)
-    block.set_alpha(PALE if pale else None)
-    axes.add_patch(block)
-
-
-def _name_instant(axes: Axes, end: complex, along: complex, words: str, order: float) -> None:
-    """Write the instant beyond an arm's end, in the direction `along`."""
-    away = 12.0 * along / (abs(along) or 1.0)
+    That tells poses of a loop apart: a slider comes back.
+    """
+    place = motion.place[n]
+    end, away = place[-1], place[-1] - place[-2]
+    if motion.closure is not None:
+        end, along, back = place[1], place[2] - place[1], place[0] - place[1]
+        away = -(along / abs(along) + back / abs(back))  # between both arms, on the outside
+        away = away if abs(away) > 0.1 else 1j * along
+    offset = plane(12.0 * away / abs(away))
     axes.annotate(
         words,
         xy=(end.real, end.imag),
-        xytext=(away.real, away.imag),
+        xytext=(offset[0], offset[1]),
         textcoords="offset points",
-        ha="left" if away.real > 4.0 else "right" if away.real < -4.0 else "center",
-        va="bottom" if away.imag > 4.0 else "top" if away.imag < -4.0 else "center",
+        ha="left" if offset[0] > 4.0 else "right" if offset[0] < -4.0 else "center",
+        va="bottom" if offset[1] > 4.0 else "top" if offset[1] < -4.0 else "center",
         fontsize=10,
         color=ORANGE,
-        zorder=order,
+        zorder=3.0 + len(motion.place),
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
     )

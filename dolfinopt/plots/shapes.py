@@ -1,35 +1,28 @@
-"""Arms as sets of cells in the plane: areas, outlines, places in the moving machine."""
+"""Plane arms and machines as pictures show them: areas, outlines, places in the motion."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.style import COLOURS
 
-if TYPE_CHECKING:
-    from matplotlib.path import Path
-
-BAR = 0.025  # largest height of a rigid arm, as a share of the arms' reach
-UNDESIGNED = "#8a8a8a"  # arms without a design
-CELLS = 3000  # of all arms in a frame; finer ones would be hardly larger than a pixel
-CART = np.array([0.06, 0.045])  # half its width and its height, as shares of the arms' reach
+# Shares of the arms' reach.
+BAR = 0.025  # largest height of a rigid arm
+CART = np.array([0.06, 0.045])  # half width and height of a cart
+BLOCK = np.array([0.06, 0.036])  # half length and half height of a slider
+CLOSED = 1e-6  # gap of a drawn loop, far below a pixel
+MAX_NEWTON = 30
 
 
 def cell_areas(corners: np.ndarray) -> np.ndarray:
     """Return the areas (n,), m2, of polygons with corners (n, k, 2), m, in order around each."""
-    return np.abs(signed_areas(corners))
-
-
-def signed_areas(corners: np.ndarray) -> np.ndarray:
-    """Return the areas (n,), m2, of polygons (n, k, 2), m; clockwise ones are negative."""
     x, y = corners[..., 0], corners[..., 1]
     after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    return 0.5 * np.sum(x * after_y - after_x * y, axis=1)
+    return 0.5 * np.abs(np.sum(x * after_y - after_x * y, axis=1))
 
 
 def volume_fraction(view: ArmView) -> float:
@@ -38,14 +31,10 @@ def volume_fraction(view: ArmView) -> float:
     return float(area @ view.density / area.sum())
 
 
-def outline(corners: np.ndarray) -> np.ndarray:
-    """Return the edges (n, 2, 2) that only one of the polygons (m, k, 2) has."""
-    return sides(corners)[boundary(corners)]
-
-
 def sides(corners: np.ndarray) -> np.ndarray:
-    """Return all edges (m * k, 2, 2) of polygons (m, k, 2)."""
-    return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
+    """Return all edges (m * k, 2, ...) of polygons (m, k, ...)."""
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
+    return edges.reshape(corners.shape[0] * corners.shape[1], 2, *corners.shape[2:])
 
 
 def boundary(corners: np.ndarray) -> np.ndarray:
@@ -53,34 +42,18 @@ def boundary(corners: np.ndarray) -> np.ndarray:
 
     It stays the same in every deformation and place of the polygons.
     """
-    node = _nodes(corners)
-    after = np.roll(node, -1, axis=1)
-    edge = (np.minimum(node, after) * (node.max() + 1) + np.maximum(node, after)).ravel()
+    flat = corners.reshape(-1, 2)
+    size = float(np.ptp(flat, axis=0).max()) or 1.0
+    column, row = np.round((flat - flat.min(axis=0)) / (1e-7 * size)).astype(np.int64).T
+    node = np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+    edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]
     _, first, count = np.unique(edge, return_index=True, return_counts=True)
     return first[count == 1]
 
 
-def _nodes(corners: np.ndarray) -> np.ndarray:
-    """Return numbers (m, k) from 0 of the places of corners (m, k, 2), equal to 1e-7."""
-    flat = corners.reshape(-1, 2)
-    low, size = flat.min(axis=0), float(np.ptp(flat, axis=0).max()) or 1.0
-    column, row = np.round((flat - low) / (1e-7 * size)).astype(np.int64).T
-    return np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
-
-
-def rings(corners: np.ndarray) -> list[np.ndarray]:
-    """Return the closed loops around polygons (m, k, 2), as indices of their m * k corners.
-
-    They run counterclockwise around the polygons, clockwise around holes.
-    """
-    from dolfinopt.part.recognise import loops
-
-    node = _nodes(corners)
-    ends = np.stack([node, np.roll(node, -1, axis=1)], axis=2)
-    clockwise = (signed_areas(corners) < 0.0)[:, None, None]
-    ends = np.where(clockwise, ends[..., ::-1], ends).reshape(-1, 2)
-    first = np.unique(node, return_index=True)[1]
-    return [first[loop] for loop in loops(ends[boundary(corners)])]
+def reach(mechanism: Mechanism) -> float:
+    """Return the length of all arms together, m."""
+    return sum(float(np.hypot(*body.outboard_point)) for body in mechanism.bodies)
 
 
 def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,120 +73,159 @@ def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.nd
     turn = np.ones(len(q_r), dtype=complex)  # of the outboard tangent of the arm before
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies)):
         q = q_e[:, part]
-        reach = complex(*body.outboard_point) + q @ (body.outboard[0] + 1j * body.outboard[1])
+        tip = complex(*body.outboard_point) + q @ (body.outboard[0] + 1j * body.outboard[1])
         swing.append(turn * np.exp(1j * q_r[:, k + 1]))
-        place.append(place[-1] + swing[-1] * reach)
+        place.append(place[-1] + swing[-1] * tip)
         turn = swing[-1] * np.exp(1j * (q @ body.outboard[2]))
     return np.stack(place, axis=1), np.stack(swing, axis=1)
 
 
-def moved(
-    points: np.ndarray, modes: np.ndarray, place: complex, swing: complex, q: np.ndarray
-) -> np.ndarray:
-    """Return in space the points (..., 2), m, of an arm that has deformed.
+def plane(points: np.ndarray) -> np.ndarray:
+    """Return complex numbers (...,) as points (..., 2)."""
+    return np.stack([points.real, points.imag], axis=-1)
+
+
+def close_loop(
+    mechanism: Mechanism, closure: Closure | None, q_r: np.ndarray, q_e: np.ndarray
+) -> np.ndarray | None:
+    """Return rigid coordinates (n, 1 + arms) whose last joints close the loop of drawn arms.
+
+    A picture magnifies deformations, or leaves them out: the arms' ends then miss the line or the
+    pin. The joints that follow from the others are turned until they meet it, by Newton's method.
 
     Args:
-        points: (..., 2) m, of the arm at rest.
-        modes: (..., 2, q) of these points.
-        place, swing: of the arm's tangent frame, see `chain`.
-        q: (q,) its elastic coordinates.
+        mechanism: with N elastic coordinates.
+        closure: what holds the end; None: nothing has to be closed.
+        q_r: (n, 1 + arms) m, rad.
+        q_e: (n, N).
+
+    Returns:
+        None where the loop of these arms cannot be closed.
     """
-    local = points + modes @ q
-    turned = place + swing * (local[..., 0] + 1j * local[..., 1])
-    return np.stack([turned.real, turned.imag], axis=-1)
+    if closure is None:
+        return q_r
+    q_r, m = q_r.copy(), closure.count
+    for _ in range(MAX_NEWTON):
+        place = chain(mechanism, q_r, q_e)[0]
+        gap = closure.gap(place[:, -1])
+        if np.abs(gap).max() <= CLOSED * reach(mechanism):
+            return q_r
+        turned = 1j * (place[:, -1:] - place[:, -1 - m : -1])  # the end, by the last m joints
+        try:
+            step = np.linalg.solve(closure.project(turned), -gap[:, :, None])[:, :, 0]
+        except np.linalg.LinAlgError:
+            return None
+        q_r[:, -m:] += np.clip(step, -0.3, 0.3)
+    return None
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
-    """An arm as a picture shows it.
+class PlaneMotion:
+    """A plane machine at n instants.
 
     Attributes:
-        view: of the arm, of cells that are large enough to be seen.
-        rim: (n, 2) m, the closed loops around the arm, one after the other, each with its first
-            point once more at its end; None where the cells themselves have the arm's shape.
-        modes: (n, 2, q) of the points of `rim`.
-        starts: (loops + 1,) where each loop begins in `rim`, and the end of the last.
+        mechanism: that moves.
+        closure: of a closed loop, or None.
+        views: the arms; of a rigid one a thin bar: its height is none that was designed.
+        rims: the edges (m, 2, 2), m, around every arm at rest, and the modes (m, 2, 2, q) there.
+        place, swing: (n, arms + 1) and (n, arms), see `chain`.
+        q_e: (n, N) elastic coordinates.
     """
 
-    view: ArmView
-    rim: np.ndarray | None = None
-    modes: Any = None
-    starts: tuple[int, ...] = ()
+    mechanism: Mechanism
+    closure: Closure | None
+    views: tuple[ArmView, ...]
+    rims: tuple[tuple[np.ndarray, np.ndarray], ...]
+    place: np.ndarray
+    swing: np.ndarray
+    q_e: np.ndarray
 
-    def cells(self, place: complex, swing: complex, q: np.ndarray) -> np.ndarray:
-        """Return the cells in space (n_cells, k, 2), m; see `moved`."""
-        return moved(self.view.corners, self.view.modes, place, swing, q)
+    def __getitem__(self, at: np.ndarray) -> PlaneMotion:
+        """Return the machine at some of the instants."""
+        return replace(self, place=self.place[at], swing=self.swing[at], q_e=self.q_e[at])
 
-    def border(self, place: complex, swing: complex, q: np.ndarray) -> Path | None:
-        """Return the loops in space, m, that clip the cells; None where nothing is clipped."""
-        from matplotlib.path import Path
+    @property
+    def slides(self) -> bool:
+        """Whether the end is a slider on a line."""
+        return self.closure is not None and self.closure.count == 1
 
-        if self.rim is None:
-            return None
-        codes = np.full(len(self.rim), Path.LINETO, dtype=Path.code_type)
-        codes[list(self.starts[:-1])] = Path.MOVETO
-        codes[np.array(self.starts[1:]) - 1] = Path.CLOSEPOLY
-        return Path(moved(self.rim, self.modes, place, swing, q), codes)
+    @property
+    def stands(self) -> bool:
+        """Whether the shoulder never moves: a fixed base, or a cart at rest."""
+        return bool(np.ptp(self.place[:, 0].real) == 0.0)
 
-    def points(self, place: complex, swing: complex, q: np.ndarray) -> np.ndarray:
-        """Return the outermost points (n, 2) in space, m, and others."""
-        if self.rim is None:
-            return self.cells(place, swing, q).reshape(-1, 2)
-        return moved(self.rim, self.modes, place, swing, q)
+    def cells(self, index: int, n: int) -> np.ndarray:
+        """Return an arm's cells (n_cells, k, 2) at an instant, m."""
+        view = self.views[index]
+        return self._moved(view.corners, view.modes, index, n)
+
+    def outline(self, index: int, n: int) -> np.ndarray:
+        """Return the edges (m, 2, 2) around an arm at an instant, m."""
+        return self._moved(*self.rims[index], index, n)
+
+    def _moved(self, points: np.ndarray, modes: np.ndarray, index: int, n: int) -> np.ndarray:
+        q = self.q_e[n, self.mechanism.slices[index]]
+        local = (points + modes @ q[: modes.shape[-1]]) @ [1.0, 1j]
+        return plane(self.place[n, index] + self.swing[n, index] * local)
+
+    def base(self, n: int) -> np.ndarray:
+        """Return the corners (4, 2), m, of the cart below the shoulder, or of a pedestal."""
+        return base_corners(self.place[n, 0], reach(self.mechanism), self.stands)
+
+    def block(self, n: int) -> np.ndarray:
+        """Return the corners (4, 2), m, of a slider's block."""
+        assert self.closure is not None
+        return block_corners(self.place[n, -1], reach(self.mechanism), self.closure)
+
+    def ground(self) -> np.ndarray:
+        """Return the lines (2, 2, 2), m, of a slider's guide; of a pin's foot its sides."""
+        assert self.closure is not None
+        size, point = reach(self.mechanism), self.closure.point
+        if not self.slides:
+            foot = base_corners(point, size, True)
+            return np.stack([foot, np.roll(foot, -1, axis=0)], axis=1)
+        along, across = self.closure.normals[0] / 1j, BLOCK[1] * size * self.closure.normals[0]
+        s = (np.conj(along) * (self.place[:, -1] - point)).real
+        margin = 1.2 * BLOCK[0] * size
+        ends = point + along * np.array([s.min() - margin, s.max() + margin])
+        return plane(np.stack([ends - across, ends + across]))
+
+    def bounds(self, *others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and highest (x, y), m, of all that is seen, and of other points."""
+        count = range(len(self.place))
+        points = [*others, *map(self.base, count)]
+        points += [self.outline(k, n) for n in count for k in range(len(self.views))]
+        if self.closure is not None:
+            points += [self.ground()]
+        flat = np.concatenate([one.reshape(-1, 2) for one in points])
+        return flat.min(axis=0), flat.max(axis=0)
 
 
-def draw_coarsely(view: ArmView, limit: int) -> Drawing:
-    """Return the arm with about `limit` cells at most: itself, or rectangles cut off at its rim.
+def plane_motion(
+    views: Sequence[ArmView],
+    mechanism: Mechanism,
+    closure: Closure | None,
+    q_r: np.ndarray,
+    q_e: np.ndarray,
+) -> PlaneMotion:
+    """Return the machine with rigid coordinates (n, 1 + arms) and elastic ones (n, N).
 
-    A rectangle takes the mean density of the cells whose centroid lies in it, or else that of the
-    cell nearest to its middle. Its corners move like the arm's nearest.
+    Arms of views that are not reduced are drawn undeformed.
     """
-    if len(view.density) <= limit:
-        return Drawing(view)
-    import shapely
-    from scipy.spatial import cKDTree
-
-    low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
-    side = np.sqrt(np.prod(high - low) / limit)
-    nx, ny = np.maximum(1, np.round((high - low) / side)).astype(int)
-    size = (high - low) / [nx, ny]
-    column, row = np.minimum(((view.centroid - low) / size).astype(int), [nx - 1, ny - 1]).T
-    areas = cell_areas(view.corners)
-    area = np.bincount(column * ny + row, areas, nx * ny)
-    mass = np.bincount(column * ny + row, areas * view.density, nx * ny)
-    first = low + size * np.stack(np.divmod(np.arange(nx * ny), ny), axis=1)
-    corners = first[:, None] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    kept = area > 0.0
-    density = np.divide(mass, area, out=np.zeros(nx * ny), where=kept)
-    # Rectangles at the rim, or smaller than the cell that they lie in, hold no centroid.
-    empty = np.flatnonzero(~kept)
-    tree = shapely.STRtree(shapely.polygons(view.corners))
-    density[empty] = view.density[tree.nearest(shapely.points(first[empty] + 0.5 * size))]
-    kept[empty[tree.query(shapely.polygons(corners[empty]), predicate="intersects")[0]]] = True
-    corners, density = corners[kept], density[kept]
-    points = view.corners.reshape(-1, 2)
-    modes = view.modes.reshape(len(points), 2, -1)
-    near = cKDTree(points).query(corners)[1]
-    coarse = replace(
-        view,
-        corners=corners,
-        centroid=corners.mean(axis=1),
-        density=density,
-        modes=modes[near],
-    )
-    if np.prod(size) * len(density) <= (1.0 + 1e-9) * areas.sum():
-        return Drawing(coarse)  # of a rectangular arm
-    loops = [np.append(ring, ring[0]) for ring in rings(view.corners)]
-    at = np.concatenate(loops)
-    starts = tuple(np.cumsum([0, *map(len, loops)]).tolist())
-    return Drawing(coarse, points[at], modes[at], starts)
+    size, place, swing = reach(mechanism), *chain(mechanism, q_r, q_e)
+    drawn = tuple(_slender(view, size) for view in views)
+    rims = []
+    for view in drawn:
+        rim = boundary(view.corners)
+        rims.append((sides(view.corners)[rim], sides(view.modes)[rim]))
+    return PlaneMotion(mechanism, closure, drawn, tuple(rims), place, swing, q_e)
 
 
 def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
-    """Return the corners (4, 2), m, of the cart below the shoulder, or of a pedestal.
+    """Return the corners (4, 2), m, of a cart below a joint, or of a pedestal.
 
     Args:
-        place: of the shoulder, m.
+        place: of the joint, m.
         size: reach of all arms together, m.
         stands: whether it never moves.
     """
@@ -223,55 +235,18 @@ def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
     return box + np.array([place.real, place.imag])
 
 
-def slender(view: ArmView, size: float) -> ArmView:
-    """Return an arm without a design as a thin bar: its height is none that was designed.
+def block_corners(place: complex, size: float, closure: Closure) -> np.ndarray:
+    """Return the corners (4, 2), m, of a slider's block at a place; `size` as above."""
+    box = BLOCK * size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return plane(place + box @ [1.0, 1j] * closure.normals[0] / 1j)
 
-    Args:
-        view: of any arm; one that bends keeps its height, which its shapes go with.
-        size: reach of all arms together, m.
+
+def _slender(view: ArmView, size: float) -> ArmView:
+    """Return a rigid arm as a thin bar; one that bends keeps its height, which its modes go with.
+
+    `size` is the reach of all arms together, m.
     """
-    if view.designed or view.modes.shape[-1]:
-        return view
     height = float(np.ptp(view.corners[..., 1]))
-    factor = min(1.0, BAR * size / height) if height > 0.0 else 1.0
-    return replace(view, corners=view.corners * [1.0, factor], centroid=view.centroid)
-
-
-def decimals(t: np.ndarray) -> int:
-    """Return how many decimals tell the instants (n,), s, of a motion of that length: 2 or more."""
-    span = float(np.ptp(t))
-    return 2 if span == 0.0 else max(2, 2 - int(np.floor(np.log10(span))))
-
-
-def filled(
-    corners: np.ndarray,
-    density: np.ndarray,
-    *,
-    smooth: bool = False,
-    designed: bool = True,
-    strength: float = 1.0,
-) -> Any:
-    """Return polygons (n, k, 2) in the colours of their densities (n,), without seams.
-
-    Args:
-        corners: in order around each.
-        density: in [0, 1].
-        smooth: with edges that are blended, for cells of a pixel or two in any direction.
-        designed: or all in one grey, of arms that have no design.
-        strength: share of the colours, the rest white; below 1 they no longer form a scale.
-    """
-    from matplotlib import colormaps, colors
-    from matplotlib.collections import PolyCollection
-
-    # Without smoothing neighbours share the pixels of their edge, nothing shines through; with it
-    # edges of the faces' colours close the seams.
-    look = {"edgecolors": "face", "linewidths": 0.2} if smooth else {"linewidths": 0.0}
-    shapes: Any = corners  # as one array: a list would become a path a cell in Python
-    cells = PolyCollection(shapes, cmap=COLOURS, antialiaseds=smooth, **look)
-    if not designed or strength < 1.0:
-        faces: Any = colormaps[COLOURS](density) if designed else colors.to_rgba_array(UNDESIGNED)
-        cells.set_facecolor(1.0 - strength * (1.0 - faces[:, :3]))
-        return cells
-    cells.set_array(density)
-    cells.set_clim(0.0, 1.0)
-    return cells
+    if view.designed or view.modes.shape[-1] or height <= BAR * size:
+        return view
+    return replace(view, corners=view.corners * [1.0, BAR * size / height])

@@ -1,122 +1,292 @@
-"""Pictures of solid links: their material where the density is above one half."""
+"""Pictures of solid links below each other: material, stress, parts.
+
+PyVista shades solids in parallel projection, without words; Matplotlib puts the images into axes
+whose coordinates are the plane of projection, m, and writes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyvista
 
 from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.output.views import AROUND, ArmView
-from dolfinopt.part.isosurface import Surface
-from dolfinopt.plots.solids import (
-    STEEL,
-    Camera,
-    Studio,
-    box_corners,
-    box_lines,
-    camera_from,
-    draw_triad,
-    material,
-    show,
+from dolfinopt.part.isosurface import Surface, surface_at
+from dolfinopt.plots.design import (
+    MEGA,
+    MILLI,
+    STRESS,
+    STRESS_COLOURS,
+    draw_ring,
+    known_stress,
+    scale_marks,
 )
-from dolfinopt.plots.style import GREY, new_figure, ticks
+from dolfinopt.plots.style import DPI, GREY, Box, colour_scale, new_figure, stacked_axes, ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DPI = 110
-WIDTH, HEIGHT = 12.0, 16.0  # inches, the most that the links take
-COLUMN = 6.0  # inches, of the links side by side
-SIDE, HEAD, LABEL, RULER = 0.55, 0.6, 0.4, 0.55  # inches: margins, title, above and below a link
-MILLI = 1e3
-Box = tuple[np.ndarray, np.ndarray]
+    from dolfinopt.part.solid_part import SolidPart
+
+LEVEL = 0.5  # density from which material is drawn
+STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
+Colour = str | tuple[float, float, float]
+# Where lights are, from the camera's point of view, and how strong.
+LIGHTS = (((0.35, 0.75, 1.0), 0.75), ((-0.6, 0.1, 0.8), 0.3))
+EDGE = 35.0  # degrees between faces from which an edge stays sharp
+SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
+          "diffuse": 0.85, "specular": 0.1}  # fmt: skip
+PLAIN = {"show_scalar_bar": False, "reset_camera": False, "render": False}
+COLUMN = 6.0  # inches, of links side by side
 
 
-def camera_of_links() -> Camera:
-    """Return how links are seen: from the front, a little from above and from the right."""
-    return camera_from((0.15, 0.45, 1.0), (0.0, 1.0, 0.0))
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A parallel projection.
+
+    Attributes:
+        right, up, back: (3,) unit vectors: to the right, upwards and towards the viewer.
+    """
+
+    right: np.ndarray
+    up: np.ndarray
+    back: np.ndarray
+
+    def plane(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (..., 3) land (..., 2), m."""
+        return points @ np.stack([self.right, self.up], axis=1)
+
+
+def camera_from(back: Sequence[float] | np.ndarray, up: Sequence[float] | np.ndarray) -> Camera:
+    """Return the projection seen from the direction `back`, with `up` upwards."""
+    towards = np.asarray(back, dtype=float) / np.linalg.norm(back)
+    right = np.cross(up, towards)
+    right /= np.linalg.norm(right)
+    return Camera(right, np.cross(towards, right), towards)
+
+
+# Links are seen from the front, a little from above and from the right.
+LINKS = camera_from((0.15, 0.45, 1.0), (0.0, 1.0, 0.0))
+
+
+class Studio:
+    """Solids in front of a camera, rendered off-screen, with no word in the picture.
+
+    Attributes:
+        low, high: (2,) what of the camera's plane is seen, m.
+        plotter: PyVista's; holds the solids.
+    """
+
+    def __init__(self, camera: Camera, low: np.ndarray, high: np.ndarray, px_per_m: float) -> None:
+        self.low, self.high = low, high
+        size = [int(np.ceil(n)) for n in (high - low) * px_per_m]
+        theme = pyvista.themes.DocumentTheme()
+        theme.multi_samples = 4  # eight double the time of the software renderer
+        self.plotter: Any = pyvista.Plotter(
+            off_screen=True, window_size=size, theme=theme, lighting="none"
+        )
+        for place, strength in LIGHTS:
+            light = pyvista.Light(position=place, light_type="camera light", intensity=strength)
+            self.plotter.add_light(light)
+        focus = 0.5 * (low + high) @ np.stack([camera.right, camera.up])
+        seen = self.plotter.camera
+        seen.focal_point, seen.position, seen.up = focus, focus + camera.back, camera.up
+        seen.parallel_projection = True
+        seen.parallel_scale = 0.5 * size[1] / px_per_m
+
+    def add(self, mesh: Any, **look: Any) -> None:
+        """Draw a mesh, shaded."""
+        self.plotter.add_mesh(mesh, **(SHADED | PLAIN | look))
+
+    def solid(self, surface: Surface, **look: Any) -> None:
+        """Draw a surface, if there is any; a look with `scalars` has values of its triangles."""
+        if len(surface.triangles):
+            mesh = poly_data(surface)
+            if "scalars" in look:
+                mesh.cell_data["values"] = look.pop("scalars")
+                look |= {"scalars": "values", "ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
+            self.add(mesh, **look)
+
+    def line(self, points: np.ndarray, colour: Colour, width: float = 1.0) -> None:
+        """Draw line segments (n, 2, 3), m; `width` px."""
+        ends = np.asarray(points, dtype=float).reshape(-1, 3)
+        mesh = pyvista.line_segments_from_points(ends)
+        self.plotter.add_mesh(mesh, color=colour, line_width=width, lighting=False, **PLAIN)
+
+    def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
+        """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
+        along = ends[1] - ends[0]
+        if (length := float(np.linalg.norm(along))) > 1e-9:
+            mesh: Any = pyvista.Cylinder(
+                center=ends.mean(axis=0), direction=along / length, radius=radius, height=length
+            )
+            self.add(mesh.triangulate(), color=colour)
+
+    def ball(self, centre: np.ndarray, radius: float, colour: Colour) -> None:
+        """Draw a sphere."""
+        self.add(pyvista.Sphere(radius=radius, center=centre), color=colour)
+
+    def render(self) -> np.ndarray:
+        """Return the picture (height, width, 3), uint8."""
+        self.plotter.reset_camera_clipping_range()
+        self.plotter.render()  # a screenshot alone would show what was rendered last
+        return np.asarray(self.plotter.screenshot(return_img=True))
+
+    def close(self) -> np.ndarray:
+        """Render, free the window, and return the picture."""
+        try:
+            return self.render()
+        finally:
+            self.plotter.close()
+
+    def show(self, axes: Axes, image: np.ndarray) -> Any:
+        """Put a picture into axes; return Matplotlib's image."""
+        extent = (self.low[0], self.high[0], self.low[1], self.high[1])
+        return axes.imshow(image, extent=extent, interpolation="antialiased", aspect="auto")
+
+
+def poly_data(surface: Surface) -> Any:
+    """Return a surface as PyVista's."""
+    return pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
+
+
+def material(view: ArmView, *, modes: bool = False) -> Surface:
+    """Return the surface of what of a link is denser than one half, in the link's frame.
+
+    Args:
+        view: of a solid.
+        modes: whether the reduced basis (n, 3, q) at the surface's points is wanted, as a field.
+    """
+    order = AROUND[view.corners.shape[1:]]  # there and back
+    fields = {"modes": view.modes[:, order]} if modes else {}
+    return surface_at(view.corners[:, order], view.density, LEVEL, fields)
+
+
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the corners (8, 3) of a box, x fastest."""
+    grid = np.meshgrid(*np.stack([low, high], axis=1), indexing="ij")
+    return np.stack([axis.ravel(order="F") for axis in grid], axis=1)
+
+
+def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> None:
+    """Draw the directions of x, y and z at a place (2,) of the plane, m."""
+    for name, along in zip("xyz", np.eye(3)):
+        arrow = length * camera.plane(along)
+        axes.annotate(
+            "", xy=tuple(at + arrow), xytext=tuple(at), annotation_clip=False,
+            arrowprops={"arrowstyle": "->", "lw": 1.0, "shrinkA": 0.0, "shrinkB": 0.0},
+        )  # fmt: skip
+        # An axis that points at the viewer is short: its name stands off all the same.
+        x, y = at + 1.3 * max(1.0, 0.6 * length / float(np.linalg.norm(arrow))) * arrow
+        axes.text(x, y, name, ha="center", va="center", fontsize=9)
 
 
 def solid_design_figure(
     views: Sequence[ArmView], title: str, masses: Mapping[str, float] | None = None
 ) -> Figure:
-    """Draw the material of solid links to one scale, below each other.
-
-    Args:
-        views: of the links.
-        title: above the picture.
-        masses: of the links by name, kg, if they are known.
-    """
-    figure, panels, scale = link_panels(views, title)
+    """Return the picture of the material of solid links; arguments as for `design_figure`."""
+    figure, panels = _box_axes([_bounds(view) for view in views], title)
     for view, axes in zip(views, panels, strict=True):
-        draw_link(axes, view, scale, lambda studio, surface: studio.solid(surface, STEEL))
+        _draw_boxed(axes, _bounds(view), material(view))
         mass = None if masses is None else masses.get(view.name)
-        axes.set_title(caption(view, mass), loc="left", fontsize=11, parse_math=False)
+        axes.set_title(caption(view, mass), loc="left", fontsize=10, parse_math=False)
     return figure
 
 
 def solid_designs_figure(
     labels: Sequence[str], rows: Sequence[Sequence[ArmView]], title: str
 ) -> Figure:
-    """Draw the links of several designs to one scale: a row a design, links side by side.
+    """Return the picture of several designs to one scale: a row a design, links side by side.
 
     Args:
         labels: of the designs.
         rows: links of each.
         title: above the picture.
     """
-    camera, columns = camera_of_links(), max(map(len, rows))
-    spans = np.array(
-        [np.ptp(camera.plane(box_corners(*_bounds(v))), axis=0) for row in rows for v in row]
-    )
-    inches = COLUMN / spans[:, 0].max()
-    height = len(rows) * (float(spans[:, 1].max()) * inches + LABEL + 0.1) + HEAD
-    figure = new_figure(COLUMN * columns + 0.4, height, DPI)
+    columns = max(map(len, rows))
+    spans = np.array([np.subtract(*_seen(_bounds(v))[::-1]) for row in rows for v in row])
+    wide, tall = spans.max(axis=0)
+    height = len(rows) * (tall / wide * COLUMN + 0.5) + 0.6
+    figure = new_figure(COLUMN * columns + 0.4, height)
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for axes, row, label in zip(grid, rows, labels, strict=True):
-        for one in axes[len(row) :]:
-            one.set_visible(False)
+        for one in axes:
+            one.set(xlim=(0.0, wide), ylim=(0.0, tall), aspect="equal")
+            one.set_axis_off()
         for one, view in zip(axes, row):
-            studio = link_studio(view, camera, inches * DPI)
-            studio.solid(material(view), STEEL)
-            studio.line(box_lines(*_bounds(view)), GREY)
-            show(one, studio.close(), studio.low, studio.high)
+            low, high = _seen(_bounds(view))
+            studio = Studio(LINKS, low, high, COLUMN * DPI / wide)
+            studio.solid(material(view), color=STEEL)
+            _draw_edges(studio, _bounds(view))
+            studio.low, studio.high = low - low, high - low
+            studio.show(one, studio.close())
+            one.set(xlim=(0.0, wide), ylim=(0.0, tall))
             one.set_title(view.name, loc="right", fontsize=9, color=GREY)
         axes[0].set_title(label, loc="left", fontsize=10, parse_math=False)
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
     return figure
 
 
-def draw_link(
-    axes: Axes, view: ArmView, scale: float, draw: Callable[[Studio, Surface], None]
-) -> None:
-    """Draw a link's material by `draw`, the box around it and lengths; `scale` in px per m."""
-    draw_boxed(axes, _bounds(view), scale, lambda studio: draw(studio, material(view)))
+def solid_stress_figure(views: Sequence[ArmView], title: str) -> Figure:
+    """Return the picture of the largest stress on the surface of solid links, MPa.
+
+    Drawn is what is denser than one half; the place of the largest stress of all is ringed, on
+    whichever side it is. Arguments as for `stress_figure`.
+    """
+    figure, panels = _box_axes([_bounds(view) for view in views], title, 0.75)
+    stresses = [MEGA * known_stress(view)[0] for view in views]
+    largest = max(float(stress.max()) for stress in stresses)
+    marks = scale_marks(largest)
+    for view, axes, stress in zip(views, panels, stresses, strict=True):
+        surface = material(view)
+        look: Any = {
+            "scalars": stress[surface.cells],
+            "cmap": STRESS_COLOURS,
+            "clim": (0.0, marks[-1]),
+        }
+        _draw_boxed(axes, _bounds(view), surface, **look)
+        worst = int(np.argmax(stress))
+        if stress[worst] == largest > 0.0:
+            draw_ring(axes, *LINKS.plane(view.centroid[worst]))
+        (x, y, z), when = MILLI * view.centroid[worst], known_stress(view)[1][worst]
+        words = f"{stress[worst]:.4g} MPa at x = {x:.4g}, y = {y:.4g}, z = {z:.4g} mm"
+        words = f"{view.name}:  largest {words}, t = {when:.4g} s"
+        axes.set_title(words, loc="left", fontsize=10, parse_math=False)
+    colour_scale(figure, STRESS, STRESS_COLOURS, marks)
+    return figure
 
 
-def draw_boxed(
-    axes: Axes, box: Box, scale: float, draw: Callable[[Studio], None], edges: bool = True
-) -> None:
-    """Draw what is in a box by `draw`, its edges if wanted, and lengths; `scale` in px per m."""
-    camera = camera_of_links()
-    studio = _box_studio(box, camera, scale)
-    draw(studio)
-    if edges:
-        studio.line(box_lines(*box), GREY)
-    show(axes, studio.close(), studio.low, studio.high)
-    _draw_ruler(axes, camera, *box, scale)
+def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[float]) -> Figure:
+    """Return the picture of parts below each other, to one scale.
+
+    Args:
+        parts: of solid arms.
+        title: above the picture.
+        masses: of the parts, kg.
+    """
+    boxes = [(one.surface.points.min(axis=0), one.surface.points.max(axis=0)) for one in parts]
+    figure, panels = _box_axes(boxes, title)
+    for part, box, axes, mass in zip(parts, boxes, panels, masses, strict=True):
+        _draw_boxed(axes, box, part.surface, edges=False)
+        words = [_size_of(part.name, box), f"volume {1e6 * part.volume:.4g} cm3"]
+        words += [f"mass {mass:.4g} kg"]
+        widths = {"thinnest member": part.widths.member, "narrowest gap": part.widths.gap}
+        words += [f"{name} {MILLI * w:.2g} mm" for name, w in widths.items() if w is not None]
+        axes.set_title(", ".join(words), loc="left", fontsize=10, parse_math=False)
+    return figure
 
 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
-    size = MILLI * np.ptp(view.corners, axis=(0, 1))
     volumes = cell_volumes(view.corners[:, AROUND[view.corners.shape[1:]]])
     volume = float(volumes @ view.density)
     words = [
-        f"{view.name}   {size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} mm",
+        _size_of(view.name, _bounds(view)),
         f"volume {1e6 * volume:.4g} cm3 ({100.0 * volume / volumes.sum():.3g} %)",
     ]
     if mass is not None:
@@ -126,70 +296,61 @@ def caption(view: ArmView, mass: float | None) -> str:
     return ", ".join(words)
 
 
-def link_panels(
-    views: Sequence[ArmView], title: str, foot: float = 0.0
-) -> tuple[Figure, list[Axes], float]:
-    """Return a figure, axes for every link below each other, and their common scale, px per m.
-
-    Args:
-        views: of the links.
-        title: above them.
-        foot: room below them, inches.
-    """
-    return box_panels([_bounds(view) for view in views], title, foot)
-
-
-def box_panels(
-    boxes: Sequence[Box], title: str, foot: float = 0.0
-) -> tuple[Figure, list[Axes], float]:
-    """Return what `link_panels` does, of boxes: lowest and highest corner (3,), m."""
-    camera = camera_of_links()
-    spans = np.array([np.ptp(camera.plane(box_corners(*box)), axis=0) for box in boxes])
-    inches = min((WIDTH - 2 * SIDE) / spans[:, 0].max(), HEIGHT / spans[:, 1].sum())
-    width = max(7.0, spans[:, 0].max() * inches + 2 * SIDE)
-    height = HEAD + foot + float((spans[:, 1] * inches + LABEL + RULER).sum()) + 0.1
-    figure = new_figure(width, height, DPI, laid_out=False)
-    figure.text(
-        SIDE / width, 1.0 - 0.38 / height, title, fontsize=14, weight="bold", parse_math=False
-    )
-    panels, top = [], height - HEAD
-    for span in spans * inches:
-        top -= LABEL + span[1]
-        box = (SIDE / width, top / height, span[0] / width, span[1] / height)
-        panels.append(figure.add_axes(box))
-        top -= RULER
-    return figure, panels, inches * DPI
+def _size_of(name: str, box: Box) -> str:
+    x, y, z = MILLI * (box[1] - box[0])
+    return f"{name}:  {x:.4g} x {y:.4g} x {z:.4g} mm"
 
 
 def _bounds(view: ArmView) -> Box:
     return view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
 
 
-def link_studio(view: ArmView, camera: Camera, scale: float) -> Studio:
-    """Return the studio for one link."""
-    return _box_studio(_bounds(view), camera, scale)
+def _seen(box: Box) -> Box:
+    """Return the lowest and highest place (2,) of a box in the camera's plane, m."""
+    seen = LINKS.plane(box_corners(*box))
+    return seen.min(axis=0), seen.max(axis=0)
 
 
-def _box_studio(box: Box, camera: Camera, scale: float) -> Studio:
-    seen = camera.plane(box_corners(*box))
-    return Studio(camera, seen.min(axis=0), seen.max(axis=0), scale)
+def _box_axes(boxes: Sequence[Box], title: str, foot: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """Return a figure and axes for the boxes (lowest and highest corner (3,), m) of links."""
+    return stacked_axes(
+        [_seen(box) for box in boxes], title, above=0.4, below=0.5, foot=foot, least=0.3
+    )
 
 
-def _draw_ruler(
-    axes: Axes, camera: Camera, low: np.ndarray, high: np.ndarray, scale: float
-) -> None:
+def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool = True, **look: Any) -> None:
+    """Draw a surface in a box, the box's edges if wanted, and lengths."""
+    scale = axes.bbox.width / np.ptp(axes.get_xlim())  # px per m
+    limits = axes.axis()
+    studio = Studio(LINKS, *_seen(box), scale)
+    studio.solid(surface, **({"color": STEEL} | look))
+    if edges:
+        _draw_edges(studio, box)
+    studio.show(axes, studio.close())
+    axes.axis(limits)
+    axes.set_axis_off()
+    _draw_ruler(axes, *box, scale)
+
+
+def _draw_edges(studio: Studio, box: Box) -> None:
+    low, high = box
+    lines = pyvista.Box([value for pair in zip(low, high) for value in pair])
+    studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
+
+
+def _draw_ruler(axes: Axes, low: np.ndarray, high: np.ndarray, scale: float) -> None:
     """Draw lengths along the lower front edge of a link's box, mm, and the directions."""
+
+    def at_front(x: float) -> np.ndarray:
+        return LINKS.plane(np.array([x, low[1], high[2]]))
+
     down = np.array([0.0, -8.0 / scale])
-    long = camera.plane(np.array([1.0, 0.0, 0.0]))
-    room = float(np.linalg.norm(long)) * (high[0] - low[0]) * scale
-    for mark in ticks(MILLI * low[0], MILLI * high[0], max(2, int(room / 110.0))):
-        at = camera.plane(np.array([mark / MILLI, low[1], high[2]]))
+    room = float(np.linalg.norm(at_front(high[0]) - at_front(low[0]))) * scale
+    marks = ticks(MILLI * low[0], MILLI * high[0], max(2, int(room / 110.0)))
+    for mark in marks:
+        at = at_front(mark / MILLI)
         axes.plot(*np.stack([at, at + down]).T, color="black", lw=0.8, clip_on=False)
-        words = f"{mark:.6g}"
-        axes.text(
-            at[0], at[1] + 1.6 * down[1], words, ha="center", va="top", fontsize=9, clip_on=False
-        )
-    end = camera.plane(np.array([high[0], low[1], high[2]])) + 1.6 * down
-    axes.text(end[0] + 42.0 / scale, end[1], "mm", va="top", fontsize=9, clip_on=False)
-    corner = camera.plane(np.array([low[0], low[1], high[2]]))
-    draw_triad(axes, camera, corner + np.array([-42.0, 24.0]) / scale, 26.0 / scale)
+        words = f"{mark:.6g} mm" if mark == marks[-1] else f"{mark:.6g}"
+        axes.text(at[0], at[1] + 1.6 * down[1], words, ha="center", va="top", fontsize=9)
+    corner = at_front(low[0]) + np.array([-42.0, 24.0]) / scale
+    draw_triad(axes, LINKS, corner, 26.0 / scale)

@@ -1,31 +1,35 @@
-"""Picture of a machine in space: its links' material in a few poses along its path."""
+"""Pictures of a machine in space: its links' material in a few poses, and frames of a film."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.lines import Line2D
 
+from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.multibody.spatial.kinematics import Frames, body_frames
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.part.isosurface import Surface
+from dolfinopt.plots.animation import FRAMES, frame_numbers, round_magnification
 from dolfinopt.plots.machine import poses_along
-from dolfinopt.plots.shapes import decimals
-from dolfinopt.plots.solids import (
+from dolfinopt.plots.solid_design import (
     BAR,
+    EDGE,
     STEEL,
     Camera,
     Studio,
+    box_corners,
     camera_from,
     draw_triad,
     material,
-    moved,
-    show,
+    poly_data,
 )
-from dolfinopt.plots.style import ORANGE, new_figure, round_number
+from dolfinopt.plots.style import DPI, GREY, ORANGE, cut_to, decimals, new_figure, round_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,9 +38,11 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
 
 POSES = 4
-DPI = 110
 MOST = (10.0, 8.0)  # inches, of the picture
-HEAD, FOOT, SIDE = 0.55, 0.3, 0.2  # inches
+ABOVE, BELOW, SIDE = 0.55, 0.3, 0.2  # inches
+FILM_MOST = (7.5, 6.5)  # inches, of a film
+TRIANGLES = 200_000  # of which 60 pictures are drawn in a minute; of more, fewer pictures
+FEWEST = 20  # pictures
 PALE = 0.72  # share of white in the first pose
 ELEVATION = np.radians(25.0)  # of the viewer
 AZIMUTHS = np.radians(np.arange(-75.0, 270.0, 30.0))
@@ -64,24 +70,30 @@ class Assembly:
         load = self.mechanism.loads.get((self.mechanism.end, self.mechanism.end_interface))
         return load is not None and load.body.mass > 0.0
 
+    @property
+    def up(self) -> np.ndarray:
+        """The axis of the world (3,) that gravity points against most; z without gravity."""
+        gravity = self.mechanism.gravity
+        k = int(np.argmax(np.abs(gravity))) if gravity.any() else 2
+        return (-np.sign(gravity[k]) or 1.0) * np.eye(3)[k]
+
+    def foot(self, frames: Frames) -> np.ndarray:
+        """Return where the machine stands (3,), m: as high as the world's origin, or lower."""
+        first = frames.origin[0, frames.parents.index(GROUND)]
+        height = min(max(0.06 * self.size, float(first @ self.up)), 0.5 * self.size)
+        return first - height * self.up
+
 
 def assemble(
     views: Sequence[ArmView], mechanism: SpatialMechanism, *, modes: bool = False
 ) -> Assembly:
     """Return the machine with its links' material; `modes` as for `material`."""
-    reach = sum(
+    size = sum(
         float(np.linalg.norm(body.points, axis=1).max() + np.linalg.norm(joint.origin))
         for body, joint in zip(mechanism.bodies, mechanism.joints, strict=True)
     )
     surfaces = tuple(material(view, modes=modes) if view.designed else None for view in views)
-    return Assembly(mechanism, surfaces, reach or 1.0)
-
-
-def figure_of(views: Sequence[ArmView], trajectory: Trajectory, title: str) -> Figure:
-    """Return the figure of `solid_machine_figure` of a simulated motion."""
-    one = trajectory
-    mechanism = cast(SpatialMechanism, one.mechanism)
-    return solid_machine_figure(views, mechanism, one.t, one.q_r, title)
+    return Assembly(mechanism, surfaces, size or 1.0)
 
 
 def solid_machine_figure(
@@ -110,11 +122,12 @@ def solid_machine_figure(
     draw_base(studio, machine, frames)
     draw_path(studio, path, ORANGE, 2.0)
     for number, n in enumerate(at):
-        pale = PALE * (1.0 - number / max(1, len(at) - 1))
-        draw_pose(studio, machine, frames, int(n), pale)
-    draw_axes(studio, machine, frames, int(at[-1]))
-    show(axes, studio.close(), studio.low, studio.high)
-    words = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0}
+        draw_pose(studio, machine, frames, n, PALE * (1.0 - number / max(1, len(at) - 1)))
+    for i, joint in enumerate(mechanism.joints):
+        if joint.coordinate is not None:
+            half = 0.5 * AXIS * machine.size * frames.axes[at[-1], i]
+            studio.line(frames.origin[at[-1], i] + np.stack([-half, half]), "black", 1.5)
+    studio.show(axes, studio.close())
     for n in at if len(at) > 1 else ():
         axes.annotate(
             f"{t[n]:.{decimals(t)}f} s",
@@ -123,9 +136,8 @@ def solid_machine_figure(
             textcoords="offset points",
             color=ORANGE,
             fontsize=10,
-            bbox=words,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0},
         )
-    draw_scale(axes, camera, studio.low, studio.high)
     return figure
 
 
@@ -137,9 +149,8 @@ def path_poses(path: np.ndarray, count: int = POSES) -> np.ndarray:
 
 def camera_of(machine: Assembly, frames: Frames) -> Camera:
     """Return the view in which the machine's places spread most."""
-    up = upwards(machine.mechanism)
-    k = int(np.argmax(np.abs(up)))
-    east, north = np.eye(3)[(k + 1) % 3], np.eye(3)[(k + 2) % 3]
+    up = machine.up
+    east, north = np.roll(np.eye(3), -1 - int(np.argmax(np.abs(up))), axis=0)[:2]
     points = np.concatenate([frames.origin, frames.outboard], axis=1).reshape(-1, 3)
     best, found = -1.0, None
     for azimuth in AZIMUTHS:
@@ -152,28 +163,18 @@ def camera_of(machine: Assembly, frames: Frames) -> Camera:
     return found
 
 
-def upwards(mechanism: SpatialMechanism) -> np.ndarray:
-    """Return the axis of the world (3,) that gravity points against most; z without gravity."""
-    gravity = mechanism.gravity
-    if not gravity.any():
-        return np.array([0.0, 0.0, 1.0])
-    k = int(np.argmax(np.abs(gravity)))
-    return -np.sign(gravity[k]) * np.eye(3)[k]
-
-
 def seen_part(
     machine: Assembly, frames: Frames, camera: Camera, *paths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest place (2,) of the plane that anything reaches, and a margin."""
-    points = [frames.origin.reshape(-1, 3), frames.outboard.reshape(-1, 3), *paths]
+    points = [frames.origin, frames.outboard, *paths]
     for i, surface in enumerate(machine.surfaces):
         if surface is not None and len(surface.points):
-            ends = np.stack([surface.points.min(axis=0), surface.points.max(axis=0)])
-            box = np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
+            box = box_corners(surface.points.min(axis=0), surface.points.max(axis=0))
             turned = np.einsum("nij,pj->npi", frames.rotation[:, i], box)
-            points.append((frames.origin[:, None, i] + turned).reshape(-1, 3))
-    plane = camera.plane(np.concatenate(points))
-    base = camera.plane(_base(machine, frames))
+            points.append(frames.origin[:, None, i] + turned)
+    plane = camera.plane(np.concatenate([one.reshape(-1, 3) for one in points]))
+    base = camera.plane(machine.foot(frames))
     low = np.minimum(plane.min(axis=0), base - PLATE * machine.size)
     high = np.maximum(plane.max(axis=0), base + PLATE * machine.size)
     margin = np.array([0.1, 0.06]) * machine.size  # room for the instants
@@ -183,32 +184,35 @@ def seen_part(
 def stage(
     camera: Camera, low: np.ndarray, high: np.ndarray, title: str, most: tuple[float, float] = MOST
 ) -> tuple[Studio, Figure, Axes]:
-    """Return the studio, and a figure with axes, for a part of the plane."""
+    """Return the studio, and a figure with axes, for a part of the plane, with its scale."""
     span = high - low
-    scale = min((most[0] - 2 * SIDE) / span[0], (most[1] - HEAD - FOOT) / span[1])
-    width, height = max(6.0, span[0] * scale + 2 * SIDE), span[1] * scale + HEAD + FOOT
-    figure = new_figure(width, height, DPI, laid_out=False)
-    box = (0.5 - 0.5 * span[0] * scale / width, FOOT / height,
+    scale = min((most[0] - 2 * SIDE) / span[0], (most[1] - ABOVE - BELOW) / span[1])
+    width, height = max(6.0, span[0] * scale + 2 * SIDE), span[1] * scale + ABOVE + BELOW
+    figure = new_figure(width, height, laid_out=False)
+    figure.text(SIDE / width, 1.0 - 0.36 / height, cut_to(title, width), fontsize=13,
+                parse_math=False)  # fmt: skip
+    box = (0.5 - 0.5 * span[0] * scale / width, BELOW / height,
            span[0] * scale / width, span[1] * scale / height)  # fmt: skip
-    figure.text(SIDE / width, 1.0 - 0.36 / height, title, fontsize=13, parse_math=False)
-    return Studio(camera, low, high, scale * DPI), figure, figure.add_axes(box)
+    axes = figure.add_axes(box)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), autoscale_on=False)
+    axes.set_axis_off()
+    length = round_number(0.12 * span[0])
+    x, y = low + 0.03 * span
+    axes.plot([x, x + length], [y, y], color="black", lw=2.0)
+    words = f"{1e3 * length:.6g} mm"
+    axes.text(x + 0.5 * length, y + 0.01 * span[1], words, ha="center", fontsize=9)
+    arm = 0.05 * float(span.min())
+    draw_triad(axes, camera, np.array([x + 1.5 * arm, y + 0.05 * span[1] + 1.5 * arm]), arm)
+    return Studio(camera, low, high, scale * DPI), figure, axes
 
 
 def draw_base(studio: Studio, machine: Assembly, frames: Frames) -> None:
     """Draw the plate that the machine stands on, and a pedestal up to its first joint."""
-    up = upwards(machine.mechanism)
-    size, foot = machine.size, _base(machine, frames)
-    studio.bar(np.stack([foot - 0.012 * size * up, foot]), PLATE * size, "#e4e4e4")
+    size, foot = machine.size, machine.foot(frames)
+    studio.bar(np.stack([foot - 0.012 * size * machine.up, foot]), PLATE * size, "#e4e4e4")
     for i, parent in enumerate(frames.parents):
         if parent == GROUND:
             studio.bar(np.stack([foot, frames.origin[0, i]]), 2.0 * ROD * size)
-
-
-def _base(machine: Assembly, frames: Frames) -> np.ndarray:
-    """Return where the plate's upper face is (3,), m: as high as the world's origin, or lower."""
-    up, size = upwards(machine.mechanism), machine.size
-    first = frames.origin[0, frames.parents.index(GROUND)]
-    return first - min(max(0.06 * size, float(first @ up)), 0.5 * size) * up
 
 
 def draw_path(studio: Studio, path: np.ndarray, colour: str, width: float) -> None:
@@ -220,8 +224,8 @@ def draw_pose(studio: Studio, machine: Assembly, frames: Frames, n: int, pale: f
     """Draw links, rigid bodies, joints and load at one instant, with a share of white."""
     for i, surface in enumerate(machine.surfaces):
         if surface is not None:
-            placed = moved(surface, frames.origin[n, i], frames.rotation[n, i])
-            studio.solid(placed, lighter(STEEL, pale))
+            points = surface.points @ frames.rotation[n, i].T + frames.origin[n, i]
+            studio.solid(Surface(points, surface.triangles), color=lighter(STEEL, pale))
     draw_skeleton(studio, machine, frames, n, pale)
 
 
@@ -232,8 +236,9 @@ def draw_skeleton(
     size, mechanism, rod = machine.size, machine.mechanism, lighter(BAR, pale)
     for i, surface in enumerate(machine.surfaces):
         origin = frames.origin[n, i]
-        if surface is None:
-            for end in _ends(frames, n, i):
+        if surface is None:  # a bar to every interface that something sits on
+            held = [frames.held[n, k] for k, parent in enumerate(frames.parents) if parent == i]
+            for end in (frames.outboard[n, i], *held):
                 studio.bar(np.stack([origin, end]), ROD * size, rod)
         if frames.parents[i] != GROUND:
             studio.bar(np.stack([frames.held[n, i], origin]), ROD * size, rod)
@@ -244,37 +249,147 @@ def draw_skeleton(
     studio.ball(frames.end[n], radius, lighter(ORANGE, pale))
 
 
-def _ends(frames: Frames, n: int, i: int) -> list[np.ndarray]:
-    """Return where something sits on a rigid body (3,), and its first outboard interface, m."""
-    places = [frames.held[n, k] for k, parent in enumerate(frames.parents) if parent == i]
-    return [frames.outboard[n, i], *places]
-
-
-def draw_axes(studio: Studio, machine: Assembly, frames: Frames, n: int) -> None:
-    """Draw the axes of the joints that move at one instant."""
-    for i, joint in enumerate(machine.mechanism.joints):
-        if joint.coordinate is not None:
-            half = 0.5 * AXIS * machine.size * frames.axes[n, i]
-            ends = frames.origin[n, i] + np.stack([-half, half])
-            studio.line(ends[None], "black", 1.5)
-
-
-def draw_scale(axes: Axes, camera: Camera, low: np.ndarray, high: np.ndarray) -> None:
-    """Draw a length in mm and the world's directions into the lower left corner."""
-    span = high - low
-    length = round_number(0.12 * span[0])
-    x, y = low + 0.03 * span
-    axes.plot([x, x + length], [y, y], color="black", lw=2.0)
-    axes.text(
-        x + 0.5 * length, y + 0.01 * span[1], f"{1e3 * length:.6g} mm", ha="center", fontsize=9
-    )
-    arm = 0.05 * float(span.min())
-    draw_triad(axes, camera, np.array([x + 1.5 * arm, y + 0.05 * span[1] + 1.5 * arm]), arm)
-
-
 def lighter(colour: str, white: float) -> tuple[float, float, float]:
     """Return a colour mixed with a share of white."""
-    from matplotlib.colors import to_rgb
-
     red, green, blue = (white + (1.0 - white) * one for one in to_rgb(colour))
     return red, green, blue
+
+
+# -- animation -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SolidFilm:
+    """The frames of a motion before they are drawn.
+
+    Attributes:
+        machine: with modes on the links' surfaces.
+        t: (n,) of the frames, s.
+        q_e: (n, N) elastic coordinates, magnified.
+        frames: of the magnified machine.
+        rigid: of the rigid machine on the desired motion.
+        desired, trace: (m, 3) m, the end-effector of both at all instants.
+        at: (n,) index of each frame in `trace`.
+        magnification: of the deformation, and of how far joints are off.
+    """
+
+    machine: Assembly
+    t: np.ndarray
+    q_e: np.ndarray
+    frames: Frames
+    rigid: Frames
+    desired: np.ndarray
+    trace: np.ndarray
+    at: np.ndarray
+    magnification: float
+
+
+def make_solid_film(
+    views: Sequence[ArmView],
+    trajectory: Trajectory,
+    magnification: float | None = None,
+    frames: int = FRAMES,
+) -> SolidFilm:
+    """Choose frames evenly from the instants and magnify the deformation; see `draw_motion`."""
+    given = cast(SpatialMechanism, trajectory.mechanism)
+    # Interfaces move linearly with the coordinates, as surfaces do.
+    mechanism = replace(given, bodies=tuple(map(linear_part, given.bodies)))
+    machine = assemble(views, mechanism, modes=True)
+    q_r, q_e = trajectory.q_r, trajectory.q_e
+    ideal = trajectory.desired.q if trajectory.is_machine else q_r
+    rigid = body_frames(mechanism, ideal, np.zeros_like(q_e))
+    if magnification is None:
+        bent = body_frames(mechanism, q_r, q_e)
+        away = np.concatenate([bent.outboard - rigid.outboard, bent.held - rigid.held], axis=1)
+        parts = zip(mechanism.slices, mechanism.bodies, strict=True)
+        turns = [
+            np.abs((q_e[:, part] @ body.outboard.T).reshape(-1, 6)[:, 3:]).max()
+            for part, body in parts
+        ]
+        turn = max(*turns, float(np.abs(q_r - ideal).max()))
+        largest = float(np.linalg.norm(away, axis=2).max())
+        magnification = round_magnification(largest, machine.size, float(turn))
+    moving = body_frames(mechanism, ideal + magnification * (q_r - ideal), magnification * q_e)
+    count = sum(len(one.triangles) for one in machine.surfaces if one is not None)
+    if count > TRIANGLES:
+        frames = min(frames, max(FEWEST, frames * TRIANGLES // count))
+    at = frame_numbers(len(q_r), frames)
+    return SolidFilm(
+        machine=machine,
+        t=trajectory.t[at],
+        q_e=magnification * q_e[at],
+        frames=moving[at],
+        rigid=rigid[at],
+        desired=rigid.end,
+        trace=moving.end,
+        at=at,
+        magnification=magnification,
+    )
+
+
+class SolidStage:
+    """A picture whose still parts are drawn once, the moving ones in every frame."""
+
+    def __init__(self, film: SolidFilm, speed: float) -> None:
+        """Draw what does not move; `speed` is that of the film over real time."""
+        self.film, self.digits = film, decimals(film.t)
+        machine, frames = film.machine, film.frames
+        camera = camera_of(machine, film.rigid)
+        low, high = seen_part(machine, frames, camera, film.desired, film.trace)
+        title = f"deformation x {film.magnification:g}, shown at {speed:.2g} x real time"
+        self.studio, self.figure, axes = stage(camera, low, high, title, FILM_MOST)
+        keys = {"rigid machine and its path": GREY, "path of the flexible one's end": ORANGE}
+        lines = [Line2D([], [], color=colour, label=key) for key, colour in keys.items()]
+        self.figure.legend(handles=lines, loc="lower center", ncols=2, frameon=False, fontsize=9)
+        draw_base(self.studio, machine, frames)
+        draw_path(self.studio, film.desired, GREY, 1.5)
+        self.links: dict[int, Any] = {}
+        self.rest: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        for i, surface in enumerate(machine.surfaces):
+            if surface is not None and len(surface.triangles):
+                self._add_link(i, poly_data(surface), surface.fields["modes"])
+        self.still = set(self.studio.plotter.actors)
+        self.image = self.studio.show(axes, self.studio.render())
+        self.clock = axes.text(0.98, 0.02, "", transform=axes.transAxes, ha="right", fontsize=11)
+
+    def _add_link(self, i: int, mesh: Any, modes: np.ndarray) -> None:
+        """Add the surface of a link; points at sharp edges are split, their modes with them."""
+        mesh.point_data["modes"] = modes.reshape(len(modes), -1)
+        mesh = mesh.compute_normals(cell_normals=False, split_vertices=True, feature_angle=EDGE)
+        split = np.array(mesh.point_data["modes"]).reshape(-1, *modes.shape[1:])
+        mesh.point_data.remove("modes")
+        normals = np.array(mesh.point_data["Normals"])
+        self.links[i] = mesh
+        self.rest[i] = (np.array(mesh.points, dtype=float), normals, split)
+        self.studio.add(mesh, color=STEEL, split_sharp_edges=False)
+
+    def surface_points(self, i: int, frame: int) -> np.ndarray:
+        """Return the points (n, 3) of a link's deformed surface in the world's frame, m."""
+        points, _, modes = self.rest[i]
+        e = self.film.q_e[frame, self.film.machine.mechanism.slices[i]]
+        R = self.film.frames.rotation[frame, i]
+        return np.asarray((points + modes @ e) @ R.T + self.film.frames.origin[frame, i])
+
+    def draw(self, frame: int) -> np.ndarray:
+        """Return a frame (height, width, 3), uint8."""
+        film, studio = self.film, self.studio
+        for name in set(studio.plotter.actors) - self.still:
+            studio.plotter.remove_actor(name, reset_camera=False, render=False)
+        for i, mesh in self.links.items():
+            mesh.points = self.surface_points(i, frame)
+            mesh.point_data["Normals"] = self.rest[i][1] @ film.frames.rotation[frame, i].T
+        draw_skeleton(studio, film.machine, film.frames, frame)
+        # The rigid machine as lines, and the path up to this frame.
+        rigid, bodies = film.rigid, film.machine.mechanism.chain
+        places = [p for i in bodies for p in (rigid.held[frame, i], rigid.origin[frame, i])]
+        draw_path(studio, np.array([*places[1:], rigid.end[frame]]), GREY, 1.0)
+        if (n := film.at[frame]) > 0:
+            draw_path(studio, film.trace[: n + 1], ORANGE, 2.0)
+        self.image.set_data(studio.render())
+        self.clock.set_text(f"t = {film.t[frame]:.{self.digits}f} s")
+        self.figure.canvas.draw()
+        return np.array(self.figure.canvas.buffer_rgba())[:, :, :3]  # type: ignore[attr-defined]
+
+    def close(self) -> None:
+        """Free the window."""
+        self.studio.plotter.close()

@@ -39,6 +39,7 @@ WIDE = 0.55  # of its font size, about, a character
 SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
 PathLike = str | os.PathLike[str]
+Box = tuple[np.ndarray, np.ndarray]  # lowest and highest corner
 
 
 def look_numbers(groups: Iterable[Sequence[str]]) -> dict[str, int]:
@@ -187,15 +188,14 @@ def spans_decade(values: np.ndarray) -> bool:
 
 def log_scale(axes: Axes, values: np.ndarray) -> None:
     """Make y logarithmic for positive values, labelled with plain numbers or powers of ten."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     axes.set_yscale("log")
     ratio = float(np.max(values)) / float(np.min(values))
     # A short axis would otherwise have one number, or none.
     subs = [1.0, 2.0, 5.0] if ratio < 50.0 else [1.0]
-    if ratio < 3.0:
-        subs = [float(k) for k in range(1, 10)]
-    axes.yaxis.set_major_locator(LogLocator(subs=subs))
+    short = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
+    axes.yaxis.set_major_locator(short if ratio < 5.0 else LogLocator(subs=subs))
     if ratio < 1e4:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
@@ -226,10 +226,20 @@ def ticks(low: float, high: float, count: int = 10) -> np.ndarray:
     return step * np.arange(int(first), int(last) + 1)  # of integers: there is no -0
 
 
+def decimals(t: np.ndarray) -> int:
+    """Return how many decimals tell the instants (n,), s, of a motion of that length: 2 or more."""
+    span = float(np.ptp(t))
+    return 2 if span == 0.0 else max(2, 2 - int(np.floor(np.log10(span))))
+
+
 # -- figures and files -----------------------------------------------------------------------
 
+DPI = 110  # px per inch
+WIDTH, HEIGHT, NARROW = 13.0, 16.0, 8.0  # inches: the most that stacked axes take, the least width
+LEFT, RIGHT, HEAD = 0.85, 0.5, 0.5  # inches beside and above stacked axes
 
-def new_figure(width: float, height: float, dpi: int = 110, *, laid_out: bool = True) -> Figure:
+
+def new_figure(width: float, height: float, dpi: int = DPI, *, laid_out: bool = True) -> Figure:
     """Return an empty figure, inches, that no global state knows of.
 
     Args:
@@ -245,6 +255,64 @@ def new_figure(width: float, height: float, dpi: int = 110, *, laid_out: bool = 
         figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     FigureCanvasAgg(figure)
     return figure
+
+
+def cut_to(title: str, inches: float) -> str:
+    """Return as much of a title as fits into a width."""
+    most = int(8.0 * inches)  # letters of a bold title
+    return title if len(title) <= most else title[: max(0, most - 3)] + "..."
+
+
+def stacked_axes(
+    boxes: Sequence[Box],
+    title: str,
+    *,
+    above: float = 0.3,
+    below: float = 0.3,
+    foot: float = 0.0,
+    least: float = 0.0,
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes below each other, to one scale and with one range of x.
+
+    Args:
+        boxes: lowest and highest (x, y) that each shows, in any unit of length.
+        title: above them.
+        above, below: room for words at each, inches.
+        foot: room below all of them, inches.
+        least: height of axes, inches.
+    """
+    lows, highs = (np.array(ends, dtype=float) for ends in zip(*boxes, strict=True))
+    left, right = lows[:, 0].min(), highs[:, 0].max()
+    tall = (highs - lows)[:, 1]
+    scale = min((WIDTH - LEFT - RIGHT) / (right - left), HEIGHT / tall.sum())
+    heights, wide = np.maximum(scale * tall, least), scale * (right - left)
+    width, head = max(NARROW, wide + LEFT + RIGHT), HEAD if title else 0.0
+    height = head + foot + float((heights + above + below).sum())
+    figure = new_figure(width, height, laid_out=False)
+    figure.text(LEFT / width, 1.0 - 0.15 / height, cut_to(title, width - LEFT), va="top",
+                fontsize=13, weight="bold", parse_math=False)  # fmt: skip
+    rows, top = [], height - head
+    for middle, inches in zip(0.5 * (lows + highs)[:, 1], heights, strict=True):
+        top -= above + inches
+        axes = figure.add_axes((LEFT / width, top / height, wide / width, inches / height))
+        half = 0.5 * inches / scale
+        axes.set(xlim=(left, right), ylim=(middle - half, middle + half))
+        rows.append(axes)
+        top -= below
+    return figure, rows
+
+
+def colour_scale(
+    figure: Figure, label: str, colours: str, marks: Sequence[float] | np.ndarray
+) -> None:
+    """Draw a scale of colours from 0 to the last of its marks at the foot of a figure."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    width, height = figure.get_size_inches()
+    axes = figure.add_axes((0.5 - 2.5 / width, 0.55 / height, 5.0 / width, 0.15 / height))
+    shown = ScalarMappable(Normalize(0.0, marks[-1]), colours)
+    figure.colorbar(shown, cax=axes, orientation="horizontal", ticks=list(marks), label=label)
 
 
 def png(figure: Figure) -> bytes:

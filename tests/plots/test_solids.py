@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
@@ -15,15 +16,8 @@ from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.kinematics import body_frames
 from dolfinopt.output.views import AROUND, ArmView, designed
 from dolfinopt.part.isosurface import surface_at
-
-pytest.importorskip("pyvista")
-from dolfinopt.plots import (
-    solid_animation,
-    solid_design,
-    solid_machine,
-    solid_stress,
-    solids,
-)
+from dolfinopt.plots import animation, solid_design, solid_machine
+from dolfinopt.plots.design import design_figure, stress_figure
 
 pytestmark = pytest.mark.serial
 CELLS, SIZE = (20, 4, 2), np.array([0.5, 0.1, 0.05])
@@ -42,54 +36,58 @@ def link(density):
     )
 
 
-def drawn_area(view):
-    """Return the area that a link's material covers in the picture, m2."""
-    camera, scale = solid_design.camera_of_links(), 1000.0
-    studio = solid_design.link_studio(view, camera, scale)
-    studio.solid(solids.material(view), solids.STEEL)
-    return float((studio.close() < 250).any(axis=-1).sum()) / scale**2
-
-
-def box_area(size):
-    """Return the projected area of a box, m2."""
-    back = solid_design.camera_of_links().back
-    return float(np.abs(back) @ [size[1] * size[2], size[0] * size[2], size[0] * size[1]])
-
-
 def test_projected_area_of_a_link():
     """A full box covers the sum of its faces' projections, half of it half as much."""
-    assert drawn_area(link(lambda x: np.ones(len(x)))) == pytest.approx(box_area(SIZE), rel=0.01)
+
+    def drawn(view):
+        low, high = np.array([-0.1, -0.3]), np.array([0.6, 0.3])
+        studio = solid_design.Studio(solid_design.LINKS, low, high, 1000.0)
+        studio.solid(solid_design.material(view), color=solid_design.STEEL)
+        return float((studio.close() < 250).any(axis=-1).sum()) / 1000.0**2
+
+    def expected(x, y, z):
+        return float(np.abs(solid_design.LINKS.back) @ [y * z, x * z, x * y])
+
+    assert drawn(link(lambda x: np.ones(len(x)))) == pytest.approx(expected(*SIZE), rel=0.01)
     half = link(lambda x: (x[:, 0] < 0.25).astype(float))
     # The nodes at the border have density 1/2, half way between those of the cells.
-    expected = box_area(SIZE * [0.5, 1.0, 1.0])
-    assert drawn_area(half) == pytest.approx(expected, rel=0.05)
-    assert drawn_area(link(lambda x: np.full(len(x), 0.4))) == 0.0
+    assert drawn(half) == pytest.approx(expected(*(SIZE * [0.5, 1.0, 1.0])), rel=0.05)
+    assert drawn(link(lambda x: np.full(len(x), 0.4))) == 0.0
 
 
-def test_caption_of_a_link():
-    words = solid_design.caption(link(lambda x: np.full(len(x), 0.4)), 1.25)
-    assert words == (
-        "link   500 x 100 x 50 mm, volume 1000 cm3 (40 %), mass 1.25 kg, no density above 0.5"
-    )
+def test_picture_of_a_link():
+    """Its caption has size, volume and mass; lengths stand below its lower front edge."""
+    view = link(lambda x: np.full(len(x), 0.6))
+    figure = design_figure([view], "title", {"link": 1.25})
+    (axes,) = figure.axes
+    words = axes.get_title(loc="left")
+    assert words == "link:  500 x 100 x 50 mm, volume 1500 cm3 (60 %), mass 1.25 kg"
+    assert "no density above 0.5" in solid_design.caption(link(lambda x: 0.0 * x[:, 0]), None)
+    lengths = [text for text in axes.texts if text.get_text()[:1].isdigit()]
+    marks = [text.get_text() for text in lengths]
+    assert marks == [*(f"{mark}" for mark in range(0, 500, 50)), "500 mm"]
+    places = np.array([text.get_position() for text in lengths])
+    edge = solid_design.LINKS.plane(np.array([[0.0, -0.05, 0.025], [0.5, -0.05, 0.025]]))
+    np.testing.assert_allclose(places[[0, -1], 0], edge[:, 0], atol=1e-12)
+    assert (places[:, 1] < np.linspace(*edge[:, 1], 11)).all()
+    box = figure.get_tightbbox()
+    assert box.x0 >= 0.0 and box.x1 <= figure.get_figwidth()
+    several = solid_design.solid_designs_figure(["a", "b"], [[view], [view, view]], "two")
+    assert sum(bool(axes.images) for axes in several.axes) == 3
 
 
 def test_surface_carries_fields_and_cells():
     """Fields that are linear in space stay so on the surface; every triangle knows its cell."""
     view = link(lambda x: 1.2 * (1.0 - x[:, 0] / SIZE[0]))
-    surface = solids.material(view, modes=True)
+    surface = solid_design.material(view, modes=True)
     points = surface.points
     assert surface.fields["modes"] == pytest.approx(points[..., None] * [1.0, 2.0], abs=1e-6)
     middle = surface.corners.mean(axis=1)
     away = np.abs(middle - view.centroid[surface.cells]) * CELLS / SIZE
     assert away.max() <= 0.5 + 1e-5
-
-
-def test_surface_at_a_level():
-    view = link(lambda x: 1.2 * (1.0 - x[:, 0] / SIZE[0]))
     corners = view.corners[:, AROUND[8, 3]]
-    surface = surface_at(corners, view.density, 0.5)
-    total = cell_volumes(corners).sum()
-    assert surface.volume == pytest.approx(total * (1.0 - 0.5 / 1.2), rel=1e-3)
+    volume = surface_at(corners, view.density, 0.5).volume
+    assert volume == pytest.approx(cell_volumes(corners).sum() * (1.0 - 0.5 / 1.2), rel=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +119,7 @@ def test_picture_of_a_machine_in_space(result):
     frames = body_frames(one.mechanism, one.q_r, np.zeros_like(one.q_e))
     camera = solid_machine.camera_of(machine, frames)
     low, high = solid_machine.seen_part(machine, frames, camera)
-    studio = solids.Studio(camera, low, high, 300.0)
+    studio = solid_design.Studio(camera, low, high, 300.0)
     solid_machine.draw_pose(studio, machine, frames, len(one.t) - 1)
     image = studio.close().astype(int)
 
@@ -140,10 +138,12 @@ def test_picture_of_a_machine_in_space(result):
 def test_figures_of_a_model_in_space(result):
     assert len(designed(result.views)) == 2
     assert len(result.plot_design().axes) == 2
-    figure = result.plot_machine()
-    words = [text.get_text() for text in figure.axes[0].texts]
+    axes = result.plot_machine().axes[0]
+    words = [text.get_text() for text in axes.texts]
+    assert {"0.000 s", "0.600 s", "x", "y", "z"} <= set(words)
+    assert any(word.endswith(" mm") for word in words)
+    assert np.ptp(np.asarray(axes.images[0].get_array())) > 150
     assert len(result.plot_stress().axes) == 3  # and the colour scale
-    assert "0.000 s" in words and "0.600 s" in words
 
 
 def test_colours_of_stress():
@@ -153,31 +153,29 @@ def test_colours_of_stress():
     stress[7] = 1e8
     view = replace(view, stress=stress, stress_instant=np.full(len(stress), 0.25))
     x, y, z = 1e3 * view.centroid[7]
-    assert solid_stress.stress_caption(view) == (
-        f"link   largest 100 MPa at x = {x:.4g}, y = {y:.4g}, z = {z:.4g} mm, t = 0.25 s"
-    )
-    (panel, scale) = solid_stress.solid_stress_figure([view], "title").axes
-    assert scale.get_xlim() == (0.0, 100.0)
+    (panel, scale) = stress_figure([view], "title").axes
+    words = f"100 MPa at x = {x:.4g}, y = {y:.4g}, z = {z:.4g} mm, t = 0.25 s"
+    assert panel.get_title(loc="left").endswith(words)
+    assert scale.get_xlim() == (0.0, 100.0) and "[MPa]" in scale.get_xlabel()
     image = np.asarray(panel.images[0].get_array()).astype(int)
-    camera, extent = solid_design.camera_of_links(), panel.images[0].get_extent()
+    extent = panel.images[0].get_extent()
 
     def colour_at(point):
-        x, y = camera.plane(np.array(point)) - [extent[0], extent[2]]
+        x, y = solid_design.LINKS.plane(np.array(point)) - [extent[0], extent[2]]
         size = image.shape[1] / (extent[1] - extent[0])
         return image[image.shape[0] - 1 - round(y * size), round(x * size)]
 
     calm, strained = colour_at([0.2, 0.0, 0.025]), colour_at([0.4, 0.0, 0.025])
     assert calm[1] > 200 > 60 > strained[1]  # light yellow, dark red
+    (ring,) = [line.get_xydata() for line in panel.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(ring, solid_design.LINKS.plane(view.centroid[7:8]))
 
 
 def test_film_in_space(result, tmp_path):
     """Surfaces end at the interfaces of the magnified machine; every frame is another picture."""
-    from PIL import Image
-
     one = result.trajectory
-    args = (result.views, one.mechanism, one.t, one.q_r, one.q_e)
-    film = solid_animation.make_solid_film(*args, magnification=2.0, frames=4)
-    stage = solid_animation.SolidStage(film, 0.1)
+    film = solid_machine.make_solid_film(result.views, one, magnification=2.0, frames=4)
+    stage = solid_machine.SolidStage(film, 0.1)
     try:
         for i in (1, 2):
             points = stage.rest[i][0]
@@ -190,7 +188,7 @@ def test_film_in_space(result, tmp_path):
         stage.close()
     bent = film.trace - film.desired
     assert np.abs(bent - 2.0 * one.deviation).max() < 0.1 * np.abs(bent).max()
-    path = solid_animation.draw_solid_motion(tmp_path / "motion.gif", *args, frames=4)
+    path = animation.draw_motion(tmp_path / "motion.gif", result.views, one, frames=4)
     with Image.open(path) as found:
         assert found.n_frames == 4
         images = []
