@@ -2,184 +2,181 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
+from typing import Any
 
-from dolfinopt.bench.common import Diagram, Goal, Plan, Row, Tell, curves, fitted_exponent
-from dolfinopt.bench.solid_link import MOVE, PHASES
-from dolfinopt.bench.whole import mpirun
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, Rows, Steps
+from dolfinopt.bench.measure import in_processes, mpirun
+from dolfinopt.bench.programs import PlainStatics
 from dolfinopt.fem import interior
 from dolfinopt.fem.interior import ITERATIVE
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.mesh.budget import free_memory, solid_bytes
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.tables import Panel
 
-# Links of 0.5 x 0.04 x 0.02 m from 2e4 to 1e6 dofs.
+SIZE = LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
+PHASES = "filter", "assembly", "factorisation", "solves", "body", "gradient"
+MOVE = 0.05  # of densities from one design to the next
+# Links from 2e4 to 1e6 dofs.
 CELLS = (90, 9, 6), (120, 12, 8), (180, 18, 12), (260, 26, 17), (362, 36, 24)
 QUICK = (40, 4, 3), (60, 6, 4)
-RANKS = 1, 2
-OURS, PLAIN = "dolfinopt, q = 6", "plain DOLFINx, one load"
-# Who is measured: both solvers beside each other where the choice between them is made.
-WHO = {"ours": OURS, "factor": "factor", "iterative": ITERATIVE, "plain": PLAIN}
+# Both solvers beside each other where the choice between them is made.
 COMPARED = (90, 9, 6), (120, 12, 8), (150, 15, 10), (180, 18, 12), (220, 22, 14)
-QUICKLY_COMPARED = QUICK[:1]
 COLD, WARM = "first design", "nearby design"
-SECONDS = tuple(f"{phase} [s]" for phase in PHASES)
-SMALLEST = 15_000  # dofs from which on goals hold
-LARGE, MOST_MEMORY = 900_000, 20.0  # dofs from which on two ranks may take so many GB
+OURS, PLAIN = "dolfinopt, q = 6", "plain DOLFINx, one load"
+# Who is measured: the solver that is chosen, either of both, or plain DOLFINx.
+WHO = {"ours": OURS, "factor": "factor", "iterative": ITERATIVE, "plain": PLAIN}
+
+Found = dict[str, Any]  # "dofs" of all ranks, "solver" and "phases", seconds of `PHASES` by design
 
 
-def diagram() -> Diagram:
-    """Return the diagram of solid links."""
-    return Diagram(
-        "solid",
-        "One solid link: a design iteration against degrees of freedom",
-        ("what", "ranks", "dofs", "iteration [s]", *SECONDS, "memory [GB]", "solver"),
-        _measure,
-        _panels,
-        _notes,
-        abreast=3,
-        goals=_goals,
-    )
+def link_scene(scene: Scene, cells: tuple[int, int, int]) -> Scene:
+    """Return the scene with one solid link, whatever its motion would be."""
+    size = {"length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": cells}
+    arm = scene.arms[0].model_copy(update={**size, "element": "incompatible", "passive": 0.02})
+    reduction = scene.reduction.model_copy(update={"method": "craig-bampton", "coordinates": 6})
+    radius = 1.5 * LENGTH / cells[0]
+    design = scene.design.model_copy(update={"filter_radius": radius})
+    return scene.model_copy(update={"arms": (arm,), "reduction": reduction, "design": design})
 
 
-def _measure(plan: Plan, tell: Tell) -> dict[str, Callable[[], list[Row]]]:
+def box_beam(centroid: np.ndarray) -> np.ndarray:
+    """Return design variables (n,): solid around a core of nearly void."""
+    y, z = centroid[:, 1] / HEIGHT, centroid[:, 2] / THICKNESS
+    return np.where((np.abs(y) < 0.3) & (np.abs(z) < 0.25), 0.02, 0.9)
+
+
+class _Clock:
+    """CPU seconds of parts; those of the slowest rank."""
+
+    def __init__(self, comm: MPI.Comm):
+        self.comm, self.seconds = comm, dict.fromkeys(PHASES, 0.0)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Time a block (collective)."""
+        self.comm.Barrier()
+        begun = time.process_time()
+        yield
+        self.seconds[name] += self.comm.allreduce(time.process_time() - begun, op=MPI.MAX)
+
+
+def iterate_link(comm: MPI.Comm, scene: Scene, cells: tuple[int, int, int], who: str) -> Found:
+    """Return an iteration of this package: a first design and one nearby (collective)."""
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.profiling import Profile
+    from dolfinopt.responses.sensitivity import esl_gradient
+
+    if who != "ours":
+        interior.WIDEST = 0 if who == "iterative" else sys.maxsize
+    arm = Arm(link_scene(scene, cells), 0, comm, Profile())
+    x, found = box_beam(arm.mesh.centroid), []
+    for _ in range(2):
+        clock = _Clock(comm)
+        with clock("filter"):
+            x_phys = arm.physical(x)
+        state = arm.state(x_phys)
+        with clock("assembly"):
+            _ = state.elastic.K.matrix
+        with clock("factorisation"):
+            state.elastic.factorise()
+        with clock("solves"):
+            state.elastic.constraint_modes()
+        with clock("body"):
+            _ = state.body
+        with clock("gradient"):
+            gradient = esl_gradient(state, np.eye(6))
+        with clock("filter"):
+            arm.backward(gradient)
+        found.append(list(clock.seconds.values()))
+        x = np.clip(x + MOVE * np.sin(60.0 * arm.mesh.centroid @ [1.0, 2.0, 3.0]), 1e-3, 1.0)
+    solver = arm.substructure.interior.solver_name
+    return {"dofs": arm.substructure.T.num_dofs, "solver": solver, "phases": found}
+
+
+def plain_link(comm: MPI.Comm, scene: Scene, cells: tuple[int, int, int], who: str) -> Found:
+    """Return a static iteration in plain DOLFINx: trilinear hexahedra, one load (collective)."""
+    from dolfinopt.arms.arm import field_tolerance
+
+    arm, material, clock = box_arm(comm, "link", SIZE, cells), scene.material_of(0), _Clock(comm)
+    plain = PlainStatics(
+        arm, material.young_modulus, material.poisson_ratio, HEIGHT * THICKNESS,
+        field_tolerance(scene),
+    )  # fmt: skip
+    x = box_beam(arm.centroid)
+    with clock("assembly"):
+        plain.assemble(x)
+    plain.add_rigid_motions()
+    with clock("factorisation"):
+        plain.factorise()
+    with clock("solves"):
+        plain.solve()
+    with clock("gradient"):
+        plain.gradient()
+    dofs = plain.load.getSize()
+    return {"dofs": dofs, "solver": ITERATIVE, "phases": [list(clock.seconds.values())]}
+
+
+def _steps(plan: Plan) -> Steps:
+    def rows(who: str, cells: tuple[int, int, int], ranks: int) -> Rows:
+        function = plain_link if who == "plain" else iterate_link
+        found, memory = in_processes(function, plan.scene, cells, who, ranks=ranks)
+        names = [PLAIN] if who == "plain" else [f"{WHO[who]}, {COLD}", f"{WHO[who]}, {WARM}"]
+        for name, phases in zip(names, found["phases"], strict=True):
+            rest = found["dofs"], sum(phases), *phases, memory * 2**20 / 1e9, found["solver"]
+            yield name, ranks, *rest
+
+    sizes, compared = (QUICK, QUICK[:1]) if plan.quick else (CELLS, COMPARED)
     asked = [
         (who, cells, ranks)
-        for ranks in RANKS
-        if ranks == 1 or mpirun() is not None
-        for cells in (QUICK if plan.quick else CELLS)
+        for ranks in ((1, 2) if mpirun() else (1,))
+        for cells in sizes
         for who in ("ours", "plain")
     ]
-    compared = QUICKLY_COMPARED if plan.quick else COMPARED
     asked += [(who, cells, 1) for cells in compared for who in ("factor", "iterative")]
     free = free_memory()
-    if large := [one for one in asked if solid_bytes(math.prod(one[1]), one[2]) > free]:
-        tell(f"{len(large)} measurements need more memory than is free: left out")
-    asked = [one for one in asked if one not in large]
-    return {
-        f"{WHO[who]}, {' x '.join(map(str, cells))} cells, {_ranks(ranks)}": partial(
-            in_process, plan.scene, who, cells, ranks
-        )
-        for who, cells, ranks in asked
-    }
+    large = [one for one in asked if solid_bytes(math.prod(one[1]), one[2]) > free]
+    if large:
+        yield f"{len(large)} measurements need more memory than is free: left out", list
+    for who, cells, ranks in (one for one in asked if one not in large):
+        size = f"{' x '.join(map(str, cells))} cells, {ranks} rank{'s' * (ranks > 1)}"
+        yield f"{WHO[who]}, {size}", partial(rows, who, cells, ranks)
 
 
-def _ranks(count: int) -> str:
-    return f"{count} rank{'' if count == 1 else 's'}"
+def _of(*who: str) -> Callable[[Frame], Frame]:
+    return lambda frame: frame[frame["what"].str.startswith(who)]
 
 
-def in_process(scene: Scene, who: str, cells: tuple[int, int, int], ranks: int) -> list[Row]:
-    """Measure one of `WHO` in processes of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scene.json"
-        path.write_text(json.dumps(scene.to_dict()), encoding="utf-8")
-        words = (who, *map(str, cells), str(path))
-        command = [sys.executable, "-m", "dolfinopt.bench.solid_link", *words]
-        if ranks > 1:
-            command = [str(mpirun()), "-n", str(ranks), *command]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"{' '.join(command)}: {done.stderr[-2000:]}")
-    found = json.loads(done.stdout.strip().splitlines()[-1])
-    names = (PLAIN,) if who == "plain" else (f"{WHO[who]}, {COLD}", f"{WHO[who]}, {WARM}")
-    return [
-        (name, ranks, found["dofs"], sum(phases), *phases, found["memory"], found["solver"])
-        for name, phases in zip(names, found["phases"], strict=True)
-    ]
+def _phases(frame: Frame) -> Frame:
+    """Return the phases of first designs, a row each."""
+    first = frame[frame["what"] == f"{OURS}, {COLD}"]
+    names = [f"{phase} [s]" for phase in PHASES]
+    return first.melt(["ranks", "dofs"], names, var_name="phase", value_name="seconds [s]")
 
 
-def _is(row: Row, *who: str) -> bool:
-    """Return whether a row is of one of `WHO`."""
-    return any(str(row[0]).startswith(WHO[one]) for one in who)
-
-
-def _panels(rows: Sequence[Row]) -> tuple[Panel, ...]:
-    def panel(title: str, y_label: str, shown: list[Row], column: int) -> Panel:
-        return Panel(title, "degrees of freedom [-]", y_label, curves(shown, 0, 2, column))
-
-    several = [int(ranks) for ranks in dict.fromkeys(row[1] for row in rows)]
-    both = {n: [r for r in rows if r[1] == n and _is(r, "ours", "plain")] for n in several}
-    panels = [panel(_ranks(n), "iteration [s]", both[n], 3) for n in several]
-    compared = [row for row in rows if _is(row, "factor", "iterative")]
-    if compared:
-        panels.append(panel("either solver, one rank", "iteration [s]", compared, 3))
-    for n in several:  # both designs are of one process, whose peak it is
-        once = [row for row in both[n] if row[0] != f"{OURS}, {WARM}"]
-        panels.append(panel(f"peak of {_ranks(n)}", "memory [GB]", once, 4 + len(PHASES)))
-    first = [row for row in both[several[-1]] if row[0] == f"{OURS}, {COLD}"]
-    parts = [(name, *row[1:3], value) for row in first for name, value in _parts(row).items()]
-    title = f"phases of the {COLD}, {_ranks(several[-1])}"
-    return (*panels, panel(title, "CPU time [s]", parts, 3))
-
-
-def _parts(row: Row) -> dict[str, float]:
-    """Return the seconds of the two longest phases and of all others."""
-    seconds = dict(zip(PHASES, (float(value) for value in row[4:]), strict=False))
-    longest = {name: seconds.pop(name) for name in ("factorisation", "solves")}
-    return {**longest, ", ".join(seconds): sum(seconds.values())}
-
-
-def _goals(rows: Sequence[Row]) -> list[Goal]:
-    goals = []
-    for ranks in dict.fromkeys(int(row[1]) for row in rows):
-        here = [row for row in rows if row[1] == ranks and float(row[2]) >= SMALLEST]
-        alone = [float(row[3]) for row in here if _is(row, "plain")]
-        first, nearby = (
-            [row for row in here if row[0] == f"{OURS}, {name}"] for name in (COLD, WARM)
-        )
-        if not first:
-            continue
-        words = f"{_dofs(first[0])} to {_dofs(first[-1])} dofs, {_ranks(ranks)}"
-        for what, limit, ours_ in (
-            ("iteration beside plain DOLFINx", 3.0, first),
-            ("with warm starts beside it", 1.5, nearby),
-        ):
-            ratio = max(float(r[3]) / each for r, each in zip(ours_, alone, strict=True))
-            goals.append(Goal(f"{what}, the largest of {words}", limit, ratio))
-        for name in (COLD, WARM):
-            exponent = _exponent_beyond([row for row in here if str(row[0]).endswith(name)])
-            what = f"exponent of a {name} beyond the range of factors, {_ranks(ranks)}"
-            goals.append(Goal(what, 1.15, exponent))
-        largest = first[-1]
-        if ranks == 2 and float(largest[2]) >= LARGE:
-            words = f"memory of {_dofs(largest)} dofs on two ranks, GB"
-            goals.append(Goal(words, MOST_MEMORY, float(largest[-2])))
-    return goals
-
-
-def _exponent_beyond(rows: list[Row]) -> float:
-    """Return the exponent of seconds in dofs where the chosen solver is iterative."""
-    factors = [float(row[2]) for row in rows if _is(row, "ours") and row[-1] != ITERATIVE]
-    found = [r for r in rows if r[-1] == ITERATIVE and float(r[2]) > max(factors, default=0.0)]
-    return fitted_exponent([float(r[2]) for r in found], [float(r[3]) for r in found])
-
-
-def _dofs(row: Row) -> str:
-    return f"{int(row[2]):,}".replace(",", " ")
-
-
-def _notes(rows: Sequence[Row]) -> list[str]:
-    here = [row for row in rows if row[1] == 1 and _is(row, "ours", "plain")]
-    notes = [
-        "CPU seconds of the slowest rank; a box beam with a core of nearly void. The first design "
-        "makes the factor or hierarchy, a nearby one (densities moved by up to "
-        f"{MOVE:g}) starts from its fields. One iteration: filter, K, six interface fields, body, "
-        "energies; of plain DOLFINx: K, one load by conjugate gradients with GAMG to the same "
-        "tolerance, energies.",
-        f"Factors are made up to a bandwidth of {interior.WIDEST}, where memory allows.",
-    ]
-    for name, points in ((line.label, line) for line in curves(here, 0, 2, 3)):
-        if len(points.x) > 1:
-            notes.append(
-                f"{name}: exponent {fitted_exponent(list(points.x), list(points.y)):.2f} in dofs."
-            )
-    return notes
+DIAGRAM = Diagram(
+    "solid",
+    "One solid link: a design iteration against degrees of freedom",
+    f"what | ranks | dofs | iteration [s] | {' | '.join(f'{p} [s]' for p in PHASES)} | "
+    "memory [GB] | solver",
+    _steps,
+    (
+        Panel("dofs", "iteration [s]", "what", each=("ranks",), rows=_of(OURS, PLAIN), powers=True),
+        Panel("dofs", "iteration [s]", "what", "one rank", rows=_of("factor", ITERATIVE)),
+        Panel("dofs", "memory [GB]", "what", "peak", each=("ranks",), rows=_of(OURS, PLAIN)),
+        Panel("dofs", "seconds [s]", "phase", f"phases, {COLD}", each=("ranks",), rows=_phases),
+    ),
+    "CPU seconds of the slowest rank; a box beam with a core of nearly void. The first design "
+    f"makes the factor or hierarchy, a nearby one (densities moved by up to {MOVE:g}) starts from "
+    "its fields: filter, K, six interface fields, body, energies. Plain DOLFINx: K, one load by "
+    "conjugate gradients with GAMG to the same tolerance, energies. Factors are made up to a "
+    f"bandwidth of {interior.WIDEST}, where memory allows.",
+)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from dolfinopt.cli.shared import out_option, prepare, start
-from dolfinopt.errors import InputError
-
-if TYPE_CHECKING:
-    pass
+from dolfinopt.errors import ConvergenceError, InputError
 
 
 @click.command()
 @click.argument("names", metavar="[DIAGRAM]...", nargs=-1)
 @out_option("diagrams and bench.md; default: results/bench")
-@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some two minutes")
+@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
 def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     """Measure run time against error.
 
@@ -31,17 +29,43 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    from dolfinopt.bench import QUICKLY, Plan, named
-    from dolfinopt.bench import bench as run
-    from dolfinopt.bench.progress import live_diagrams
+    from dolfinopt.bench.diagram import Plan
+    from dolfinopt.bench.run import QUICKLY, named
+    from dolfinopt.bench.run import bench as run
     from dolfinopt.paper.reproduction import load_paper
 
     chosen = named(names)
     begun = time.perf_counter()
     folder = out or Path("results") / "bench"
     prepare(world, folder)
-    scene = load_paper(False, QUICKLY if quick else ())
-    with live_diagrams(len(chosen)) as (tell, done):
-        summary = run(Plan(scene, quick), folder, tell, chosen, done)
+    plan = Plan(load_paper(False, QUICKLY if quick else ()), quick)
+    with _progress(len(chosen)) as (tell, done):
+        failures = run(plan, folder, chosen, tell, done)
     seconds = time.perf_counter() - begun
-    click.echo(f"diagrams in {folder}, summary in {summary}; {seconds:.0f} s")
+    click.echo(f"diagrams in {folder}, summary in {folder / 'bench.md'}; {seconds:.0f} s")
+    if failures:
+        raise ConvergenceError("; ".join(failures))
+
+
+@contextmanager
+def _progress(count: int) -> Iterator[tuple[Callable[[str], None], Callable[[str], None]]]:
+    """Yield what shows a step on a live line, or prints it, and what prints a finished diagram."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True, highlight=False, markup=False)
+
+    def line(text: str) -> None:
+        console.print(text, soft_wrap=True)
+
+    if not console.is_terminal:
+        yield line, line
+        return
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("starting", total=count)
+
+        def done(text: str) -> None:
+            line(text)
+            progress.advance(task)
+
+        yield lambda text: progress.update(task, description=text.replace("[", r"\[")), done

@@ -34,22 +34,21 @@ def reproduce(
     """
     world = start()
     from dolfinopt.output.summary import filter_warnings
-    from dolfinopt.paper.page import write_reproduction
-    from dolfinopt.paper.reproduction import Plan, cell_sizes, load_paper, setting_of
-    from dolfinopt.paper.reproduction import reproduce as run
+    from dolfinopt.paper import reproduction as paper
+    from dolfinopt.paper.report import write_report
     from dolfinopt.paper.statements import check_paper, failed_checks
     from dolfinopt.parallel import on_root
 
     folder = out or Path("results") / "paper"
-    scene = on_root(world, load_paper, coarse, overrides)
+    scene = on_root(world, paper.load_paper, coarse, overrides)
     if world.rank == 0:
-        warn(filter_warnings(scene, cell_sizes(scene)))
-    plan = Plan(scene)
-    results, outcomes = run(plan, folder, world)
-    checks = check_paper(results, setting_of(scene))
+        warn(filter_warnings(scene, paper.cell_sizes(scene)))
+    plan = paper.Plan(scene)
+    results, outcomes = paper.reproduce(plan, folder, world)
+    checks = check_paper(results, scene)
 
     def conclude() -> None:
-        write_reproduction(plan, results, outcomes, checks, folder, plots=plots)
+        write_report(plan, results, outcomes, checks, folder, plots=plots)
         for check in checks:
             click.echo(f"{check.name} (paper: {check.paper}). {check.sentence}")
         page = " and report.html" if plots else ""

@@ -1,8 +1,5 @@
 """The paper's cases as a table, and the same table with what came out of them.
 
-R. Seifried, A. Moghadasi, A. Held: Analysis of design uncertainties in structurally optimized
-lightweight machines. Procedia IUTAM 13 (2015) 71-81, doi:10.1016/j.piutam.2015.01.018.
-
 Every row is one design in one scene:
 
 | column | meaning |
@@ -23,13 +20,12 @@ most, over the latter's largest. What failed has nan.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -65,10 +61,11 @@ SWEEPS = {  # table: key, axis, what a value is called
     "path": ("motion.flattening", "flattening s [-]", "s = {:g}"),
 }
 SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
+# The paper's theory is linear, and so were its elements.
+LINEAR = ("simulation.stiffening=false", "arms.element=linear")
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")
 # Both set the filter's radius; where neither is asked for, coarse cells get `FILTER_CELLS` of it.
 FILTER_KEYS = ("design.filter_radius", "design.minimum_member", "design.minimum_gap")
-NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
 
 Row = tuple[str, str, str, float, float, Case, Case]
 
@@ -87,14 +84,7 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     """
     from dolfinopt.multibody.motion import check_motion
 
-    # The paper's theory is linear, and so were its elements.
-    given = (
-        "simulation.stiffening=false",
-        "arms.element=linear",
-        *(COARSE if coarse else ()),
-        *overrides,
-    )
-    scene = load_scene(paper_scene(), given)
+    scene = load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
     asked = {text.partition("=")[0].strip() for text in overrides}
     if coarse and asked.isdisjoint(FILTER_KEYS):
         radius = max(scene.design.radius, FILTER_CELLS * max(cell_sizes(scene).values()))
@@ -132,30 +122,27 @@ class Plan:
     flattenings: tuple[float, ...] = tuple(0.125 * k for k in range(9))
     paths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
 
+    @property
+    def optimum(self) -> Case:
+        """The paper's design."""
+        return Case(with_objective(self.scene, *DYNAMIC), "optimize", label=OPTIMUM)
+
     @cached_property
     def table(self) -> pd.DataFrame:
         """All cases, see the module."""
         ends = changed(self.scene, f"arms.passive={SOLID_ENDS}")
-        shown = [one for one in self.variants if one[0] in SHOWN]
+        columns = ["table", "label", "kind", "x", "made_for", "case", "made"]
         rows = [
             *_objectives("objectives", self.scene, self.variants),
-            *_reductions("reductions", self.scene, self.optimised),
+            *_reductions("reductions", self.scene, self.optimised, self.optimised),
             *_coordinates(self.scene, self.optimum, self.swept),
             *_sweep("payload", self.scene, self.masses, self.payloads),
             *_sweep("path", self.scene, self.flattenings, self.paths),
-            *_objectives("ends objectives", ends, shown),
+            *_objectives("ends objectives", ends, [v for v in self.variants if v[0] in SHOWN]),
             # Many Craig-Bampton coordinates make no other design than few.
-            *_reductions("ends reductions", ends, self.optimised, {MODAL: self.optimised}),
+            *_reductions("ends reductions", ends, self.optimised[:1], self.optimised),
         ]
-        return pd.DataFrame(
-            rows, columns=["table", "label", "kind", "x", "made_for", "case", "made"]
-        )
-
-    @property
-    def optimum(self) -> Case:
-        """The paper's design."""
-        scene = with_objective(self.scene, *DYNAMIC)
-        return Case(scene, "optimize", label=OPTIMUM)
+        return pd.DataFrame(rows, columns=columns)
 
 
 def _objectives(
@@ -170,23 +157,17 @@ def _objectives(
         yield table, label, other.objective.kind, math.nan, math.nan, case, case
 
 
-def _reductions(
-    table: str,
-    scene: Scene,
-    counts: tuple[int, ...],
-    by_method: Mapping[str, tuple[int, ...]] | None = None,
-) -> Iterator[Row]:
-    """Yield designs by reduction in the reference model; `by_method`: else the fewest alone."""
+def _reductions(table: str, scene: Scene, *counts: Sequence[int]) -> Iterator[Row]:
+    """Yield designs by reduction, so many coordinates of each method, in the reference model."""
     reference = reference_scene(scene)
-    for method in METHODS:
-        mine = counts if by_method is None else by_method.get(method, counts[:1])
+    for method, mine in zip(METHODS, counts, strict=True):
         for other in _reduced(scene, method, mine):
             made = Case(other, "optimize", label=f"{method} {other.reduction.coordinates}")
             again = Case(reference, "simulate", made, f"{made.label} in the reference")
             yield table, made.label, method, other.reduction.count, math.nan, again, made
 
 
-def _coordinates(scene: Scene, optimum: Case, counts: tuple[int, ...]) -> Iterator[Row]:
+def _coordinates(scene: Scene, optimum: Case, counts: Sequence[int]) -> Iterator[Row]:
     """Yield the initial and the optimised design with either method and more coordinates."""
     for label, design in ((INITIAL, None), (OPTIMUM, optimum)):
         for method in METHODS:
@@ -226,13 +207,7 @@ def _sweep(
 def reproduce(
     plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True
 ) -> tuple[pd.DataFrame, Outcomes]:
-    """Do everything that is not done yet (collective); the same on all ranks.
-
-    Args:
-        plan: of the paper's scene, see `load_paper`.
-        folder: DIR, where the cases are kept.
-        world: all ranks.
-        shown: draw progress.
+    """Do everything that is not done yet, kept in DIR `folder` (collective); the same on all ranks.
 
     Returns:
         The plan's table with results, those of cases that failed nan; and all outcomes.
@@ -262,14 +237,13 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
         own=[one.compliance for one in made],
         apart=math.nan,
     )
-    for names, by, distance in (
-        (["coordinates"], "label", _distance),
-        (["reductions", "ends reductions"], "table", _cells_apart),
+    compared = results[results.table.isin(["coordinates", "reductions", "ends reductions"])]
+    for (name, _), group in compared.groupby(
+        ["table", compared.label.where(compared.table == "coordinates", "")]
     ):
-        for _, group in results[results.table.isin(names)].groupby(by):
-            finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
-            apart = [distance(outcomes[case], finest) for case in group.made]
-            results.loc[group.index, "apart"] = apart
+        finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
+        distance = _distance if name == "coordinates" else _cells_apart
+        results.loc[group.index, "apart"] = [distance(outcomes[c], finest) for c in group.made]
     return results
 
 
@@ -300,77 +274,3 @@ def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
     """Return the relative loss (n, n) of a design made for i against the one made for j, at j."""
     values = cross_values(rows, quantity)
     return values / np.diag(values) - 1.0
-
-
-# -- the scene in words, and everything as JSON ----------------------------------------------
-
-
-def setting_of(scene: Scene) -> dict[str, Any]:
-    """Return what the texts say of a scene.
-
-    Returns:
-        payload (kg); machine, a sentence; relative_stiffness, Young's modulus of the initial
-        design over the solid one; interpolation, how that comes about; volume_fraction.
-    """
-    from dolfinopt.density.interpolation import interpolate
-
-    options, x, motion = scene.interpolation, scene.design.initial, scene.motion
-    stiffness = interpolate(np.array([x]), options.law, options.penalty, options.floor).stiffness
-    count = sum(arm.flexible for arm in scene.arms)
-    arms = "arm that moves" if count == 1 else "arms that move"
-    base = "cart carries" if motion.base == "cart" else "fixed base carries"
-    path = "a given path"
-    if motion.path in ("arc", "line"):
-        round_ = motion.path == "arc" and motion.flattening > 0.0
-        path = "a semicircle" if round_ else "a straight line"
-        if round_ and motion.flattening != 1.0:
-            path += f" flattened to {motion.flattening:g}"
-    number, p = NUMBERS.get(count, count), f"{options.penalty:g}"
-    law = f"{x:g} with q = {p} of RAMP" if options.law == "ramp" else f"{x:g} to the power {p}"
-    return {
-        "payload": scene.payload.mass,
-        "machine": f"A {base} {number} flexible {arms} {scene.payload.mass:g} kg along {path}.",
-        "relative_stiffness": round(float(stiffness[0]), 4),
-        "interpolation": law,
-        "volume_fraction": scene.design.volume_fraction,
-    }
-
-
-def as_json(plan: Plan, results: pd.DataFrame) -> str:
-    """Return measured.json: all results, curves as lists."""
-    made = ["label", "kind", "compliance", "deviation", "grayness", "iterations", "note"]
-    reduced_by = ["method", "coordinates", "own", "compliance", "deviation", "apart", "iterations"]
-    curves = ["coordinates", "compliance", "deviation", "apart"]
-    by = dict(iter(results.groupby("table")))
-    for name in ("reductions", "coordinates", "ends reductions"):
-        renamed = by[name].rename(columns={"kind": "method", "x": "coordinates"})
-        by[name] = renamed.astype({"coordinates": int})
-
-    def sweep(name: str) -> dict[str, Any]:
-        rows = by[name]
-        designs = [
-            {"label": label, "made_for": one.made_for.iloc[0]}
-            | one[["compliance", "deviation"]].to_dict("list")
-            for label, one in rows.groupby("label", sort=False)
-        ]
-        return {"axis": SWEEPS[name][1], "values": [*rows.x.unique()], "designs": designs}
-
-    content = {
-        "cells": plan.scene.arms[0].cells or (),
-        "iterations": plan.scene.optimizer.max_iterations,
-        "objectives": by["objectives"][made].to_dict("records"),
-        "reductions": by["reductions"][reduced_by].to_dict("records"),
-        "coordinates": [
-            {"design": design, "method": method} | one[curves].to_dict("list")
-            for (design, method), one in by["coordinates"].groupby(["label", "method"], sort=False)
-        ],
-        "payload": sweep("payload"),
-        "path": sweep("path"),
-        "ends": {
-            "length": SOLID_ENDS,
-            "objectives": by["ends objectives"][made].to_dict("records"),
-            "reductions": by["ends reductions"][reduced_by].to_dict("records"),
-        },
-        "setting": setting_of(plan.scene),
-    }
-    return json.dumps(content, indent=1) + "\n"

@@ -1,8 +1,4 @@
-"""The paper's statements, `statements.toml`, checked against the results.
-
-Paper: Seifried, Moghadasi & Held, Procedia IUTAM 13 (2015) 71-81,
-doi:10.1016/j.piutam.2015.01.018.
-"""
+"""The paper's statements, `statements.toml`, checked against the results."""
 
 from __future__ import annotations
 
@@ -16,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dolfinopt.density.interpolation import interpolate
 from dolfinopt.paper.reproduction import (
     CRAIG_BAMPTON,
     INITIAL,
@@ -26,6 +23,7 @@ from dolfinopt.paper.reproduction import (
     cross_values,
     loss,
 )
+from dolfinopt.scene.load import Scene
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,17 +68,13 @@ class Check:
         return f"Does not hold: {self.found}. {self.reason}".strip()
 
 
-def check_paper(results: pd.DataFrame, setting: Mapping[str, Any]) -> list[Check]:
-    """Return all checks in the order of the paper's figures.
-
-    Args:
-        results, setting: see `reproduction.add_outcomes` and `setting_of`.
-    """
+def check_paper(results: pd.DataFrame, scene: Scene) -> list[Check]:
+    """Return all checks of the results, see `add_outcomes`, in the order of the paper's figures."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(undefined=StrictUndefined)
     environment.filters |= {"mm": mm, "percent": percent, "Nm": torque, "listed": listed}
-    values = TOLERANCE | quantities(results, setting)
+    values = TOLERANCE | quantities(results, scene)
 
     def filled(text: str) -> str:
         return environment.from_string(text).render(values).strip()
@@ -102,11 +96,7 @@ def check_paper(results: pd.DataFrame, setting: Mapping[str, Any]) -> list[Check
 
 def failed_checks(checks: Iterable[Check]) -> list[str]:
     """Return what `--check` demands and is not so, one line each."""
-    return [
-        f"{check.name}: expected {check.demand}; found {check.found}"
-        for check in checks
-        if not check.stands
-    ]
+    return [f"{c.name}: expected {c.demand}; found {c.found}" for c in checks if not c.stands]
 
 
 def mm(length: float) -> str:
@@ -134,7 +124,7 @@ def listed(parts: Mapping[str, float]) -> str:
 # -- quantities ------------------------------------------------------------------------------
 
 
-def quantities(results: pd.DataFrame, setting: Mapping[str, Any]) -> dict[str, Any]:
+def quantities(results: pd.DataFrame, scene: Scene) -> dict[str, Any]:
     """Return everything that texts and criteria name; nan where a case failed."""
     by = dict(iter(results.groupby("table")))
     curves = by["coordinates"]
@@ -146,7 +136,7 @@ def quantities(results: pd.DataFrame, setting: Mapping[str, Any]) -> dict[str, A
         "after": _of_coordinates(curves[curves.label == OPTIMUM]),
         **_of_payloads(by["payload"]),
         **_of_paths(by["path"]),
-        **_of_stiffness(setting),
+        **_of_stiffness(scene),
     }
 
 
@@ -225,7 +215,7 @@ def _of_coordinates(rows: pd.DataFrame) -> dict[str, Any]:
 def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
     x, made_for = rows.x.unique(), rows.made_for.dropna().unique()
     designs = dict(iter(rows.groupby("label")))
-    initial = designs[INITIAL].compliance.to_numpy()
+    initial = designs[INITIAL].compliance
     made = rows.pivot(index="made_for", columns="x", values="compliance").loc[made_for].to_numpy()
     return {
         "lightest": x[0],
@@ -267,28 +257,33 @@ def _losses(rows: pd.DataFrame) -> list[float]:
     return [float(np.max(loss(rows, name).to_numpy())) for name in ("compliance", "deviation")]
 
 
-def _of_stiffness(setting: Mapping[str, Any]) -> dict[str, Any]:
+def _of_stiffness(scene: Scene) -> dict[str, Any]:
     """Return what flanges allow: those of a part V of the material have 1 - (1 - V)^3 of EI."""
-    volume = setting["volume_fraction"]
-    more = 1.0 / volume
+    law, x, volume = scene.interpolation, scene.design.initial, scene.design.volume_fraction or 1.0
+    stiffness = interpolate(np.array([x]), law.law, law.penalty, law.floor).stiffness
+    power = (
+        f"with q = {law.penalty:g} of RAMP"
+        if law.law == "ramp"
+        else f"to the power {law.penalty:g}"
+    )
     return {
-        "stiffness": setting["relative_stiffness"],
-        "interpolation": setting["interpolation"],
+        "stiffness": round(float(stiffness[0]), 4),
+        "interpolation": f"{x:g} {power}",
         "volume": volume,
         "flanges": 1.0 - (1.0 - volume) ** 3,
-        "more": "twice the material" if more == 2.0 else f"{more:.3g} times the material",
+        "more": "twice the material" if volume == 0.5 else f"{1.0 / volume:.3g} times the material",
     }
 
 
 def span(values: Iterable[float]) -> float:
     """Return (largest - smallest) / largest; nan where a value is."""
-    found = np.array(list(values))
+    found = np.array([*values])
     return float((found.max() - found.min()) / found.max())
 
 
 def bend(x: Iterable[float], y: Iterable[float]) -> float:
     """Return the largest distance from the straight line of best fit, relative to the mean."""
-    x, y = np.array(list(x)), np.array(list(y))
+    x, y = np.array([*x]), np.array([*y])
     if not np.isfinite(y).all():
         return math.nan
     return float(np.abs(y - np.polyval(np.polyfit(x, y, 1), x)).max() / y.mean())

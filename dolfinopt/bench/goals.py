@@ -1,0 +1,204 @@
+"""The goals: what is wanted of the figures that the diagrams measure, all in `GOALS`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from dolfinopt.bench import arms, iterations, motion, solid
+from dolfinopt.bench.diagram import Frame, curves, fastest, fitted_power
+from dolfinopt.fem.interior import ITERATIVE
+
+Figure = tuple[float, str]  # nan where it was not measured, or not well enough; a remark
+SECONDS, ERROR = "seconds [s]", "error of elastic coordinates [-]"
+OURS = solid.OURS
+FASTER = 50.0  # than SciPy
+LARGE = 4e4  # elements per arm up to which the exponent is fitted
+SETTLED, DEMO = (math.prod(cells) for cells in (iterations.SETTLED, iterations.DEMO))
+FEWEST, MILLION = 15_000, 900_000  # dofs from which on goals of links, and of their memory, hold
+
+
+class Goal(NamedTuple):
+    """What was wanted: a figure of a diagram's frame at most, or at `least`, at a limit."""
+
+    diagram: str
+    what: str
+    limit: float
+    measure: Callable[[Frame], Figure]
+    least: bool = False
+
+    def cells(self, frame: Frame) -> tuple[str, str, str, str]:
+        """Return goal, limit, measured, met."""
+        value, said = self.measure(frame)
+        limit = f"at {'least' if self.least else 'most'} {self.limit:g}"
+        met = value >= self.limit if self.least else value <= self.limit
+        verdict = "" if math.isnan(value) else "yes" if met else "no"
+        figure = f"{value:.3g}" if verdict else "not measured"
+        return self.what, limit, f"{figure} ({said})" if said else figure, verdict
+
+
+def goal_table(frames: Mapping[str, Frame]) -> Frame:
+    """Return the goals of these diagrams' frames, a row each."""
+    rows = [goal.cells(frames[goal.diagram]) for goal in GOALS if goal.diagram in frames]
+    return Frame(rows, columns=["goal", "limit", "measured", "met"])
+
+
+def _at(frame: Frame, **values: object) -> Frame:
+    """Return the rows with these values; in names _ stands for a space."""
+    for name, value in values.items():
+        frame = frame[frame[name.replace("_", " ")] == value]
+    return frame
+
+
+# -- the motion ------------------------------------------------------------------------------
+
+
+def _simulation(coordinates: int, frame: Frame) -> Figure:
+    """Return the seconds of a simulation as scenes have it by default, of the slower design."""
+    usual = _at(frame, **motion.USUAL, coordinates_per_arm=coordinates)
+    cells = usual[["design", SECONDS, ERROR]].itertuples(index=False)
+    return usual[SECONDS].max(), "; ".join(f"{name} {s:.3g}, error {e:.1e}" for name, s, e in cells)
+
+
+def _superiority(coordinates: int, frame: Frame) -> Figure:
+    """Return how many times as long SciPy takes to our error, of the less superior design.
+
+    A method that did not get there takes longer than its finest setting did: a bound. One that is
+    too low tells nothing.
+    """
+    here, ratios, bounds, shown = _at(frame, coordinates_per_arm=coordinates), [], 0, []
+    for design, seconds, error in _at(here, **motion.USUAL)[["design", SECONDS, ERROR]].values:
+        theirs = here[here["method"].str.startswith("SciPy") & (here["design"] == design)]
+        found = curves(theirs, SECONDS, ERROR, "method")
+        there = fastest(found, error)
+        best, bound = (there[1], False) if there else (math.nan, True)
+        for points in found.values():
+            last = points[SECONDS].iloc[-1]
+            if points[ERROR].min() > error and not last >= best:
+                best, bound = last, True
+        ratios.append(best / seconds)
+        bounds += bound
+        words = " or more: SciPy stopped short of that error" if bound else ""
+        shown.append(f"{design} {ratios[-1]:.0f}{words}")
+    least = np.min(ratios) if ratios else math.nan
+    return math.nan if bounds and least < FASTER else least, "; ".join(shown)
+
+
+def _worst_error(frame: Frame) -> Figure:
+    """Return the largest true error over the tolerance."""
+    known = (over := frame["true error [-]"] / frame["tolerance [-]"]).dropna()
+    missed, failed = (known > 1.0).sum(), len(over) - len(known)
+    said = f"{missed} of {len(known)} random simulations miss it; {failed} failed"
+    return known.max(), said
+
+
+# -- iterations ------------------------------------------------------------------------------
+
+
+def _over_plain(program: str, column: str, frame: Frame) -> Figure:
+    """Return the seconds of a program's iteration over those of plain DOLFINx's."""
+    here = _at(frame, task=iterations.ITERATION, elements_per_arm=SETTLED)
+    ours, plain = (_at(here, program=name)[column].min() for name in (program, iterations.PLAIN))
+    ratio = ours / plain
+    return ratio, "" if math.isnan(ratio) else f"{ours:.3g} s over {plain:.3g} s"
+
+
+def _power_of_elements(frame: Frame) -> Figure:
+    """Return the power of the elements that an iteration's time on one rank grows with."""
+    here = _at(frame, ranks=1)[["elements per arm", "iteration [s]"]]
+    here = here[here["elements per arm"] <= LARGE]
+    reach = "{} to {} elements".format(*here["elements per arm"].agg(["min", "max"]))
+    return fitted_power(here), reach if len(here) else ""
+
+
+def _demo(frame: Frame) -> Figure:
+    """Return the seconds of a whole optimisation."""
+    done = _at(frame, ranks=2, elements_per_arm=DEMO, iterations=iterations.ITERATIONS)
+    return done["all iterations, wall clock [s]"].min(), ""
+
+
+def _coarse_error(frame: Frame) -> Figure:
+    """Return the default element's error on the coarsest cells, %."""
+    here = _at(frame, element=arms.DEFAULT, cells="{} x {}".format(*arms.CELLS[0]))
+    return 100.0 * here["error of tip compliance [-]"].min(), ""
+
+
+# -- solid links -----------------------------------------------------------------------------
+
+
+def _links(frame: Frame, what: str, ranks: int, fewest: float = FEWEST) -> Frame:
+    here = _at(frame, what=what, ranks=ranks)
+    return here[here["dofs"] >= fewest]
+
+
+def _of(rows: Frame, value: float) -> Figure:
+    """Return a figure with the range of dofs that it is of."""
+    reach = f"{rows['dofs'].min():,} to {rows['dofs'].max():,} dofs" if len(rows) else ""
+    return value, reach.replace(",", " ")
+
+
+def _beside_plain(design: str, ranks: int, frame: Frame) -> Figure:
+    """Return the largest ratio of an iteration to plain DOLFINx's of all sizes."""
+    ours, plain = (_links(frame, what, ranks) for what in (f"{OURS}, {design}", solid.PLAIN))
+    if len(ours) != len(plain):  # some failed
+        return math.nan, ""
+    return _of(ours, (ours["iteration [s]"] / plain["iteration [s]"].to_numpy()).max())
+
+
+def _power_of_dofs(design: str, ranks: int, frame: Frame) -> Figure:
+    """Return the power of the dofs that time grows with beyond the range of factors."""
+    ours, iterative = (_links(frame, f"{who}, {design}", ranks) for who in (OURS, ITERATIVE))
+    factored = ours["dofs"][ours["solver"] != ITERATIVE].max()
+    rows = pd.concat([ours, iterative])
+    rows = rows[(rows["solver"] == ITERATIVE) & ~(rows["dofs"] <= factored)]
+    return _of(rows, fitted_power(rows[["dofs", "iteration [s]"]]))
+
+
+def _memory(frame: Frame) -> Figure:
+    rows = _links(frame, f"{OURS}, {solid.COLD}", 2, MILLION)
+    return _of(rows, rows["memory [GB]"].max())
+
+
+# -- the table -------------------------------------------------------------------------------
+
+GOALS = (
+    Goal("time", "simulation to 1e-4 from cold, 4 coordinates per arm [s]", 0.03,
+         partial(_simulation, 4)),
+    Goal("time", "simulation to 1e-4 from cold, 48 coordinates per arm [s]", 0.3,
+         partial(_simulation, 48)),
+    Goal("time", "times as fast as solve_ivp at the same error, 4 coordinates per arm [-]", FASTER,
+         partial(_superiority, 4), least=True),
+    Goal("time", "times as fast as solve_ivp at the same error, 48 coordinates per arm [-]", FASTER,
+         partial(_superiority, 48), least=True),
+    Goal("peers", "dynamic iteration of two arms of 400 x 24 cells over plain DOLFINx's static one "
+         "of one arm [-]", 1.6, partial(_over_plain, iterations.DYNAMIC, SECONDS)),
+    Goal("peers", "the same on two ranks, wall clock [-]", 1.1,
+         partial(_over_plain, iterations.TWO_RANKS, "wall clock [s]")),
+    Goal("whole", "exponent of an iteration's time, elements up to 40000 per arm, 1 rank [-]", 1.3,
+         _power_of_elements),
+    Goal("whole", "400 iterations of demos/two_arm.toml on two ranks, set-up included, wall clock "
+         "[s]", 20.0, _demo),
+    Goal("mesh", "error of tip compliance, 50 x 3 cells of the default element [%]", 0.5,
+         _coarse_error),
+    Goal("tolerance", "largest true error over simulation.tolerance [-]", 1.0, _worst_error),
+    *(
+        goal
+        for ranks, on in ((1, "1 rank"), (2, "2 ranks"))
+        for goal in (
+            Goal("solid", f"iteration beside plain DOLFINx, the largest of all links, {on} [-]",
+                 3.0, partial(_beside_plain, solid.COLD, ranks)),
+            Goal("solid", f"with warm starts beside it, the largest of all links, {on} [-]",
+                 1.5, partial(_beside_plain, solid.WARM, ranks)),
+            Goal("solid", f"exponent of a first design beyond the range of factors, {on} [-]",
+                 1.15, partial(_power_of_dofs, solid.COLD, ranks)),
+            Goal("solid", f"exponent of a nearby design beyond the range of factors, {on} [-]",
+                 1.15, partial(_power_of_dofs, solid.WARM, ranks)),
+        )
+    ),
+    Goal("solid", "memory of a million dofs on two ranks [GB]", 20.0, _memory),
+)  # fmt: skip

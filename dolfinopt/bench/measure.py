@@ -1,0 +1,155 @@
+"""The clock, designs to measure, and measurements in processes of their own.
+
+These have several ranks or threads and a memory of their own:
+`python -m dolfinopt.bench.measure MODULE FUNCTION FILE`, also under mpirun, calls a function of
+`dolfinopt.bench.MODULE` with all ranks, the scene and the arguments in FILE; prints one line of
+JSON: what the root's returned, and the peak memory of all ranks, MB.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from dolfinopt.arms.arm import Arm, build_arms, chain_of, uniform_design
+from dolfinopt.bench.diagram import Plan
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.output.run import optimize
+from dolfinopt.parallel import partition_arms
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.study.variants import changed
+
+Arms: TypeAlias = dict[int, Arm]
+Densities: TypeAlias = dict[int, np.ndarray]
+DESIGNS = INITIAL, OPTIMISED = "initial design", "optimised design"
+# As dolfinopt.sh has it: containers run as root; more ranks than cores are fine; ranks are not
+# bound to the cores of another run. Open MPI 4 (OMPI), then 5 (PRTE).
+ENVIRONMENT = {
+    "OMPI_ALLOW_RUN_AS_ROOT": "1",
+    "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+    "OMPI_MCA_rmaps_base_oversubscribe": "1",
+    "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
+    "OMPI_MCA_hwloc_base_binding_policy": "none",
+    "PRTE_MCA_hwloc_default_binding_policy": "none",
+}
+
+
+def tidy() -> None:
+    """Free matrices and factors that nothing refers to: PETSc keeps them until it is told."""
+    gc.collect()
+    if hasattr(PETSc, "garbage_cleanup"):  # from 3.18 on
+        PETSc.garbage_cleanup(MPI.COMM_SELF)
+
+
+def timed(action: Callable[[], Any], repeats: int = 1) -> tuple[float, float, Any]:
+    """Call `repeats` times; return the least seconds of CPU and on the wall, and the last value.
+
+    CPU time of this process leaves out others on the machine; whatever disturbs a call makes it
+    longer. No garbage of earlier calls is collected meanwhile.
+    """
+    cpu = wall = math.inf
+    for _ in range(repeats):
+        gc.collect()
+        begun, since = time.process_time(), time.perf_counter()
+        value = action()
+        cpu = min(cpu, time.process_time() - begun)
+        wall = min(wall, time.perf_counter() - since)
+    return cpu, wall, value
+
+
+def arms_of(scene: Scene) -> Arms:
+    """Return the scene's arms on this rank alone."""
+    return build_arms(scene, partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile())
+
+
+def bodies_of(scene: Scene, arms: Arms, x_phys: Densities) -> list[ShapeIntegrals]:
+    """Reduce the arms as `scene` asks for; return the bodies from the cart outwards."""
+    owned = {}
+    for k, arm in arms.items():
+        arm.set_design(x_phys[k])  # shared with those `under` other scenes, which rely on it
+        owned[k] = arm.under(scene).reduce(x_phys[k])
+    return chain_of(scene, owned)
+
+
+@cache
+def designs(plan: Plan) -> dict[str, tuple[Arms, Densities]]:
+    """Return arms and physical densities of the initial and an optimised design."""
+    scene = changed(plan.scene, f"optimizer.max_iterations={15 if plan.quick else 100}")
+    result = optimize(scene, world=MPI.COMM_SELF)
+    arms = dict(result.arms)
+    uniform = uniform_design(scene, result.partition, arms, scene.design.initial)
+    return {INITIAL: (arms, uniform), OPTIMISED: (arms, dict(result.x_phys))}
+
+
+# -- processes -------------------------------------------------------------------------------
+
+
+def mpirun() -> str | None:
+    """Return the command that starts ranks, None where there is none."""
+    return shutil.which("mpirun") or shutil.which("mpiexec")
+
+
+def in_processes(
+    function: Callable[..., Any], scene: Scene, *given: Any, ranks: int = 1, threads: int = 1
+) -> tuple[Any, float]:
+    """Return what function(comm, scene, *given) does there, and the peak memory, MB.
+
+    Raises:
+        ConvergenceError: the processes failed.
+    """
+    name = function.__module__.rpartition(".")[2], function.__name__
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "given.json"
+        path.write_text(json.dumps([scene.to_dict(), *given]), encoding="utf-8")
+        command = [sys.executable, "-m", __name__, *name, str(path)]
+        if ranks > 1:
+            command = [str(mpirun()), "-n", str(ranks), *command]
+        # os.environ is as Python found it: without what MPI added for this process alone.
+        environment = {**ENVIRONMENT, **os.environ, "OMP_NUM_THREADS": str(threads)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise ConvergenceError(f"{' '.join(command)}: {done.stderr.strip()[-2000:]}")
+    found, memory = json.loads(done.stdout.strip().splitlines()[-1])
+    return found, memory
+
+
+def _peak() -> float:
+    """Return this process's peak memory, MB; not that of its parent, which getrusage inherits."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    lines = dict(line.split(":", 1) for line in status.read_text().splitlines() if ":" in line)
+    return float(lines["VmHWM"].split()[0]) / 1024.0
+
+
+def _main(module: str, name: str, file: str) -> None:
+    comm = MPI.COMM_WORLD
+    scene, *given = json.loads(Path(file).read_text(encoding="utf-8"))
+    function = getattr(import_module(f"dolfinopt.bench.{module}"), name)
+    found = function(comm, scene_from_dict(scene), *given)
+    memory = comm.allreduce(_peak())
+    if comm.rank == 0:
+        print(json.dumps([found, memory]), flush=True)
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])

@@ -1,0 +1,149 @@
+"""A bench: diagrams measured step by step, kept, drawn and summed up."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from time import perf_counter
+
+from dolfinopt.bench import arms, iterations, motion, solid, tolerance
+from dolfinopt.bench.diagram import Diagram, Frame, Plan, Row, draw
+from dolfinopt.bench.goals import goal_table
+from dolfinopt.disk import write_text
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.plots.style import save
+
+Tell = Callable[[str], None]
+QUICKLY = ("arms.cells=[100,6]",)  # the scene of a quick bench
+# The main one first; solid links, which take hours, only when they are named.
+DIAGRAMS = (
+    motion.DIAGRAM,
+    iterations.PEERS,
+    iterations.WHOLE,
+    arms.MESHES,
+    arms.REDUCTIONS,
+    tolerance.DIAGRAM,
+    iterations.SOLVERS,
+)
+
+
+def named(names: Sequence[str]) -> tuple[Diagram, ...]:
+    """Return the diagrams of these names; all of plane arms for none."""
+    known = {one.name: one for one in (*DIAGRAMS, solid.DIAGRAM)}
+    if wrong := [name for name in names if name not in known]:
+        raise InputError(f"bench: no diagram {wrong[0]!r}: expected {' | '.join(known)}")
+    return tuple(known[name] for name in names) or DIAGRAMS
+
+
+def bench(
+    plan: Plan, folder: Path, diagrams: Sequence[Diagram], tell: Tell, done: Tell
+) -> list[str]:
+    """Measure what is not measured yet, draw everything, write bench.md; return what failed.
+
+    Rows are kept in FOLDER/<name>.json as soon as they are there: a bench that was ended goes on
+    from the step it was at, and tries again what failed. The summary grows with every diagram.
+
+    Args:
+        plan: what is measured on.
+        folder: for <name>.json, .csv, .png and bench.md.
+        diagrams: in the order of the summary.
+        tell: takes a line for every step.
+        done: takes a line for every diagram that is finished.
+    """
+    how = f"`dolfinopt bench{' --quick' if plan.quick else ''}`"
+    frames: dict[str, Frame] = {}
+    parts, failures = [], []
+    for k, diagram in enumerate(diagrams, 1):
+        begun = perf_counter()
+        rows, failed = measured(diagram, plan, folder, tell)
+        frame = frames[diagram.name] = diagram.frame(rows)
+        parts.append(_write(diagram, frame, folder))
+        failures += failed
+        head = [
+            "# Run time against error",
+            f"Measured by {how}: CPU seconds of this process, the least of the repeats, one "
+            "thread, unless a table says otherwise.",
+            *(f"Failed: {failure}" for failure in failures),
+        ]
+        if rest := [one.name for one in diagrams[k:]]:
+            head.append(f"Not finished: {', '.join(rest)} are missing.")
+        if len(goals := goal_table(frames)):
+            coarse = (
+                "A quick bench is coarser than what some goals are about: the table is partial."
+            )
+            head += ["## Goals", *([coarse] if plan.quick else []), _markdown(goals)]
+        write_text(folder / "bench.md", "\n\n".join([*head, *parts]) + "\n")
+        done(f"{diagram.name}: {diagram.title}, {perf_counter() - begun:.0f} s")
+    return failures
+
+
+def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[list[Row], list[str]]:
+    """Return the rows of all steps, from FOLDER/<name>.json or measured, and what failed.
+
+    Rows that another source of this package, or other versions of what they use, left there are
+    measured anew: they must not stand beside those of today's.
+    """
+    path = folder / f"{diagram.name}.json"
+    versions = [_version(package) for package in diagram.uses]
+    asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
+    content = {"stamp": json.loads(json.dumps(asked)), "complete": False, "rows": {}}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if found["stamp"] == content["stamp"]:
+            content = found
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # not there, or cut off: measured anew
+    kept: dict[str, list[Row]] = content["rows"]
+    failures = []
+    for name, step in () if content["complete"] else diagram.steps(plan):
+        if name in kept:
+            continue
+        tell(f"{diagram.name}: {name}")
+        try:
+            kept[name] = [*step()]
+        except ConvergenceError as error:
+            failures.append(f"{diagram.name}, {name}: {error}")
+        write_text(path, json.dumps(content, default=lambda one: one.item()))
+    content["complete"] = not failures
+    write_text(path, json.dumps(content, default=lambda one: one.item()))
+    return [row for rows in kept.values() for row in rows], failures
+
+
+@cache
+def source(folder: Path = Path(__file__).parents[1]) -> str:
+    """Return a digest of this package's Python files, as they are when first asked for."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
+def _write(diagram: Diagram, frame: Frame, folder: Path) -> str:
+    """Write <name>.csv and <name>.png; return the diagram's part of the summary."""
+    text = frame.to_csv(index=False, float_format="%.10g", lineterminator="\n")
+    write_text(folder / f"{diagram.name}.csv", text)
+    save(draw(diagram, frame), folder / f"{diagram.name}.png")
+    notes = [note for panel in diagram.panels for note in panel.notes(frame)]
+    for package in diagram.uses:
+        if not _version(package):
+            notes.append(f"Left out, not installed (pip install 'dolfinopt[bench]'): {package}.")
+    head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)", diagram.note]
+    listed = "\n".join(f"- {note}" for note in notes)
+    return "\n\n".join(filter(None, [*head, listed, _markdown(frame)]))
+
+
+def _markdown(frame: Frame) -> str:
+    """Return a table, four digits a number, nothing for nan."""
+    cells = frame.astype(object).where(frame.notna(), None)
+    return str(cells.to_markdown(index=False, floatfmt=".4g"))
