@@ -13,7 +13,7 @@ import pandas as pd
 
 from dolfinopt.paper.reproduction import INITIAL, METHODS, OPTIMUM, SHOWN, SWEEPS, loss
 from dolfinopt.study.cases import Case, Outcome, Outcomes
-from dolfinopt.study.plans import design_figure, deviation_panels
+from dolfinopt.study.studies import design_figure, deviation_panels
 from dolfinopt.study.tables import Figure, Line, LineFigure, MatrixFigure, Panel, Table
 
 LABELS = {"compliance": "compliance [N m]", "deviation": "maximal deviation [mm]"}

@@ -26,8 +26,7 @@ from dolfinopt.paper.reproduction import (
     setting_of,
 )
 from dolfinopt.paper.statements import Check, mm
-from dolfinopt.study.html import embedded, html_page
-from dolfinopt.study.tables import DesignFigure, LineFigure
+from dolfinopt.study.tables import DesignFigure, LineFigure, embedded, html_page
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:

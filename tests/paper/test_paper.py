@@ -359,7 +359,13 @@ def test_killed_run_continues(small, whole, tmp_path, capsys):
         begun.wait()
     done, every = (len(list(path.glob("cases/*/summary.json"))) for path in (out, whole))
     capsys.readouterr()
-    small("--out", out)
+    while True:
+        try:
+            small("--out", out)
+            break
+        except InputError as error:  # a rank outlives its killed mpirun for a moment
+            assert "another run works" in str(error) and time.monotonic() < limit
+            time.sleep(0.1)
     # A rank may outlive its killed mpirun for a moment, and finish a case.
     assert 5 <= done and 0 < computed_cases(capsys.readouterr().out) <= every - done
     a, b = (sorted(path.glob("*.*")) for path in (out, whole))
