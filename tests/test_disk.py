@@ -21,7 +21,7 @@ from dolfinopt import disk, locks
 from dolfinopt.data import paper_scene
 from dolfinopt.disk import append_text, make_folder, write_arrays, write_atomically, write_text
 from dolfinopt.errors import InputError, OutputError
-from dolfinopt.locks import has_locks, try_lock
+from dolfinopt.locks import working_in
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
 from dolfinopt.output.run_folder import write_question
@@ -155,48 +155,31 @@ def without(number):
     return lock
 
 
-@pytest.mark.parametrize("number", locks.HELD)
-def test_held_by_another(number):
-    assert try_lock(without(number)) is False
-
-
-@pytest.mark.parametrize("number", [*locks.ABSENT, errno.EIO])
-def test_no_lock_is_not_one_that_another_holds(number):
-    with pytest.raises(OSError, match=os.strerror(number)):
-        try_lock(without(number))
-
-
-@pytest.mark.parametrize("number", locks.ABSENT)
-def test_a_file_system_without_locks_is_told(number, shared_tmp_path, monkeypatch, capsys):
-    assert has_locks(shared_tmp_path, COMM)
-    assert capsys.readouterr().err == ""
-    COMM.Barrier()
-    monkeypatch.setattr(fcntl, "lockf", without(number))
-    if COMM.size > 1:
-        with pytest.raises(InputError, match=r"has no locks.*use one rank"):
-            has_locks(shared_tmp_path, COMM)
-    else:
-        assert not has_locks(shared_tmp_path, COMM)
-        (line,) = capsys.readouterr().err.splitlines()
+def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
+    """That is not a lock which another holds."""
+    for number in locks.ABSENT:
+        monkeypatch.setattr(fcntl, "lockf", without(number))
+        with working_in(tmp_path):
+            (line,) = capsys.readouterr().err.splitlines()
         assert f"has no locks ({os.strerror(number)}); continuing without" in line
-    assert not list(shared_tmp_path.iterdir())
-
-
-def test_other_errors_of_locks_are_errors(tmp_path, monkeypatch):
+    for number in locks.HELD:
+        monkeypatch.setattr(fcntl, "lockf", without(number))
+        with pytest.raises(InputError, match="another run works in this folder"):
+            working_in(tmp_path).__enter__()
     monkeypatch.setattr(fcntl, "lockf", without(errno.EIO))
     with pytest.raises(OutputError, match="Input/output error"):
-        has_locks(tmp_path, SELF)
+        working_in(tmp_path).__enter__()
 
 
-def test_one_rank_studies_without_locks(tmp_path, monkeypatch, capsys):
+def test_studies_without_locks(shared_tmp_path, monkeypatch, capsys):
     """It hung: a lock that is missing was taken for one that somebody holds."""
     monkeypatch.setattr(fcntl, "lockf", without(errno.ENOTSUP))
     scene = load_scene(paper_scene(), COARSE)
-    outcomes = run_cases([Case(scene)], tmp_path, SELF, shown=False)
+    outcomes = run_cases([Case(scene)], shared_tmp_path, COMM, shown=False)
     assert outcomes.computed == 1 and not outcomes.failures
     samples = sample_cases(scene, [(), ("payload.mass=5.0",), ("payload.mass=7.0",)], "", None)
-    assert run_cases(samples, tmp_path, SELF, shown=False).computed == 3
-    assert capsys.readouterr().err.count("continuing without") == 2
+    assert run_cases(samples, shared_tmp_path, COMM, shown=False).computed == 3
+    assert capsys.readouterr().err.count("continuing without") == 2 * (COMM.rank == 0)
 
 
 # -- what other programs have computed -------------------------------------------------------

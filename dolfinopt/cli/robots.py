@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene
-    from dolfinopt.study.before_after_page import Side
+    from dolfinopt.study.before_after import Side
     from dolfinopt.study.tables import Table
 
 SAMPLES = 2000  # at which a trajectory's rates are looked at
@@ -347,17 +347,16 @@ def _side(run: _Run, views: list[ArmView]) -> Side:
     """Return what the page needs of a run (root only)."""
     from dolfinopt.arms.arm import chain_of
     from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
-    from dolfinopt.study.before_after_page import Side, read_motion
+    from dolfinopt.study.before_after import read_side
 
     scene = run.scene
     mechanism = build_spatial_mechanism(scene, chain_of(scene, run.bodies))
-    motion = read_motion(run.folder, scene)
-    return Side(run.folder, scene, _summary(run.folder), motion, views, mechanism)
+    return read_side(run.folder, scene, _summary(run.folder), views, mechanism)
 
 
 def _pages(table: Table, before: Side, after: Side) -> dict[str, bytes]:
     """Return table and page of both runs by the names of their files (root only)."""
-    from dolfinopt.study.before_after_page import before_after_page
+    from dolfinopt.study.before_after import before_after_page
 
     texts = {
         ".md": table.markdown(),

@@ -1,9 +1,8 @@
-"""What the commands that vary a scene share: their options, the folder, what they write."""
+"""`dolfinopt sweep`, `compare` and `uncertainty`: the commands that vary a scene."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +26,9 @@ if TYPE_CHECKING:
     from dolfinopt.scene.load import Scene
     from dolfinopt.study.tables import Study
 
+PRESETS = ("payload", "flattening", "coordinates")
+COMPARED = {"objectives": "objective", "reductions": "reduction"}  # preset by the command's word
+
 designs_option = click.option(
     "--design",
     "designs",
@@ -37,92 +39,57 @@ designs_option = click.option(
 )
 
 
-def study_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command with a scene the options of all studies; it takes them as a `StudyRun`."""
-
-    @wraps(command)
-    def wrapped(
-        scene: Path,
-        out: Path | None,
-        overwrite: bool,
-        overrides: tuple[str, ...],
-        plots: bool,
-        **own: Any,
-    ) -> None:
-        world, loaded = load(scene, overrides)
-        # One folder for all studies of a scene, which share the optimised design.
-        folder = out or Path("results") / f"{scene.stem}-study"
-        command(StudyRun(world, loaded, folder, overwrite, plots), **own)
-
-    decorated: Callable[..., None] = wrapped
-    out = out_option("tables, pictures and cases; default: results/SCENE-study")
-    for option in (plots_option, set_option, overwrite_option, out):
-        decorated = option(decorated)
-    return decorated
+# What a command asks: name of the study's files, design.npz files, what does the study in a folder,
+# and what else it asks, but for the values it goes through, which may grow.
+Question = tuple[str, Sequence[Path], Callable[["Path", "MPI.Comm"], "Study"], dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class StudyRun:
-    """A study of a scene in a folder.
+def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
+    """Make a command of a function of the scene; it writes, draws and prints what the study found.
 
-    Attributes:
-        world: all ranks.
-        scene, folder: what is varied, and DIR.
-        overwrite: replace the files of another question.
-        plots: draw pictures.
+    The same question in the same folder goes on: cases that were computed are taken from there. One
+    of another scene or other designs under the same name is refused, InputError. ConvergenceError
+    says that a case failed; all others are written.
     """
 
-    world: MPI.Comm
-    scene: Scene
-    folder: Path
-    overwrite: bool
-    plots: bool
-
-    def carry_out(
-        self,
-        name: str,
-        designs: Sequence[Path],
-        study: Callable[[Path, MPI.Comm], Study],
-        **question: Any,
+    @wraps(ask)
+    def command(
+        scene: Path, out: Path | None, overwrite: bool, overrides: Any, plots: bool, **own: Any
     ) -> None:
-        """Do a study; write, draw and print what it found (collective).
-
-        The same question in the same folder goes on: cases that were computed are taken from there.
-
-        Args:
-            name: of the study's files.
-            designs: design.npz files; they and the scene tell one question from another.
-            study: does it in a folder, on all ranks.
-            question: what else it asks, but for the values it goes through, which may grow.
-
-        Raises:
-            InputError: the folder answers another question under this name.
-            ConvergenceError: a case failed; all others are written.
-        """
+        world, loaded = load(scene, overrides)
+        name, designs, study, question = ask(loaded, **own)
         from dolfinopt.output.run_folder import check_question, remove_listed, write_question
         from dolfinopt.parallel import on_root
         from dolfinopt.study.tables import write_study
 
-        asked = on_root(self.world, _asked, self.scene, designs) | question
-        if not self.overwrite:
-            on_root(self.world, check_question, self.folder, name, asked)
-        done = study(self.folder, self.world)
+        # One folder for all studies of a scene, which share the optimised design.
+        folder = out or Path("results") / f"{scene.stem}-study"
+        asked = on_root(world, _asked, loaded, designs) | question
+        if not overwrite:
+            on_root(world, check_question, folder, name, asked)
+        done = study(folder, world)
 
         def conclude() -> None:
-            remove_listed(self.folder, name)
-            written = write_study(done, self.folder)
-            if self.plots:
+            remove_listed(folder, name)
+            written = write_study(done, folder)
+            if plots:
                 from dolfinopt.study.figures import draw_study
 
-                written += draw_study(done, self.folder)
-            write_question(self.folder, name, asked, [path.name for path in written])
+                written += draw_study(done, folder)
+            write_question(folder, name, asked, [path.name for path in written])
             click.echo(done.markdown())
-            click.echo(f"{done.computed} cases computed; tables and pictures in {self.folder}")
+            click.echo(f"{done.computed} cases computed; tables and pictures in {folder}")
 
-        on_root(self.world, conclude)  # a rank that raised below meanwhile would end its writing
+        on_root(world, conclude)  # a rank that raised below meanwhile would end its writing
         if done.failures:
             more = f" (and {len(done.failures) - 1} more)" if len(done.failures) > 1 else ""
             raise ConvergenceError(f"{done.failures[0]}{more}")
+
+    decorated: Callable[..., None] = command
+    out = out_option("tables, pictures and cases; default: results/SCENE-study")
+    for option in (plots_option, set_option, overwrite_option, out):
+        decorated = option(decorated)
+    return decorated
 
 
 def _asked(scene: Scene, designs: Sequence[Path]) -> dict[str, Any]:
@@ -131,11 +98,6 @@ def _asked(scene: Scene, designs: Sequence[Path]) -> dict[str, Any]:
 
     known = [file_digest(path) if path.is_file() else str(path) for path in designs]
     return {"scene": with_digests(scene.to_dict()), "designs": known}
-
-
-# -- `dolfinopt sweep` ---------------------------------------------------------------------------
-
-PRESETS = ("payload", "flattening", "coordinates")
 
 
 @click.command()
@@ -149,10 +111,10 @@ PRESETS = ("payload", "flattening", "coordinates")
 )
 @designs_option
 @click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
-@study_options
+@study_command
 def sweep(
-    run: StudyRun, preset: Any, vary: tuple[str, ...], designs: tuple[Path, ...], reoptimize: bool
-) -> None:
+    scene: Scene, preset: Any, vary: tuple[str, ...], designs: tuple[Path, ...], reoptimize: bool
+) -> Question:
     """Simulate designs of SCENE for a range of values: tables and curves of what they do.
 
     Values are those of the payload's mass, the path's flattening, the number of coordinates, or
@@ -166,14 +128,45 @@ def sweep(
         )
     from dolfinopt.study.studies import study, sweep_name
 
-    run.carry_out(
-        sweep_name(preset, vary),
-        designs,
-        partial(study, run.scene, preset, vary, designs, reoptimize=reoptimize),
-    )
+    do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize)
+    return sweep_name(preset, vary), designs, do, {}
 
 
-# -- `dolfinopt uncertainty` ---------------------------------------------------------------------
+@click.command()
+@scene_argument
+@click.argument("what", type=click.Choice(list(COMPARED)))
+@click.option(
+    "--coordinates",
+    multiple=True,
+    type=int,
+    metavar="N",
+    help="of the reductions, any number of times; default: 4 and 12",
+)
+@click.option(
+    "--kind",
+    "kinds",
+    multiple=True,
+    metavar="KIND",
+    help="of the objectives, any number of times; default: all",
+)
+@study_command
+def compare(
+    scene: Scene, what: str, coordinates: tuple[int, ...], kinds: tuple[str, ...]
+) -> Question:
+    """Optimise SCENE for every objective or with every reduction, and compare the designs.
+
+    What is computed is kept in DIR and taken from there the next time; a call that was
+    interrupted goes on.
+    """
+    if coordinates and what == "objectives":
+        raise InputError("--coordinates: expected only with compare SCENE reductions")
+    if kinds and what != "objectives":
+        raise InputError("--kind: expected only with compare SCENE objectives")
+    from dolfinopt.study.studies import study
+
+    preset: Any = COMPARED[what]
+    vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
+    return preset, [], partial(study, scene, preset, vary, [], kinds=kinds), {}
 
 
 @click.command()
@@ -203,10 +196,10 @@ def sweep(
     help="Sobol' indices of a polynomial fitted to the samples, or of more simulations",
 )
 @designs_option
-@study_options
+@study_command
 def uncertainty(
-    run: StudyRun, random: tuple[str, ...], designs: tuple[Path, ...], **sampling: Any
-) -> None:
+    scene: Scene, random: tuple[str, ...], designs: tuple[Path, ...], **sampling: Any
+) -> Question:
     """Simulate designs of SCENE with random values: statistics and Sobol' indices.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
@@ -214,49 +207,5 @@ def uncertainty(
     """
     from dolfinopt.study.uncertainty import Sampling, random_name, study_random
 
-    run.carry_out(
-        random_name(random),
-        designs,
-        partial(study_random, run.scene, random, designs, sampling=Sampling(**sampling)),
-        distributions=sorted(random),
-    )
-
-
-# -- `dolfinopt compare` -------------------------------------------------------------------------
-
-PRESETS = {"objectives": "objective", "reductions": "reduction"}
-
-
-@click.command()
-@scene_argument
-@click.argument("what", type=click.Choice(list(PRESETS)))
-@click.option(
-    "--coordinates",
-    multiple=True,
-    type=int,
-    metavar="N",
-    help="of the reductions, any number of times; default: 4 and 12",
-)
-@click.option(
-    "--kind",
-    "kinds",
-    multiple=True,
-    metavar="KIND",
-    help="of the objectives, any number of times; default: all",
-)
-@study_options
-def compare(run: StudyRun, what: str, coordinates: tuple[int, ...], kinds: tuple[str, ...]) -> None:
-    """Optimise SCENE for every objective or with every reduction, and compare the designs.
-
-    What is computed is kept in DIR and taken from there the next time; a call that was
-    interrupted goes on.
-    """
-    if coordinates and what == "objectives":
-        raise InputError("--coordinates: expected only with compare SCENE reductions")
-    if kinds and what != "objectives":
-        raise InputError("--kind: expected only with compare SCENE objectives")
-    from dolfinopt.study.studies import study
-
-    preset: Any = PRESETS[what]
-    vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
-    run.carry_out(preset, [], partial(study, run.scene, preset, vary, [], kinds=kinds))
+    do = partial(study_random, scene, random, designs, sampling=Sampling(**sampling))
+    return random_name(random), designs, do, {"distributions": sorted(random)}

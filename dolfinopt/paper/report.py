@@ -25,9 +25,17 @@ from dolfinopt.paper.reproduction import (
 )
 from dolfinopt.paper.statements import Check
 from dolfinopt.study.cases import Case, Outcome, Outcomes
-from dolfinopt.study.html import embedded, html_page
-from dolfinopt.study.plans import design_figure, deviation_panels
-from dolfinopt.study.tables import Figure, Line, LineFigure, MatrixFigure, Panel, Table
+from dolfinopt.study.studies import design_figure, deviation_panels
+from dolfinopt.study.tables import (
+    Figure,
+    Line,
+    LineFigure,
+    MatrixFigure,
+    Panel,
+    Table,
+    embedded,
+    html_page,
+)
 from dolfinopt.study.variants import differences
 
 LABELS = {"compliance": "compliance [N m]", "deviation": "maximal deviation [mm]"}

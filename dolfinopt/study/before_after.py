@@ -1,25 +1,40 @@
-"""What a machine does with a design beside what it did before, from the summaries of two runs."""
+"""What a machine does with a design beside what it did before: table and page of two runs."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from dolfinopt.errors import InputError
-from dolfinopt.study.tables import Table
+from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.output.trajectory import drive_units
+from dolfinopt.output.views import designed
+from dolfinopt.plots.style import look, png
+from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, html_page
+from dolfinopt.study.variants import differences
 
-Summary = Mapping[str, Any]
+if TYPE_CHECKING:
+    from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
+    from dolfinopt.output.views import ArmView
+
+Summary = Mapping[str, Any]  # content of summary.json
+Image = dict[str, Any]  # see `tables.embedded`
+BEFORE, AFTER = "before", "after"
+LOOKS = {BEFORE: look(1), AFTER: look(0)}  # as an initial and an optimised design
 MM = 1e3  # of a metre
+
+
+# -- table -----------------------------------------------------------------------------------
 
 
 def before_after(before: Summary, after: Summary) -> Table:
     """Return mass, deflection, frequencies and drive forces of two runs of one machine.
-
-    Args:
-        before, after: content of their summary.json.
 
     Raises:
         InputError: they have other arms or drives.
@@ -31,38 +46,154 @@ def before_after(before: Summary, after: Summary) -> Table:
                 f"the runs have other {what}: {', '.join(names[0]) or 'none'} before, "
                 f"{', '.join(names[1]) or 'none'} after; name runs of the same machine"
             )
-    rows = [
-        (name, _number(a), _number(b), unit)
-        for (name, a, unit), (_, b, _) in zip(_figures(before), _figures(after), strict=True)
-    ]
-    frame = pd.DataFrame(rows, columns=["figure", "before", "after", "unit"])
-    ratio = frame["after"] / frame["before"]
-    frame.insert(3, "change [%]", (100.0 * (ratio - 1.0)).round(2) + 0.0)
+    frame = pd.DataFrame(_figures(before), columns=["figure", BEFORE, "unit"])
+    frame.insert(2, AFTER, [value for _, value, _ in _figures(after)])
+    frame = frame.astype({BEFORE: float, AFTER: float})  # what a run does not have is nan
+    change = 100.0 * (frame[AFTER] / frame[BEFORE] - 1.0)
+    frame.insert(3, "change [%]", change.round(2) + 0.0)
     return Table("before_after", f"{after['name']}: before and after", frame)
 
 
 def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
     """Yield name, value and unit."""
-    yield "mass of all arms", sum(summary["mass"].values()), "kg"
+
+    def millimetres(key: str) -> float | None:
+        return None if summary.get(key) is None else MM * summary[key]
+
     links = summary["first_frequency"]
+    yield "mass of all arms", sum(summary["mass"].values()), "kg"
     for link in links:
         yield f"mass of {link}", summary["mass"][link], "kg"
-    deflection = summary.get("max_deviation")
-    yield "largest tool deflection", None if deflection is None else MM * deflection, "mm"
-    settling = summary.get("settling")
-    yield "deflection after the motion", None if settling is None else MM * settling, "mm"
+    yield "largest tool deflection", millimetres("max_deviation"), "mm"
+    yield "deflection after the motion", millimetres("settling"), "mm"
     for link, frequency in links.items():
         yield f"first frequency of {link}", frequency, "Hz"
+    joints = {one["name"]: one["type"] for one in summary["scene"].get("joints", ())}
     for key, word in (("drive_peak", "peak"), ("drive_rms", "root mean square")):
         for drive, value in (summary.get(key) or {}).items():
-            yield f"{word} of drive {drive}", value, _unit(summary, drive)
+            slides = joints.get(drive) == "prismatic" or (not joints and drive == "cart")
+            yield f"{word} of drive {drive}", value, "N" if slides else "N m"
 
 
-def _unit(summary: Summary, drive: str) -> str:
-    """Return the unit of a drive's force: of the cart and of slides N, else N m."""
-    joints = {one["name"]: one["type"] for one in summary["scene"].get("joints", ())}
-    return "N" if joints.get(drive) == "prismatic" or (not joints and drive == "cart") else "N m"
+# -- page ------------------------------------------------------------------------------------
 
 
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the two runs, in space.
+
+    Attributes:
+        folder, scene, summary: of the run, the folder as the user named it.
+        views: of all arms, in the scene's order.
+        mechanism: of its bodies.
+        t, q_r: (n,) s; (n, joints) rad or m.
+        deviation: (n,) of the tool from where rigid links carry it, m.
+        drive_forces: (n,) by the drive's name, N or N m.
+    """
+
+    folder: Path
+    scene: Scene
+    summary: Summary
+    views: list[ArmView]
+    mechanism: SpatialMechanism
+    t: np.ndarray
+    q_r: np.ndarray
+    deviation: np.ndarray
+    drive_forces: Mapping[str, np.ndarray]
+
+
+def read_side(
+    folder: Path,
+    scene: Scene,
+    summary: Summary,
+    views: list[ArmView],
+    mechanism: SpatialMechanism,
+) -> Side:
+    """Return a finished run with its motion, see `Side`.
+
+    Raises:
+        InputError: it has no trajectory.npz, or another machine's.
+    """
+    path = folder / "trajectory.npz"
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            forces = data["joint_forces"][:, scene.driven_columns].T
+            by_drive = dict(zip(scene.driven, forces, strict=True))
+            motion = data["t"], data["q_r"], lengths(data["deviation"]), by_drive
+            return Side(folder, scene, summary, views, mechanism, *motion)
+    except Exception as error:  # whatever a foreign file may raise
+        raise InputError(
+            f"{path}: cannot be read ({type(error).__name__}); name a finished run"
+        ) from None
+
+
+def before_after_page(before: Side, after: Side, table: Table) -> str:
+    """Return the page of two runs of one machine, with the table of their figures."""
+    from dolfinopt.plots.solid_machine import solid_machine_figure
+
+    sides, rows = {BEFORE: before, AFTER: after}, table.frame
+    on_top = rows["figure"].str.startswith(("mass of", "largest tool", "first frequency"))
+    on_top &= (rows["figure"] != "mass of all arms") & rows[[BEFORE, AFTER]].notna().all(axis=1)
+    machines = []
+    for label, side in sides.items():
+        drawn = solid_machine_figure(side.views, side.mechanism, side.t, side.q_r, label)
+        machines.append((label, embedded(png(drawn))))
+    return html_page(
+        "before_after.html",
+        title=table.title,
+        sides=sides,
+        cards=[
+            (row.figure, f"{row.before:.4g} → {row.after:.4g} {row.unit}")
+            for row in rows[on_top].itertuples()
+        ],
+        machines=machines,
+        links=list(_links(sides)),
+        curves=list(_curves(sides, table)),
+        table=table,
+        differing=differences(before.scene, after.scene),
+        scene=after.scene,
+    )
+
+
+def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
+    """Yield every link that one of the runs designs, by its name: both to one scale."""
+    from dolfinopt.plots.solid_design import solid_design_figure
+
+    found = [(label, view) for label, side in sides.items() for view in designed(side.views)]
+    for name in dict.fromkeys(view.name for _, view in found):
+        own = [(label, view) for label, view in found if view.name == name]
+        masses = {label: sides[label].summary["mass"][name] for label, _ in own}
+        views = [replace(view, name=label) for label, view in own]
+        yield name, embedded(png(solid_design_figure(views, name, masses)))
+
+
+def _curves(sides: Mapping[str, Side], table: Table) -> Iterator[tuple[str, str, Image]]:
+    """Yield title, figures in words, and picture of deflection and drive forces over time."""
+    title, figure = "deflection of the tool", "largest tool deflection"
+    deflections = {label: MM * side.deviation for label, side in sides.items()}
+    words = _words(table, "largest", figure)
+    yield title, words, _plot(sides, title, f"{title} [mm]", deflections)
+    for drive, unit in drive_units(sides[AFTER].scene).items():
+        forces = {label: side.drive_forces[drive] for label, side in sides.items()}
+        words = "; ".join(
+            _words(table, word, f"{word} of drive {drive}") for word in ("peak", "root mean square")
+        )
+        what = "force" if unit == "N" else "torque"
+        yield f"drive {drive}", words, _plot(sides, f"drive {drive}", f"{what} [{unit}]", forces)
+
+
+def _words(table: Table, word: str, figure: str) -> str:
+    """Return a row of the table in words."""
+    row = table.frame.set_index("figure").loc[figure]
+    change = row["change [%]"]
+    ending = f" ({change:+.3g} %)" if np.isfinite(change) and change else ""
+    return f"{word} {row[BEFORE]:.4g} → {row[AFTER]:.4g} {row['unit']}{ending}"
+
+
+def _plot(sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]) -> Image:
+    """Return curves of both runs over time."""
+    from dolfinopt.study.figures import column_figure
+
+    lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
+    panel = Panel(title, "time [s]", label, lines, y_log=False)
+    return embedded(png(column_figure(LineFigure("", title, ((panel,),)), LOOKS)))

@@ -9,39 +9,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.output.design import read_history
+from dolfinopt.reduction import BasisErrors
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, program, with_digests
 from dolfinopt.study import variants
-
-if TYPE_CHECKING:
-    from dolfinopt.optimization.history import HistoryRow
-    from dolfinopt.study.simulate import BasisFigures
+from dolfinopt.study.simulate import MODES
 
 Action = Literal["optimize", "simulate", "compare", "sample"]
 
-# Scenes that differ in nothing but these tables have the same arms: they are meshed, assembled
-# and factorised once.
-SCENARIO = (
-    "motion",
-    "control",
-    "closure",
-    "payload",
-    "damping",
-    "reduction",
-    "simulation",
-    "objective",
-    "constraints",
-    "optimizer",
-    "scenarios",
+# Scenes that differ in these tables alone have the same arms, which are built and factorised once.
+SCENARIO = frozenset(
+    "motion control closure payload damping reduction simulation objective constraints optimizer "
+    "scenarios".split()
 )
-# These values of material and arms do no more to the reduced arms than scale their integrals, where
-# the basis does not depend on them: Krylov's shifts and the Gramian's band are frequencies. The
-# thickness in the plane alone: in space it is one of the cells' sides.
+# These values of material and arms scale the integrals of the reduced arms, where the basis does
+# not depend on them: Krylov's shifts and the Gramian's band are frequencies. The thickness in the
+# plane alone: in space it is one of the cells' sides.
 SCALING = ("young_modulus", "density", "thickness")
 SCALABLE = ("craig-bampton", "modal")
 
@@ -50,11 +40,14 @@ SCALABLE = ("craig-bampton", "modal")
 class Case:
     """One thing to compute. Two cases are equal when they compute the same.
 
+    The key is a hash of the scene's content, of the design and of the program that computes, never
+    of a name, a path or a date.
+
     Attributes:
         scene: complete; its name does not matter.
         action: "optimize" finds a design, "simulate" moves a given one, "compare" says what its
             reduced basis misses of `variants.REFERENCE` Craig-Bampton coordinates, "sample" moves
-            it at several samples of the scene's values, one after the other.
+            it at several samples of the scene's values.
         design: given; that of an optimising case, of a file, or None, the initial one.
         label: what progress and messages call it.
         samples: what each sample changes, "key.path=value" each.
@@ -73,17 +66,14 @@ class Case:
         """Sixteen hexadecimal digits that stand for everything the case computes."""
         parts: list[Any] = [program(), self.action, scene_content(self.scene), self.design_key]
         if self.action == "compare":
-            from dolfinopt.study.simulate import MODES
-
             parts += [variants.REFERENCE_METHOD, variants.REFERENCE, MODES]
         return _digest([*parts, self.samples])
 
     @property
     def title(self) -> str:
         """Its label, with the numbers of its samples."""
-        if not self.samples:
-            return self.label
-        return f"{self.label}, samples {self.first} to {self.first + len(self.samples) - 1}"
+        samples = f", samples {self.first} to {self.first + len(self.samples) - 1}"
+        return self.label + samples * bool(self.samples)
 
     @cached_property
     def design_key(self) -> str:
@@ -94,26 +84,21 @@ class Case:
 
     @cached_property
     def arms_key(self) -> str:
-        """Equal where the same arms with the same design are simulated or compared.
-
-        Optimisations and samples share nothing.
-        """
-        if self.action in ("optimize", "sample"):
+        """Equal where the same arms with the same design are simulated, compared or sampled."""
+        if self.action == "optimize":
             return self.key
-        content = scene_content(self.scene)
-        kept = {table: value for table, value in content.items() if table not in SCENARIO}
-        return _digest([self.action, kept, self.design_key])
+        free = frozenset() if self.action == "sample" else SCENARIO  # samples are of one scene
+        return _digest([self.action, scene_content(self.scene, free), self.design_key])
 
     @cached_property
     def batch_key(self) -> str:
         """Equal where cases are done at once: simulations of the same arms and basis."""
-        scene, content = self.scene, scene_content(self.scene)
+        scene = self.scene
         if self.action != "simulate" or scene.reduction.coordinates == "auto":  # each its own
             return self.key
-        free = {*SCENARIO} - {"reduction"}
-        if scene.reduction.method == "balanced":  # the Gramian knows the damping
-            free.remove("damping")
-        kept = {table: value for table, value in content.items() if table not in free}
+        # The balanced reduction's Gramian knows the damping.
+        fixed = {"reduction", "damping"} if scene.reduction.method == "balanced" else {"reduction"}
+        kept = scene_content(scene, SCENARIO - fixed)
         motion_alone = scene.objective.needs("motion") and not any(vars(scene.constraints).values())
         if motion_alone and scene.reduction.method in SCALABLE:
             for row in (kept["material"], *kept["arms"]):
@@ -135,13 +120,10 @@ class Outcome:
     Attributes:
         case, folder: which, and where its files are.
         failure: message, "" where it succeeded.
-        objective: N m, N m s, m or s2.
-        compliance: of the load cases, N m.
-        max_deviation, max_deviation_time: m, s.
-        grayness: over all arms.
-        iterations, stop_reason: of an optimisation.
+        objective, compliance, max_deviation, max_deviation_time, grayness, iterations,
+            stop_reason: of the summary; SI units.
         seconds: that it took.
-        bases: of a comparison, one an arm with a design of its own.
+        bases: of a comparison, by the names of the arms with a design of their own.
         samples: compliance, max_deviation and max_deviation_time (n,) of samples.
         messages: of the samples that failed, by number.
     """
@@ -157,20 +139,28 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
-    bases: tuple[BasisFigures, ...] = ()
+    bases: Mapping[str, BasisErrors] = field(default_factory=dict)
     samples: Mapping[str, np.ndarray] = field(default_factory=dict)
     messages: Mapping[int, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        if self.failure:
+            return f"{self.case.title}: failed: {self.failure}"
+        found = f"compliance {self.compliance:.4g} N m, deviation {1e3 * self.max_deviation:.4g} mm"
+        if self.case.action == "optimize":
+            found = f"{self.iterations} iterations, {found}"
+        elif self.case.action != "simulate":
+            found = f"{len(self.case.samples)} samples" if self.case.samples else "compared"
+        return f"{self.case.title}: {found}, {self.seconds:.1f} s"
 
     @property
     def failures(self) -> list[str]:
         """What failed, a line each."""
         if not self.messages:
             return [f"{self.case.title}: {self.failure}"] if self.failure else []
-        return [
-            f"{self.case.label}, sample {number} "
-            f"({', '.join(self.case.samples[number - self.case.first])}): {message}"
-            for number, message in self.messages.items()
-        ]
+        case = self.case
+        names = {k: f"{k} ({', '.join(one)})" for k, one in enumerate(case.samples, case.first)}
+        return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
 
     @property
     def design(self) -> Path:
@@ -189,19 +179,12 @@ class Outcome:
 
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""
-        from dolfinopt.output.design import read_history
-
         return read_history(self.folder / "history.csv")
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """All cases of a run.
-
-    Attributes:
-        by_case: in the order asked for.
-        computed: how many were not there before; every sample counts.
-    """
+    """All cases of a run, and how many were computed in it; every sample counts."""
 
     by_case: Mapping[Case, Outcome]
     computed: int
@@ -216,14 +199,10 @@ class Outcomes:
         return [outcome for outcome in self.by_case.values() if outcome.failure]
 
 
-# -- keys ------------------------------------------------------------------------------------
-
-
-def scene_content(scene: Scene) -> dict[str, Any]:
-    """Return everything that a scene computes with: its values, and its files' content."""
+def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:
+    """Return what a scene computes with: its values and its files' content, `but` some tables."""
     data = with_digests(scene.to_dict())
-    del data["name"]
-    return data
+    return {table: value for table, value in data.items() if table != "name" and table not in but}
 
 
 def _digest(content: Any) -> str:

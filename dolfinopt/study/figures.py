@@ -4,44 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.output.design import read_views
 from dolfinopt.output.views import designed
-from dolfinopt.plots.style import (
-    COLOURS,
-    DENSITY,
-    GREY,
-    PALETTE,
-    ends_right,
-    label_ends,
-    log2_scale,
-    log_scale,
-    looks,
-    new_figure,
-    save,
-    shortened,
-    spans_decade,
-    width_of_names,
-)
-from dolfinopt.study import tables as findings
-from dolfinopt.study.tables import (
-    DesignFigure,
-    FrameFigure,
-    LineFigure,
-    MatrixFigure,
-    Panel,
-    Study,
-    joined,
-)
+from dolfinopt.plots import style
+from dolfinopt.plots.style import GREY, PALETTE
+from dolfinopt.study import tables
+from dolfinopt.study.tables import FrameFigure, LineFigure, MatrixFigure, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from dolfinopt.output.views import ArmView
 
 FEW = 40  # points a line that get markers
 NARROW = 5.4  # inches, of a column
@@ -49,21 +25,19 @@ CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
 PANEL = 3.2  # inches, height of a panel of curves
 LEAST = 3.4  # inches, of a panel without the names of its curves: less is no picture
+LEGEND: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9, "handlelength": 5.0}
 
 Looks = Mapping[str, Mapping[str, Any]]
 
 
-def draw_study(study: Study, folder: Path) -> list[Path]:
+def draw_study(study: tables.Study, folder: Path) -> list[Path]:
     """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
     styles = common_looks(study.figures)
-    paths = []
-    for figure in study.figures:
-        name = joined(study.name, figure.name)
-        paths.append(save(draw(figure, styles), folder / f"{name}.png"))
-    return paths
+    files = [folder / f"{tables.joined(study.name, one.name)}.png" for one in study.figures]
+    return [style.save(draw(one, styles), file) for one, file in zip(study.figures, files)]
 
 
-def common_looks(figures: Iterable[findings.Figure]) -> Looks:
+def common_looks(figures: Iterable[tables.Figure]) -> Looks:
     """Return one look for every curve's name in all these figures, and for every design's."""
     groups = []
     for figure in figures:
@@ -71,16 +45,11 @@ def common_looks(figures: Iterable[findings.Figure]) -> Looks:
             groups.append([line.label for row in figure.rows for p in row for line in p.lines])
         elif isinstance(figure, FrameFigure) and figure.kind in ("histogram", "scatter"):
             groups.append(list(figure.frame["design"].unique()))
-    return looks(groups)
+    return style.looks(groups)
 
 
-def draw(figure: findings.Figure, styles: Looks | None = None) -> Figure:
-    """Return a study's figure, drawn.
-
-    Args:
-        figure: what.
-        styles: of curves and designs by name, see `common_looks`; default: of this figure alone.
-    """
+def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
+    """Return a study's figure, drawn in the looks of `common_looks`; default: of itself alone."""
     styles = styles or common_looks([figure])
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
@@ -96,7 +65,7 @@ def _grid(
 ) -> tuple[Figure, np.ndarray]:
     """Return a figure with its title, and axes (rows, columns), inches each."""
     (rows, columns), (width, height) = shape, panel
-    drawn = new_figure(width * columns + 0.6, height * rows + 0.6)
+    drawn = style.new_figure(width * columns + 0.6, height * rows + 0.6)
     drawn.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
     return drawn, drawn.subplots(rows, columns, squeeze=False, **options)
 
@@ -121,7 +90,7 @@ def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     styles = styles or common_looks([figure])
     names = [line.label for row in figure.rows for panel in row for line in panel.lines]
     width = (4.4 if columns > 1 else 6.5) + 2.4 / columns  # with the names beside them
-    width = max(width, LEAST + width_of_names(names))
+    width = max(width, LEAST + style.width_of_names(names))
     drawn, grid = _grid(figure.title, (rows, columns), (width, PANEL + 0.4))
     for row, panels in zip(grid, figure.rows, strict=True):
         for axes in row[len(panels) :]:
@@ -160,22 +129,15 @@ def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
     left = dict.fromkeys(line.label for panel in panels for line in panel.lines)
     if all(list(left) == [panel.title] for panel in panels):  # the title says it
         return
-    if all(ends_right(axes) for axes in row[: last + 1] if axes.lines):
+    if all(style.ends_right(axes) for axes in row[: last + 1] if axes.lines):
         for k in range(last, -1, -1):
             mine = {line.label for line in panels[k].lines} & set(left)
-            label_ends(row[k], PANEL - 0.7, mine)
+            style.label_ends(row[k], PANEL - 0.7, mine)
             left = {name: None for name in left if name not in mine}
         return
     handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
-    row[last].legend(
-        [handles[name] for name in left],
-        list(map(shortened, left)),
-        loc="upper left",
-        bbox_to_anchor=(1.0, 1.02),
-        frameon=False,
-        fontsize=9,
-        handlelength=5.0,
-    )
+    names = list(map(style.shortened, left))
+    row[last].legend([handles[name] for name in left], names, **LEGEND, bbox_to_anchor=(1.0, 1.02))
 
 
 def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
@@ -186,41 +148,33 @@ def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     panels = [panel for row in figure.rows for panel in row]
     styles = styles or common_looks([figure])
     heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
-    drawn = new_figure(NARROW, sum(heights), 160)
+    drawn = style.new_figure(NARROW, sum(heights), 160)
     grid = drawn.subplots(len(panels), 1, squeeze=False, height_ratios=[1.0] * len(panels))[:, 0]
     for axes, panel in zip(grid, panels, strict=True):
         _draw_panel(axes, panel, styles)
         if panel.lines and [line.label for line in panel.lines] != [panel.title]:
-            axes.legend(
-                loc="upper left",
-                bbox_to_anchor=(0.0, -0.2),
-                borderaxespad=0.0,
-                frameon=False,
-                fontsize=9,
-                handlelength=5.0,
-            )
+            axes.legend(**LEGEND, bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
     drawn.align_ylabels(list(grid))
     return drawn
 
 
 def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
-    """Draw one panel."""
     from matplotlib.ticker import MaxNLocator
 
     for line in panel.lines:
-        style = dict(styles[line.label])
+        look = dict(styles[line.label])
         if len(line.x) > FEW:
-            style["marker"] = ""
-        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **style)
-    values = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
+            look["marker"] = ""
+        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **look)
+    y = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
     x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
-    over = bool(len(values)) and panel.y_log is not False and spans_decade(values)
-    if over or (panel.y_log and len(values) and values.min() > 0.0):
-        log_scale(axes, values)
-    elif len(values) and values.min() >= 0.0 and values.min() < 0.5 * values.max():
+    wide = bool(len(y)) and panel.y_log is not False and style.spans_decade(y)
+    if wide or (panel.y_log and len(y) and y.min() > 0.0):
+        style.log_scale(axes, y)
+    elif len(y) and y.min() >= 0.0 and y.min() < 0.5 * y.max():
         axes.set_ylim(bottom=0.0)
     if panel.x_log2 and len(x) and x.min() > 0.0:
-        log2_scale(axes)
+        style.log2_scale(axes)
     elif len(x) and (x % 1 == 0).all():
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if any(len(line.x) > FEW for line in panel.lines):
@@ -229,7 +183,7 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
     axes.grid(True, alpha=0.3)
 
 
-# -- tables ----------------------------------------------------------------------------------
+# -- tables and samples ------------------------------------------------------------------------
 
 
 def matrix_figure(figure: MatrixFigure) -> Figure:
@@ -246,14 +200,10 @@ def matrix_figure(figure: MatrixFigure) -> Figure:
         axes.set_xticks(range(count), figure.labels)
         axes.set_yticks(range(count), figure.labels)
         _label(axes, title, figure.column_label, figure.row_label)
-        drawn.colorbar(image, ax=axes, shrink=0.8, extend=_beyond(values))
+        ends = {(False, False): "neither", (True, False): "min", (False, True): "max"}
+        beyond = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
+        drawn.colorbar(image, ax=axes, shrink=0.8, extend=ends.get(beyond, "both"))
     return drawn
-
-
-def _beyond(values: np.ndarray) -> Literal["neither", "min", "max", "both"]:
-    """Return at which ends of the colour scale values lie beyond it."""
-    low, high = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
-    return "both" if low and high else "min" if low else "max" if high else "neither"
 
 
 def tornado_figure(figure: FrameFigure, styles: Looks) -> Figure:
@@ -284,7 +234,8 @@ def bar_figure(figure: FrameFigure, styles: Looks) -> Figure:
     Columns: design, quantity, input, and for each group its value and both ends of its interval.
     """
     panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
-    inputs = list(figure.frame["input"].unique())
+    # A key in two lines takes half the width.
+    inputs = [label.replace(".", ".\n", 1) for label in figure.frame["input"].unique()]
     place, columns = np.arange(len(inputs)), figure.frame["quantity"].nunique()
     shape = len(panels) // columns, columns
     drawn, grid = _grid(figure.title, shape, (1.5 + 1.1 * max(3, len(inputs)), 3.3), sharey=True)
@@ -295,16 +246,11 @@ def bar_figure(figure: FrameFigure, styles: Looks) -> Figure:
             label = str(bars.columns[k]).partition(" [")[0]
             axes.bar(place + shift, value, 0.36, yerr=ends, capsize=3, label=label, color=colour,
                      alpha=0.8)  # fmt: skip
-        # A key in two lines takes half the width.
-        names = [label.replace(".", ".\n", 1) for label in inputs]
-        axes.set_xticks(place, names, fontsize=8, parse_math=False)
+        axes.set_xticks(place, inputs, fontsize=8, parse_math=False)
         _label(axes, f"{design}: {quantity}", "", "share of the variance [-]")
         axes.grid(True, axis="y", alpha=0.3)
     grid[0, 0].legend(frameon=False, fontsize=9)
     return drawn
-
-
-# -- samples ---------------------------------------------------------------------------------
 
 
 def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
@@ -341,11 +287,8 @@ def scatter_figure(figure: FrameFigure, styles: Looks) -> Figure:
     from matplotlib.ticker import EngFormatter
 
     inputs, quantities = figure.frame.columns[1:-2], figure.frame.columns[-2:]
-    rows = [
-        (design, what, own)
-        for design, own in figure.frame.groupby("design", sort=False)
-        for what in quantities
-    ]
+    designs = figure.frame.groupby("design", sort=False)
+    rows = [(design, what, own) for design, own in designs for what in quantities]
     shape = len(rows), len(inputs)
     drawn, grid = _grid(figure.title, shape, (3.2, 2.5), sharex="col", sharey="row")
     for row, (design, what, own) in zip(grid, rows, strict=True):
@@ -372,8 +315,10 @@ FRAMES = {
 # -- designs ---------------------------------------------------------------------------------
 
 
-def design_figure(figure: DesignFigure) -> Figure:
+def design_figure(figure: tables.DesignFigure) -> Figure:
     """Return the designs below each other, arms side by side, to one scale."""
+    from matplotlib.collections import PolyCollection
+
     views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
     if figure.designs[0][1].is_spatial:
         from dolfinopt.plots.solid_design import solid_designs_figure
@@ -382,36 +327,25 @@ def design_figure(figure: DesignFigure) -> Figure:
     columns = max(map(len, views))
     tall = max(np.ptp(v.corners[..., 1]) / np.ptp(v.corners[..., 0]) for row in views for v in row)
     wide = 6.0
-    drawn = new_figure(wide * columns + 0.4, len(views) * (wide * tall + 0.45) + 1.2)
+    drawn = style.new_figure(wide * columns + 0.4, len(views) * (wide * tall + 0.45) + 1.2)
     grid = drawn.subplots(len(views), columns, squeeze=False)
     for row, arms, (label, _, _) in zip(grid, views, figure.designs, strict=True):
-        for axes, view in zip(row, arms):
-            image = _draw_arm(axes, view)
-            axes.set_title(view.name, loc="right", fontsize=9, color=GREY)
         for axes in row[len(arms) :]:
             axes.set_visible(False)
+        for axes, view in zip(row, arms):
+            # Edges of the faces' colour close the seams between neighbours.
+            cells = PolyCollection(list(view.corners), array=view.density, cmap=style.COLOURS,
+                                   edgecolors="face", linewidths=0.2)  # fmt: skip
+            cells.set_clim(0.0, 1.0)
+            axes.add_collection(cells)
+            low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", yticks=[])
+            axes.xaxis.set_visible(False)
+            axes.set_title(view.name, loc="right", fontsize=9, color=GREY)
         row[0].set_title(label, loc="left", fontsize=10, parse_math=False)
     for axes in grid[-1]:
         axes.xaxis.set_visible(True)
         axes.set_xlabel("x [m]")
-    drawn.colorbar(image, ax=grid, location="bottom", shrink=0.3, aspect=40, label=DENSITY)
+    drawn.colorbar(cells, ax=grid, location="bottom", shrink=0.3, aspect=40, label=style.DENSITY)
     drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
     return drawn
-
-
-def _draw_arm(axes: Axes, view: ArmView) -> Any:
-    """Fill the cells of one arm."""
-    from matplotlib.collections import PolyCollection
-
-    # Edges of the faces' colour close the seams between neighbours.
-    cells = PolyCollection(list(view.corners), array=view.density, cmap=COLOURS,
-                           edgecolors="face", linewidths=0.2)  # fmt: skip
-    cells.set_clim(0.0, 1.0)
-    axes.add_collection(cells)
-    low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_aspect("equal")
-    axes.xaxis.set_visible(False)
-    axes.set_yticks([])
-    return cells

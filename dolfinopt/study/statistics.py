@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,6 +23,8 @@ from dolfinopt.errors import InputError
 Sampler = Literal["sobol", "latin-hypercube"]
 
 CONFIDENCE = 0.95  # of all intervals
+TAIL = 0.5 * (1.0 - CONFIDENCE)
+WIDE = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))  # half an interval, in standard errors
 QUANTILES = (0.05, 0.5, 0.95)
 RESAMPLES = 400  # of a bootstrap: its ends are right to a tenth of the interval
 # Quantiles beyond it, at both ends, are out of reach of any number of samples.
@@ -96,10 +97,7 @@ class Distribution:
 
     @cached_property
     def _quadrature(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes (2 n,) and weights, with sum 1, of integrals over the distribution.
-
-        Gauss's rule on both sides of a breakpoint.
-        """
+        """Nodes (2 n,) and weights, with sum 1: Gauss's rule on both sides of a breakpoint."""
         ends = self.at(np.array([0.0, 1.0]))
         middle = float(np.clip(ends.mean() if self.breakpoint is None else self.breakpoint, *ends))
         nodes, weights = legendre.leggauss(NODES)
@@ -109,15 +107,7 @@ class Distribution:
         return x, w / w.sum()
 
     def polynomials(self, x: np.ndarray, degree: int) -> np.ndarray:
-        """Return the orthonormal polynomials of the distribution, degrees 0 to `degree`.
-
-        Args:
-            x: (n,) where.
-            degree: of the last one.
-
-        Returns:
-            (n, degree + 1).
-        """
+        """Return its orthonormal polynomials (n, degree + 1), degrees 0 to `degree`, at x (n,)."""
         nodes, weights = self._quadrature
         middle, half = 0.5 * (nodes[-1] + nodes[0]), 0.5 * (nodes[-1] - nodes[0])
         known = legendre.legvander((nodes - middle) / half, degree)
@@ -126,48 +116,55 @@ class Distribution:
         return np.linalg.solve(upper.T, rows.T).T * np.sign(np.diag(upper))
 
 
-def parse_distribution(text: str) -> Distribution:
-    """Return the distribution that a text like "normal:6:0.3" means.
+# By name: parameters and what they must fulfil, in words and as a function; SciPy's law of them.
+LAWS: dict[str, tuple[str, Callable[..., bool], Callable[..., Any]]] = {
+    "normal": ("MEAN:DEVIATION with DEVIATION > 0", lambda m, s: s > 0.0, stats.norm),
+    "uniform": (
+        "LOW:HIGH with LOW < HIGH",
+        lambda a, b: a < b,
+        lambda a, b: stats.uniform(a, b - a),
+    ),
+    "triangular": (
+        "LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
+        lambda a, b, c: a <= b <= c and a < c,
+        lambda a, b, c: stats.triang((b - a) / (c - a), a, c - a),
+    ),
+    "lognormal": (
+        "MEDIAN:SIGMA with both > 0",
+        lambda m, s: m > 0.0 and s > 0.0,
+        lambda m, s: stats.lognorm(s, scale=m),
+    ),
+}
 
-    "normal:MEAN:DEVIATION", "uniform:LOW:HIGH", "triangular:LOW:MODE:HIGH",
-    "lognormal:MEDIAN:SIGMA" with the standard deviation SIGMA of the logarithm.
+
+def parse_distribution(text: str) -> Distribution:
+    """Return the distribution that a text like "normal:6:0.3" means, see `LAWS`.
+
+    SIGMA is the standard deviation of the logarithm.
 
     Raises:
         InputError: it means none.
     """
     name, *words = (part.strip() for part in text.split(":"))
-    forms = {
-        "normal": "normal:MEAN:DEVIATION with DEVIATION > 0",
-        "uniform": "uniform:LOW:HIGH with LOW < HIGH",
-        "triangular": "triangular:LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
-        "lognormal": "lognormal:MEDIAN:SIGMA with both > 0",
-    }
-    if name not in forms:
-        raise InputError(f"{text}: expected one of {', '.join(forms)}, for example normal:6:0.3")
-    wrong = InputError(f"{text}: expected {forms[name]}")
+    if name not in LAWS:
+        raise InputError(f"{text}: expected one of {', '.join(LAWS)}, for example normal:6:0.3")
+    form, is_allowed, law = LAWS[name]
     try:
         values = [float(word) for word in words]
-    except ValueError:
-        raise wrong from None
-    if len(values) != forms[name].split()[0].count(":") or not all(map(math.isfinite, values)):
-        raise wrong
-    a, b, c = (*values, values[-1])[:3]
-    if name == "normal" and b > 0.0:
-        return Distribution(text, stats.norm(a, b), False)
-    if name == "lognormal" and a > 0.0 and b > 0.0:
-        return Distribution(text, stats.lognorm(b, scale=a), False)
-    if name == "uniform" and a < b:
-        return Distribution(text, stats.uniform(a, b - a), True)
-    if name == "triangular" and a <= b <= c and a < c:
-        return Distribution(text, stats.triang((b - a) / (c - a), a, c - a), True, breakpoint=b)
-    raise wrong
+        allowed = all(map(math.isfinite, values)) and is_allowed(*values)
+    except (ValueError, TypeError):  # no number, too few or too many
+        allowed = False
+    if not allowed:
+        raise InputError(f"{text}: expected {name}:{form}")
+    middle = values[1] if name == "triangular" else None
+    return Distribution(text, law(*values), name in ("uniform", "triangular"), breakpoint=middle)
 
 
 # -- samples ---------------------------------------------------------------------------------
 
 
 def unit_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
-    """Return points (count, dimensions) of the unit cube that fill it evenly.
+    """Return points (count, dimensions) that fill the unit cube evenly.
 
     "sobol": Owen's scrambling of Sobol's sequence; more of them begin with the same ones.
     "latin-hypercube": every input has one point in each of `count` equal intervals.
@@ -216,14 +213,13 @@ def statistics(values: np.ndarray) -> dict[str, Estimate]:
     quantiles lie between order statistics. Even samples (`unit_points`) do better than these say.
     """
     n = len(values)
-    wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
     mean, s = float(values.mean()), float(values.std(ddof=1))
     of_mean = s / math.sqrt(n)
     m4 = float(np.mean((values - mean) ** 4))
     of_s = math.sqrt(max(m4 - s**4 * (n - 3) / (n - 1), 0.0) / n) / (2.0 * s) if s > 0.0 else 0.0
     return {
-        "mean": Estimate(mean, mean - wide * of_mean, mean + wide * of_mean),
-        "standard deviation": Estimate(s, s - wide * of_s, s + wide * of_s),
+        "mean": Estimate(mean, mean - WIDE * of_mean, mean + WIDE * of_mean),
+        "standard deviation": Estimate(s, s - WIDE * of_s, s + WIDE * of_s),
         **{f"{100.0 * share:g} % quantile": quantile(values, share) for share in QUANTILES},
     }
 
@@ -236,9 +232,8 @@ def quantile(values: np.ndarray, share: float) -> Estimate:
     """
     ordered = np.sort(values)
     n = len(ordered)
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low = int(stats.binom.ppf(tail, n, share))
-    high = int(stats.binom.ppf(1.0 - tail, n, share)) + 1
+    low = int(stats.binom.ppf(TAIL, n, share))
+    high = int(stats.binom.ppf(1.0 - TAIL, n, share)) + 1
     return Estimate(
         float(np.quantile(ordered, share)),
         float(ordered[low - 1]) if low >= 1 else math.nan,
@@ -254,8 +249,7 @@ class Indices:
     """Shares of the variance, one an input.
 
     Attributes:
-        first: of the input alone.
-        total: of the input alone and together with others.
+        first, total: of the input alone; of it alone and together with others.
         degree: of the polynomial they were taken from; 0 without one.
         unexplained: share of the variance that the polynomial misses, found by leaving one out.
     """
@@ -287,7 +281,11 @@ def saltelli_indices(values: np.ndarray, dimensions: int, seed: int) -> Indices:
         total = 0.5 * (f[0] - f[2:]) ** 2 @ weights
         return np.concatenate([first, total]) / variance
 
-    found = _bootstrap(estimate, n, seed)
+    # A bootstrap. Source: Efron & Tibshirani (1993), 13.3, doi:10.1201/9780429246593.
+    even = np.full(n, 1.0 / n)
+    draws = np.random.default_rng(seed).multinomial(n, even, size=RESAMPLES) / n
+    ends = np.quantile([estimate(weights) for weights in draws], [TAIL, 1.0 - TAIL], axis=0)
+    found = [Estimate(*map(float, row)) for row in zip(estimate(even), *ends)]
     return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]))
 
 
@@ -307,52 +305,45 @@ def polynomial_indices(
     if not spread.any():
         none = (Estimate(0.0, 0.0, 0.0),) * dimensions
         return Indices(none, none, 0, 0.0)
-    degrees = [p for p in range(1, MAX_DEGREE + 1) if _terms(dimensions, p) <= n / SAMPLES_A_TERM]
-    single = [
-        one.polynomials(samples[:, i], max(degrees, default=1))
-        for i, one in enumerate(distributions)
-    ]
+    degrees = [p for p in range(1, MAX_DEGREE + 1)
+               if math.comb(dimensions + p, p) <= n / SAMPLES_A_TERM] or [1]  # fmt: skip
+    single = [one.polynomials(samples[:, i], degrees[-1]) for i, one in enumerate(distributions)]
     fits = []
-    for degree in degrees or [1]:
+    for degree in degrees:
         powers = _powers(dimensions, degree)
         basis = np.prod([single[i][:, powers[:, i]] for i in range(dimensions)], axis=0)
-        fits.append(_fit(basis, spread, powers))
-    best = min(fits, key=lambda fit: fit.left_out)
-    shares = [_shares(best.powers, c) for c in (best.all_but_one, best.coefficients[None])]
-    found = [_jackknife(share[0], leaving) for share, leaving in zip(shares[1].T, shares[0].T)]
-    degree = int(best.powers.sum(axis=1).max())
-    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]), degree, best.left_out)
+        fits.append((powers, *_fit(basis, spread)))
+    powers, coefficients, without, missed = min(fits, key=lambda fit: fit[-1])
+    shares, leaving = _shares(powers, coefficients[None])[0], _shares(powers, without)
+    found = [_jackknife(share, others) for share, others in zip(shares, leaving.T)]
+    degree = int(powers.sum(axis=1).max())
+    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]), degree, missed)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A polynomial fitted by least squares.
+def _powers(dimensions: int, degree: int) -> np.ndarray:
+    """Return the degrees (terms, d) of all products up to a total degree, the constant first."""
+    rows: list[tuple[int, ...]] = [()]
+    for _ in range(dimensions):
+        rows = [(*row, p) for row in rows for p in range(degree + 1 - sum(row))]
+    return np.array(sorted(rows, key=lambda row: (sum(row), row)))
 
-    Attributes:
-        powers: (terms, d), see `_powers`.
-        coefficients: (terms,).
-        all_but_one: (n, terms) those without each of the samples.
-        left_out: relative squared error at each sample of the fit to all others.
+
+def _fit(basis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Fit values (n,) by least squares in a basis (n, terms).
+
+    Returns:
+        Coefficients (terms,), those (n, terms) without each of the samples, and the relative
+        squared error at each sample of the fit to all others.
     """
-
-    powers: np.ndarray
-    coefficients: np.ndarray
-    all_but_one: np.ndarray
-    left_out: float
-
-
-def _fit(basis: np.ndarray, values: np.ndarray, powers: np.ndarray) -> _Fit:
-    """Fit values (n,) in a basis (n, terms)."""
     q, r = np.linalg.qr(basis)
     diagonal = np.abs(np.diag(r))
     if len(basis) <= basis.shape[1] or diagonal.min() < DEPENDENT * diagonal.max():
-        none = np.full(len(powers), math.nan)
-        return _Fit(powers, none, np.full(basis.shape, math.nan), math.inf)
+        return np.full(basis.shape[1], math.nan), np.full(basis.shape, math.nan), math.inf
     own = 1.0 - np.sum(q**2, axis=1)  # what a sample does not decide alone
     errors = (values - q @ (q.T @ values)) / np.maximum(own, REMOTE)
     coefficients = np.linalg.solve(r, q.T @ values)
     without = coefficients - np.linalg.solve(r, (q * errors[:, None]).T).T
-    return _Fit(powers, coefficients, without, float(errors @ errors / (values @ values)))
+    return coefficients, without, float(errors @ errors / (values @ values))
 
 
 def _shares(powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
@@ -370,33 +361,5 @@ def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
     Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
     """
     n = len(leaving)
-    wide = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
-    half = wide * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
+    half = WIDE * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
     return Estimate(float(value), max(float(value) - half, 0.0), min(float(value) + half, 1.0))
-
-
-def _terms(dimensions: int, degree: int) -> int:
-    return math.comb(dimensions + degree, degree)
-
-
-def _powers(dimensions: int, degree: int) -> np.ndarray:
-    """Return the degrees (terms, d) of all products up to a total degree, the constant first."""
-    rows: list[tuple[int, ...]] = [()]
-    for _ in range(dimensions):
-        rows = [(*row, p) for row, p in product(rows, range(degree + 1)) if sum(row) + p <= degree]
-    return np.array(sorted(rows, key=lambda row: (sum(row), row)))
-
-
-def _bootstrap(
-    estimate: Callable[[np.ndarray], np.ndarray], count: int, seed: int
-) -> list[Estimate]:
-    """Return what `estimate(weights)` gives, with intervals from samples drawn with repetition.
-
-    Source: Efron & Tibshirani (1993), 13.3, doi:10.1201/9780429246593.
-    """
-    even = np.full(count, 1.0 / count)
-    draws = np.random.default_rng(seed).multinomial(count, even, size=RESAMPLES) / count
-    found = np.array([estimate(weights) for weights in draws])
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low, high = np.quantile(found, [tail, 1.0 - tail], axis=0)
-    return [Estimate(*map(float, row)) for row in zip(estimate(even), low, high)]

@@ -1,31 +1,100 @@
-"""Studies of a scene: objectives, reductions, and sweeps over any numeric value.
+"""Studies of a scene: sweeps over any numeric value, comparisons of objectives and reductions.
 
-A study plans cases, has those done that its folder does not hold yet, and makes tables and figures
-of the data frame of all results.
+A study plans labelled cases, has those done that its folder does not hold yet, and makes tables and
+figures of the data frame of all results.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import pandas as pd
+from mpi4py import MPI
 
 from dolfinopt.errors import InputError
+from dolfinopt.output.design import read_design
+from dolfinopt.parallel import on_root, together
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.plans import Plan, tabulated
-from dolfinopt.study.presets import coordinates_plan, objective_plan, reduction_plan
+from dolfinopt.scene.tables.objective import need_of
+from dolfinopt.study.cases import Action, Case, Outcome, Outcomes
+from dolfinopt.study.simulate import build_alone
 from dolfinopt.study.store import run_cases
-from dolfinopt.study.sweep import sweep_plan
-from dolfinopt.study.tables import Study, file_name
-from dolfinopt.study.variants import COORDINATES, Vary, parse_vary
+from dolfinopt.study.tables import (
+    DesignFigure,
+    Figure,
+    FrameFigure,
+    Line,
+    LineFigure,
+    MatrixFigure,
+    Panel,
+    Study,
+    Table,
+    file_name,
+    joined,
+)
+from dolfinopt.study.variants import (
+    COORDINATES,
+    METHODS,
+    OBJECTIVES,
+    RESPONSES,
+    Vary,
+    asked_by,
+    changed,
+    parse_vary,
+    posed,
+    reduction_name,
+    reductions,
+    reference_scene,
+    with_objective,
+)
 
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
+Item = TypeVar("Item")
 Preset = Literal["payload", "flattening", "coordinates", "objective", "reduction"]
+Design = Case | Path | None  # optimised by a case, of a file, or the initial one
+Rows = list[tuple[Mapping[str, Any], Case]]
+Report = tuple[list[Table], list[Figure]]
 
+COMPLIANCE, DEVIATION = QUANTITIES = ("compliance [N m]", "maximal deviation [mm]")
 # What a preset varies unless told otherwise.
 RANGES = {"payload": "payload.mass=4:8:9", "flattening": "motion.flattening=0:1:9"}
+SWEPT = (4, 6, 8, 12, 16, 24, 48)  # coordinates of "coordinates"
+OPTIMISED = (4, 12, 48)  # coordinates of "reduction"
+COMPARED = (4, 12)
+# These tables say how a design is found and nothing about what a given one does.
+FOR_OPTIMISATION = ("design", "constraints", "optimizer")
+RESIZING = r"^arms\.(.+\.)?(length|height)$"
+MADE = "made for it"  # the design that was optimised for the scenario it is simulated in
+# Loads at the outboard interface that bend or twist an arm, and their places among all of them.
+BENDING = {"tip compliance lost, F_y [%]": 1, "moment [%]": 2}
+BENDING_IN_SPACE = {"tip compliance lost, F_y [%]": 1, "F_z [%]": 2, "M_x [%]": 3, "M_y [%]": 4,
+                    "M_z [%]": 5}  # fmt: skip
+
+
+# -- the run ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Cases to do, and what to make of them; pickled from the root to all ranks.
+
+    Attributes:
+        name: of the study's files.
+        rows: labels by column and the case of each; cases that these need may be left out.
+        report: returns tables and figures of the frame of all rows, see `tabulated`.
+    """
+
+    name: str
+    rows: Sequence[tuple[Mapping[str, Any], Case]]
+    report: Callable[[pd.DataFrame], Report]
 
 
 def study(
@@ -40,46 +109,64 @@ def study(
     kinds: Sequence[str] = (),
     shown: bool = True,
 ) -> Study:
-    """Do a study (collective); the result is complete on the root.
+    """Do a study (collective); the result is the same on all ranks.
 
     Args:
         scene: what is varied.
         preset: which study; None: a sweep over `vary` alone.
         vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
-        folder: DIR, where the cases are kept.
-        world: all ranks.
+        folder, world, shown: see `run_cases`.
         reoptimize: optimise for every scenario, too.
         kinds: of objectives to compare; by default all.
-        shown: draw progress.
 
     Raises:
         InputError: something asked for is not possible; nothing was computed.
     """
-    from dolfinopt.parallel import on_root
-
     plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize, kinds)
     return carry_out(plan, folder, world, shown=shown)
 
 
 def carry_out(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) -> Study:
-    """Do what is planned (collective); the result is complete on the root.
-
-    Args:
-        plan: the same on all ranks.
-        folder: DIR, where the cases are kept.
-        world: all ranks.
-        shown: draw progress.
-    """
-    from dolfinopt.output.run_folder import prepare_folder
-    from dolfinopt.parallel import on_root, together
-
-    on_root(world, prepare_folder, folder)
+    """Do what is planned, see `study`."""
     outcomes = run_cases([case for _, case in plan.rows], folder, world, shown=shown)
     with together(world):
         tables, figures = plan.report(tabulated(plan, outcomes))
     failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
     return Study(plan.name, tuple(tables), tuple(figures), failures, outcomes.computed)
+
+
+def tabulated(plan: Plan, outcomes: Outcomes) -> pd.DataFrame:
+    """Return a row a case: the plan's labels, the results with units, and the outcome itself."""
+    found = [outcomes[case] for _, case in plan.rows]
+    results = pd.DataFrame(
+        {
+            "label": [one.case.label for one in found],
+            COMPLIANCE: [one.compliance for one in found],
+            DEVIATION: [1e3 * one.max_deviation for one in found],
+            "at [s]": [one.max_deviation_time for one in found],
+            "grayness [-]": [one.grayness for one in found],
+            "iterations": [one.iterations for one in found],
+            "seconds": [one.seconds for one in found],
+            "ended by": [_ended(one) for one in found],
+            "failure": [one.failure for one in found],
+            "outcome": pd.Series(found, dtype=object),
+        }
+    )
+    return pd.concat([pd.DataFrame([labels for labels, _ in plan.rows]), results], axis=1)
+
+
+def _ended(outcome: Outcome) -> str:
+    """Return why an optimisation stopped, or what failed."""
+    stopped = outcome.stop_reason if outcome.case.action == "optimize" else ""
+    return f"failed: {outcome.failure}" if outcome.failure else stopped
+
+
+def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
+    """Return the name of a sweep's files: the preset, and the keys that it varies besides."""
+    own = COORDINATES if preset == "coordinates" else RANGES.get(preset or "", "").split("=")[0]
+    keys = [text.partition("=")[0].strip() for text in vary]
+    return file_name(preset or "", *(key for key in keys if key != own))
 
 
 def _plan(
@@ -97,45 +184,463 @@ def _plan(
         if keys.count(key) > 1:
             raise InputError(f"--vary {key} twice; give all its values in one")
     if preset in ("objective", "reduction", "coordinates"):
-        return _preset_plan(scene, preset, asked, designs, reoptimize, kinds)
+        command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
+        for one in asked:
+            if preset == "objective" or one.key != COORDINATES:
+                only = "none" if preset == "objective" else f"only {COORDINATES}"
+                raise InputError(f"--vary {one.text}: expected {only} with {command}")
+        if preset != "coordinates" and designs:
+            raise InputError(f"--design: expected none with {command}, which makes its own")
+        if reoptimize:
+            raise InputError(f"--reoptimize: not with {command}; see compare reductions")
+        if preset == "objective":
+            return objective_plan(scene, kinds)
+        counts = asked[0].whole_numbers if asked else None
+        if preset == "reduction":
+            return reduction_plan(scene, counts)
+        return coordinates_plan(scene, designs, counts)
     if preset is None and not asked:
         raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
-    if preset is not None:
-        own = parse_vary(RANGES[preset])
-        if own.key not in keys:
-            asked.insert(0, own)
+    if preset is not None and (own := parse_vary(RANGES[preset])).key not in keys:
+        asked.insert(0, own)
     return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
 
 
-def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
-    """Return the name of a sweep's files: the preset, and the keys that it varies besides."""
-    own = RANGES.get(preset or "", "=").partition("=")[0]
-    own = COORDINATES if preset == "coordinates" else own
-    keys = [text.partition("=")[0].strip() for text in vary]
-    return file_name(*([preset] if preset else []), *(key for key in keys if key != own))
+def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
+    """Return the files' designs by label, or else the initial and the optimised one.
+
+    Where the scene leaves nothing to optimise, as that of parts does, the solid arms alone.
+
+    Raises:
+        InputError: a design cannot be read, or does not fit the scene's arms.
+    """
+    if designs:
+        for path in designs:
+            if not path.is_file():
+                raise InputError(f"{path}: --design: no such file; give design.npz files")
+        partition, arms = build_alone(scene, Profile())
+        for path in designs:
+            read_design(path, partition, arms)
+        names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
+        plain = len(set(names)) == len(names)
+        return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
+    if scene.design.is_solid:
+        return {"solid arms": None}
+    optimised = Case(scene, "optimize", label="optimised design")
+    return {"initial design": None, optimised.label: optimised}
 
 
-def _preset_plan(
-    scene: Scene,
-    preset: Preset,
-    asked: Sequence[Vary],
-    designs: tuple[Path, ...],
-    reoptimize: bool,
-    kinds: Sequence[str],
+# -- parts of reports ------------------------------------------------------------------------
+
+
+def by_design(
+    frame: pd.DataFrame, index: Sequence[str], results: Sequence[str] = QUANTITIES
+) -> pd.DataFrame:
+    """Return the columns `index`, and each design's `results` in columns beside one another.
+
+    Args:
+        frame: with a column "design"; all designs have the same rows, in one order.
+        index: columns of what was varied.
+        results: columns.
+    """
+    parts = {name: part.reset_index() for name, part in frame.groupby("design", sort=False)}
+    wide = next(iter(parts.values()))[[*index]].copy()
+    for name, part in parts.items():
+        for what in results:
+            wide[f"{name}: {what}"] = part[what]
+    return wide
+
+
+def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> tuple[Line, ...]:
+    """Return a line for each value of the column `by`, columns y against x.
+
+    Its name is the value, of a number with the `label` before it.
+    """
+    return tuple(
+        Line(f"{label}{value:g}" if label else str(value), part[x].to_numpy(), part[y].to_numpy())
+        for value, part in frame.groupby(by, sort=False)
+    )
+
+
+def deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel, ...]]:
+    """Return the deviation over time; designs of another magnitude get a panel of their own."""
+    rows: list[tuple[Panel, ...]] = []
+    for group in magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
+        curves = [(one.case.label, *one.deviation()) for one in group]
+        lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
+        rows.append((Panel(title, "time [s]", "deviation [mm]", lines),))
+    return rows
+
+
+def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
+    """Return the designs beside one another, each with its results."""
+    designs = [
+        (f"{o.case.label}: {o.compliance:.4g} N m, {1e3 * o.max_deviation:.4g} mm", o.case.scene,
+         o.design)
+        for o in found
+    ]  # fmt: skip
+    return DesignFigure(name, title, tuple(designs))
+
+
+def magnitudes(
+    items: Sequence[Item], size: Callable[[Item], float], ratio: float
+) -> list[list[Item]]:
+    """Group what a panel can show on one scale: sizes within a factor, the largest group first."""
+    groups: list[list[Item]] = []
+    for item in sorted(items, key=lambda item: -size(item)):
+        if groups and size(groups[-1][0]) <= ratio * size(item):
+            groups[-1].append(item)
+        else:
+            groups.append([item])
+    return [[item for item in items if item in group] for group in groups]
+
+
+def _good(found: Iterable[Outcome]) -> list[Outcome]:
+    return [outcome for outcome in found if not outcome.failure]
+
+
+# -- sweeps: one value, a grid of two, or more beside one another ------------------------------
+
+
+def sweep_plan(
+    scene: Scene, name: str, asked: Sequence[Vary], designs: Sequence[Path], reoptimize: bool
 ) -> Plan:
-    """Plan a preset that has its own variants."""
-    command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
+    """Plan one key, two in a grid, or more, each alone.
+
+    Raises:
+        InputError: no given design fits the values, or they do nothing to it.
+    """
     for one in asked:
-        if preset == "objective" or one.key != COORDINATES:
-            only = "none" if preset == "objective" else f"only {COORDINATES}"
-            raise InputError(f"--vary {one.text}: expected {only} with {command}")
-    if preset != "coordinates" and designs:
-        raise InputError(f"--design: expected none with {command}, which makes its own")
+        idle = one.key.partition(".")[0] in FOR_OPTIMISATION and one.key != "design.initial"
+        if idle and not reoptimize:
+            raise InputError(
+                f"--vary {one.text}: does not change what a given design does; add "
+                "--reoptimize to optimise one for every value"
+            )
+    resized = [one for one in asked if re.search(RESIZING, one.key)]
+    if resized and (designs or not reoptimize):
+        raise InputError(
+            f"--vary {resized[0].text}: no given design fits arms of several sizes; "
+            + ("leave out --design" if reoptimize else "add --reoptimize to optimise one for each")
+        )
+    given = {"initial design": None} if resized else given_designs(scene, designs)
+    grids = [asked] if len(asked) <= 2 else [[one] for one in asked]
+    rows = [row for keys in grids for row in _sweep(scene, keys, given, reoptimize, not resized)]
+    if len(grids) == 1:
+        return Plan(name, rows, partial(_sweep_report, keys=tuple(asked)))
+    rows += [
+        ({"role": "base", "design": label},
+         Case(scene, "simulate", design, f"{label}, as it is"))
+        for label, design in given.items()
+    ]  # fmt: skip
+    return Plan(name, rows, partial(_several, keys=tuple(asked)))
+
+
+def _sweep(
+    scene: Scene, keys: Sequence[Vary], given: Mapping[str, Design], reoptimize: bool, fits: bool
+) -> Rows:
+    """Return all scenarios of the keys' values for every design.
+
+    Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
+    "made for" in scenario "point", where it fits their arms; "optimum" its optimisation.
+    """
+    swept = ", ".join(vary.key for vary in keys)
+    points, labels, columns = [], [], []
+    for j, values in enumerate(product(*(vary.values for vary in keys))):
+        settings = list(zip(keys, values, strict=True))
+        with asked_by(" ".join(f"--vary {vary.text}" for vary in keys)):
+            points.append(changed(scene, *(f"{vary.key}={value}" for vary, value in settings)))
+        labels.append(", ".join(f"{vary.key} = {float(value):g}" for vary, value in settings))
+        known = {vary.axis: float(value) for vary, value in settings}
+        columns.append({"swept": swept, "point": j, **known})
+    every = range(len(points))
+
+    def row(role: str, name: str, design: Design, j: int, made: int = -1) -> tuple[Any, Case]:
+        known = {"role": role, "design": name * (role == "shown"), "made for": made, **columns[j]}
+        return known, Case(points[j], "simulate", design, f"{name}, {labels[j]}")
+
+    rows = [row("shown", name, design, j) for name, design in given.items() for j in every]
     if reoptimize:
-        raise InputError(f"--reoptimize: not with {command}; see compare reductions")
-    if preset == "objective":
-        return objective_plan(scene, kinds)
-    counts = asked[0].whole_numbers if asked else None
-    if preset == "coordinates":
-        return coordinates_plan(scene, preset, designs, counts)
-    return reduction_plan(scene, counts)
+        optima = [Case(points[j], "optimize", label=f"optimised, {labels[j]}") for j in every]
+        rows += [row("shown", MADE, optima[j], j) for j in every]
+        if fits:
+            rows += [row("crossed", f"made for {labels[i]}", optima[i], j, i)
+                     for i, j in product(every, every)]  # fmt: skip
+            rows += [({"role": "optimum", **columns[j]}, optima[j]) for j in every]
+    return rows
+
+
+def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -> Report:
+    """Return tables and figures of one key, or two in a grid; `prefix` is part of their names."""
+    axes = [vary.axis for vary in keys]
+    shown = frame[frame["role"] == "shown"]
+    table = by_design(shown, axes)
+    failed = shown.groupby("point")["failure"].agg(lambda s: "; ".join(s[s != ""].unique()))
+    if (failed != "").any():
+        table["failed"] = failed.to_numpy()
+    title = f"Designs by {' and '.join(axes)}."
+    tables = [Table(prefix, title, table)]
+    figures: list[Figure] = [LineFigure(prefix, title, _sweep_panels(shown, keys))]
+    if (frame["role"] == "crossed").any():
+        more = _cross(frame, table[axes], prefix)
+        tables, figures = tables + more[0], figures + more[1]
+    return tables, figures
+
+
+def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[tuple[Panel, ...], ...]:
+    """Return a column a quantity; designs share a row where they are of one magnitude."""
+    names, x = list(shown["design"].unique()), keys[0].axis
+    by, label, groups = "design", "", [[name] for name in names]
+    if len(keys) == 1:
+        largest = shown.groupby("design")[COMPLIANCE].max().fillna(0.0)
+        groups = magnitudes(names, lambda name: float(largest[name]), 3.0)
+    else:
+        by, label = keys[1].axis, f"{keys[1].key} = "
+    rows = []
+    for group in groups:
+        own, title = shown[shown["design"].isin(group)], group[0] if len(group) == 1 else ""
+        rows.append(tuple(Panel(title, x, y, lines_by(own, by, x, y, label)) for y in QUANTITIES))
+    return tuple(rows)
+
+
+def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
+    """Return design i in scenario j, and what it loses against the one made for j."""
+    labels = [", ".join(f"{value:g}" for value in point) for point in points.to_numpy()]
+    axis = ", ".join(points.columns)
+    made, used = f"made for {axis}", f"used at {axis}"
+    crossed = frame[frame["role"] == "crossed"]
+    tables, panels = [], []
+    for what in QUANTITIES:
+        values = crossed.pivot(index="made for", columns="point", values=what).to_numpy()
+        loss = 100.0 * (values / np.diag(values) - 1.0)
+        quantity = what.partition(" [")[0]
+        for ending, title, matrix in (
+            ("", f"{what[0].upper()}{what[1:]} of design i in scenario j.", values),
+            ("_loss", f"Loss of {quantity} against the design made for j [%].", loss),
+        ):
+            wide = pd.DataFrame(matrix, columns=[f"used at {label}" for label in labels])
+            wide.insert(0, made, labels)
+            name = joined(prefix, f"cross_{quantity.replace(' ', '_')}{ending}")
+            tables.append(Table(name, title, wide))
+        panels.append((f"loss of {quantity} [%]", loss))
+    title = "What a design loses where it was not made for"
+    figures: list[Figure] = [
+        MatrixFigure(joined(prefix, "cross"), title, made, used, tuple(labels), tuple(panels))
+    ]
+    if optima := _good(frame.loc[frame["role"] == "optimum", "outcome"]):
+        figures.append(design_figure(joined(prefix, "designs"), "Designs by scenario", optima))
+    return tables, figures
+
+
+def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
+    """Return the reports of three and more keys, and their effects beside one another."""
+    tables: list[Table] = []
+    figures: list[Figure] = []
+    rows = []
+    for vary in keys:
+        more = _sweep_report(frame[frame["swept"] == vary.key], [vary], vary.key)
+        tables, figures = tables + more[0], figures + more[1]
+    shown = frame[frame["role"] == "shown"]
+    for _, base in frame[frame["role"] == "base"].iterrows():
+        own = shown[shown["design"] == base["design"]].groupby("swept")
+        for what in QUANTITIES:
+            first, last = (100.0 * (end / base[what] - 1.0)
+                           for end in (own[what].nth(0), own[what].nth(-1)))  # fmt: skip
+            bars = [
+                (f"{vary.axis}: {vary.numbers[0]:g} ... {vary.numbers[-1]:g}", float(a), float(b))
+                for vary, a, b in zip(keys, first, last, strict=True)
+            ]
+            bars.sort(key=lambda bar: -max(abs(bar[1]), abs(bar[2])))
+            rows += [(base["design"], what.partition(" [")[0], *bar) for bar in bars]
+    title = "Change at both ends of each key, the others as in the scene."
+    columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
+    table = pd.DataFrame(rows, columns=columns)
+    figures.insert(0, FrameFigure("tornado", title, "tornado", table))
+    return [Table("", title, table), *tables], figures
+
+
+# -- objectives ------------------------------------------------------------------------------
+
+
+def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
+    """Plan a design for every objective that the scene allows, or for some kinds, see `posed`.
+
+    Raises:
+        InputError: the scene cannot have one of these kinds.
+    """
+    cases = [Case(scene, label="initial design")]
+    cases += [Case(posed(scene, kind), "optimize", label=kind) for kind in kinds]
+    for label, settings in () if kinds else (*OBJECTIVES, *RESPONSES):
+        try:
+            cases.append(Case(with_objective(scene, *settings), "optimize", label=label))
+        except InputError:  # the scene excludes it, as passive ends do "nothing attached"
+            continue
+    report = partial(_objectives, weights=scene.objective.effort_weights)
+    return Plan("objective", [({}, case) for case in cases], report)
+
+
+def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
+    measures = pd.DataFrame([_measures(outcome, weights) for outcome in frame["outcome"]])
+    rest = ["grayness [-]", "iterations", "seconds", "ended by"]
+    whole = pd.concat([frame[["label", *QUANTITIES, "at [s]"]], measures, frame[rest]], axis=1)
+    title = "Designs optimised for every objective, simulated in the scene."
+    table = Table("", title, whole.rename(columns={"label": "objective"}))
+    good = _good(frame["outcome"])
+    dynamic = [o for o in good if o.case.action == "optimize" and need_of(o.case.scene, "motion")]
+    others = [o for o in good if o not in dynamic]
+    panels = [
+        *deviation_panels("initial, static, eigenfrequency", others),
+        *deviation_panels("made for the loads of the motion", dynamic),
+    ]
+    return [table], [
+        LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
+        design_figure("designs", "Designs by objective", good),
+    ]
+
+
+def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, float]:
+    """Return what else a design does in its motion: true values, efforts by one set of weights."""
+    names = ("settling [mm]", "stress [MPa]", "effort [-]", "mass [kg]")
+    if outcome.failure:
+        return dict.fromkeys(names, math.nan)
+    summary = outcome.summary()
+    forces = np.array([*summary["drive_rms"].values()])
+    effort = float(np.linalg.norm(forces if weights is None else forces * np.array(weights)))
+    stress = math.nan if summary.get("stress") is None else 1e-6 * summary["stress"]["value"]
+    mass = float(sum(summary["mass"].values()))
+    return dict(zip(names, (1e3 * summary["settling"], stress, effort, mass)))
+
+
+# -- coordinates and reductions --------------------------------------------------------------
+
+
+def coordinates_plan(scene: Scene, designs: Sequence[Path], counts: Sequence[int] | None) -> Plan:
+    """Plan given designs, simulated with every method and number of coordinates."""
+    given = given_designs(scene, designs)
+    rows = _by_reduction("given", given, reductions(scene, counts, SWEPT), "simulate", "")
+    return Plan("coordinates", rows, partial(_coordinates, name=""))
+
+
+def _by_reduction(
+    role: str, given: Mapping[str, Design], scenes: Sequence[Scene], action: Action, words: str
+) -> Rows:
+    """Return every design with every reduction."""
+    return [
+        (
+            {"role": role, "design": label, **_reduction(scene)},
+            Case(scene, action, design, f"{label}, {words}{reduction_name(scene)}"),
+        )
+        for label, design in given.items()
+        for scene in scenes
+    ]
+
+
+def _reduction(scene: Scene) -> dict[str, Any]:
+    return {"method": scene.reduction.method, "coordinates": scene.reduction.coordinates}
+
+
+def _coordinates(frame: pd.DataFrame, name: str) -> Report:
+    title = "Given designs against the number of elastic coordinates of each arm."
+    table = Table(name, title, by_design(frame, ["method", "coordinates"]))
+    rows = []
+    x_label = "elastic coordinates of each arm [-]"
+    for label, design in frame.groupby("design", sort=False):
+        lines = {what: lines_by(design, "method", "coordinates", what) for what in QUANTITIES}
+        rows.append(tuple(Panel(str(label), x_label, *one, x_log2=True) for one in lines.items()))
+    figures: list[Figure] = [LineFigure(name, title, tuple(rows))]
+    # The last design's deviation with the fewest and the most coordinates.
+    found = []
+    for method, part in design.groupby("method", sort=False):
+        for outcome in dict.fromkeys(part["outcome"].iloc[[0, -1]]):
+            if method in METHODS[:2]:
+                case = replace(outcome.case, label=reduction_name(outcome.case.scene))
+                found.append(replace(outcome, case=case))
+    if panels := deviation_panels(str(label), _good(found)):
+        figures.append(LineFigure("deviation", "Deviation of the end-effector", tuple(panels)))
+    return [table], figures
+
+
+def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
+    """Plan designs optimised with every reduction, simulated with the reference; and the sweep."""
+    reference = reference_scene(scene)
+    called = reduction_name(reference)
+    rows: Rows = []
+    for other in reductions(scene, counts, OPTIMISED):
+        made = Case(other, "optimize", label=reduction_name(other))
+        again = Case(reference, "simulate", made, f"{made.label} in {called}")
+        known = _reduction(other)
+        rows += [({"role": "own", **known}, made), ({"role": "again", **known}, again)]
+    rows += coordinates_plan(scene, (), None).rows
+    compared = reductions(scene, None, COMPARED)
+    rows += _by_reduction("compared", given_designs(scene, ()), compared, "compare", "basis of ")
+    return Plan("reduction", rows, partial(_reductions, called=called))
+
+
+def _reductions(frame: pd.DataFrame, called: str) -> Report:
+    parts = {role: part.reset_index() for role, part in frame.groupby("role")}
+    own, again = parts["own"], parts["again"]
+    tables, figures = _coordinates(parts["given"], "coordinates")
+    tables = [_reduction_table(own, again, called), *tables, _bases(parts["compared"], called)]
+    title = f"Designs optimised with every reduction, simulated with {called}"
+    pairs = zip(own["outcome"], again["outcome"], strict=True)
+    simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
+    if panels := deviation_panels("", simulated):
+        figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
+        figures.append(design_figure("designs", title, simulated))
+    if good := _good(own["outcome"]):
+        figures.append(_convergence(good))
+    return tables, figures
+
+
+def _reduction_table(own: pd.DataFrame, again: pd.DataFrame, called: str) -> Table:
+    """Return the designs' results in their own model and in the reference."""
+    ended = own["ended by"].where((own["failure"] != "") | (again["failure"] == ""),
+                                  again["ended by"])  # fmt: skip
+    known = {"method": own["method"], "coordinates": own["coordinates"]}
+    compared = {
+        "compliance, own model [N m]": own[COMPLIANCE],
+        f"compliance, {called} [N m]": again[COMPLIANCE],
+        "own model off by [%]": 100.0 * (own[COMPLIANCE] / again[COMPLIANCE] - 1.0),
+        f"maximal deviation, {called} [mm]": again[DEVIATION],
+    }
+    rest = {name: own[name] for name in ("grayness [-]", "iterations", "seconds")}
+    title = f"Designs optimised with every reduction, simulated with {called} as well."
+    return Table("", title, pd.DataFrame(known | compared | rest | {"ended by": ended}))
+
+
+def _bases(compared: pd.DataFrame, called: str) -> Table:
+    """Return what the bases miss of the reference's."""
+    rows = []
+    for row in compared.to_dict("records"):
+        for arm, b in row["outcome"].bases.items():
+            frequency, mac = ([*v, math.nan, math.nan, math.nan][:3] for v in (b.frequency, b.mac))
+            known = {"design": row["design"], "arm": arm, "method": row["method"]}
+            known["coordinates"] = row["coordinates"]
+            known |= {f"frequency {k} off by [%]": _percent(v) for k, v in enumerate(frequency, 1)}
+            known |= {f"MAC {k} [-]": round(value, 6) for k, value in enumerate(mac, 1)}
+            known["largest angle [deg]"] = round(math.degrees(max(b.angle)), 4)
+            loads = BENDING if len(b.compliance) == 3 else BENDING_IN_SPACE
+            rows.append(known | {name: _percent(b.compliance[i]) for name, i in loads.items()})
+    title = f"What the bases miss of {called}: first natural modes and tip."
+    return Table("bases", title, pd.DataFrame(rows))
+
+
+def _percent(share: float) -> float:
+    """Return a share in per cent, without the noise of rounding."""
+    return round(100.0 * share, 4) + 0.0
+
+
+def _convergence(found: Sequence[Outcome]) -> LineFigure:
+    """Return objective and grayness against the iteration."""
+    rows = [
+        {"made": outcome.case.label, **vars(row)} for outcome in found for row in outcome.history()
+    ]
+    frame = pd.DataFrame(rows)
+    unit = {"compliance": "N m s", "deviation": "m", "eigenfrequency": "s2"}
+    label = f"objective [{unit.get(found[0].case.scene.objective.kind, 'N m')}]"
+    objective, grayness = (
+        lines_by(frame, "made", "iteration", name) for name in ("objective", "grayness")
+    )
+    first = Panel("as the own model sees it", "iteration [-]", label, objective, y_log=True)
+    second = Panel("", "iteration [-]", "grayness [-]", grayness)
+    return LineFigure("convergence", "Convergence", ((first,), (second,)))

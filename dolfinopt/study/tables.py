@@ -1,7 +1,8 @@
-"""What a study finds: tables and the data of figures, and their files."""
+"""What a study finds: tables and the data of figures, as Markdown, CSV and HTML."""
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import math
 import re
@@ -12,10 +13,15 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from dolfinopt.data import page_folders
+from dolfinopt.disk import write_text
 from dolfinopt.scene.load import Scene
 
 Cell = str | int | float
 LONGEST = 120  # characters of a study's name, which file names begin with
+
+
+# -- tables ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +61,12 @@ def as_text(frame: pd.DataFrame, digits: int, missing: str = "") -> pd.DataFrame
     return frame.apply(lambda column: column.map(text))
 
 
+# -- figures ---------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One curve.
-
-    Attributes:
-        label: in the legend.
-        x, y: equal lengths.
-    """
+    """One curve: its label in the legend; x and y of equal lengths."""
 
     label: str
     x: np.ndarray
@@ -98,17 +102,16 @@ class LineFigure:
 
     def csv(self) -> str:
         """Return all curves: a row a point."""
+        panels = [panel for row in self.rows for panel in row]
         points = [
             (panel.title, line.label, float(x), float(y))
-            for row in self.rows
-            for panel in row
+            for panel in panels
             for line in panel.lines
             for x, y in zip(line.x, line.y, strict=True)
         ]
-        first = self.rows[0][0]
-        one = len({(p.x_label, p.y_label) for row in self.rows for p in row}) == 1
-        labels = (first.x_label, first.y_label) if one else ("x", "y")
-        return Table("", "", pd.DataFrame(points, columns=["panel", "line", *labels])).csv()
+        labels = {(panel.x_label, panel.y_label) for panel in panels}
+        axes = labels.pop() if len(labels) == 1 else ("x", "y")
+        return Table("", "", pd.DataFrame(points, columns=["panel", "line", *axes])).csv()
 
 
 @dataclass(frozen=True)
@@ -134,13 +137,7 @@ class MatrixFigure:
 
 @dataclass(frozen=True, eq=False)
 class FrameFigure:
-    """A figure of a data frame.
-
-    Attributes:
-        name, title: of its file, and above it.
-        kind: which picture; see `figures.FRAMES` for the columns that each needs.
-        frame: what is drawn.
-    """
+    """A figure of a data frame; see `figures.FRAMES` for the columns that each kind needs."""
 
     name: str
     title: str
@@ -149,6 +146,9 @@ class FrameFigure:
 
 
 Figure = LineFigure | DesignFigure | MatrixFigure | FrameFigure
+
+
+# -- files -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,6 @@ class Study:
 
 def write_study(study: Study, folder: Path) -> list[Path]:
     """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
-    from dolfinopt.disk import write_text
-
     texts = {f"{joined(study.name, table.name)}.csv": table.csv() for table in study.tables}
     for figure in study.figures:
         if isinstance(figure, LineFigure):
@@ -199,3 +197,25 @@ def file_name(*parts: str) -> str:
 def joined(*parts: str) -> str:
     """Return the parts of a file name that are not empty, with _ between them."""
     return "_".join(part for part in parts if part)
+
+
+def html_page(template: str, **content: Any) -> str:
+    """Return a page from a template of `data.page_folders`; what it names must be given.
+
+    It is one file, its pictures inside, so that it opens anywhere.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    templates = Environment(
+        loader=FileSystemLoader(page_folders()),
+        autoescape=lambda name: str(name).endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    )
+    return templates.get_template(template).render(as_text=as_text, **content).lstrip()
+
+
+def embedded(data: bytes) -> dict[str, Any]:
+    """Return a PNG as a page's macro `image` takes it."""
+    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # of its header
+    return {"data": base64.b64encode(data).decode(), "width": width, "height": height}

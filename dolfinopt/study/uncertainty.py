@@ -7,40 +7,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
+from mpi4py import MPI
 from pydantic.fields import FieldInfo
 
 from dolfinopt.errors import InputError
+from dolfinopt.parallel import on_root
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.tables.base import without_none
+from dolfinopt.study import statistics as stats
 from dolfinopt.study.cases import Case
-from dolfinopt.study.plans import QUANTITIES, Design, Plan, Report, by_design, given_designs
 from dolfinopt.study.simulate import scales_bodies, with_sample
-from dolfinopt.study.statistics import (
-    CONFIDENCE,
-    Distribution,
-    Indices,
-    Sampler,
-    draw,
-    parse_distribution,
-    polynomial_indices,
-    saltelli_indices,
-    saltelli_points,
-    statistics,
-    unit_points,
+from dolfinopt.study.studies import (
+    QUANTITIES,
+    Design,
+    Plan,
+    Report,
+    by_design,
+    carry_out,
+    given_designs,
 )
-from dolfinopt.study.studies import carry_out
 from dolfinopt.study.tables import Figure, FrameFigure, Study, Table, file_name
-from dolfinopt.study.variants import axis_of, changed
+from dolfinopt.study.variants import asked_by, axis_of, changed
 
-if TYPE_CHECKING:
-    from mpi4py import MPI
-
-NAME = "uncertainty"
 # Tables and keys that do not change what a given design does, or that no given design outlives.
 TABLES = (
     "motion", "control", "closure", "payload", "damping", "material", "arms", "interpolation",
@@ -49,7 +42,7 @@ SIZES = ("length", "height", "mesh_size", "passive")
 LEAST = 10  # samples: fewer tell nothing of the scatter
 CHUNK = 25  # samples that an interruption may cost
 REDUCED = 5  # of those that are meshed and reduced anew, which take longer
-INTERVAL = f"{100.0 * CONFIDENCE:g} %"
+INTERVAL = f"{100.0 * stats.CONFIDENCE:g} % confidence intervals"
 
 
 @dataclass(frozen=True)
@@ -66,8 +59,15 @@ class Sampling:
 
     samples: int = 1000
     seed: int = 1
-    sampler: Sampler = "sobol"
+    sampler: stats.Sampler = "sobol"
     indices: Literal["polynomial", "saltelli"] = "polynomial"
+
+    def points(self, dimensions: int) -> np.ndarray:
+        """Return points (n, d) of the unit cube."""
+        if self.indices == "saltelli" and dimensions > 1:
+            half = -(-self.samples // 2)
+            return stats.saltelli_points(half, dimensions, self.sampler, self.seed)
+        return stats.unit_points(self.samples, dimensions, self.sampler, self.seed)
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,17 @@ class Input:
 
     key: str
     nominal: object
-    distribution: Distribution
+    distribution: stats.Distribution
 
     @property
     def axis(self) -> str:
         """Key with its unit."""
         return axis_of(self.key)
+
+    @property
+    def number(self) -> float:
+        """The nominal value, nan where arms differ in it."""
+        return self.nominal if isinstance(self.nominal, float) else math.nan
 
 
 def study_random(
@@ -100,23 +105,19 @@ def study_random(
         scene: with the nominal values; its scenarios are left out.
         random: texts "key.path=distribution", see `statistics.parse_distribution`.
         designs: design.npz files in place of the initial and the optimised design.
-        folder: DIR, where simulations are kept.
-        world: all ranks.
+        folder, world, shown: see `run_cases`.
         sampling: how many samples, and how they are drawn.
-        shown: draw progress.
 
     Raises:
         InputError: something asked for is not possible.
     """
-    from dolfinopt.parallel import on_root
-
     plan = on_root(world, _plan, scene, tuple(random), tuple(designs), sampling)
     return carry_out(plan, folder, world, shown=shown)
 
 
 def random_name(random: Sequence[str]) -> str:
     """Return the name of the files of a study: the keys that are random."""
-    return file_name(NAME, *(text.partition("=")[0].strip() for text in random))
+    return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
 
 
 # -- what is asked ---------------------------------------------------------------------------
@@ -136,14 +137,16 @@ def _plan(
     for key in keys:
         if keys.count(key) > 1:
             raise InputError(f"--random {key} twice; a value has one distribution")
-    values = draw([one.distribution for one in inputs], _points(sampling, len(inputs)))
+    values = stats.draw([one.distribution for one in inputs], sampling.points(len(inputs)))
     samples = sample_texts(keys, values)
     for column in values.T:  # what is refused is so at the ends, mostly
         for index in (int(np.argmin(column)), int(np.argmax(column))):
             with_sample(nominal, samples[1 + index], 1 + index)
-    given = given_designs(scene, designs)
-    cases = [one for label, design in given.items()
-             for one in sample_cases(nominal, samples, label, design)]  # fmt: skip
+    cases = [
+        case
+        for label, design in given_designs(scene, designs).items()
+        for case in sample_cases(nominal, samples, label, design)
+    ]
     report = partial(_report, inputs=inputs, values=values, sampling=sampling)
     return Plan(random_name(random), [({"design": case.label}, case) for case in cases], report)
 
@@ -169,13 +172,6 @@ def sample_cases(
     ]
 
 
-def _points(sampling: Sampling, dimensions: int) -> np.ndarray:
-    if sampling.indices == "saltelli" and dimensions > 1:
-        half = -(-sampling.samples // 2)
-        return saltelli_points(half, dimensions, sampling.sampler, sampling.seed)
-    return unit_points(sampling.samples, dimensions, sampling.sampler, sampling.seed)
-
-
 def parse_input(scene: Scene, text: str) -> Input:
     """Return what "key.path=distribution" asks for.
 
@@ -185,16 +181,14 @@ def parse_input(scene: Scene, text: str) -> Input:
         InputError: there is no such key or distribution, the key is no number, has no influence
             or changes the arms' size; or the distribution leaves its range.
     """
-    where = f"--random {text}"
     key, equals, law = (part.strip() for part in text.partition("="))
     if not key or not equals:
-        raise InputError(f"{where}: expected KEY=DISTRIBUTION, for example "
-                         "payload.mass=normal:6:0.3")  # fmt: skip
-    try:
-        distribution = parse_distribution(law)
+        example = "for example payload.mass=normal:6:0.3"
+        raise InputError(f"--random {text}: expected KEY=DISTRIBUTION, {example}")
+    with asked_by(f"--random {text}"):
+        distribution = stats.parse_distribution(law)
         middle = float(distribution.at(np.array(0.5)))
-        known = changed(scene, f"{key}={middle!r}")
-        if not isinstance(nominal_value(known, key), float):
+        if not isinstance(nominal_value(changed(scene, f"{key}={middle!r}"), key), float):
             raise InputError("expected a key with a real number as its value")
         parts = key.split(".")
         if parts[0] not in TABLES:
@@ -204,13 +198,11 @@ def parse_input(scene: Scene, text: str) -> Input:
         sizes = (*SIZES, "thickness") if scene.is_spatial else SIZES
         if parts[0] == "arms" and parts[-1] in sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
-        low, high = _range(key)
+        field = field_at(("arms", 0, parts[-1]) if parts[0] == "arms" else tuple(parts))
         try:
-            return Input(key, nominal_value(scene, key), distribution.within(low, high))
+            return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
         except InputError as error:
-            raise InputError(f"{error}; {key} is {allowed_words(_field(key))}") from None
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+            raise InputError(f"{error}; {key} is {allowed_words(field)}") from None
 
 
 def nominal_value(scene: Scene, key: str) -> object:
@@ -228,24 +220,15 @@ def nominal_value(scene: Scene, key: str) -> object:
     return values.pop() if len(values) == 1 else None
 
 
-def _field(key: str) -> FieldInfo:
-    parts = key.split(".")
-    return field_at(("arms", 0, parts[-1]) if parts[0] == "arms" else tuple(parts))
-
-
-def _rules(field: FieldInfo) -> list[Any]:
-    """Return the bounds of a field, also where it may be left out (`T | None`)."""
+def _range(field: FieldInfo) -> tuple[float, float]:
+    """Return the least and the largest value of a key, also of one that may be left out."""
     inner = get_args(without_none(field.annotation))[1:]
-    return [*field.metadata, *(rule for one in inner for rule in getattr(one, "metadata", ()))]
-
-
-def _range(key: str) -> tuple[float, float]:
-    """Return the least and the largest value of a key."""
-    low, high = -math.inf, math.inf
-    for rule in _rules(_field(key)):
-        low = max([low, *(getattr(rule, name) for name in ("gt", "ge") if hasattr(rule, name))])
-        high = min([high, *(getattr(rule, name) for name in ("lt", "le") if hasattr(rule, name))])
-    return low, high
+    rules = [*field.metadata, *(rule for one in inner for rule in getattr(one, "metadata", ()))]
+    lows, highs = (
+        [getattr(rule, name) for rule in rules for name in names if hasattr(rule, name)]
+        for names in (("gt", "ge"), ("lt", "le"))
+    )
+    return max(lows, default=-math.inf), min(highs, default=math.inf)
 
 
 # -- what comes out --------------------------------------------------------------------------
@@ -258,38 +241,33 @@ def _report(
     tables = [_input_table(inputs)]
     if any(o.failure and not o.messages for o in frame["outcome"]):  # a design is missing
         return tables, []
-    samples = _samples(frame, inputs, values)
+    samples, axes = _samples(frame, inputs, values), [one.axis for one in inputs]
     figures: list[Figure] = []
     if not (frame["failure"] != "").any():
-        # Saltelli's mixed samples are no draws of their own.
         several = len(inputs) > 1
+        # Saltelli's mixed samples are no draws of their own.
         mixed = sampling.indices == "saltelli" and several
         used = 2 * len(values) // (len(inputs) + 2) if mixed else len(values)
         drawn = samples[samples["sample"] <= used]
         tables.append(_statistics_table(drawn, used))
+        shown = drawn[["design", "sample", *QUANTITIES]]
         title = f"Designs under {used} samples of the random values"
-        figures.append(
-            FrameFigure("", title, "histogram", drawn[["design", "sample", *QUANTITIES]])
-        )
+        figures.append(FrameFigure("", title, "histogram", shown))
         if several:
             tables.append(_indices_table(samples, inputs, sampling))
-            title = f"Sobol' indices with {INTERVAL} confidence intervals"
+            title = f"Sobol' indices with {INTERVAL}"
             figures.append(FrameFigure("indices", title, "bars", tables[-1].frame))
-        columns = ["design", *(one.axis for one in inputs), *QUANTITIES]
-        title = "Samples by each random value"
-        points = drawn.loc[drawn["sample"] > 0, columns]
-        figures.append(FrameFigure("scatter", title, "scatter", points))
-    index = ["sample", *(one.axis for one in inputs)]
-    wide = by_design(samples[samples["sample"] > 0], index, (*QUANTITIES, "at [s]"))
-    tables.append(Table("", "All samples.", wide, long=True))
-    return tables, figures
+        points = drawn.loc[drawn["sample"] > 0, ["design", *axes, *QUANTITIES]]
+        figures.append(FrameFigure("scatter", "Samples by each random value", "scatter", points))
+    results = (*QUANTITIES, "at [s]")
+    wide = by_design(samples[samples["sample"] > 0], ["sample", *axes], results)
+    return [*tables, Table("", "All samples.", wide, long=True)], figures
 
 
 def _samples(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> pd.DataFrame:
     """Return a row a design and sample, number 0 with the nominal values: inputs and results."""
-    nominal = [one.nominal if isinstance(one.nominal, float) else math.nan for one in inputs]
-    columns = [one.axis for one in inputs]
-    known = pd.DataFrame(np.vstack([nominal, values]), columns=columns)
+    rows = np.vstack([[one.number for one in inputs], values])
+    known = pd.DataFrame(rows, columns=[one.axis for one in inputs])
     known.insert(0, "sample", np.arange(len(known)))
     parts = []
     for design, own in frame.groupby("design", sort=False):
@@ -308,7 +286,7 @@ def _input_table(inputs: Sequence[Input]) -> Table:
         {
             "input": one.axis,
             "distribution": one.distribution.text,
-            "nominal": one.nominal if isinstance(one.nominal, float) else math.nan,
+            "nominal": one.number,
             "mean": one.distribution.mean,
             "standard deviation": one.distribution.deviation,
             "cut off [%]": round(100.0 * one.distribution.cut_off, 6),
@@ -326,16 +304,13 @@ def _statistics_table(samples: pd.DataFrame, used: int) -> Table:
         columns: dict[str, dict[str, float]] = {}
         for design, own in samples.groupby("design", sort=False):
             values = own[what].to_numpy()
-            found = {"nominal": (values[0], math.nan, math.nan), **statistics(values[1:])}
+            found = {"nominal": (values[0], math.nan, math.nan), **stats.statistics(values[1:])}
             for k, end in enumerate(("", ": from", ": to")):
                 columns[f"{design}{end}"] = {name: one[k] for name, one in found.items()}
         part = pd.DataFrame(columns).rename_axis("statistic").reset_index()
         part.insert(0, "quantity", what)
         parts.append(part)
-    title = (
-        f"Designs under {used} samples, with {INTERVAL} confidence intervals as for independent "
-        "samples."
-    )
+    title = f"Designs under {used} samples, with {INTERVAL} as for independent samples."
     return Table("statistics", title, pd.concat(parts, ignore_index=True))
 
 
@@ -345,22 +320,20 @@ def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input], sampling: Sam
     names = ("first order [-]", "from", "to", "total [-]", "total from", "total to")
     rows = []
     for design, own in samples[samples["sample"] > 0].groupby("design", sort=False):
+        points = own[[one.axis for one in inputs]].to_numpy()
         for what in QUANTITIES:
-            one = _indices(own, what, inputs, sampling)
-            for known, first, total in zip(inputs, one.first, one.total, strict=True):
+            values = own[what].to_numpy()
+            if fitted:
+                laws = [one.distribution for one in inputs]
+                found = stats.polynomial_indices(points, values, laws)
+            else:
+                found = stats.saltelli_indices(values, len(inputs), sampling.seed)
+            for known, first, total in zip(inputs, found.first, found.total, strict=True):
                 row: dict[str, Any] = {"design": design, "quantity": what.partition(" [")[0]}
                 row |= {"input": known.key, **dict(zip(names, (*first, *total), strict=True))}
                 if fitted:
-                    row |= {"degree [-]": one.degree, "unexplained [-]": one.unexplained}
+                    row |= {"degree [-]": found.degree, "unexplained [-]": found.unexplained}
                 rows.append(row)
     how = "of a polynomial fitted to the samples" if fitted else "by Saltelli's scheme"
-    title = f"Sobol' indices, shares of the variance, {how}, with {INTERVAL} confidence intervals."
+    title = f"Sobol' indices, shares of the variance, {how}, with {INTERVAL}."
     return Table("indices", title, pd.DataFrame(rows))
-
-
-def _indices(own: pd.DataFrame, what: str, inputs: Sequence[Input], sampling: Sampling) -> Indices:
-    values = own[what].to_numpy()
-    if sampling.indices == "saltelli":
-        return saltelli_indices(values, len(inputs), sampling.seed)
-    samples = own[[one.axis for one in inputs]].to_numpy()
-    return polynomial_indices(samples, values, [one.distribution for one in inputs])

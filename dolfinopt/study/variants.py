@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
 from dolfinopt.scene.tables.objective import LIGHTER, unused_options
 
-# Label, kind, and the settings that make it.
+# Label; kind, and the settings that make it.
 OBJECTIVES = (
     ("dynamic loads (esl)", ("esl", "gradient=esl", "worst=compliance")),
     ("dynamic loads (esl), exact gradient", ("esl", "gradient=exact", "worst=compliance")),
@@ -48,13 +49,7 @@ MOST = {"balanced": 12}
 
 @dataclass(frozen=True)
 class Vary:
-    """One scene value and what it takes.
-
-    Attributes:
-        key: its path, e.g. "payload.mass".
-        values: as --set would take them.
-        text: as the user wrote it.
-    """
+    """One scene value by its path, what it takes as --set would, and the text that asks for it."""
 
     key: str
     values: tuple[str, ...]
@@ -67,11 +62,7 @@ class Vary:
 
     @property
     def whole_numbers(self) -> list[int]:
-        """The values, each once, as whole numbers.
-
-        Raises:
-            InputError: one is none.
-        """
+        """The values, each once, as whole numbers; InputError where one is none."""
         for value, number in zip(self.values, self.numbers, strict=True):
             if number % 1.0:
                 raise InputError(f"--vary {self.text}: expected whole numbers, found {value}")
@@ -86,12 +77,9 @@ class Vary:
 def axis_of(key: str) -> str:
     """Return a key with its unit, "[-]" where it has none."""
     name = re.sub(r"^(arms)\.[^.]+\.(?=[^.]+$)", r"\1.", key)
-    units = {
-        info.key: match[1]
-        for info in describe_keys()
-        if (match := re.search(r"\[([^\]]*)\]$", info.description))
-    }
-    return f"{key} [{units.get(name, '-')}]"
+    texts = {info.key: info.description for info in describe_keys()}
+    unit = re.search(r"\[([^\]]*)\]$", texts.get(name, ""))
+    return f"{key} [{unit[1] if unit else '-'}]"
 
 
 def parse_vary(text: str) -> Vary:
@@ -142,13 +130,20 @@ def changed(scene: Scene, *overrides: str) -> Scene:
     return other
 
 
+@contextmanager
+def asked_by(words: str) -> Iterator[None]:
+    """Let every InputError of the block begin with what asked for it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{words}: {error}") from None
+
+
 def differences(scene: Scene, other: Scene) -> dict[str, tuple[Any, Any]]:
     """Return by its key every value in which scenes differ, here and there; None: not set."""
     here, there = (dict(_values(one.to_dict())) for one in (scene, other))
-    every = dict.fromkeys([*here, *there])
-    return {
-        key: (here.get(key), there.get(key)) for key in every if here.get(key) != there.get(key)
-    }
+    pairs = {key: (here.get(key), there.get(key)) for key in [*here, *there]}
+    return {key: (a, b) for key, (a, b) in pairs.items() if a != b}
 
 
 def _values(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -160,6 +155,9 @@ def _values(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         return
     for name, value in data.items():
         yield from _values(value, f"{key}.{name}" if key else str(name))
+
+
+# -- objectives ------------------------------------------------------------------------------
 
 
 def with_objective(scene: Scene, kind: str, *settings: str) -> Scene:
@@ -174,13 +172,6 @@ def with_objective(scene: Scene, kind: str, *settings: str) -> Scene:
     tree["objective"] |= {"kind": kind}
     _drop_unused(tree)
     return scene_from_dict(tree, scene.source, [f"objective.{one}" for one in settings])
-
-
-def _drop_unused(tree: dict[str, Any]) -> None:
-    """Take out of a scene's data what its objective and its limits do not use."""
-    limited = [key for key, limit in tree["constraints"].items() if limit is not None]
-    for key in unused_options(tree["objective"]["kind"], limited):
-        tree["objective"].pop(key, None)
 
 
 def posed(scene: Scene, kind: str) -> Scene:
@@ -204,12 +195,11 @@ def posed(scene: Scene, kind: str) -> Scene:
     return scene_from_dict(tree, scene.source)
 
 
-def varied(scene: Scene, settings: Sequence[tuple[Vary, str]]) -> Scene:
-    try:
-        return changed(scene, *(f"{vary.key}={value}" for vary, value in settings))
-    except InputError as error:
-        asked = " ".join(f"--vary {vary.text}" for vary, _ in settings)
-        raise InputError(f"{asked}: {error}") from None
+def _drop_unused(tree: dict[str, Any]) -> None:
+    """Take out of a scene's data what its objective and its limits do not use."""
+    limited = [key for key, limit in tree["constraints"].items() if limit is not None]
+    for key in unused_options(tree["objective"]["kind"], limited):
+        tree["objective"].pop(key, None)
 
 
 # -- reductions ------------------------------------------------------------------------------
@@ -241,25 +231,24 @@ def reductions(scene: Scene, counts: Sequence[int] | None, usual: Sequence[int])
     Raises:
         InputError: one that was asked for, `counts`, is possible with no method.
     """
-    scenes = []
+    scenes: list[Scene] = []
     refusals: dict[int, InputError] = {}
     for method in METHODS:
         for count in usual if counts is None else counts:
-            if counts is None and count > MOST.get(method, count):
-                continue
-            try:
-                scenes.append(reduced(scene, method, count))
-                refusals.pop(count, None)
-            except InputError as error:
-                known = any(s.reduction.coordinates == count for s in scenes)
-                if counts is not None and not known:
-                    refusals[count] = error
-    if refusals:
-        raise next(iter(refusals.values()))
+            if counts is not None or count <= MOST.get(method, count):
+                try:
+                    scenes.append(reduced(scene, method, count))
+                except InputError as error:
+                    refusals.setdefault(count, error)
+    possible = {one.reduction.coordinates for one in scenes}
+    for count in counts or ():
+        if count not in possible:
+            raise refusals[count]
     if not scenes:
         raise InputError(f"{scene.source}: no reduction is possible with these arms")
     return scenes
 
 
 def reduction_name(scene: Scene) -> str:
+    """Return method and number of coordinates."""
     return f"{scene.reduction.method} {scene.reduction.coordinates}"

@@ -318,7 +318,7 @@ def test_cases():
     (alone,) = simulate_scenarios(scenes[1:], None)
     assert light > heavy == alone.choice.coordinates
     (bases,) = compare(scenes[1:], None)
-    assert [one.arm for one in bases] == ["arm1", "arm2"]
+    assert list(bases) == ["arm1", "arm2"]
 
 
 @pytest.mark.serial

@@ -1,8 +1,6 @@
 """Cases: known by what they compute, done once, resumed, and the same on any number of ranks."""
 
-import json
 import shutil
-import subprocess
 import sys
 
 import numpy as np
@@ -11,9 +9,10 @@ from mpi4py import MPI
 from runs import TWO_ARM
 
 import dolfinopt as do
+from dolfinopt import locks
 from dolfinopt.optimization import iterate
 from dolfinopt.optimization import loop as optimization
-from dolfinopt.output import checkpoint, run
+from dolfinopt.output import checkpoint
 from dolfinopt.responses import evaluation
 from dolfinopt.study import store
 from dolfinopt.study.cases import Case, scene_content
@@ -21,89 +20,74 @@ from dolfinopt.study.simulate import simulate_scenarios
 from dolfinopt.study.store import run_cases
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
-SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=3", "simulation.sample=0.01")
+TOLERANCE = 1e-3  # of the coordinates
+SMALL = ("arms.cells=[12,3]", "optimizer.max_iterations=3", "simulation.sample=0.01",
+         f"simulation.tolerance={TOLERANCE}", "motion.horizon=2.2")  # fmt: skip
+alone = pytest.mark.serial  # ranks have no part in it
 
 
 def scene(*overrides):
     return do.load_scene(TWO_ARM, [*SMALL, *overrides])
 
 
-def design_of(folder):
-    with np.load(folder / "design.npz") as data:
-        return {key: data[key] for key in data.files}
+def assert_close(one, other):
+    """Both are right to the tolerance in the coordinates; compliance is their square."""
+    assert one.compliance == pytest.approx(other.compliance, rel=4.0 * TOLERANCE)
+    assert one.max_deviation == pytest.approx(other.max_deviation, rel=2.0 * TOLERANCE)
 
 
-def assert_same_design(one, other):
-    assert one.keys() == other.keys()
-    for key, value in one.items():
-        np.testing.assert_array_equal(value, other[key])
+def assert_same(one, other):
+    """Both have the same bits."""
+    assert one.compliance == other.compliance and one.max_deviation == other.max_deviation
+    with np.load(one.design) as a, np.load(other.design) as b:
+        assert a.files == b.files
+        for key in a.files:
+            np.testing.assert_array_equal(a[key], b[key])
 
 
-def forbid(monkeypatch):
-    """Let every attempt to compute something fail."""
+class Killed(Exception):
+    """Ends a run as a signal would."""
 
-    def refuse(*args, **kwargs):
-        raise AssertionError("computed again")
 
-    for module, name in ((run, "optimize"), (evaluation, "simulate_batch")):
-        monkeypatch.setattr(module, name, refuse)
+def killed(*args, **kwargs):
+    raise Killed
 
 
 # -- keys ------------------------------------------------------------------------------------
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_name_is_no_part_of_the_key():
-    assert Case(scene()).key == Case(scene('name="another"')).key
-    assert Case(scene(), label="a") == Case(scene('name="b"'), label="b")
+CHANGES = {
+    "material": "material.density=2701",
+    "interpolation": "interpolation.penalty=3.1",
+    "arms": "arms.arm2.length=1.01",
+    "motion": "motion.flattening=0.9",
+    "payload": "payload.mass=6.0001",
+    "damping": "damping.stiffness_proportional=1e-4",
+    "reduction": "reduction.coordinates=5",
+    "simulation": "simulation.tolerance=2e-4",
+    "objective": "objective.load_cases=29",
+    "constraints": "constraints.first_frequency=1.0",
+    "design": "design.initial=0.4",
+    "optimizer": "optimizer.max_iterations=4",
+    "control": "control={stiffness=[1e3, 1e3, 1e3], damping=[1.0, 1.0, 1.0]}",
+    "scenarios": "scenarios=[{changes=['payload.mass=4']}]",
+}
 
 
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize(
-    "change",
-    [
-        "material.density=2701",
-        "interpolation.penalty=3.1",
-        "arms.arm2.length=1.01",
-        "motion.flattening=0.9",
-        "payload.mass=6.0001",
-        "damping.stiffness_proportional=1e-4",
-        "reduction.coordinates=5",
-        "simulation.tolerance=2e-4",
-        "objective.load_cases=29",
-        "constraints.first_frequency=1.0",
-        "design.initial=0.4",
-        "optimizer.max_iterations=4",
-        "control={stiffness=[1e3, 1e3, 1e3], damping=[1.0, 1.0, 1.0]}",
-        "scenarios=[{changes=['payload.mass=4']}]",
-    ],
-)
-def test_every_value_is_part_of_the_key(change):
-    assert Case(scene()).key != Case(scene(change)).key
+@alone
+def test_every_value_is_part_of_the_key():
+    """But the name; closures and joints are tables of other machines."""
+    known = Case(scene()).key
+    assert Case(scene('name="another"'), label="b").key == known
+    assert {*scene_content(scene())} == {*CHANGES, "closure", "joints"}
+    for change in CHANGES.values():
+        assert Case(scene(change)).key != known
+    spatial = TWO_ARM.parent / "spatial_arm.toml"
+    other = "joints.elbow.origin=[0, 0, 0.01]"
+    assert Case(do.load_scene(spatial)).key != Case(do.load_scene(spatial, [other])).key
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_every_table_is_tried_above():
-    tried = set(scene_content(scene()))
-    assert tried == {
-        "material", "interpolation", "arms", "motion", "payload", "damping", "reduction",
-        "simulation", "objective", "constraints", "design", "optimizer", "scenarios", "control",
-        "closure",  # a table like the others, which asks for another motion
-        "joints",  # of machines in space, below
-    }  # fmt: skip
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_joints_are_part_of_the_key():
-    path = TWO_ARM.parent / "spatial_arm.toml"
-    keys = {
-        Case(do.load_scene(path, change)).key
-        for change in ([], ["joints.elbow.axis=[0, 0, -1]"], ["joints.elbow.origin=[0, 0, 0.01]"])
-    }
-    assert len(keys) == 3
-
-
-@pytest.mark.serial  # ranks have no part in it
+@alone
 def test_action_and_design_are_part_of_the_key(tmp_path):
     first, second = tmp_path / "a.npz", tmp_path / "b.npz"
     first.write_bytes(b"one")
@@ -124,7 +108,7 @@ def test_action_and_design_are_part_of_the_key(tmp_path):
     assert Case(base, "simulate", first).key != Case(base, "simulate", second).key
 
 
-@pytest.mark.serial  # ranks have no part in it
+@alone
 def test_files_of_the_scene_count_by_content(tmp_path):
     def key(path):
         return Case(scene('motion.path="points"', f'motion.file="{path}"')).key
@@ -137,12 +121,30 @@ def test_files_of_the_scene_count_by_content(tmp_path):
     assert key(tmp_path / "a.csv") != key(tmp_path / "b.csv")
 
 
+@alone
+def test_batches_have_one_basis():
+    """A basis that depends on frequencies, or a frequency that is asked for, is not scaled."""
+    key = Case(scene()).batch_key
+    light = "material.density=2600"
+    assert Case(scene(light, "payload.mass=4")).batch_key == key
+    others = ["reduction.coordinates=5", "material.poisson_ratio=0.3", "design.initial=0.4"]
+    assert key not in {Case(scene(other)).batch_key for other in others}
+    krylov = ("reduction.method=krylov", "reduction.shifts=[30]")
+    for settings in (krylov, ("objective.kind=static",), ("constraints.first_frequency=1",)):
+        assert Case(scene(*settings)).batch_key != Case(scene(*settings, light)).batch_key
+    damped, gramian = "damping.stiffness_proportional=1e-3", "reduction.method=balanced"
+    assert Case(scene(damped)).batch_key == key
+    assert Case(scene(gramian, damped)).batch_key != Case(scene(gramian)).batch_key
+    chosen = Case(scene("reduction.coordinates=auto"))
+    assert chosen.batch_key == chosen.key
+
+
 # -- doing them ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def plan():
-    """An optimisation, its design and the initial one in three scenes, and a comparison."""
+    """An optimisation's design and the initial one in three scenes, and a comparison."""
     made = Case(scene(), "optimize", label="made")
     others = [scene(), scene("payload.mass=4"), scene("damping.stiffness_proportional=1e-3")]
     return [
@@ -160,102 +162,6 @@ def done(plan, tmp_path_factory):
     return folder, run_cases(plan, folder, WORLD, shown=False)
 
 
-def test_files_and_outcomes(plan, done):
-    folder, outcomes = done
-    assert outcomes.computed == 8 and not outcomes.failures  # the optimisation was implied
-    made = plan[0].design
-    files = {path.name for path in outcomes[made].folder.iterdir()}
-    assert files == {
-        "checkpoint.npz", "design.npz", "history.csv", "summary.json", "trajectory.csv",
-        "trajectory.npz",
-    }  # fmt: skip
-    assert outcomes[made].folder == folder / "cases" / made.key
-    assert outcomes[made].iterations == 3 and len(outcomes[made].history()) == 4
-    t, distance = outcomes[made].deviation()
-    # The file has samples; extremes are looked for between them, too.
-    assert distance.max() <= outcomes[made].max_deviation * (1.0 + 1e-12)
-    assert distance.max() == pytest.approx(outcomes[made].max_deviation, rel=1e-3)
-    assert abs(t[distance.argmax()] - outcomes[made].max_deviation_time) <= t[1] - t[0]
-    assert outcomes[plan[0]].case is plan[0]
-
-
-def test_same_as_without_cases(plan, done):
-    """The optimisation has the bits of `optimize` on one rank."""
-    _, outcomes = done
-    made = plan[0].design
-    result = do.optimize(scene(), world=SELF)
-    design = design_of(outcomes[made].folder)
-    for k, name in enumerate(("arm1", "arm2")):
-        arm = result.arms[k]
-        order = np.lexsort((arm.mesh.centroid[:, 1].round(9), arm.mesh.centroid[:, 0].round(9)))
-        np.testing.assert_array_equal(design[f"{name}/density"], result.x_phys[k][order])
-    assert outcomes[made].compliance == result.evaluation.compliance
-    assert outcomes[made].max_deviation == result.evaluation.max_deviation
-
-
-def test_ranks_do_not_matter(plan, done, tmp_path):
-    """Done on each rank alone: the same bits as together, in any order."""
-    _, together = done
-    plan = plan[::-1]
-    alone = run_cases(plan, tmp_path, SELF, shown=False)
-    assert alone.computed == together.computed
-    for case, outcome in alone.by_case.items():
-        other = together[case]
-        assert outcome.bases == other.bases
-        if case.action != "compare":
-            assert outcome.compliance == other.compliance
-            assert outcome.max_deviation == other.max_deviation
-            assert_same_design(design_of(outcome.folder), design_of(other.folder))
-
-
-def test_second_run_computes_nothing(plan, done, monkeypatch):
-    folder, outcomes = done
-    forbid(monkeypatch)
-    again = run_cases([*plan, *plan], folder, WORLD, shown=False)
-    assert again.computed == 0
-    assert repr(again.by_case) == repr(outcomes.by_case)  # nan is not equal to nan
-
-
-def test_comparison(plan, done):
-    """The first modes of modal truncation are those of many Craig-Bampton coordinates."""
-    _, outcomes = done
-    bases = outcomes[plan[-1]].bases
-    assert [one.arm for one in bases] == ["arm1", "arm2"]
-    for one in bases:
-        np.testing.assert_allclose(one.mac, 1.0, atol=1e-4)
-        np.testing.assert_allclose(one.frequency, 0.0, atol=1e-3)
-        # Four modes lack what they need to bend under a moment at the tip.
-        assert one.compliance[2] > 0.02
-
-
-def assert_close(one, other):
-    """Both are right to `simulation.tolerance` in the coordinates; compliance is their square."""
-    tolerance = scene().simulation.tolerance
-    assert one.compliance == pytest.approx(other.compliance, rel=4.0 * tolerance)
-    assert one.max_deviation == pytest.approx(other.max_deviation, rel=2.0 * tolerance)
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_scenarios_share_what_they_can():
-    """One mesh and factorisation, one basis and batch a reduction; results as if alone."""
-    scenes = [
-        scene(),
-        scene("payload.mass=4", "motion.flattening=0.8"),
-        scene("damping.stiffness_proportional=1e-3"),
-        scene("reduction.coordinates=5", "damping.stiffness_proportional=1e-3"),
-        scene("reduction.method=modal"),
-    ]
-    counts = []
-    for one, found in zip(scenes, simulate_scenarios(scenes, None)):
-        counts.append(found.profile.counts)
-        [alone] = simulate_scenarios([one], None)
-        assert_close(found.evaluation, alone.evaluation)
-        assert found.scene is one and found.trajectory.scene is one
-    assert [c.factorisations for c in counts] == [2, 0, 0, 0, 0]
-    assert [c.eigenproblems for c in counts] == [2, 0, 0, 2, 2]
-    assert [c.simulations for c in counts] == [3, 0, 0, 1, 1]
-
-
 @pytest.fixture
 def batches(monkeypatch):
     """How many scenes every call of the simulation took on this rank."""
@@ -270,179 +176,214 @@ def batches(monkeypatch):
     return sizes
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_sweep_of_nine_is_one_batch(tmp_path, batches):
-    masses = np.linspace(4.0, 8.0, 9)
-    sweep = [Case(scene(f"payload.mass={mass}")) for mass in masses]
-    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
-    assert batches == [9]
-    # The first of the batch bears its account: one arm is factorised once, the other, too.
-    counts = [
-        json.loads((outcomes[case].folder / "summary.json").read_text())["counts"]
-        for case in sorted(sweep, key=lambda case: case.key)
-    ]
-    assert [one["simulations"] for one in counts] == [9] + 8 * [0]
-    assert [one["factorisations"] for one in counts] == [2] + 8 * [0]
-    # In any order the same company, and nothing is computed again.
-    again = run_cases(sweep[::-1], tmp_path, SELF, shown=False)
-    assert again.computed == 0 and batches == [9]
+def test_files_and_outcomes(plan, done):
+    """The optimisation that was implied has the files and bits of `optimize` on one rank."""
+    folder, outcomes = done
+    assert outcomes.computed == 8 and not outcomes.failures
+    assert {path.name for path in folder.iterdir()} == {"cases"}
+    made = outcomes[plan[0].design]
+    assert made.folder == folder / "cases" / plan[0].design.key
+    assert {path.name for path in made.folder.iterdir()} == {
+        "checkpoint.npz", "design.npz", "history.csv", "summary.json", "trajectory.csv",
+        "trajectory.npz",
+    }  # fmt: skip
+    assert made.iterations == 3 and len(made.history()) == 4
+    t, distance = made.deviation()
+    # The file has samples; extremes are looked for between them, too.
+    assert distance.max() <= made.max_deviation * (1.0 + 1e-12)
+    assert abs(t[distance.argmax()] - made.max_deviation_time) <= t[1] - t[0]
+    result = do.optimize(scene(), world=SELF)
+    assert made.compliance == result.evaluation.compliance
+    with np.load(made.design) as design:
+        for k, name in enumerate(("arm1", "arm2")):
+            x, y = result.arms[k].mesh.centroid.T.round(9)
+            order = np.lexsort((y, x))
+            np.testing.assert_array_equal(design[f"{name}/density"], result.x_phys[k][order])
+    # The first modes of modal truncation are those of many Craig-Bampton coordinates.
+    bases = outcomes[plan[-1]].bases
+    assert list(bases) == ["arm1", "arm2"]
+    for one in bases.values():
+        np.testing.assert_allclose(one.mac, 1.0, atol=1e-4)
+        np.testing.assert_allclose(one.frequency, 0.0, atol=1e-3)
+        # Four modes lack what they need to bend under a moment at the tip.
+        assert one.compliance[2] > 0.02
 
 
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize(
-    "key", ["material.density", "material.young_modulus", "arms.arm1.thickness"]
-)
-def test_what_scales_the_arms_is_one_batch(tmp_path, batches, key):
-    """Against arms that are assembled and reduced anew."""
-    values = {"density": (2500, 2900), "young_modulus": (60e9, 75e9), "thickness": (0.009, 0.012)}
-    sweep = [Case(scene(f"{key}={value}")) for value in values[key.rpartition(".")[2]]]
-    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
-    assert batches == [2]
-    for case in sweep:
-        [alone] = simulate_scenarios([case.scene], None)
-        assert_close(outcomes[case], alone.evaluation)
+@pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
+def test_ranks_do_not_matter(plan, done, tmp_path, shared_tmp_path, batches):
+    """Done on each rank alone: the same bits as together, in any order; every job is done once."""
+    _, together = done
+    single = run_cases(plan[::-1], tmp_path, SELF, shown=False)
+    assert single.computed == together.computed
+    for case, outcome in single.by_case.items():
+        if case.action != "compare":
+            assert_same(outcome, together[case])
+    batches.clear()
+    run_cases(plan[3:], shared_tmp_path / "all", WORLD, shown=False)
+    assert sum(WORLD.allgather(sum(batches))) == 3
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_batches_have_one_basis():
-    """A basis that depends on frequencies, or a frequency that is asked for, is not scaled."""
-    key = Case(scene()).batch_key
-    light = "material.density=2600"
-    assert Case(scene(light, "payload.mass=4")).batch_key == key
-    others = ["reduction.coordinates=5", "material.poisson_ratio=0.3", "design.initial=0.4"]
-    assert key not in {Case(scene(other)).batch_key for other in others}
-    krylov = ("reduction.method=krylov", "reduction.shifts=[30]")
-    for settings in (krylov, ("objective.kind=static",), ("constraints.first_frequency=1",)):
-        one, other = Case(scene(*settings)), Case(scene(*settings, light))
-        assert one.batch_key != other.batch_key
+def test_second_run_computes_nothing(plan, done, monkeypatch):
+    folder, outcomes = done
+    monkeypatch.setattr(store, "_do", killed)
+    again = run_cases([*plan, *plan], folder, WORLD, shown=False)
+    assert again.computed == 0
+    assert repr(again.by_case) == repr(outcomes.by_case)  # nan is not equal to nan
+
+
+@alone
+def test_scenarios_share_what_they_can():
+    """One mesh and factorisation, one basis and batch a reduction; results as if alone."""
     damped = "damping.stiffness_proportional=1e-3"
-    assert Case(scene(damped)).batch_key == key
-    gramian = "reduction.method=balanced"
-    assert Case(scene(gramian, damped)).batch_key != Case(scene(gramian)).batch_key
+    scenes = [
+        scene(),
+        scene("payload.mass=4", "motion.flattening=0.8"),
+        scene(damped),
+        scene("reduction.coordinates=5", damped),
+        scene("reduction.method=balanced"),
+        scene("reduction.method=balanced", damped),
+    ]
+    counts = []
+    for one, found in zip(scenes, simulate_scenarios(scenes, None)):
+        counts.append(found.profile.counts)
+        [single] = simulate_scenarios([one], None)
+        assert_close(found.evaluation, single.evaluation)
+        assert found.scene is one and found.trajectory.scene is one
+    assert [c.factorisations for c in counts][:4] == [2, 0, 0, 0]
+    assert [c.eigenproblems for c in counts][:4] == [2, 0, 0, 2]
+    assert [c.simulations for c in counts] == [3, 0, 0, 1, 1, 1]
 
 
-@pytest.mark.serial  # ranks have no part in it
+@alone
 def test_chosen_coordinates_are_those_of_each_scene():
     """Nothing that "auto" came to in one scene is left in the next."""
     auto = "reduction.coordinates=auto"
     strict, loose = (scene(auto, f"reduction.tolerance={value}") for value in (0.002, 0.05))
     first, found = simulate_scenarios([strict, loose], None)
-    [alone] = simulate_scenarios([loose], None)
-    assert found.choice == alone.choice and found.evaluation == alone.evaluation
+    [single] = simulate_scenarios([loose], None)
+    assert found.choice == single.choice and found.evaluation == single.evaluation
     assert first.choice.coordinates > found.choice.coordinates
-    assert Case(strict).batch_key == Case(strict).key
 
 
-@pytest.mark.serial  # ranks have no part in it
+@alone
+def test_sweep_is_one_batch(tmp_path, batches):
+    """The first bears the account of all; in any order the same cases."""
+    sweep = [Case(scene(f"payload.mass={mass}")) for mass in np.linspace(4.0, 8.0, 5)]
+    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
+    keys = [case.key for case in sweep]
+    first = sweep[keys.index(min(keys))]
+    counts = [outcomes[case].summary()["counts"] for case in sweep]
+    assert [one["simulations"] for one in counts] == [5 * (case is first) for case in sweep]
+    assert [one["factorisations"] for one in counts] == [2 * (case is first) for case in sweep]
+    assert run_cases(sweep[::-1], tmp_path, SELF, shown=False).computed == 0 and batches == [5]
+
+
+@alone
+def test_what_scales_the_arms_is_one_batch(tmp_path, batches):
+    """Against arms that are assembled and reduced anew."""
+    changes = ("material.density=2900", "material.young_modulus=60e9", "arms.arm1.thickness=0.012")
+    sweep = [Case(scene(change)) for change in changes]
+    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
+    assert batches == [3]
+    for case in sweep:
+        [single] = simulate_scenarios([case.scene], None)
+        assert_close(outcomes[case], single.evaluation)
+
+
+@alone
 def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batches):
     """What is there stays as it is, and all are right to the tolerance in any company."""
     _, outcomes = done
     [case, *_] = together = plan[3:6]
-    alone = run_cases([case], tmp_path, SELF, shown=False)
-    kept = alone[case].design.stat().st_mtime_ns
+    first = run_cases([case], tmp_path, SELF, shown=False)
+    kept = first[case].design.stat().st_mtime_ns
     after = run_cases(together, tmp_path, SELF, shown=False)
     assert batches == [1, 2] and after.computed == 2
     assert after[case].design.stat().st_mtime_ns == kept
-    assert after[case].compliance == alone[case].compliance
+    assert after[case].compliance == first[case].compliance
     for one in together:
         assert_close(after[one], outcomes[one])
-    assert run_cases(plan[3:5], tmp_path, SELF, shown=False).computed == 0
 
 
-def test_batch_interrupted_while_it_is_written(plan, done, shared_tmp_path, monkeypatch, batches):
-    """Cases that are missing are computed with the company of those that are there."""
-    from dolfinopt.output import run_folder as results
+# -- interruptions and failures --------------------------------------------------------------
 
+
+@alone
+def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch, batches):
+    """Nothing of it is in place: it is computed anew as a whole, to the same bits."""
     _, outcomes = done
-    together = plan[3:6]
     written = []
-    whole = results.write_simulation
-
-    class Killed(Exception):
-        pass
+    whole = store.write_simulation
 
     def stop(*args, **kwargs):
         if written:
             raise Killed
         written.append(whole(*args, **kwargs))
 
-    if WORLD.rank == 0:
-        with monkeypatch.context() as patch:
-            patch.setattr(results, "write_simulation", stop)
-            with pytest.raises(Killed):
-                run_cases(together, shared_tmp_path, SELF, shown=False)
-        batches.clear()
-    WORLD.barrier()
-    again = run_cases(together, shared_tmp_path, WORLD, shown=False)
-    assert again.computed == 2 and sum(WORLD.allgather(sum(batches))) == 3
-    for case in together:
-        assert again[case].compliance == outcomes[case].compliance
-        np.testing.assert_array_equal(again[case].deviation(), outcomes[case].deviation())
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "write_simulation", stop)
+        with pytest.raises(Killed):
+            run_cases(plan[3:6], tmp_path, SELF, shown=False)
+    assert not list(tmp_path.rglob("summary.json"))
+    again = run_cases(plan[3:6], tmp_path, SELF, shown=False)
+    assert again.computed == 3 and batches == [3, 3]
+    for case in plan[3:6]:
+        assert_same(again[case], outcomes[case])
 
 
-def test_damaged_summary_is_done_anew(plan, done, shared_tmp_path):
+@alone
+def test_damaged_summary_is_done_anew(plan, done, tmp_path):
+    """As are its other files; what a killed run has left is removed."""
     folder, outcomes = done
     case = plan[3]
-    if WORLD.rank == 0:
-        shutil.copytree(folder / "cases", shared_tmp_path / "cases")
-        name = outcomes[case].folder.name
-        (shared_tmp_path / "cases" / name / "summary.json").write_text('{"seconds": {')
-    WORLD.barrier()
-    again = run_cases(plan, shared_tmp_path, WORLD, shown=False)
-    assert again.computed == 1
-    assert again[case].compliance == outcomes[case].compliance
+    shutil.copytree(folder / "cases", tmp_path / "cases")
+    (tmp_path / "cases" / case.key / "summary.json").write_text('{"seconds": {')
+    left = tmp_path / ".work-0123"
+    left.mkdir()
+    (left / f"{case.key}.taken").touch()
+    again = run_cases(plan, tmp_path, SELF, shown=False)
+    assert again.computed == 1 and {path.name for path in tmp_path.iterdir()} == {"cases"}
+    assert_close(again[case], outcomes[case])
 
 
-# -- interruptions and failures --------------------------------------------------------------
-
-
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize("where", ["before the first iteration", "between two", "at the end"])
-def test_interrupted_run_goes_on(plan, done, tmp_path, monkeypatch, where):
+@alone
+@pytest.mark.parametrize("where", ["between two iterations", "at the end"])
+def test_interrupted_optimisation_goes_on(plan, done, tmp_path, monkeypatch, where):
     """What is computed again begins at the last checkpoint and ends in the same bits."""
     _, outcomes = done
     made = plan[0].design
-    stop = {"before the first iteration": 0, "between two": 2, "at the end": None}[where]
     monkeypatch.setattr(optimization, "CHECKPOINT_INTERVAL", 0.0)
-
-    class Killed(Exception):
-        pass
-
-    def tell(progress, label="", done=0, *args, **kwargs):
-        if done == stop and not kwargs:
-            raise Killed
-
-    def no_summary(*args, **kwargs):
-        raise Killed
-
+    reached = 3
     with monkeypatch.context() as patch:
-        patch.setattr(store.Progress, "tell", tell)
-        if stop is None:
-            from dolfinopt.output import run_folder as results
+        if where == "at the end":
+            patch.setattr(store, "write_result", killed)
+        else:
+            reached, told = 1, []
 
-            patch.setattr(results, "write_summary", no_summary)
+            def stop(place):
+                told.append(place)
+                if len(told) == 4:  # before the job, then after each iteration
+                    raise Killed
+
+            patch.setattr(store._Place, "check", stop)
         with pytest.raises(Killed):
             run_cases([made], tmp_path, SELF, shown=False)
     left = tmp_path / "cases" / made.key
     assert not (left / "summary.json").exists()
-    reached = int(np.load(left / "checkpoint.npz")["iteration"])
-    assert reached == {0: -1, 2: 1, None: 3}[stop]
-
+    assert int(np.load(left / "checkpoint.npz")["iteration"]) == reached
     iterations = []
     step = iterate.Iterate._update
     monkeypatch.setattr(
         iterate.Iterate, "_update", lambda run, *a: (iterations.append(1), step(run, *a))
     )
     # Under another name: a checkpoint does not depend on it.
-    renamed = Case(scene('name="another"'), "optimize")
-    again = run_cases([renamed], tmp_path, SELF, shown=False)
-    assert len(iterations) == 3 - max(reached, 0)
-    assert again[made].compliance == outcomes[made].compliance
-    assert_same_design(design_of(left), design_of(outcomes[made].folder))
+    again = run_cases([Case(scene('name="another"'), "optimize")], tmp_path, SELF, shown=False)
+    assert len(iterations) == 3 - reached
+    assert_same(again[made], outcomes[made])
     assert [row.iteration for row in again[made].history()] == [0, 1, 2, 3]
 
 
-@pytest.mark.serial  # ranks have no part in it
+@alone
 def test_foreign_checkpoint_is_not_used(plan, done, tmp_path):
     """A checkpoint of another scene in the folder: the case begins anew."""
     _, outcomes = done
@@ -450,12 +391,11 @@ def test_foreign_checkpoint_is_not_used(plan, done, tmp_path):
     left = tmp_path / "cases" / made.key
     left.mkdir(parents=True)
     checkpoint.begin(left, scene("payload.mass=1"))
-    assert run_cases([made], tmp_path, SELF, shown=False)[made].compliance == (
-        outcomes[made].compliance
-    )
+    assert_same(run_cases([made], tmp_path, SELF, shown=False)[made], outcomes[made])
 
 
 def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypatch):
+    """The next run tries again, and what failed alone; designs that were not found are named."""
     _, outcomes = done
     whole = evaluation.simulate_batch
 
@@ -464,59 +404,47 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
         found = whole(scenes, *args, **options)
         return [error if s.payload.mass == 4.0 else one for s, one in zip(scenes, found)]
 
-    with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "simulate_batch", fail_at_four)
-        first = run_cases(plan[3:6], shared_tmp_path, WORLD, shown=False)
-    assert [one.failure for one in first.failures] == ["no solution at 4 kg"]
-    assert first[plan[4]].failure and np.isnan(first[plan[4]].compliance)
-    assert first[plan[5]].compliance == outcomes[plan[5]].compliance
-    # The next run tries again, and what failed alone.
-    again = run_cases(plan[3:6], shared_tmp_path, WORLD, shown=False)
-    assert again.computed == 1 and not again.failures
-    assert again[plan[4]].compliance == outcomes[plan[4]].compliance
-
-
-def test_design_that_was_not_found(plan, shared_tmp_path, monkeypatch):
-    """Simulations of a design whose optimisation failed say so."""
-
     def fail(*args, **kwargs):
         raise do.ConvergenceError("no way")
 
-    monkeypatch.setattr(run, "optimize", fail)
-    outcomes = run_cases(plan[:4], shared_tmp_path, WORLD, shown=False)
-    assert [one.failure for one in outcomes.failures] == ["no way"] + 3 * ["made: no way"]
-    assert outcomes[plan[3]].compliance > 0.0
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "simulate_batch", fail_at_four)
+        patch.setattr(store, "optimize", fail)
+        first = run_cases(plan[:6], shared_tmp_path, WORLD, shown=False)
+    told = sorted(one.failure for one in first.failures)
+    assert told == ["made: no way"] * 3 + ["no solution at 4 kg", "no way"]
+    assert first[plan[4]].failure and np.isnan(first[plan[4]].compliance)
+    assert first[plan[5]].compliance == outcomes[plan[5]].compliance
+    again = run_cases(plan[3:6], shared_tmp_path, WORLD, shown=False)
+    assert again.computed == 1 and not again.failures
+    assert_close(again[plan[4]], outcomes[plan[4]])
 
 
-# Another program that does a case: its folder's name is the key.
-OWNER = """
-import fcntl, pathlib, sys, time
-place = pathlib.Path(sys.argv[1])
-with open(place.parent / ".lock", "a+b") as stream:
-    fcntl.lockf(stream, fcntl.LOCK_EX, 1, int(place.name[:12], 16))
-    print("locked", flush=True)
-    time.sleep(0.3)
-    (place / "part").rename(place / "summary.json")
-"""
+@alone
+def test_another_run_is_refused(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "try_lock", lambda *arguments: False)
+    with pytest.raises(do.InputError, match="another run works in this folder"):
+        run_cases(plan, tmp_path, SELF, shown=False)
 
 
-def test_case_in_other_hands_is_waited_for(plan, done, shared_tmp_path):
-    """A locked case is left to its owner, whose result is taken."""
-    _, outcomes = done
-    case = plan[3]
-    if WORLD.rank > 0:
-        run_cases([case], shared_tmp_path, WORLD, shown=False)
-        return
-    place = shared_tmp_path / "cases" / case.key
-    place.mkdir(parents=True)
-    data = json.loads((outcomes[case].folder / "summary.json").read_text())
-    (place / "part").write_text(json.dumps(data | {"compliance": 12345.0}))
-    owner = [sys.executable, "-c", OWNER, str(place)]
-    with subprocess.Popen(owner, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline() == "locked\n"
-        found = run_cases([case], shared_tmp_path, WORLD, shown=False)
-    assert found[case].compliance == 12345.0
-    assert outcomes[case].compliance != 12345.0
+# -- progress --------------------------------------------------------------------------------
+
+
+class Terminal:
+    """Standard error that is a terminal, and keeps what is written."""
+
+    def __init__(self):
+        self.text = ""
+
+    def isatty(self):
+        return True
+
+    def write(self, text):
+        self.text += text
+        return len(text)
+
+    def flush(self):
+        pass
 
 
 def test_plain_lines_tell_of_every_case(plan, shared_tmp_path, capsys):
@@ -525,3 +453,21 @@ def test_plain_lines_tell_of_every_case(plan, shared_tmp_path, capsys):
     assert len(lines) == (2 if WORLD.rank == 0 else 0)
     for k, line in enumerate(lines, 1):
         assert line.startswith(f"{k}/2") and "N m" in line
+    run_cases(plan[3:5], shared_tmp_path, WORLD)
+    assert capsys.readouterr().err == ""
+
+
+@alone
+def test_terminal(plan, done, tmp_path, monkeypatch):
+    """A bar, how far optimisations are, and a line for every case."""
+    terminal = Terminal()
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", terminal)
+    run_cases(plan[3:5], tmp_path, SELF)
+    assert "2/2 cases" in terminal.text and terminal.text.count("compliance") == 2
+    made, place = plan[0].design, store._Place(done[0] / "cases", tmp_path)
+    assert list(store._running([made], place)) == []
+    place.taken(made).touch()
+    objective = f"{done[1][made].history()[-1].objective:.4g}"
+    assert list(store._running([made], place)) == [f"made: 3/3 objective {objective}"]

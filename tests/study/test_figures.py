@@ -205,21 +205,18 @@ def test_column_of_panels():
     assert first.get_legend().get_window_extent().y0 > second.get_window_extent().y1
 
 
-def test_losses_have_one_scale():
-    for factor in (0.1, 1.0, 100.0):
-        values = factor * np.array([[0.0, 1.5], [-2.0, 0.0]])
-        panels = (("loss [%]", values),)
-        drawn = matrix_figure(MatrixFigure("", "", "i", "j", ("4", "8"), panels))
-        assert drawn.axes[0].images[0].get_clim() == (-10.0, 10.0)
+@pytest.mark.parametrize("factor", [0.1, 1.0, 100.0])
+def test_losses_have_one_scale(factor):
+    values = factor * np.array([[0.0, 1.5], [-2.0, 0.0]])
+    panels = (("loss [%]", values),)
+    labels = "made for [kg]", "used at [kg]", ("4", "8")
+    axes = matrix_figure(MatrixFigure("", "T", *labels, panels)).axes[0]
+    assert axes.images[0].get_clim() == (-10.0, 10.0)
+    assert [text.get_text() for text in axes.texts] == [f"{value:.2f}" for value in values.flat]
+    assert axes.get_ylabel() == "made for [kg]"
 
 
-def test_matrix_and_tornado_figures():
-    values = np.array([[0.0, 1.5], [-2.0, 0.0]])
-    drawn = matrix_figure(MatrixFigure("", "T", "made for [kg]", "used at [kg]", ("4", "8"),
-                                       (("loss [%]", values),)))  # fmt: skip
-    texts = [text.get_text() for text in drawn.axes[0].texts]
-    assert texts == ["0.00", "1.50", "-2.00", "0.00"]
-    assert drawn.axes[0].get_ylabel() == "made for [kg]"
+def test_tornado():
     columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
     frame = pd.DataFrame([("one", "compliance", "mass", -3.0, 4.0)], columns=columns)
     drawn = draw(FrameFigure("", "T", "tornado", frame))

@@ -7,74 +7,53 @@ from studies import rows_of
 
 import dolfinopt as do
 
-WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 CONTROLLED = ROOT / "demos" / "controlled_two_arm.toml"
 SLIDER_CRANK = ROOT / "demos" / "slider_crank.toml"
+TOLERANCE = 1e-3  # of the coordinates, whose square is the compliance
 SMALL = {
-    CONTROLLED: ["arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01",
-                 "motion.horizon=2.0"],
+    CONTROLLED: ["arms.cells=[12,3]", "optimizer.max_iterations=1", "simulation.sample=0.01",
+                 "motion.horizon=2.0", f"simulation.tolerance={TOLERANCE}"],
     SLIDER_CRANK: ["arms.rod.cells=[24,4]", "optimizer.max_iterations=1",
-                   "simulation.sample=1e-3", "motion.horizon=0.06"],
+                   "simulation.sample=1e-3", "motion.horizon=0.06",
+                   f"simulation.tolerance={TOLERANCE}"],
 }  # fmt: skip
-TOLERANCE = 1e-4  # of the coordinates, whose square is the compliance
+pytestmark = pytest.mark.serial
 
 
-def small(path, *changes):
-    return do.load_scene(path, [*SMALL[path], *changes])
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("machines") if WORLD.rank == 0 else None
-    return WORLD.bcast(path, root=0)
-
-
-@pytest.mark.serial
 @pytest.mark.parametrize(
-    ("path", "key", "values"),
+    ("path", "key", "values", "law"),
     [
-        (CONTROLLED, "control.stiffness_factor", ("0.1", "1")),
-        (SLIDER_CRANK, "motion.speed", ("100", "150")),
+        (CONTROLLED, "control.stiffness_factor", ("0.1", "1"), "normal:1:0.05"),
+        (SLIDER_CRANK, "motion.speed", ("100", "150"), "normal:150:3"),
     ],
     ids=["gains", "speed"],
 )
-def test_sweep(path, key, values, folder):
+def test_swept_and_random(path, key, values, law, tmp_path):
     """Every row is a simulation by itself: nothing of another row's gains or speed is kept."""
-    run("sweep", path, "--vary", f"{key}={','.join(values)}", *overrides(*SMALL[path]), "--out",
-        folder)  # fmt: skip
-    rows = rows_of(folder / f"{key}.csv")
+    more = ["--no-plots", *overrides(*SMALL[path]), "--out", tmp_path]
+    run("sweep", path, "--vary", f"{key}={','.join(values)}", *more)
     found = []
-    for row, value in zip(rows, values, strict=True):
-        model = do.Model(small(path, f"{key}={value}"), comm=SELF)
-        alone = model.simulate()
-        got = float(row["initial design: compliance [N m]"])
-        assert got == pytest.approx(alone.compliance, rel=4.0 * TOLERANCE)
-        found.append(got)
+    for row, value in zip(rows_of(tmp_path / f"{key}.csv"), values, strict=True):
+        scene = do.load_scene(path, [*SMALL[path], f"{key}={value}"])
+        alone = do.Model(scene, comm=MPI.COMM_SELF).simulate()
+        found.append(float(row["initial design: compliance [N m]"]))
+        assert found[-1] == pytest.approx(alone.compliance, rel=4.0 * TOLERANCE)
     assert abs(found[1] - found[0]) > 0.05 * found[0]
-
-
-@pytest.mark.serial
-def test_random_gain_and_speed(folder):
-    for path, key, law in (
-        (CONTROLLED, "control.stiffness_factor", "normal:1:0.05"),
-        (SLIDER_CRANK, "motion.speed", "normal:150:3"),
-    ):
-        run("uncertainty", path, "--random", f"{key}={law}", "--samples", 10, "--no-plots",
-            *overrides(*SMALL[path]), "--out", folder)  # fmt: skip
-        rows = rows_of(folder / f"uncertainty_{key}.csv")
-        assert len(rows) == 10
-        assert len({row["initial design: compliance [N m]"] for row in rows}) == 10
+    made = tmp_path / "made.npz"
+    next((tmp_path / "cases").glob("*/history.csv")).with_name("design.npz").rename(made)
+    run("uncertainty", path, "--random", f"{key}={law}", "--samples", 10, "--design", made, *more)
+    rows = rows_of(tmp_path / f"uncertainty_{key}.csv")
+    assert len({row["made: compliance [N m]"] for row in rows}) == 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [CONTROLLED, SLIDER_CRANK], ids=lambda path: path.stem)
-def test_compare_objectives(path, folder):
-    """Every objective goes with feedback control and closed loops."""
-    quick = overrides(*SMALL[path], "simulation.tolerance=1e-2")
-    # Of the controlled arms pictures are those of the two-arm scene, see test_study.
-    drawn = ["--no-plots"] if path == CONTROLLED else []
-    run("compare", path, "objectives", *quick, *drawn, "--out", folder / path.stem)
-    rows = rows_of(folder / path.stem / "objective.csv")
+def test_compare_objectives(path, tmp_path):
+    """Objectives of the motion, of stress and of the drives go with control and closed loops."""
+    kinds = [part for kind in ("esl", "compliance", "stress") for part in ("--kind", kind)]
+    more = [*overrides(*SMALL[path]), "--no-plots", "--out", tmp_path]
+    run("compare", path, "objectives", *kinds, *more)
+    rows = rows_of(tmp_path / "objective.csv")
     compliance = {row["objective"]: float(row["compliance [N m]"]) for row in rows}
-    for name in ("dynamic loads (esl)", "compliance over the horizon, exact gradient"):
-        assert compliance[name] < compliance["initial design"]
+    assert list(compliance) == ["initial design", "esl", "compliance", "stress"]
+    assert max(compliance["esl"], compliance["compliance"]) < compliance["initial design"]

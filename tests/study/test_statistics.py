@@ -128,15 +128,6 @@ def quadrature(law: Distribution) -> tuple[np.ndarray, np.ndarray]:
     return x, w * law.law.pdf(x)
 
 
-def test_polynomials_of_uniform_inputs_are_legendre():
-    x = np.linspace(-1.0, 1.0, 9)
-    found = parse_distribution("uniform:-1:1").polynomials(x, 2)
-    expected = np.stack(
-        [np.ones_like(x), np.sqrt(3.0) * x, np.sqrt(5.0) * 0.5 * (3.0 * x**2 - 1.0)], axis=1
-    )
-    np.testing.assert_allclose(found, expected, atol=1e-9)  # tails of 1e-12 are left out
-
-
 # -- samples ---------------------------------------------------------------------------------
 
 
@@ -206,19 +197,19 @@ def test_statistics_of_a_normal_sample():
 
 
 def test_intervals_cover():
-    """Of 1000 samples of a skewed law, intervals miss the truth 5 % of the time, or less."""
+    """Of 400 samples of a skewed law, intervals miss the truth 5 % of the time, or less."""
     rng = np.random.default_rng(3)
     law = stats.gamma(4.0)
     missed = np.zeros(5)
-    for _ in range(1000):
+    for _ in range(400):
         found = statistics(law.rvs(100, random_state=rng))
         truth = [law.mean(), law.std(), *law.ppf([0.05, 0.5, 0.95])]
         for k, (one, true) in enumerate(zip(found.values(), truth, strict=True)):
             missed[k] += not (one.low <= true <= one.high or math.isnan(one.low + one.high))
-    # Three standard errors of 1000 trials are 2 %; those of s rest on the law's fourth moment,
+    # Three standard errors of 400 trials are 3.3 %; those of s rest on the law's fourth moment,
     # which 100 samples underestimate.
-    assert missed[0] / 1000 < 0.08 and missed[1] / 1000 < 0.14
-    assert (missed[2:] / 1000 < 0.07).all() and (missed > 0).all()
+    assert missed[0] / 400 < 0.09 and missed[1] / 400 < 0.15
+    assert (missed[2:] / 400 < 0.083).all() and (missed > 0).all()
 
 
 def test_few_samples_bound_no_quantile():

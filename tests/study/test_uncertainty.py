@@ -1,4 +1,4 @@
-"""Random uncertainties from the command line: what is asked, tables and pictures."""
+"""Random uncertainties: what is asked, what each sample gives, tables and pictures."""
 
 from __future__ import annotations
 
@@ -12,15 +12,26 @@ from studies import cells_of, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.study import simulate, uncertainty
 from dolfinopt.study.figures import draw
-from dolfinopt.study.uncertainty import Sampling, nominal_value, parse_input, study_random
+from dolfinopt.study.simulate import scales_bodies, with_sample
+from dolfinopt.study.store import run_cases
+from dolfinopt.study.uncertainty import (
+    Sampling,
+    nominal_value,
+    parse_input,
+    sample_cases,
+    sample_texts,
+    study_random,
+)
 
-WORLD = MPI.COMM_WORLD
+WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 SMALL = ["arms.cells=[12,3]", "optimizer.max_iterations=2", "simulation.sample=0.01",
-         "simulation.tolerance=1e-2"]  # fmt: skip
-SETTINGS = overrides(*SMALL)
+         "simulation.tolerance=1e-2", "motion.horizon=2.2"]  # fmt: skip
 MASS, YOUNG = "payload.mass=normal:6:0.3", "material.young_modulus=normal:70e9:2e9"
 TWO = "uncertainty_payload.mass_material.young_modulus"
+CHUNK = 6
+alone = pytest.mark.serial  # ranks: test_ranks_do_not_matter
 
 
 def scene(*overrides):
@@ -38,8 +49,19 @@ def folder(tmp_path_factory):
     return WORLD.bcast(path, root=0)
 
 
-def tables_of(done):
-    return {table.name: table for table in done.tables}
+@pytest.fixture(scope="module")
+def given(folder):
+    """A design of solid arms in a file, which needs no optimisation."""
+    return write_uniform(folder / "solid.npz", (12, 3), 1.0)
+
+
+def evaluated(*overrides, density=0.5):
+    """Return what `evaluate` finds in a scene with one density, arms built for it alone."""
+    other = scene(*overrides)
+    partition = do.partition_arms(SELF, other.cell_counts)
+    arms = do.build_arms(other, partition, do.Profile())
+    x = {k: arm.uniform(density) for k, arm in arms.items()}
+    return do.evaluate(other, partition, arms, x, do.Profile())[0]
 
 
 # -- what is asked ---------------------------------------------------------------------------
@@ -75,7 +97,7 @@ BAD = {
 def test_bad_input_is_one_line(name, shared_tmp_path):
     arguments, word = BAD[name]
     with pytest.raises((InputError, click.UsageError)) as caught:
-        run(TWO_ARM, *arguments, *SETTINGS, "--out", shared_tmp_path / "o")
+        run(TWO_ARM, *arguments, *overrides(*SMALL), "--out", shared_tmp_path / "o")
     error = caught.value
     message = error.format_message() if isinstance(error, click.UsageError) else str(error)
     assert "\n" not in message and word in message
@@ -105,14 +127,154 @@ def test_nominal_values():
         assert nominal_value(given, key) == value
 
 
+def test_a_sample_out_of_reach_names_its_number():
+    assert with_sample(scene(), (), 0) == scene()
+    with pytest.raises(InputError, match=r"--random, sample 2 \(motion.radius=5.0\): [^\n]*$"):
+        with_sample(scene(), ("motion.radius=5.0",), 2)
+
+
+# -- samples ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def chunks(monkeypatch):
+    monkeypatch.setattr(uncertainty, "CHUNK", CHUNK)
+
+
+def masses(count):
+    return 6.0 + 0.3 * np.sin(np.arange(count, dtype=float))
+
+
+def payloads(count, *overrides, design=None):
+    """Return cases of samples of the payload's mass."""
+    samples = sample_texts(["payload.mass"], masses(count)[:, None])
+    return sample_cases(scene(*overrides), samples, "it", design)
+
+
+def respond(cases, folder, comm=WORLD):
+    """Return what came of all samples (3, 1 + n), how many were computed, and all messages."""
+    outcomes = run_cases(cases, folder, comm, shown=False)
+    found = [outcomes[case] for case in cases]
+    arrays = np.concatenate([np.stack([*one.samples.values()]) for one in found], axis=1)
+    return arrays, outcomes.computed, {k: v for o in found for k, v in o.messages.items()}
+
+
+@alone
+@pytest.mark.parametrize(
+    ("changes", "scaling"),
+    [
+        ({"payload.mass": 7.0, "motion.duration": 2.1, "arms.arm2.young_modulus": 60e9}, True),
+        ({"arms.thickness": 0.009, "damping.stiffness_proportional": 1e-3}, True),
+        ({"material.poisson_ratio": 0.2, "material.density": 3000.0}, False),
+    ],
+    ids=["scaled", "thickness", "reduced anew"],
+)
+def test_samples_are_scenes_by_themselves(changes, scaling, tmp_path):
+    """Whether bodies are scaled or reduced anew: as `evaluate` has it."""
+    base = scene("simulation.tolerance=1e-6")
+    assert scales_bodies(base, changes) == scaling
+    cases = sample_cases(base, sample_texts([*changes], np.array([[*changes.values()]])), "", None)
+    found, computed, failures = respond(cases, tmp_path)
+    assert computed == 2 and not failures
+    texts = [f"{key}={value}" for key, value in changes.items()]
+    each = [evaluated("simulation.tolerance=1e-6", *more) for more in ((), texts)]
+    figures = [(one.compliance, one.max_deviation, one.max_deviation_time) for one in each]
+    # Both are right to the tolerance in the coordinates; some of it is lost in their squares.
+    np.testing.assert_allclose(found.T, figures, rtol=1e-5)
+    assert np.abs(figures[1][0] / figures[0][0] - 1.0) > 1e-4  # it does matter
+
+
+def test_what_is_known_is_not_done_again(chunks, given, shared_tmp_path):
+    """Further samples are added to complete chunks, whose bits stay; damaged ones are done anew."""
+    count = 2 * CHUNK - 1  # and the scene itself: two chunks
+    first, computed, _ = respond(payloads(count), shared_tmp_path)
+    assert computed == 2 * CHUNK and first.shape == (3, 2 * CHUNK)
+    WORLD.barrier()  # all have read them
+    if WORLD.rank == 0:
+        damaged, _ = (shared_tmp_path / "cases").glob("*/summary.json")
+        damaged.write_bytes(damaged.read_bytes()[:100])
+    WORLD.barrier()
+    again, computed, _ = respond(payloads(count), shared_tmp_path)
+    assert computed == CHUNK
+    np.testing.assert_array_equal(first, again)
+    more, computed, _ = respond(payloads(count + 3, 'name="other"'), shared_tmp_path)
+    assert computed == 3  # another name is the same scene
+    np.testing.assert_array_equal(first, more[:, : 2 * CHUNK])
+    few = CHUNK - 1
+    assert respond(payloads(few, "motion.flattening=0.9"), shared_tmp_path)[1] == CHUNK
+    assert respond(payloads(few, design=given), shared_tmp_path)[1] == CHUNK
+
+
+@alone
+def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
+    """Ctrl-C in the third chunk: two are kept, and the end is the same."""
+    count = 3 * CHUNK - 1
+    honest, calls = simulate.simulate_batch, []
+
+    def interrupted(scenes, *others):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return honest(scenes, *others)
+
+    monkeypatch.setattr(simulate, "simulate_batch", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        respond(payloads(count), tmp_path / "a", SELF)
+    found, computed, _ = respond(payloads(count), tmp_path / "a", SELF)
+    assert computed == CHUNK
+    expected, computed, _ = respond(payloads(count), tmp_path / "b", SELF)
+    assert computed == 3 * CHUNK
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
+def test_ranks_do_not_matter(chunks, given, tmp_path, shared_tmp_path):
+    """The same bits, whoever does a chunk, of two designs."""
+    count = 2 * CHUNK + 1
+    cases = payloads(count - 1) + payloads(count - 1, design=given)
+    single, *_ = respond(cases, tmp_path / "alone", SELF)
+    together, computed, _ = respond(cases, shared_tmp_path / "all")
+    assert computed == 2 * count
+    np.testing.assert_array_equal(single, together)
+    assert (single[0, :count] != single[0, count:]).all()
+
+
+@alone
+def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch):
+    """What was found is kept for this run; the command ends with status 1."""
+    honest = simulate.simulate_batch
+
+    def failing(scenes, *others):
+        return [
+            ConvergenceError("too heavy") if scene.payload.mass > 6.25 else one
+            for scene, one in zip(scenes, honest(scenes, *others), strict=True)
+        ]
+
+    cases = payloads(CHUNK - 1)
+    heavy = np.flatnonzero(masses(CHUNK - 1) > 6.25) + 1
+    assert 0 < len(heavy) < CHUNK - 1
+    with monkeypatch.context() as patch:
+        patch.setattr(simulate, "simulate_batch", failing)
+        found, _, failures = respond(cases, tmp_path, SELF)
+        with pytest.raises(ConvergenceError, match=r"sample \d+ \(payload.*\): too heavy \(and"):
+            run(TWO_ARM, "--random", MASS, "--samples", 10, "--design", given, *overrides(*SMALL),
+                "--out", tmp_path / "f")  # fmt: skip
+    assert list(failures) == list(heavy) and {*failures.values()} == {"too heavy"}
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found[0])), heavy)
+    rows = rows_of(tmp_path / "f" / "uncertainty_payload.mass.csv")
+    assert len(rows) == 10 and "" in {row["solid: compliance [N m]"] for row in rows}
+    found, computed, failures = respond(cases, tmp_path, SELF)
+    assert computed == CHUNK and not failures and np.isfinite(found).all()
+
+
 # -- what comes out --------------------------------------------------------------------------
 
 
-@pytest.mark.serial
+@alone
 def test_command(folder, capsys):
     """Statistics are those of the samples in the file; the second time nothing is computed."""
-    arguments = (TWO_ARM, "--random", MASS, "--random", YOUNG, "--samples", 32, *SETTINGS,
-                 "--out", folder / "two")  # fmt: skip
+    arguments = (TWO_ARM, "--random", MASS, "--random", YOUNG, "--samples", 32,
+                 *overrides(*SMALL), "--out", folder / "two")  # fmt: skip
     run(*arguments)
     first = capsys.readouterr().out
     rows = rows_of(folder / "two" / f"{TWO}.csv")
@@ -146,22 +308,12 @@ def test_command(folder, capsys):
         assert (total > 0.5) == (one["input"] == "payload.mass")
     names = ("", "_indices", "_scatter")
     assert all((folder / "two" / f"{TWO}{name}.png").is_file() for name in names)
-    if WORLD.rank == 0:
-        assert "67 cases computed" in first  # two designs at 33 points, and one made
-        assert (folder / "two" / f"{TWO}.md").read_text() in first
-    WORLD.barrier()
+    assert "67 cases computed" in first  # two designs at 33 points, and one made
+    assert (folder / "two" / f"{TWO}.md").read_text() in first
     before = (folder / "two" / f"{TWO}.csv").read_bytes()
     run(*arguments, "--no-plots")
-    if WORLD.rank == 0:
-        assert "0 cases computed" in capsys.readouterr().out
+    assert "0 cases computed" in capsys.readouterr().out
     assert (folder / "two" / f"{TWO}.csv").read_bytes() == before
-
-
-@pytest.fixture(scope="module")
-def given(tmp_path_factory):
-    """A design of solid arms in a file, which needs no optimisation."""
-    path = tmp_path_factory.mktemp("design") / "solid.npz" if WORLD.rank == 0 else None
-    return write_uniform(WORLD.bcast(path, root=0), (12, 3), 1.0)
 
 
 def study(given, folder, *random, base=None, **options):
@@ -169,32 +321,29 @@ def study(given, folder, *random, base=None, **options):
     return study_random(base, random, [given], folder, WORLD, Sampling(**options), shown=False)
 
 
-@pytest.mark.serial  # ranks: test_ranks_do_not_matter of test_sampling
+def tables_of(done):
+    return {table.name: table for table in done.tables}
+
+
+@alone
 def test_small_scatter_is_linear(folder, given):
     """The standard deviation is that of the linearised model, by central differences."""
-    fine = scene("simulation.tolerance=1e-4", "motion.horizon=2.2")
+    fine = "simulation.tolerance=1e-4"
     spread = {"payload.mass": 0.01, "material.young_modulus": 1e8, "arms.thickness": 1e-5}
     centre = {"payload.mass": 6.0, "material.young_modulus": 70e9, "arms.thickness": 0.01}
     texts = [f"{key}=normal:{centre[key]!r}:{s!r}" for key, s in spread.items()]
-    done = study(given, folder, *texts, base=fine, samples=64)
+    done = study(given, folder, *texts, base=scene(fine), samples=64)
     found = {row[:2]: row[2] for row in cells_of(tables_of(done)["statistics"])}
 
-    def simulate(key, value):
-        other = scene("simulation.tolerance=1e-4", "motion.horizon=2.2", f"{key}={value!r}")
-        partition = do.partition_arms(MPI.COMM_SELF, other.cell_counts)
-        arms = do.build_arms(other, partition, do.Profile())
-        x = {k: arm.uniform(1.0) for k, arm in arms.items()}
-        evaluation, _ = do.evaluate(other, partition, arms, x, do.Profile())
-        return np.array([evaluation.compliance, 1e3 * evaluation.max_deviation])
+    def at(key, value):
+        one = evaluated(fine, f"{key}={value!r}", density=1.0)
+        return np.array([one.compliance, 1e3 * one.max_deviation])
 
-    parts = [
-        0.5 * (simulate(key, centre[key] + s) - simulate(key, centre[key] - s))
-        for key, s in spread.items()
-    ]
+    parts = [0.5 * (at(key, centre[key] + s) - at(key, centre[key] - s))
+             for key, s in spread.items()]  # fmt: skip
     expected = np.sqrt(np.sum(np.square(parts), axis=0))
     shares = np.square(parts) / np.sum(np.square(parts), axis=0)
-    quantities = ("compliance [N m]", "maximal deviation [mm]")
-    for j, quantity in enumerate(quantities):
+    for j, quantity in enumerate(("compliance [N m]", "maximal deviation [mm]")):
         # 64 net points give a normal law's standard deviation to some 2 %.
         assert found[quantity, "standard deviation"] == pytest.approx(expected[j], rel=0.04)
         name = quantity.partition(" [")[0]
@@ -203,7 +352,7 @@ def test_small_scatter_is_linear(folder, given):
         np.testing.assert_allclose([row[3] for row in rows], shares[:, j], atol=0.01)
 
 
-@pytest.mark.serial  # ranks: test_ranks_do_not_matter of test_sampling
+@alone
 def test_both_ways_to_the_indices(folder, given):
     """Saltelli's scheme takes more simulations and comes to the polynomial's indices."""
     fitted = study(given, folder / "i", MASS, YOUNG, samples=32)
@@ -223,38 +372,17 @@ def test_both_ways_to_the_indices(folder, given):
 
 
 def test_one_input_has_no_indices(folder, given):
-    done = study(given, folder, MASS, samples=20, sampler="latin-hypercube", indices="saltelli")
-    assert done.computed == 21
+    """Nor have the scene's scenarios a part in it."""
+    done = study(given, folder, MASS, samples=10, sampler="latin-hypercube", indices="saltelli")
+    assert done.computed == 11
     assert list(tables_of(done)) == ["inputs", "statistics", ""]
     assert [figure.name for figure in done.figures] == ["", "scatter"]
-
-
-def test_scenarios_are_left_out(folder, given):
     several = scene('scenarios=[{changes=["payload.mass=4"]}]')
-    plain = study(given, folder / "p", MASS, samples=10)
-    assert study(given, folder / "p", MASS, base=several, samples=10).computed == 0
-    assert plain.computed == 11
+    again = study(given, folder, MASS, base=several, samples=10, sampler="latin-hypercube")
+    assert again.computed == 0
 
 
-@pytest.mark.serial
-def test_failures_end_with_status_1(folder, given, monkeypatch):
-    from dolfinopt.study import simulate
-
-    def failing(scenes, *_):
-        return [ConvergenceError("no luck")] * len(scenes)
-
-    monkeypatch.setattr(simulate, "simulate_batch", failing)
-    with pytest.raises(ConvergenceError, match=r"solid, sample 0 \(\): no luck \(and 10 more\)"):
-        run(TWO_ARM, "--random", MASS, "--samples", 10, "--design", given, *SETTINGS,
-            "--out", folder / "f")  # fmt: skip
-    rows = rows_of(folder / "f" / "uncertainty_payload.mass.csv")
-    assert len(rows) == 10 and rows[0]["solid: compliance [N m]"] == ""
-
-
-# -- pictures --------------------------------------------------------------------------------
-
-
-@pytest.mark.serial
+@alone
 def test_pictures_show_the_samples(folder, given):
     done = study(given, folder / "i", MASS, YOUNG, samples=32)
     values = tables_of(done)[""].frame.to_numpy()[:, 3:5]
