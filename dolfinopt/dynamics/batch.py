@@ -32,7 +32,7 @@ from dolfinopt.dynamics.elastic_system import (
     proportion,
     static_equilibrium,
 )
-from dolfinopt.dynamics.newton import Iterate, Tuning, newton
+from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.mechanism import Mechanism, Scale
@@ -50,7 +50,6 @@ RUNS = Tuning(
     keep=(0.2, 0.2),
     near=0.02,
     keep_near=0.6,
-    shortest=1.0,
     matrices=6,
 )
 MAX_GRIDS = 4  # refinements until a system is left to `radau.integrate`
@@ -146,8 +145,8 @@ def _together(
     """
     modes = batch.preconditioner()
     found: list[Solution | None] = [None] * batch.runs
-    rest, able = static_equilibrium(batch)
-    left, guesses, more = np.flatnonzero(able), list(known), 1.0
+    rest, starts = static_equilibrium(batch)
+    left, guesses, more = np.flatnonzero(starts), list(known), 1.0
     if any(guesses[i] is None for i in left):
         pilot, more = _pilot(modes, left, rest, tolerance, stages, profile)
         guesses = [pilot if one is None else one for one in guesses]
@@ -156,35 +155,37 @@ def _together(
     own = [one is not None for one in known]  # whether a guess is of the system itself
     tuning = replace(RUNS, goal=goal)
     for _ in range(MAX_GRIDS):
+        able, steps = _common_steps(batch, left, guesses, own, more, tolerance, stages)
+        if not able:
+            break
         missing = []
-        for steps, group in _groups(batch, left, guesses, own, more, tolerance, stages).items():
-            most = max(1, MAX_SIZE // (rest.shape[1] * sum(steps)))
-            for first in range(0, len(group), most):
-                members = np.array(group[first : first + most])
-                time_grids = _common_time_grids([batch.members[i] for i in members], steps)
-                solutions = _on_grid(
-                    modes.chosen(members),
-                    time_grids,
-                    stages,
-                    rest[members],
-                    [guesses[i] for i in members],
-                    tolerance,
-                    tuning,
-                )
-                for i, solution in zip(members, solutions, strict=True):
-                    if solution is None:
-                        continue
-                    profile.counts.newton_iterations += solution.iterations
-                    guesses[i], own[i] = solution, True
-                    if solution.error <= radau.ACCEPT * tolerance:
-                        found[i] = solution
-                    else:
-                        missing.append(i)
-        left = np.array(sorted(missing), dtype=int)
+        most = max(1, MAX_SIZE // (rest.shape[1] * sum(steps)))
+        for first in range(0, len(able), most):
+            members = np.array(able[first : first + most])
+            time_grids = _common_time_grids([batch.members[i] for i in members], steps)
+            solutions = _on_grid(
+                modes.chosen(members),
+                time_grids,
+                stages,
+                rest[members],
+                [guesses[i] for i in members],
+                tolerance,
+                tuning,
+            )
+            for i, solution in zip(members, solutions, strict=True):
+                if solution is None:
+                    continue
+                profile.counts.newton_iterations += solution.iterations
+                guesses[i], own[i] = solution, True
+                if solution.error <= radau.ACCEPT * tolerance:
+                    found[i] = solution
+                else:
+                    missing.append(i)
+        left = np.array(missing, dtype=int)
     return found
 
 
-def _groups(
+def _common_steps(
     batch: BatchSystem,
     left: np.ndarray,
     guesses: Sequence[Solution | None],
@@ -192,14 +193,12 @@ def _groups(
     more: float,
     tolerance: float,
     stages: int,
-) -> dict[tuple[int, ...], list[int]]:
-    """Return the systems that are solved together, by their steps between the breakpoints.
+) -> tuple[list[int], list[int]]:
+    """Return who is solved, and the steps between the breakpoints that the worst of them needs.
 
-    Those whose own guesses are on as many steps keep them, if the worst allows; those without one
-    take `more` steps than the pilot.
+    Those without a guess of their own take `more` steps than the pilot.
     """
-    alike: dict[tuple[int, ...], list[int]] = {}
-    wanted: dict[int, np.ndarray] = {}
+    able, wanted = [], []
     for i in left:
         system, guess = batch.members[i], guesses[i]
         assert guess is not None
@@ -207,16 +206,10 @@ def _groups(
             grid = radau.next_time_grid(system, guess, tolerance, stages)
         except GivenUp:  # more steps than there is room for: left to whoever solves it by itself
             continue
-        steps = tuple(steps_between_breakpoints(system, guess.time_grid)) if own[i] else ()
-        alike.setdefault(steps, []).append(int(i))
-        wanted[int(i)] = steps_between_breakpoints(system, grid)
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for group in alike.values():
-        most = np.max([wanted[i] for i in group], axis=0)
-        if not own[group[0]]:
-            most = np.ceil(more * most).astype(int)
-        groups.setdefault(tuple(most), []).extend(group)
-    return groups
+        steps = steps_between_breakpoints(system, grid)
+        able.append(int(i))
+        wanted.append(steps if own[i] else np.ceil(more * np.asarray(steps)))
+    return able, [int(n) for n in np.max(wanted, axis=0)] if able else []
 
 
 def _pilot(
@@ -259,7 +252,7 @@ def _on_grid(
     """Return every system's solution on its grid, see `radau.on_grids`, from rest (R, N)."""
 
     def solve(steps: Stages, state: State, first: np.ndarray) -> Iterate:
-        return newton(steps, state, first, tolerance, tuning)
+        return newton_batch(steps, state, first, tolerance, tuning)
 
     state = (rest, np.zeros_like(rest))
     return radau.on_grids(modes, time_grids, state, guesses, stages, solve, tuning.limits)

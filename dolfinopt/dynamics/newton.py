@@ -1,14 +1,13 @@
-"""Newton's method for all stages of all steps at once, of one run of steps or of many.
+"""Newton's method for all stages of all steps at once: of one run of steps, or of several.
 
-The runs share each matrix; who has converged stays as it is, and whoever needs a new matrix gets
-one together with all that have not converged. A run by itself can do more: where its steps contract
-poorly although the matrix is new, the matrix follows the stages, then treats more coordinates
-densely; where even that fails, the run is solved in windows (`march`).
+Several runs share each matrix and take whole steps. A run by itself can do more: its steps are
+damped, and where they contract poorly although the matrix is new, the matrix follows the stages,
+then treats more coordinates densely; where even that fails, it is solved in windows (`radau`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.blas import dtbsv
@@ -412,7 +411,7 @@ class Iterate:
     iterations: np.ndarray
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Point:
     """Runs at one iterate: a, q, qd and residual (n, s, N), the largest residual (runs,)."""
 
@@ -420,7 +419,13 @@ class _Point:
     q: np.ndarray
     qd: np.ndarray
     residual: np.ndarray
-    norm: np.ndarray
+    norm: np.ndarray  # energy^(1/2), where the stiffness is one
+
+
+def _point(stages: Stages, state: State, a: np.ndarray) -> _Point:
+    q, qd = at_stages(stages, state, a)
+    residual = residual_at(stages, q, qd, a)
+    return _Point(a, q, qd, residual, np.abs(residual).reshape(stages.runs, -1).max(axis=1))
 
 
 def newton(
@@ -432,25 +437,32 @@ def newton(
     *,
     simplified: bool = True,
 ) -> Iterate:
-    """Solve the residual of all stages = 0 by Newton's method, damped on the residual.
+    """Solve the residual of all stages of one run = 0 by Newton's method, damped on the residual.
 
     The matrix is the simplified one as long as it serves, and kept while the steps contract. The
     iteration ends where a step leaves, by the contraction seen in steps and residual, a small share
     of the tolerance.
 
     Args:
-        stages: of all runs.
-        state: q, qd (runs, N) that they begin with.
+        stages: of the run.
+        state: q, qd (1, N) that it begins with.
         a: (n, s, N) initial guess.
         tolerance: relative error of the coordinates that is asked for.
         tuning: see there.
         simplified: whether to begin with the simplified matrix.
     """
-    return _Iteration(stages, state, a, tolerance, tuning, simplified).run()
+    run = _Run(stages, state, a, tolerance, tuning, simplified)
+    for _ in range(tuning.matrices):
+        if len(windows(stages, run.slow)) > 1:
+            break  # no room for a matrix of all steps
+        if not run.with_one_matrix():
+            break
+    found = np.array([run.converged]), np.array([run.rate]), np.array([run.iterations])
+    return Iterate(run.at.a, *found)
 
 
-class _Iteration:
-    """Newton's method at work: owns iterates and matrix of the runs that have not converged."""
+class _Run:
+    """Newton's method at work on one run of steps."""
 
     def __init__(
         self,
@@ -461,185 +473,184 @@ class _Iteration:
         tuning: Tuning,
         simplified: bool,
     ) -> None:
-        runs = stages.runs
-        self.answer = a.reshape(runs, -1, *a.shape[1:]).copy()
-        self.converged = np.zeros(runs, dtype=bool)
-        self.rate, self.iterations = np.zeros(runs), np.zeros(runs, dtype=int)
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
         self.simplified = simplified and stages.preconditioner.guided
         self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0)
-        self.at = self.point(a)
-        self.active: np.ndarray = np.arange(runs)  # those that are iterated, by index
-        self.done: np.ndarray = np.zeros(runs, dtype=bool)  # of the active
-        self.before: np.ndarray = np.full(runs, np.inf)
-        self.norm_before: np.ndarray = self.at.norm
-        self.made: np.ndarray = np.full(
-            runs, np.inf
-        )  # distance from the solution where the matrix was made
+        self.at = _point(stages, state, a)
+        self.before, self.norm_before = np.inf, self.at.norm[0]
+        self.converged, self.rate, self.iterations = False, 0.0, 0
 
-    def point(self, a: np.ndarray) -> _Point:
-        """Return the active runs at an iterate."""
-        q, qd = at_stages(self.stages, self.state, a)
-        residual = residual_at(self.stages, q, qd, a)
-        return _Point(a, q, qd, residual, self.largest(residual))
+    def with_one_matrix(self) -> bool:
+        """Iterate with one matrix; return whether it is worth while to go on with another."""
+        exact = len(self.slow) == self.at.a.shape[2] and not self.simplified
+        matrix, rest = self._matrix(), np.zeros((2, self.at.a.shape[2]))
+        keep = self.tuning.keep[0 if self.simplified else 1]
+        self.rate, age = 0.0, 0
+        while True:
+            self.iterations += 1
+            spend(float(self.stages.length))
+            step, shift = matrix.solve(self.at.residual, rest)
+            size = self.stages.relative(shift, self.at.q + shift)[0]
+            with np.errstate(all="ignore"):  # inf / inf of what diverges
+                contraction = size / self.before
+                left = _left(
+                    np.maximum(contraction, self.at.norm[0] / self.norm_before), self.tuning
+                )
+            if np.isfinite(self.before) and np.isfinite(size):
+                self.rate = max(self.rate, float(contraction))
+            ends = left * size <= self.tuning.goal * self.tolerance
+            if ends or (exact and age == 0 and size <= 1e-3 * self.tolerance):
+                self.at = replace(self.at, a=self.at.a + step)
+                self.converged = True
+                return False
+            poor = age > 0 and size > keep * self.before
+            if poor or not np.isfinite(size) or not self._damped(step):
+                return self._after_failure(size, age, exact)
+            self.before, age = size, age + 1
 
-    def largest(self, residual: np.ndarray) -> np.ndarray:
-        """Return the largest residual (active,), energy^(1/2) where the stiffness is one."""
-        return np.abs(residual).reshape(self.stages.runs, -1).max(axis=1)
-
-    def matrix(self) -> NewtonMatrix:
-        """Return Newton's matrix at the iterate."""
+    def _matrix(self) -> NewtonMatrix:
         if self.simplified:
             begin = step_beginnings(self.stages, self.state, self.at.a)
             return simplified_newton_matrix(self.stages, begin, self.at.a, self.slow)
         return factorise(self.stages, self.at.q, self.at.qd, self.at.a, self.slow)
 
-    def run(self) -> Iterate:
-        """Iterate to the end."""
-        size = self.at.a.shape[2]
-        for _ in range(self.tuning.matrices):
-            if self.stages.runs == 1 and len(windows(self.stages, self.slow)) > 1:
-                break  # no room for a matrix of all steps
-            exact = len(self.slow) == size and not self.simplified
-            going = self._with_one_matrix(exact)
-            if not going.any():
-                break
-            self._keep(going)
-        self._put(np.arange(self.stages.runs))
-        shape = (-1, *self.answer.shape[2:])
-        return Iterate(self.answer.reshape(shape), self.converged, self.rate, self.iterations)
-
-    def _put(self, which: np.ndarray) -> None:
-        """Write active runs into the answer."""
-        flat = self.at.a.reshape(self.stages.runs, *self.answer.shape[1:])
-        self.answer[self.active[which]] = flat[which]
-
-    def _keep(self, going: np.ndarray) -> None:
-        """Go on with some of the active runs."""
-        if going.all():
-            return
-        self._put(np.flatnonzero(~going))
-        runs, chosen = self.stages.runs, np.flatnonzero(going)
-        a, q, qd, residual = (
-            x.reshape(runs, self.stages.length, *x.shape[1:])[chosen].reshape(-1, *x.shape[1:])
-            for x in (self.at.a, self.at.q, self.at.qd, self.at.residual)
-        )
-        self.at = _Point(a, q, qd, residual, self.at.norm[chosen])
-        self.stages = self.stages.chosen(chosen)
-        self.state = (self.state[0][chosen], self.state[1][chosen])
-        self.active, self.done = self.active[chosen], self.done[chosen]
-        self.before, self.norm_before = self.before[chosen], self.norm_before[chosen]
-
-    def _with_one_matrix(self, exact: bool) -> np.ndarray:
-        """Iterate until all are done, or one calls for another matrix.
-
-        Returns:
-            (active,) those for which it is worth while to go on with a new one.
-        """
-        matrix, tuning, runs = self.matrix(), self.tuning, self.stages.runs
-        rest = np.zeros((2, self.at.a.shape[2]))
-        keep, age = tuning.keep[0 if self.simplified else 1], 0
-        kept = np.full(runs, keep)
-        self.rate[self.active] = 0.0  # of this matrix
-        while True:
-            self.iterations[self.active[~self.done]] += 1
-            spend(float(np.count_nonzero(~self.done)) * self.stages.length)
-            step, shift = matrix.solve(self.at.residual, rest)
-            step_size = self.stages.relative(shift, self.at.q + shift)
-            if age == 0 and tuning.near:
-                kept = np.where(step_size <= tuning.near, tuning.keep_near, keep)
-            with np.errstate(all="ignore"):  # inf / inf of what diverges
-                contraction = step_size / self.before
-                left = _left(np.maximum(contraction, self.at.norm / self.norm_before), tuning)
-            ends = left * step_size <= tuning.goal * self.tolerance
-            if exact and age == 0:
-                ends |= step_size <= 1e-3 * self.tolerance
-            ends &= ~self.done
-            seen = ~self.done & np.isfinite(self.before) & np.isfinite(step_size)
-            rate = self.rate[self.active]
-            self.rate[self.active] = np.where(seen, np.maximum(rate, contraction), rate)
-            self._end(ends, step)
-            if self.done.all():
-                return ~self.done
-            poor = (step_size > kept * self.before) if age else np.zeros(runs, dtype=bool)
-            wanted = ~self.done & np.isfinite(step_size)
-            if runs == 1:  # of many, the next matrix comes for all: a poor step is still a step
-                wanted &= ~poor
-            stepped = self._damped(step, wanted)
-            failed = ~self.done & (~stepped | poor)
-            self.norm_before = np.where(stepped, self._norm_was, self.norm_before)
-            earlier = self.before
-            self.before = np.where(stepped, step_size, self.before)
-            if failed.any():
-                return self._after_failure(failed, step_size, earlier, age, exact)
-            age += 1
-
-    def _end(self, ends: np.ndarray, step: np.ndarray) -> None:
-        """Take the last step of the runs that end."""
-        if not ends.any():
-            return
-        if ends.all():
-            self.at.a = self.at.a + step
-        else:
-            self.at.a = self.at.a + np.where(self._each(ends), step, 0.0)
-        self.done |= ends
-        self.converged[self.active[ends]] = True
-
-    def _each(self, x: np.ndarray) -> np.ndarray:
-        """Return what multiplies (n, s, N) run by run."""
-        return np.repeat(x, self.stages.length)[:, None, None]
-
-    def _damped(self, step: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Take the longest step that lowers the residual; return who has found one (active,)."""
-        self._norm_was = self.at.norm
-        if not wanted.any():
-            return wanted
-        runs = self.stages.runs
-        length = wanted.astype(float)
-        while True:
-            scaled = (float(length[0]) if runs == 1 else self._each(length)) * step
-            if runs > 1:
-                scaled[np.repeat(~wanted, self.stages.length)] = 0.0  # no number, perhaps
+    def _damped(self, step: np.ndarray) -> bool:
+        """Take the longest step that lowers the residual; return whether there is one."""
+        length = 1.0
+        while length >= self.tuning.shortest:
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
-                new = self.point(self.at.a + scaled)
-                lower = new.norm <= (1.0 - 0.1 * length) * self.at.norm
-            if lower[wanted].all():
-                self.at = new
-                return wanted
-            shorter = wanted & ~lower
-            if (0.5 * length[shorter] < self.tuning.shortest).any():
-                wanted = wanted & lower
-                length = np.where(wanted, length, 0.0)
-                if not wanted.any():
-                    return wanted
-            else:
-                length = np.where(shorter, 0.5 * length, length)
+                new = _point(self.stages, self.state, self.at.a + length * step)
+            if new.norm[0] <= (1.0 - 0.1 * length) * self.at.norm[0]:
+                self.at, self.norm_before = new, self.at.norm[0]
+                return True
+            length *= 0.5
+        return False
 
-    def _after_failure(
-        self,
-        failed: np.ndarray,
-        step_size: np.ndarray,
-        before: np.ndarray,
-        age: int,
-        exact: bool,
-    ) -> np.ndarray:
-        """Return who goes on with a new matrix; of a single run, say how that is made."""
-        if self.stages.runs > 1:
-            if age == 0:  # a new matrix did not help: left to whoever solves it by itself
-                self.rate[self.active[failed]] = np.inf
-                return ~self.done & ~failed
-            return ~self.done
+    def _after_failure(self, size: float, age: int, exact: bool) -> bool:
+        """Choose the next matrix; return whether there is one."""
         if exact and age == 0:  # rounding, where the step is small: nothing is left to gain
-            self.converged[self.active] = step_size <= max(self.tolerance, ROUNDING)
-            return np.zeros(1, dtype=bool)
-        if age == 0 or (age == 1 and before[0] <= SETTLED):
+            self.converged = bool(size <= max(self.tolerance, ROUNDING))
+            return False
+        if age == 0 or (age == 1 and self.before <= SETTLED):
             if self.simplified:
                 self.simplified = False
             elif self.limits:
                 self.slow, self.limits = next_slow_coordinates(
                     self.stages, self.limits, len(self.slow)
                 )
-        return failed
+        return True
+
+
+def newton_batch(
+    stages: Stages, state: State, a: np.ndarray, tolerance: float, tuning: Tuning
+) -> Iterate:
+    """Solve the residual of all stages of several runs = 0 by Newton's method, undamped.
+
+    The runs share the simplified matrix, which is kept while the steps of all contract. A run
+    whose steps do not contract with a new matrix has failed; it stays as it is, like one that has
+    converged, while the others go on.
+
+    Args:
+        stages: of all runs.
+        state: q, qd (runs, N) that they begin with.
+        a: (n, s, N) initial guesses.
+        tolerance: relative error of the coordinates that is asked for.
+        tuning: see there.
+    """
+    shape, runs = a.shape, stages.runs
+    answer = a.reshape(runs, -1, *shape[1:]).copy()
+    converged, rate = np.zeros(runs, dtype=bool), np.zeros(runs)
+    iterations = np.zeros(runs, dtype=int)
+    slow, _ = next_slow_coordinates(stages, tuning.limits, 0)
+    active = np.arange(runs)
+    before, norm_before = np.full(runs, np.inf), np.full(runs, np.nan)
+    for _ in range(tuning.matrices):
+        group = _Group(stages, state, a, before, norm_before)
+        going = group.with_one_matrix(slow, tolerance, tuning)
+        answer[active] = group.at.a.reshape(len(active), *answer.shape[1:])
+        converged[active], rate[active] = group.ended, group.rate
+        iterations[active] += group.iterations
+        if not going.any():
+            break
+        chosen = np.flatnonzero(going)
+        active, before, norm_before = active[going], group.before[going], group.norm_before[going]
+        a = answer[active].reshape(-1, *shape[1:])
+        stages, state = stages.chosen(chosen), (state[0][chosen], state[1][chosen])
+    return Iterate(answer.reshape(shape), converged, rate, iterations)
+
+
+class _Group:
+    """Newton's method at work on several runs, with one matrix."""
+
+    def __init__(
+        self,
+        stages: Stages,
+        state: State,
+        a: np.ndarray,
+        before: np.ndarray,
+        norm_before: np.ndarray,
+    ) -> None:
+        self.stages, self.state, self.at = stages, state, _point(stages, state, a)
+        self.before = before
+        self.norm_before = np.where(np.isnan(norm_before), self.at.norm, norm_before)
+        self.ended = np.zeros(stages.runs, dtype=bool)
+        self.rate, self.iterations = np.zeros(stages.runs), np.zeros(stages.runs, dtype=int)
+
+    def with_one_matrix(self, slow: np.ndarray, tolerance: float, tuning: Tuning) -> np.ndarray:
+        """Iterate until all have ended, or one needs another matrix.
+
+        Returns:
+            (runs,) those for which it is worth while to go on with a new one.
+        """
+        begin = step_beginnings(self.stages, self.state, self.at.a)
+        matrix = simplified_newton_matrix(self.stages, begin, self.at.a, slow)
+        rest, age, kept = np.zeros((2, self.at.a.shape[2])), 0, tuning.keep[0]
+        while True:
+            left = ~self.ended
+            self.iterations[left] += 1
+            spend(float(np.count_nonzero(left)) * self.stages.length)
+            step, shift = matrix.solve(self.at.residual, rest)
+            size = self.stages.relative(shift, self.at.q + shift)
+            if age == 0 and tuning.near:
+                kept = np.where(size <= tuning.near, tuning.keep_near, kept)
+            with np.errstate(all="ignore"):  # inf / inf of what diverges
+                contraction = size / self.before
+                rest_of = _left(np.maximum(contraction, self.at.norm / self.norm_before), tuning)
+            seen = left & np.isfinite(self.before) & np.isfinite(size)
+            self.rate = np.where(seen, np.maximum(self.rate, contraction), self.rate)
+            ends = left & (rest_of * size <= tuning.goal * tolerance)
+            self.at = replace(self.at, a=self.at.a + self._of(ends, step))
+            self.ended |= ends
+            left = ~self.ended
+            if not left.any():
+                return left
+            poor = (size > kept * self.before) & (age > 0)
+            stepped = self._take(step, left & np.isfinite(size))
+            failed = left & (~stepped | poor)
+            self.before = np.where(stepped, size, self.before)
+            if failed.any():
+                if age == 0:  # a new matrix did not help: left to whoever solves it by itself
+                    self.rate[failed] = np.inf
+                    return left & ~failed
+                return left
+            age += 1
+
+    def _of(self, chosen: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return the step of these runs, zero for the others: theirs may be no number."""
+        return np.where(np.repeat(chosen, self.stages.length)[:, None, None], step, 0.0)
+
+    def _take(self, step: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Take the whole step where that lowers the residual; return who has done so (runs,)."""
+        while wanted.any():
+            with np.errstate(all="ignore"):  # trial steps may lead anywhere
+                new = _point(self.stages, self.state, self.at.a + self._of(wanted, step))
+                lower = new.norm <= 0.9 * self.at.norm
+            if lower[wanted].all():
+                self.norm_before = np.where(wanted, self.at.norm, self.norm_before)
+                self.at = new
+                break
+            wanted = wanted & lower
+        return wanted
 
 
 def _left(rate: np.ndarray, tuning: Tuning) -> np.ndarray:

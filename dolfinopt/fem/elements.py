@@ -1,4 +1,4 @@
-"""Finite elements: one file each, of `base.Element`'s protocol; `ELEMENTS` lists them by name.
+"""Finite elements in the plane and in space; `ELEMENTS` lists them by name.
 
 `element_of` chooses one for a mesh.
 """
@@ -245,7 +245,7 @@ class LagrangeElement:
         for kernels called cell by cell.
         """
         if mesh.dim == 3:
-            return solid_operators(self, mesh, poisson_ratio)
+            return quadrature_operators(self, mesh, thickness, poisson_ratio)
         vector = compat.lagrange_space(mesh.mesh, self.degree, components=2)
         k_form = compat.compile_form(stiffness_form(vector))
         m_form = mass_form(mesh, self.degree)
@@ -276,14 +276,10 @@ class LagrangeElement:
 
     def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
         """Return those in the reference cell times the inverse Jacobian, see `Element`."""
-        if mesh.dim == 3:
-            return by_cells(
-                lambda part: nodal_gradients(part, self.degree, points),
-                same_corners(cell_corners(mesh)),
-            )
-        corners = cell_corners(mesh)
-        local = shape_derivatives(corners.shape[1], self.degree, points)
-        return local @ np.linalg.inv(jacobian(corners, points))
+        return by_cells(
+            lambda part: nodal_gradients(part, self.degree, points),
+            same_corners(cell_corners(mesh)),
+        )
 
     def strain_operator(
         self, mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
@@ -315,7 +311,6 @@ def mass_form(mesh: ArmMesh, degree: int) -> Any:
 # -- bilinear quadrilaterals and trilinear hexahedra with incompatible modes ---------------------
 
 BILINEAR = LagrangeElement(1)
-PLANE_CENTRE = np.array([[0.5, 0.5]])
 
 
 @dataclass(frozen=True)
@@ -333,7 +328,7 @@ class IncompatibleElement:
 
     so that k_e stays proportional to Young's modulus. 2 Gauss points a direction. The modes move
     no nodes and carry no mass: m_e is that of the bilinear functions. Hexahedra have the shear of
-    their twisting coupled, see `twist.twisting_strains`.
+    their twisting coupled, see `twisting_strains`.
 
     Source: Taylor, Beresford & Wilson, Int. J. Numer. Methods Eng. 10 (1976) 1211-1219,
     doi:10.1002/nme.1620100602.
@@ -343,24 +338,7 @@ class IncompatibleElement:
 
     def operators(self, mesh: ArmMesh, thickness: float, poisson_ratio: float) -> ElementOperators:
         """Return the condensed matrices, see `Element`."""
-        if mesh.dim == 3:
-            return solid_operators(self, mesh, poisson_ratio, modes=True)
-        space = compat.lagrange_space(mesh.mesh, 1, components=2)
-        m_form = mass_form(mesh, 1)
-        with together(mesh.comm):
-            stiffness, recovery = _condensed_plane(mesh, poisson_ratio)
-            coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
-            return ElementOperators(
-                space=space,
-                cells=compat.cell_nodes(space, mesh.num_cells),
-                points=space.tabulate_dof_coordinates()[:, :2].copy(),
-                stiffness=thickness * stiffness,
-                mass=compat.tabulate_cells(m_form, [thickness], coordinates),
-                element=self,
-                thickness=thickness,
-                poisson_ratio=poisson_ratio,
-                recovery=recovery,
-            )
+        return quadrature_operators(self, mesh, thickness, poisson_ratio, modes=True)
 
     def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
         """Return those of the nodes' functions, see `Element`."""
@@ -371,44 +349,17 @@ class IncompatibleElement:
     ) -> np.ndarray:
         """Return B, the condensed modes' strains included, see `Element`."""
         assert operators.recovery is not None
-        if mesh.dim == 3:
-            corners = same_corners(cell_corners(mesh))
-            own = by_cells(lambda part: strains(mode_gradients(part, points)), corners)
-            return by_cells(
-                lambda gradients, own, recovery: strains(gradients) + own @ recovery[:, None],
-                self.derivatives(mesh, points),
-                own,
-                operators.recovery,
-            )
-        own = strains(_mode_gradients(cell_corners(mesh), points))
-        return strains(self.derivatives(mesh, points)) + own @ operators.recovery[:, None]
+        corners = same_corners(cell_corners(mesh))
+        own = by_cells(lambda part: strains(mode_gradients(part, points)), corners)
+        return by_cells(
+            lambda gradients, own, recovery: strains(gradients) + own @ recovery[:, None],
+            self.derivatives(mesh, points),
+            own,
+            operators.recovery,
+        )
 
 
-def _condensed_plane(mesh: ArmMesh, poisson_ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return k_e (n_cells, 8, 8) of unit E and thickness, and the recovery (n_cells, 4, 8)."""
-    corners = cell_corners(mesh)
-    points, weights = gauss_points(4, 2)
-    area = weights * np.abs(np.linalg.det(jacobian(corners, points)))
-    nodal, own = BILINEAR.derivatives(mesh, points), _mode_gradients(corners, points)
-    C = plane_stress(poisson_ratio)
-    k = np.zeros((len(corners), 12, 12))
-    for p in range(len(points)):
-        B = strains(np.concatenate([nodal[:, p], own[:, p]], axis=1))
-        k += B.transpose(0, 2, 1) @ (area[:, p, None, None] * (C @ B))
-    recovery = -np.linalg.solve(k[:, 8:, 8:], k[:, 8:, :8])
-    stiffness = k[:, :8, :8] + k[:, :8, 8:] @ recovery
-    return 0.5 * (stiffness + stiffness.transpose(0, 2, 1)), recovery
-
-
-def _mode_gradients(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the gradients (n_cells, p, 2, 2) of the modes a (1 - a) and b (1 - b), 1/m."""
-    centre = jacobian(corners, PLANE_CENTRE)
-    ratio = np.linalg.det(centre) / np.linalg.det(jacobian(corners, points))
-    local = (1.0 - 2.0 * points)[:, :, None] * np.eye(2)
-    return local @ np.linalg.inv(centre) * ratio[:, :, None, None]
-
-
-# -- finite elements: one file each, of `base.Element`'s protocol; `ELEMENTS` lists them by name
+# -- by name and by cells ------------------------------------------------------------------------
 
 ELEMENTS: dict[str, Element] = {
     "incompatible": IncompatibleElement(),
@@ -464,9 +415,7 @@ def quadrature(mesh: ArmMesh, operators: ElementOperators) -> Quadrature:
 
     Exactly so on parallelograms and triangles, see `gauss_order`.
     """
-    corners, element, dim = cell_corners(mesh), operators.element, mesh.dim
-    if dim == 3:
-        corners = same_corners(corners)
+    corners, element, dim = same_corners(cell_corners(mesh)), operators.element, mesh.dim
     around = corners.shape[1]
     points, weights = gauss_points(around, gauss_order(element.degree, around, dim), dim)
     law = operators.thickness * elasticity(dim, operators.poisson_ratio)
@@ -502,70 +451,71 @@ def gauss_order(degree: int, corners: int, dim: int = 2) -> int:
     return highest // 2 + 1
 
 
-# -- element matrices of cells in space, by Gauss quadrature in NumPy ----------------------------
+# -- element matrices by Gauss quadrature in NumPy, in the plane and in space --------------------
 
 CELLS = 4096  # whose matrices are summed up at a time
-CENTRE = np.full((1, 3), 0.5)
 
 
-def solid_operators(
-    element: Element, mesh: ArmMesh, poisson_ratio: float, modes: bool = False
+def quadrature_operators(
+    element: Element, mesh: ArmMesh, thickness: float, poisson_ratio: float, modes: bool = False
 ) -> ElementOperators:
     """Return the element matrices of all cells (collective on the arm's ranks).
 
-        k_e = int B' C B dV with E = 1,  m_e = int N' N dV.
+        k_e = int B' C B t dA with E = 1,  m_e = int N' N t dA,  in space without t over dV.
 
     Args:
         element: whose they are; its degree counts.
-        mesh: the arm, in space.
+        mesh: the arm.
+        thickness: t, m; of a plane arm.
         poisson_ratio: nu.
-        modes: whether hexahedra have the incompatible modes a (1 - a), b (1 - b), c (1 - c).
+        modes: whether cells have the incompatible modes, see `IncompatibleElement`.
     """
-    space = compat.lagrange_space(mesh.mesh, element.degree, components=3)
+    degree, dim, recovery = element.degree, mesh.dim, None
+    space = compat.lagrange_space(mesh.mesh, degree, components=dim)
+    t = thickness if dim == 2 else 1.0
     with together(mesh.comm):
         corners = same_corners(cell_corners(mesh))
-        degree, recovery = element.degree, None
+        stiffness = by_cells(lambda part: t * _full(part, degree, poisson_ratio, modes), corners)
         if modes:
-            stiffness = by_cells(lambda part: _full(part, 1, poisson_ratio, True), corners)
             recovery = by_cells(_recovery, stiffness)
             stiffness = by_cells(_condensed, stiffness, recovery)
-        else:
-            stiffness = by_cells(lambda part: _full(part, degree, poisson_ratio, False), corners)
         return ElementOperators(
             space=space,
             cells=compat.cell_nodes(space, mesh.num_cells),
-            points=space.tabulate_dof_coordinates()[:, :3].copy(),
+            points=space.tabulate_dof_coordinates()[:, :dim].copy(),
             stiffness=stiffness,
-            mass=by_cells(lambda part: _mass(part, degree), corners),
+            mass=by_cells(lambda part: t * _mass(part, degree), corners),
             element=element,
-            thickness=1.0,
+            thickness=t,
             poisson_ratio=poisson_ratio,
             recovery=recovery,
         )
 
 
 def nodal_gradients(corners: np.ndarray, degree: int, points: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n_cells, p, n, 3) of the shape functions by x, y, z, 1/m."""
+    """Return the derivatives (n_cells, p, n, d) of the shape functions by x, y, z, 1/m."""
     local = shape_derivatives(corners.shape[1], degree, points)
     return local @ np.linalg.inv(jacobian(corners, points))
 
 
 def mode_gradients(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the gradients (n_cells, p, 3, 3) of the modes a (1 - a), b (1 - b), c (1 - c), 1/m.
+    """Return the gradients (n_cells, p, d, d) of the modes a (1 - a), b (1 - b), ..., 1/m.
 
     By the Jacobian of the cell's centre, times det J_0 / det J: see `IncompatibleElement`.
     """
-    centre = jacobian(corners, CENTRE)
+    dim = points.shape[1]
+    centre = jacobian(corners, np.full((1, dim), 0.5))
     ratio = np.linalg.det(centre) / np.linalg.det(jacobian(corners, points))
-    local = (1.0 - 2.0 * points)[:, :, None] * np.eye(3)
+    local = (1.0 - 2.0 * points)[:, :, None] * np.eye(dim)
     return local @ np.linalg.inv(centre) * ratio[:, :, None, None]
 
 
 def _full(corners: np.ndarray, degree: int, poisson_ratio: float, modes: bool) -> np.ndarray:
-    """Return k_e (n_cells, 3n, 3n) of unit E; the modes' amplitudes after the nodes."""
-    around, C = corners.shape[1], isotropic(poisson_ratio)
-    # Exact on parallelepipeds and tetrahedra, whose collapsed coordinates add two degrees.
-    points, weights = gauss_points(around, degree + 1, 3)
+    """Return k_e (n_cells, dn, dn) of unit E; the modes' amplitudes after the nodes."""
+    around, dim = corners.shape[1:]
+    C, nodal = elasticity(dim, poisson_ratio), dim * around
+    # Exact on parallelepipeds and simplices, whose collapsed coordinates add d - 1 degrees.
+    points, weights = gauss_points(around, degree + 1, dim)
     found = []
     for first in range(0, max(len(corners), 1), CELLS):
         part = corners[first : first + CELLS]
@@ -573,32 +523,39 @@ def _full(corners: np.ndarray, degree: int, poisson_ratio: float, modes: bool) -
         gradients = nodal_gradients(part, degree, points)
         if modes:
             gradients = np.concatenate([gradients, mode_gradients(part, points)], axis=2)
-            twist = twisting_strains(part, points)
-        size = 3 * gradients.shape[2]
+        twist = twisting_strains(part, points) if modes and dim == 3 else None
+        size = dim * gradients.shape[2]
         k = np.zeros((len(part), size, size))
         for p in range(len(points)):
             B = strains(gradients[:, p])
-            if modes:
-                B[:, :, :24] += twist[:, p]
+            if twist is not None:
+                B[:, :, :nodal] += twist[:, p]
             k += B.transpose(0, 2, 1) @ (volume[:, p, None, None] * (C @ B))
         found.append(0.5 * (k + k.transpose(0, 2, 1)))
     return np.concatenate(found)
 
 
+def _num_modes(k: np.ndarray) -> int:
+    """Return the number of modes' amplitudes behind the displacements of all corners."""
+    return 4 if k.shape[1] == 12 else 9
+
+
 def _recovery(k: np.ndarray) -> np.ndarray:
-    """Return the amplitudes (n_cells, 9, 24) of the modes by the nodes' displacements."""
-    return -np.linalg.solve(k[:, 24:, 24:], k[:, 24:, :24])
+    """Return the amplitudes (n_cells, m, dn) of the modes by the nodes' displacements."""
+    n = k.shape[1] - _num_modes(k)
+    return -np.linalg.solve(k[:, n:, n:], k[:, n:, :n])
 
 
 def _condensed(k: np.ndarray, recovery: np.ndarray) -> np.ndarray:
-    """Return k_e (n_cells, 24, 24) with the modes' amplitudes at rest."""
-    stiffness = k[:, :24, :24] + k[:, :24, 24:] @ recovery
+    """Return k_e (n_cells, dn, dn) with the modes' amplitudes at rest."""
+    n = recovery.shape[2]
+    stiffness = k[:, :n, :n] + k[:, :n, n:] @ recovery
     return 0.5 * (stiffness + stiffness.transpose(0, 2, 1))
 
 
 def _mass(corners: np.ndarray, degree: int) -> np.ndarray:
     """Return m_e (n_cells, n, n) of one component, exact on cells with straight edges."""
-    points, weights = gauss_points(corners.shape[1], degree + 2, 3)
+    points, weights = gauss_points(corners.shape[1], degree + 2, corners.shape[2])
     N = shape_functions(corners.shape[1], degree, points)[0]
     volume = weights * np.abs(np.linalg.det(jacobian(corners, points)))
     products = (N[:, :, None] * N[:, None, :]).reshape(len(points), -1)
@@ -616,7 +573,7 @@ def _mass(corners: np.ndarray, degree: int) -> np.ndarray:
 # with the amplitudes a = (h_z (p + r), h_y (p + t), h_x (r + t)) and the energy G V |a|^2 / 24.
 
 COUPLING = 0.8  # s; 1 has no energy left where two faces of a cell turn against each other
-TWIST_CENTRE = np.full((1, 3), 0.5)
+CENTRE = np.full((1, 3), 0.5)
 # Axes of the shear strains 2 e_xy, 2 e_xz, 2 e_yz; the axis along which each of them grows.
 PAIRS, ALONG = ((0, 1), (0, 2), (1, 2)), (2, 1, 0)
 
@@ -646,7 +603,7 @@ def twisting_strains(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
         corners: (n_cells, 8, 3) m.
         points: (p, 3) places in the reference cell.
     """
-    centre = jacobian(corners, TWIST_CENTRE)[:, 0]
+    centre = jacobian(corners, CENTRE)[:, 0]
     inverse = np.linalg.inv(centre)
     ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian(corners, points))
     length = np.linalg.norm(centre, axis=1)
@@ -661,7 +618,7 @@ def _amplitudes(
     corners: np.ndarray, centre: np.ndarray, inverse: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
     """Return a (n_cells, 3, 24) by nodal displacements, zero for linear ones."""
-    local = shape_derivatives(8, 1, TWIST_CENTRE)[0]
+    local = shape_derivatives(8, 1, CENTRE)[0]
     signs = np.sign(local)
     products = signs[:, 1] * signs[:, 2], signs[:, 2] * signs[:, 0], signs[:, 0] * signs[:, 1]
     pattern = 0.5 * np.stack(products)

@@ -194,6 +194,17 @@ class Constraint:
 # Limits whose word means another response as objective: the compliance of the whole horizon.
 LIMITED = {"compliance": "load_case_compliance"}
 
+# Files of responses whose names are not theirs.
+FILES = {
+    **dict.fromkeys(
+        ("compliance", "deviation", "esl", "load_case_compliance", "settling"), "motion"
+    ),
+    **dict.fromkeys(("effort", "peak_force"), "drives"),
+    **dict.fromkeys(("eigenfrequency", "first_frequency"), "frequency"),
+    "tip_deflection": "static",
+    "volume_fraction": "mass",
+}
+
 _known: dict[str, type[Response]] = {}
 
 
@@ -204,9 +215,9 @@ def register(response: R) -> R:
 
 
 def find(name: str) -> type[Response]:
-    """Return the response of that name, imported from the file of that name at first use."""
+    """Return the response of that name, whose file is imported at first use."""
     if name not in _known:
-        import_module(f"dolfinopt.responses.{name}")
+        import_module(f"dolfinopt.responses.{FILES.get(name, name)}")
     return _known[name]
 
 

@@ -267,16 +267,17 @@ def test_order_does_not_matter():
         assert np.array_equal(one.time_grid, other.time_grid) and np.array_equal(one.a, other.a)
 
 
-def test_a_start_keeps_its_steps(alone):
-    """From its own solution the same steps, and less work."""
+def test_a_start_takes_the_steps_of_the_worst(alone):
+    """From their own solutions all take as many steps as the worst one had, and less work."""
     problems = various()
     cold, first = solve(problems)
     warm, second = solve(problems, cold)
     assert not alone
     assert second.counts.newton_iterations < first.counts.newton_iterations
     for problem, one, other in zip(problems, cold, warm, strict=True):
-        assert np.array_equal(one.time_grid, other.time_grid)
-        assert distance(problem, one, other) <= LEFT
+        assert distance(problem, one, other) <= TOLERANCE
+    most = max(len(one.time_grid) for one in cold)
+    assert {len(one.time_grid) for one in warm} == {most}
 
 
 def test_one_problem_is_solved_as_ever(alone):
@@ -322,14 +323,14 @@ def test_failure_stays_alone():
 def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
     """Whom Newton's method in the batch gives up is solved by itself."""
     problems = [two_arms(), two_arms(payload=1.3), two_arms(payload=1.6)]
-    newton = batch.newton
+    newton = batch.newton_batch
 
     def refuses(stages, *rest):
         found = newton(stages, *rest)
         heavy = stages.preconditioner.system.payload[:, 0] == 1.6
         return replace(found, converged=found.converged & ~heavy)
 
-    monkeypatch.setattr(batch, "newton", refuses)
+    monkeypatch.setattr(batch, "newton_batch", refuses)
     found, _ = solve(problems)
     assert alone == [problems[2]]
     assert all(one.error <= TOLERANCE for one in found)

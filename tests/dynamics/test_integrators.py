@@ -856,9 +856,9 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
         made.append((len(stages.h), len(slow)))
         return simplified_newton_matrix(stages, begin, a, slow)
 
-    for module in ("newton", "error_estimate", "newton_matrix", "adjoint"):
+    for module in ("newton", "radau", "adjoint"):
         monkeypatch.setattr(f"dolfinopt.dynamics.{module}.factorise", spy)
-    for module in ("newton", "error_estimate"):
+    for module in ("newton", "radau"):
         name = f"dolfinopt.dynamics.{module}.simplified_newton_matrix"
         monkeypatch.setattr(name, simplified_spy)
     return made

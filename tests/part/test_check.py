@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from conftest import folder_with, frame
 from mpi4py import MPI
+from parts import folder_with, frame
 from runs import run
 
 import dolfinopt as do

@@ -12,8 +12,8 @@ import click
 import numpy as np
 import pytest
 from browser import browser, open_browser
-from conftest import folder_with, frame
 from mpi4py import MPI
+from parts import folder_with, frame
 from PIL import Image
 from runs import run, shell
 

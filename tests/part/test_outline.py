@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
-from conftest import frame
 from mpi4py import MPI
+from parts import frame
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import folder_with, frame
+from parts import folder_with, frame
 from runs import run
 
 from dolfinopt.cli.shared import scene_of

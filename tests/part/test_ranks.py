@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from conftest import frame
 from mpi4py import MPI
+from parts import frame
 from runs import TWO_ARM, run, shell
 
 import dolfinopt as do
