@@ -25,7 +25,6 @@ from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
-from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.parallel import Partition, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
@@ -501,22 +500,17 @@ def chain_of(scene: scenes.Scene, owned: Mapping[int, ShapeIntegrals]) -> list[S
 
 
 @cache
-def _read_body(sid: str, changed: int, length: float) -> ShapeIntegrals:
-    """Read a body in the plane once for every state of its file."""
-    return load_body(Path(sid), length)
-
-
-@cache
-def _read_spatial_body(
+def _read_body(
     sid: str,
     changed: int,
+    dimension: int,
     length: float,
     interfaces: tuple[tuple[str, tuple[float, float, float]], ...],
 ) -> ShapeIntegrals:
-    """Read a body in space once for every state of its file."""
-    from dolfinopt.multibody.spatial.body_of_sid import load_body as load_spatial_body
+    """Read a body once for every state of its file."""
+    from dolfinopt.multibody.standard_input import load_body  # what few scenes need
 
-    return load_spatial_body(Path(sid), length, dict(interfaces))
+    return load_body(Path(sid), dimension, length, dict(interfaces))
 
 
 def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
@@ -527,11 +521,9 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     arm = scene.arms[index]
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
-        if scene.is_spatial:
-            interfaces = tuple((one.name, one.point) for one in arm.interfaces)
-            body = _read_spatial_body(arm.sid, changed, arm.length, interfaces)
-        else:
-            body = _read_body(arm.sid, changed, arm.length)
+        interfaces = tuple((one.name, one.point) for one in arm.interfaces)
+        dimension = 3 if scene.is_spatial else 2
+        body = _read_body(arm.sid, changed, dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body
         if scene.is_spatial:

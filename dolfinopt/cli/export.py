@@ -77,9 +77,8 @@ def export(
         raise InputError(f"{scene}: a folder; name a scene file, or add --urdf for a robot's run")
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
-    from dolfinopt.disk import write_arrays, write_text
-    from dolfinopt.exchange.mbdyn import fem_text
-    from dolfinopt.exchange.sid import sid_arrays, sid_text
+    from dolfinopt.exchange.mbdyn import write_fem
+    from dolfinopt.exchange.sid import write_sid, write_sid_npz
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import decide_stiffening
@@ -104,9 +103,9 @@ def export(
             click.echo(f"{arm.name}: not exported, {_why(loaded, index)}")
             continue
         data, element = bodies[owner]
-        write_text(folder / f"{arm.name}.sid", sid_text(data))
-        write_arrays(folder / f"{arm.name}.sid.npz", sid_arrays(data))
-        write_text(folder / f"{arm.name}.fem", fem_text(element))
+        write_sid(folder / f"{arm.name}.sid", data)
+        write_sid_npz(folder / f"{arm.name}.sid.npz", data)
+        write_fem(folder / f"{arm.name}.fem", element)
         stiffness = ", geometric stiffness" if len(element.loads) else ""
         click.echo(
             f"{arm.name}: {data.mass:.6g} kg, {data.num_modes} coordinates, "
@@ -134,21 +133,17 @@ def _why(scene: Scene, index: int) -> str:
 
 def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
-    body = arm.reduce(x_phys)
-    title = f"{arm.mesh.name} of {arm.scene.name}"
-    if arm.mesh.dim == 3:
-        from dolfinopt.multibody.spatial import mbdyn, standard_input
-
-        if arm.elastic.comm.rank != 0:
-            return None
-        return standard_input.to_sid(body, title), mbdyn.modal_element(body)
     from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
-    from dolfinopt.multibody.shape_integrals import spatial_moments
+    from dolfinopt.multibody.shape_integrals import in_space, plate_moments
     from dolfinopt.multibody.standard_input import to_sid
 
-    assert arm.basis is not None
-    moments = spatial_moments(arm.elastic, arm.basis, thickness)
-    nodes = lumped_nodes(arm.elastic, arm.basis)
-    if nodes is None:
+    body = arm.reduce(x_phys)
+    title = f"{arm.mesh.name} of {arm.scene.name}"
+    nodes = None
+    if arm.mesh.dim == 2:
+        assert arm.basis is not None
+        body = in_space(body, plate_moments(arm.elastic, arm.basis, thickness))
+        nodes = lumped_nodes(arm.elastic, arm.basis, thickness)
+    if arm.elastic.comm.rank != 0:
         return None
-    return to_sid(body, moments, comment=title), modal_element(body, moments, nodes, thickness)
+    return to_sid(body, title), modal_element(body, nodes)

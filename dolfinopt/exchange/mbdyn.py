@@ -33,7 +33,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dolfinopt.disk import write_atomically
+from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 
 _TITLES = {
@@ -118,7 +118,7 @@ class ModalElement:
 
 def write_fem(path: Path, element: ModalElement) -> None:
     """Write the file; `read_fem` gets the same numbers back."""
-    write_atomically(path, lambda stream: stream.write(fem_text(element).encode("ascii")))
+    write_text(path, fem_text(element))
 
 
 def fem_text(element: ModalElement) -> str:

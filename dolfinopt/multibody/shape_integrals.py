@@ -328,9 +328,37 @@ def shape_integrals(
         stiffness_proportional: beta in D = beta K, s.
         loads: of that design, whose stress stiffens the body; None of a linear body.
     """
+    q = basis.V.shape[2]
+    E = generators(arm.points.shape[1])
+    mass, w, W = _integrated(arm, basis, E)
+    K0 = by_modes = by_outboard = np.zeros((0, q, q))
+    if loads is not None:
+        ends = [loads.num_frame, loads.num_inertial]
+        K0, by_modes, by_outboard = np.split(loads.geometric_stiffness(basis.V), ends)
+    if len(by_modes):
+        M = W[_diagonal(E), 1:, 1:].sum(axis=0)
+        by_modes = np.linalg.solve(M, by_modes.reshape(q, -1)).reshape(by_modes.shape)
+    return ShapeIntegrals(
+        mass=mass,
+        w=w,
+        W=W,
+        K=basis.stiffness,
+        D=stiffness_proportional * basis.stiffness,
+        outboard=basis.outboard,
+        outboard_point=arm.mesh.outboard_point,
+        K0=K0,
+        K0_outboard=by_outboard,
+        further_points=arm.mesh.further_points,
+        along_modes=by_modes,
+    )
+
+
+def _integrated(
+    arm: ElasticArm, basis: Basis, E: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return m, w and W of the design by the matrices E (collective on the arm's ranks)."""
     X, V, MV = arm.points, basis.V, basis.MV
-    d, q = X.shape[1], V.shape[2]
-    E = generators(d)
+    q = V.shape[2]
     rigid = arm.rigid_inertia  # M [1, X], per component
     MX, MV_flat = rigid[:, :, 1], MV.reshape(-1, q)
     EX, EV = _applied(E, X), _applied(E, V).reshape(len(E), -1, q)
@@ -349,27 +377,7 @@ def shape_integrals(
     mass, moment, C, second, first, modes = (
         piece.reshape(np.shape(part)) for piece, part in zip(pieces, parts, strict=True)
     )
-    W = _assembled(E, second, first, modes)
-    K0 = by_modes = by_outboard = np.zeros((0, q, q))
-    if loads is not None:
-        ends = [loads.num_frame, loads.num_inertial]
-        K0, by_modes, by_outboard = np.split(loads.geometric_stiffness(V), ends)
-    if len(by_modes):
-        M = W[_diagonal(E), 1:, 1:].sum(axis=0)
-        by_modes = np.linalg.solve(M, by_modes.reshape(q, -1)).reshape(by_modes.shape)
-    return ShapeIntegrals(
-        mass=float(mass),
-        w=np.column_stack([moment, C]),
-        W=W,
-        K=basis.stiffness,
-        D=stiffness_proportional * basis.stiffness,
-        outboard=basis.outboard,
-        outboard_point=arm.mesh.outboard_point,
-        K0=K0,
-        K0_outboard=by_outboard,
-        further_points=arm.mesh.further_points,
-        along_modes=by_modes,
-    )
+    return float(mass), np.column_stack([moment, C]), _assembled(E, second, first, modes)
 
 
 def _applied(E: np.ndarray, field: np.ndarray) -> np.ndarray:
@@ -502,69 +510,73 @@ def first_frequency(body: ShapeIntegrals) -> float:
     return float(np.sqrt(max(values[0], 0.0)) / (2.0 * np.pi))
 
 
-# -- what spatial codes ask for beyond a plane body's integrals: those of a plate of its
-# thickness
+# -- a plane body in space, as files of spatial codes hold it --------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class SpatialMoments:
-    """Integrals over the mass of a plate of constant thickness about its middle plane z = 0.
+def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegrals:
+    """Return a plane body as one in space: the same motion in x-y, none out of it.
 
-    Attributes:
-        second: (2, 2) int X X', kg m2.
-        depth: int z^2, kg m2.
-        first: (2, 2, q) int X_i Phi_jk.
-        mixed: (2, 2, q, q) int Phi_ik Phi_jl.
+    Geometric stiffness of the seven loads is spread over the eighteen,
+
+        K0_yx = -K0_xy = K0_wd / 2,   K0_xx = K0_yy = -K0_zz = K0_-ww / 2,
+
+    so that no rows feel rotation about x and y, of which a plane body does not know: neither of
+    what a_z, F_z, T_x and T_y do. The moment about x and y does feel K0_wd, by way of Gr.
+
+    Args:
+        body: in the plane.
+        W: (9, 1 + q, 1 + q) of the body, see `plate_moments`. By default a guess from the planar
+            integrals, all mass on the x axis and moving across it: out of the plane a thin bar.
     """
+    q = body.num_modes
+    w, point, K0, loads = np.zeros((3, 1 + q)), np.zeros(3), np.zeros((3, 3, q, q)), body.K0
+    w[:2], point[:2] = body.w, body.outboard_point
+    if W is None:
+        bar = np.zeros((3, 3, 1 + q, 1 + q))
+        bar[0, 0, 0], bar[0, 0, 1:, 0] = body.W[0, 0], body.j
+        bar[0, 1, 0, 1:] = bar[1, 0, 1:, 0] = body.r
+        bar[0, 1, 1:, 1:], bar[1, 0, 1:, 1:] = -0.5 * body.G, 0.5 * body.G
+        bar[1, 1, 1:, 1:] = body.M
+        W = bar.reshape(9, 1 + q, 1 + q)
+    if body.is_stiffened:
+        push = np.concatenate([body.K0[:2], np.zeros((1, q, q))])
+        K0[1, 0], K0[0, 1] = 0.5 * body.K0[2], -0.5 * body.K0[2]
+        K0[0, 0] = K0[1, 1] = 0.5 * body.K0[3]
+        K0[2, 2] = -K0[0, 0]
+        loads = np.concatenate([push, K0.reshape(9, q, q)])
+    return replace(
+        body,
+        w=w,
+        W=W,
+        outboard=_with_rows(body.outboard),
+        outboard_point=point,
+        K0=loads,
+        K0_outboard=_with_rows(body.K0_outboard) if body.is_stiffened else body.K0_outboard,
+        further_points=np.zeros((0, 3)),
+    )
 
-    second: np.ndarray
-    depth: float
-    first: np.ndarray
-    mixed: np.ndarray
+
+def _with_rows(plane: np.ndarray) -> np.ndarray:
+    """Return what stands along x, y and about z among all six."""
+    out = np.zeros((6, *plane.shape[1:]))
+    out[[0, 1, 5]] = plane
+    return out
 
 
-def spatial_moments(arm: ElasticArm, basis: Basis, thickness: float) -> SpatialMoments:
-    """Integrate over the arm's current design (collective on the arm's ranks).
+def plate_moments(arm: ElasticArm, basis: Basis, thickness: float) -> np.ndarray:
+    """Return W (9, 1 + q, 1 + q) of a plane arm's design (collective on the arm's ranks).
 
     Args:
         arm: with its design set.
         basis: of that design.
         thickness: t, m; int z^2 = m t^2 / 12.
     """
-    X, V, MV = arm.points, basis.V, basis.MV
-    q = V.shape[2]
-    rigid = arm.rigid_inertia
-    # The mass matrix treats x and y alike: its product with (x, y) has M x and M y as components.
-    parts = (
-        rigid[:, 0, 0].sum(),
-        np.einsum("ni,nj->ij", X, rigid[:, :, 1]),
-        np.einsum("ni,njk->ijk", X, MV),
-        np.einsum("nik,njl->ijkl", V, MV),
-    )
-    packed = np.concatenate([np.ravel(part) for part in parts])
-    if arm.comm.size > 1:
-        packed = arm.comm.allreduce(packed)
-    mass, second, first, mixed = np.split(packed, np.cumsum([1, 4, 4 * q]))
-    return SpatialMoments(
-        second=second.reshape(2, 2),
-        depth=float(mass[0]) * thickness**2 / 12.0,
-        first=first.reshape(2, 2, q),
-        mixed=mixed.reshape(2, 2, q, q),
-    )
-
-
-def slender_moments(body: ShapeIntegrals) -> SpatialMoments:
-    """Return a guess from the planar integrals alone: all mass on the x axis, moving across it.
-
-    int y^2 = int z^2 = int y Phi = int Phi_x Phi_x = 0, the rest as the planar integrals have it:
-    the same motion in the plane, and out of it that of a thin bar.
-    """
-    q = body.num_modes
-    first, mixed = np.zeros((2, 2, q)), np.zeros((2, 2, q, q))
-    first[0, 0], first[0, 1] = body.j, body.r
-    mixed[1, 1] = body.M
-    mixed[0, 1], mixed[1, 0] = -0.5 * body.G, 0.5 * body.G
-    return SpatialMoments(np.diag([body.inertia, 0.0]), 0.0, first, mixed)
+    mass, _, plane = _integrated(arm, basis, np.eye(4).reshape(4, 2, 2))
+    size = plane.shape[1]
+    W = np.zeros((3, 3, size, size))
+    W[:2, :2] = plane.reshape(2, 2, size, size)
+    W[2, 2, 0, 0] = mass * thickness**2 / 12.0
+    return W.reshape(9, size, size)
 
 
 # -- displacement of a body along its modes, second order included: what its own inertia sees ----

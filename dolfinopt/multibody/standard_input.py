@@ -1,27 +1,31 @@
-"""A plane body as standard input data of the spatial format, and back.
+"""Bodies as standard input data and back; see `dolfinopt.exchange.sid` for the equations.
 
-Motion is in x-y, rotation about z. What the planar equations know goes into its places in the
-spatial matrices bit by bit, so that body -> SID -> body is exact. What only a spatial code asks for
-(rotation about x and y, centrifugal forces of such rotation) comes from `SpatialMoments`.
+With a frame that accelerates by a + A X, A = wd~ + w~ w~, all that the matrices of the elastic
+coordinates hold are sums of
 
-Geometric stiffness K0_p of the loads p = (a_x, a_y, wd, -w^2, F_x, F_y, T), see `ShapeIntegrals`,
-is what the matrices of the first order lose: with every load's work C q, r q, ..., 1/2 q'K0_p q,
+    Y_ab(q)_k = int Phi_ak p_b - (K0_ab q)_k,   p = X + Phi q,
 
-    Ct(q)  = C' - K0_ax q, K0_ay q in columns 1, 2        Cr(q)  = r + G q - K0_wd q in column 3
-    Oe(q)  = -j - M q + K0_-ww q in column 3              Gr(q)  = 2 (j + M q - K0_-ww q) at (3, 3)
-    phi(q) = B - q'K0_Fx, q'K0_Fy of the outboard node    psi(q) = theta - q'K0_T of its rotation
+    Cr_kc = e_cab Y_ba,k       Oe_k = (Y_aa - tr Y)_k for w_a^2, (Y_ab + Y_ba)_k for w_a w_b
+    Gr_k = 2 (tr Y 1 - Y)_k    Ct_k = int Phi_k - K0_a q    J = tr G 1 - G, dG_ab / dq = Y_ab + Y_ba
 
-(Wallrapp 1994, doi:10.1080/08905459408905214: K0t, K0r, K0omega, K0F and K0M; `ksigma`,
-stresses without a load, is zero.) Motion of the second order is not in the format: mdCM(q) and
-origin(q) lack -1/2 q'K0_p q, force and moment -qd'K0_p qd; a body read back has them again. Nor
-does a plane body know what stiffens it out of its plane: by a_z, rotation about x and y, F_z, T_x
-and T_y the matrices are those of a linear body, as those of all nodes but the outboard one are.
+    phi(q) = B_u - q'K0_F, psi(q) = B_theta - q'K0_M of every outboard node
+
+so that geometric stiffness K0 of the 18 loads stands in matrices of the first order (Wallrapp 1994,
+doi:10.1080/08905459408905214: K0t in Ct, K0r in Cr, K0omega in Oe and Gr, K0F and K0M in the
+nodes). Motion of the second order is not in the format: mdCM(q) and origin(q) lack -1/2 q'K0_p q,
+force and moment -qd'K0_p qd; a body read back has them again.
+
+A plane body is written as the body in space that `in_space` makes of it. It is read from the
+columns that motion in x-y about z feels: they are its integrals bit by bit, and files may leave out
+the rest. In space Oe and Gr hold the symmetric parts of int Phi_a Phi_b and of K0_ab as a
+difference, which is all that inverse dynamics depends on. Of a stiffened file they are told apart
+by Me = sum_a int Phi_a Phi_a and by taking K0_ab with b = y, z, of loads A_ab X_b at places across
+the link, for zero as far as the rest of the file allows it: exact in the limit of a slender link.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,283 +38,425 @@ from dolfinopt.exchange.sid import (
     ZERO,
     Node,
     StandardInputData,
+    Taylor,
     read_sid,
     structure_of,
     taylor,
 )
-from dolfinopt.multibody.shape_integrals import (
-    ShapeIntegrals,
-    SpatialMoments,
-    plane_body,
-    slender_moments,
-)
-from dolfinopt.multibody.sid_checks import (
-    CENTRIFUGAL,
-    SMALL,
-    check_definite,
-    check_deviations,
-    check_stresses,
-    check_symmetric,
-    ends,
-    is_stiffened,
-    scales,
-)
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.spatial.kinematics import PERMUTATION
+from dolfinopt.multibody.spatial.mechanism import ONE, skew
 
+# Entries of J, and products of the angular velocity in the columns of Oe.
+INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+PRODUCTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+# How far matrices that must be symmetric, or zero, may be from it, relative to their largest
+# entry: finite elements leave 1e-12, files with six digits 1e-6.
+SMALL = 1e-6
+# How far the centrifugal matrix may be from that of the mass, relative to Me: lumped masses reach
+# 5 %, geometric stiffening by rotation changes the sign of its diagonal for slender bodies.
+CENTRIFUGAL = 0.1
 
-@dataclass(frozen=True, eq=False)
-class PlaneNode:
-    """A further node of the body.
-
-    Attributes:
-        name: other than "1" and "2".
-        point: (2,) reference position, m.
-        motion: (3, q) u_x, u_y, theta by each coordinate.
-        K0: (3, q, q) geometric stiffness by unit forces and moment at the node; None, or
-            (0, q, q), of a linear body.
-    """
-
-    name: str
-    point: np.ndarray
-    motion: np.ndarray
-    K0: np.ndarray | None = None
+Place = tuple[float, float, float]
 
 
 # -- to SID ----------------------------------------------------------------------------------
 
 
-def to_sid(
-    body: ShapeIntegrals,
-    moments: SpatialMoments | None = None,
-    further: Sequence[PlaneNode] = (),
-    comment: str = "",
-) -> StandardInputData:
-    """Return a plane body as standard input data.
+def to_sid(body: ShapeIntegrals, comment: str = "") -> StandardInputData:
+    """Return a body in space as standard input data; a plane one is brought there by `in_space`.
 
-    The first node, "1", is the inboard joint, the last one, "2", the outboard interface. A
-    coordinate's name holds sqrt(K_kk / M_kk) in Hz, as other programs expect.
+    The first node, "1", is the inboard joint, the last one, "2", the outboard interface; further
+    interfaces, "3", "4", ..., stand between them. A coordinate's name holds sqrt(K_kk / M_kk) in
+    Hz, as other programs expect.
 
     Args:
         body: tangent frame at the inboard joint.
-        moments: for spatial codes; by default those of `slender_moments`.
-        further: nodes between the two.
         comment: for the file's first line.
     """
     q = body.num_modes
-    held = PlaneNode("1", np.zeros(2), np.zeros((3, q)))
-    tip = PlaneNode("2", body.outboard_point, body.outboard, body.K0_outboard)
-    nodes = (held, *further, tip)
-    moments = moments or slender_moments(body)
-    none = np.zeros((q, 1))
+    frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
+    held = _node("1", np.zeros(3), np.zeros((6, q)), np.zeros((0, q, q)))
+    interfaces = enumerate(outboard_interfaces(body), start=2)
+    tip, *further = (_node(str(k), *interface) for k, interface in interfaces)
     return StandardInputData(
         mass=body.mass,
-        names=coordinate_names(body),
-        nodes=tuple(_node(node, q) for node in nodes),
+        names=tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1)),
+        nodes=(held, *further, tip),
         comment=comment,
         Me=taylor(body.M, nq=q, structure=SYMMETRIC),
-        ksigma=taylor(none, nq=q, structure=ZERO),
+        ksigma=taylor(np.zeros((q, 1)), nq=q, structure=ZERO),
         Ke=taylor(body.K, nq=q, structure=SYMMETRIC),
         De=taylor(body.D, nq=q, structure=structure_of(body.D)),
-        **_rigid_matrices(body, moments),
-        **_elastic_matrices(body, moments),
+        **_inertia_matrices(body),
     )
 
 
-def coordinate_names(body: ShapeIntegrals) -> tuple[str, ...]:
-    """Return names that hold sqrt(K_kk / M_kk) in Hz."""
-    frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
-    return tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1))
+def outboard_interfaces(
+    body: ShapeIntegrals,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield point (3,), modes (6, q) and K0 (6, q, q) or (0, q, q) of every outboard interface."""
+    for k, point in enumerate(body.points):
+        rows = slice(6 * k, 6 * k + 6)
+        yield point, body.outboard[rows], body.K0_outboard[rows]
 
 
-def _node(node: PlaneNode, q: int) -> Node:
-    origin, phi, psi = np.zeros((3, 1)), np.zeros((3, q)), np.zeros((3, q))
-    origin[:2, 0], phi[:2], psi[2] = node.point, node.motion[:2], node.motion[2]
-    turn = np.zeros((3, q, 3))  # tilde(psi_k)
-    turn[0, :, 1], turn[1, :, 0] = 0.0 - psi[2], psi[2]
-    phi_q = psi_q = None
-    if node.K0 is not None and len(node.K0):
-        phi_q, psi_q = np.zeros((3, q, q)), np.zeros((3, q, q))
-        phi_q[:2], psi_q[2] = 0.0 - node.K0[:2], 0.0 - node.K0[2]
+def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> Node:
+    """Return a node from its place, its displacements and rotations (6, q) and their K0."""
+    q = modes.shape[1]
+    phi, psi = modes[:3], modes[3:]
+    phi_q, psi_q = (_clean(-K0[:3]), _clean(-K0[3:])) if len(K0) else (None, None)
+    turn = _clean(skew(psi.T)).transpose(1, 0, 2)  # row, coordinate, column
     return Node(
-        name=node.name,
+        name=name,
         rframe="body ref",
-        origin=taylor(origin, phi[:, :, None].copy(), nq=q, structure=GENERAL),
+        origin=taylor(point[:, None], phi[:, :, None].copy(), nq=q, structure=GENERAL),
         phi=taylor(phi, phi_q, nq=q, structure=GENERAL),
         psi=taylor(psi, psi_q, nq=q, structure=GENERAL),
-        AP=taylor(np.eye(3), turn, nq=q, structure=GENERAL if turn.any() else UNIT),
+        AP=taylor(ONE, turn, nq=q, structure=GENERAL if turn.any() else UNIT),
     )
 
 
-def _rigid_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
-    """Return what moves the frame: mdCM, J and Gr."""
-    q, (xx, yy) = body.num_modes, np.diag(moments.second)
-    centre, centre_q = np.zeros((3, 1)), np.zeros((3, q, 1))
-    centre[:2, 0], centre_q[:2, :, 0] = body.moment, body.C
-    inertia, inertia_q = np.zeros((6, 1)), np.zeros((6, q, 1))
-    xy = moments.second[0, 1]
-    inertia[:4, 0] = yy + moments.depth, xx + moments.depth, body.inertia, 0.0 - xy
-    first = moments.first
-    inertia_q[:4, :, 0] = (
-        2.0 * first[1, 1],
-        2.0 * first[0, 0],
-        2.0 * body.j,
-        0.0 - (first[0, 1] + first[1, 0]),
-    )
-    # -2 int tilde(r) tilde(Phi_k) = 2 int (r . Phi_k) I - Phi_k r', and the same with r = Phi_l.
-    gyroscopic = np.zeros((3, q, 3))  # row, k, column
-    gyroscopic_q = np.zeros((3, q, q, 3))  # row, l, k, column
-    mixed = moments.mixed
-    for i, other in ((0, 1), (1, 0)):
-        gyroscopic[i, :, i] = 2.0 * first[other, other]
-        gyroscopic[i, :, other] = 0.0 - 2.0 * first[other, i]
-        gyroscopic_q[i, :, :, i] = 2.0 * mixed[other, other]
-        gyroscopic_q[i, :, :, other] = 0.0 - 2.0 * mixed[other, i]
-    gyroscopic[2, :, 2] = 2.0 * body.j
-    gyroscopic_q[2, :, :, 2] = 2.0 * body.M
-    if body.is_stiffened:
-        gyroscopic_q[2, :, :, 2] -= 2.0 * body.K0[3]
-    return {
-        "mdCM": taylor(centre, centre_q, nq=q, structure=GENERAL),
-        "J": taylor(inertia, inertia_q, nq=q, structure=GENERAL),
-        "Gr": taylor(
-            gyroscopic.reshape(3, 3 * q),
-            gyroscopic_q.reshape(3, q, 3 * q),
-            nq=q,
-            structure=GENERAL,
-        ),
-    }
-
-
-def _elastic_matrices(body: ShapeIntegrals, moments: SpatialMoments) -> dict:
-    """Return what moves the coordinates: Ct, Cr, Ge and Oe."""
-    q, first, mixed = body.num_modes, moments.first, moments.mixed
-    push = np.zeros((q, 3))
-    push[:, :2] = body.C.T
-    turn, turn_q = np.zeros((q, 3)), np.zeros((q, q, 3))
-    turn[:, 2], turn_q[:, :, 2] = body.r, body.G
-    coriolis = np.zeros((q, q, 3))  # row, block, column
-    coriolis[:, :, 2] = 2.0 * body.G
-    # int (Phi.w)(w.r) - w^2 (Phi.r), and the same with r = Phi_l.
-    centrifugal, centrifugal_q = np.zeros((q, 6)), np.zeros((q, q, 6))
-    columns = (first[1, 1], first[0, 0], body.j)
-    columns_q = (mixed[1, 1], mixed[0, 0], body.M)
-    for c in range(3):
-        centrifugal[:, c] = 0.0 - columns[c]
-        centrifugal_q[:, :, c] = 0.0 - columns_q[c]
-    centrifugal[:, 3] = first[0, 1] + first[1, 0]
-    centrifugal_q[:, :, 3] = mixed[0, 1] + mixed[1, 0]
+def _inertia_matrices(body: ShapeIntegrals) -> dict[str, Taylor]:
+    """Return what moves the frame, and what that does to the coordinates."""
+    q = body.num_modes
+    W = body.W.reshape(3, 3, 1 + q, 1 + q)
+    Y, Y_q = W[:, :, 1:, 0], W[:, :, 1:, 1:].copy()  # a, b, k and a, b, k, l
     push_q = None
     if body.is_stiffened:
-        push_q = np.zeros((q, q, 3))
-        push_q[:, :, :2] = 0.0 - body.K0[:2].transpose(1, 2, 0)
-        turn_q[:, :, 2] -= body.K0[2]
-        centrifugal_q[:, :, 2] += body.K0[3]
-    return {
-        "Ct": taylor(push, push_q, nq=q, structure=GENERAL),
-        "Cr": taylor(turn, turn_q, nq=q, structure=GENERAL),
-        "Ge": taylor(coriolis.reshape(q, 3 * q), nq=q, structure=GENERAL),
-        "Oe": taylor(centrifugal, centrifugal_q, nq=q, structure=GENERAL),
+        Y_q -= body.K0[3:].reshape(3, 3, q, q)
+        push_q = -body.K0[:3].transpose(1, 2, 0)
+    G, G_q = W[:, :, 0, 0], Y + Y.swapaxes(0, 1)
+    coriolis = np.einsum("abc,abkl->klc", -2.0 * PERMUTATION, W[:, :, 1:, 1:])
+    found = {
+        "mdCM": (body.w[:, :1], body.w[:, 1:, None]),
+        "J": (_moments(G)[:, None], _moments(G_q)[:, :, None]),
+        "Ct": (body.w[:, 1:].T, push_q),
+        "Cr": (turning(Y), turning(Y_q)),
+        "Gr": (_gyroscopic(Y).reshape(3, 3 * q), _gyroscopic(Y_q).transpose(0, 2, 1, 3)),
+        "Ge": (coriolis.reshape(q, 3 * q), None),
+        "Oe": (centrifugal(Y), centrifugal(Y_q)),
     }
+    return {
+        name: taylor(
+            _clean(value),
+            None if more is None else _clean(more).reshape(len(value), q, value.shape[1]),
+            nq=q,
+            structure=GENERAL,
+        )
+        for name, (value, more) in found.items()
+    }
+
+
+def _clean(values: np.ndarray) -> np.ndarray:
+    """Return the values without negative zeros, which the file would spell out."""
+    return values + 0.0
+
+
+def _moments(G: np.ndarray) -> np.ndarray:
+    """Return tr G 1 - G (3, 3, ...) as xx, yy, zz, xy, xz, yz (6, ...)."""
+    trace = np.einsum("aa...->...", G)
+    return np.stack([(a == b) * trace - G[a, b] for a, b in INERTIA])
+
+
+def turning(Y: np.ndarray) -> np.ndarray:
+    """Return e_cab Y_ba (..., 3)."""
+    return np.einsum("cab,ba...->...c", PERMUTATION, Y)
+
+
+def _gyroscopic(Y: np.ndarray) -> np.ndarray:
+    """Return 2 (tr Y 1 - Y) with rows first and columns last."""
+    trace = np.einsum("aa...,ij->ij...", Y, ONE)
+    return np.moveaxis(2.0 * (trace - Y), 1, -1)
+
+
+def centrifugal(Y: np.ndarray) -> np.ndarray:
+    """Return what w1^2, w2^2, w3^2, w1 w2, w2 w3, w1 w3 do (..., 6)."""
+    trace = np.einsum("aa...->...", Y)
+    columns = [Y[a, a] - trace if a == b else Y[a, b] + Y[b, a] for a, b in PRODUCTS]
+    return np.stack(columns, axis=-1)
 
 
 # -- from SID --------------------------------------------------------------------------------
 
 
-def load_body(path: Path, length: float | None = None) -> ShapeIntegrals:
-    """Read an SID file and return its plane body, see `from_sid`.
+def load_body(
+    path: Path,
+    dimension: int,
+    length: float | None = None,
+    further: Mapping[str, Place] | None = None,
+) -> ShapeIntegrals:
+    """Read an SID file and return its body, see `from_sid`.
 
     Args:
         path: of the file; its first node is the inboard, its last one the outboard node.
+        dimension: 2 for a body in the plane, 3 in space.
         length: joint axis to joint axis, m, with which the file must agree.
+        further: names of the nodes that are further interfaces, and where they must be, m.
 
     Raises:
-        InputError: the file is damaged, its body is not of that kind or of another length.
+        InputError: the file is damaged, its body is not of that kind, of another length or with
+            other interfaces.
     """
-    body = from_sid(read_sid(path), source=str(path))
-    if length is not None:
-        x, y = body.outboard_point
-        if np.hypot(x - length, y) > SMALL * length:
-            raise InputError(
-                f"{path}: the outboard node is at ({x:.7g}, {y:.7g}) m, but the arm's length is "
-                f"{length:.7g} m; it must be at (length, 0)"
-            )
+    further = further or {}
+    body = from_sid(read_sid(path), dimension, further=tuple(further), source=str(path))
+    if length is None:
+        return body
+    axis: Place = (length, 0.0, 0.0)
+    wanted = [axis, *further.values()]
+    for name, point, expected in zip(("", *further), body.points, wanted, strict=True):
+        if np.linalg.norm(point - expected[:dimension]) > SMALL * length:
+            if name:
+                where, told = f"node {name}", f"the arm's interface {name!r} is at {expected} m"
+            else:
+                where, told = "the outboard node", f"the arm's length is {length:.7g} m"
+                told += f"; it must be at (length{', 0' * (dimension - 1)})"
+            found = ", ".join(f"{x:.7g}" for x in point)
+            raise InputError(f"{path}: {where} is at ({found}) m, but {told}")
     return body
 
 
 def from_sid(
     data: StandardInputData,
+    dimension: int,
     inboard: str | None = None,
     outboard: str | None = None,
+    further: Sequence[str] = (),
     source: str = "SID",
 ) -> ShapeIntegrals:
-    """Return the plane body of standard input data.
+    """Return the body of standard input data.
 
-    The frame must be the tangent frame at the inboard node, all motion in x-y. Entries that plane
-    motion does not feel (J about x and y, ...) are dropped.
+    The frame must be the tangent frame at the inboard node. In the plane all motion must be in x-y;
+    entries that such motion does not feel (J about x and y, ...) are dropped.
 
     Args:
         data: of any program.
+        dimension: 2 for a body in the plane, 3 in space.
         inboard: name of the inboard node, by default the first.
         outboard: name of the outboard node, by default the last.
+        further: names of the nodes that are further interfaces.
         source: what messages call the data.
 
     Raises:
-        InputError: one line: no such node, a frame that is not held at the inboard node, motion
-            out of the plane, initial stresses, geometric stiffening by some loads only, matrices
-            that are no mechanical body's.
+        InputError: one line: no such node, a frame that is not held at the inboard node, motion out
+            of the plane, initial stresses, geometric stiffening by some loads only, no matrices of
+            the first order in Oe of a body in space, matrices that are no mechanical body's.
     """
-    first, last = ends(data, inboard, outboard, source)
-    _check_nodes(first, last, source)
-    _check_plane(data, source)
-    inertia = data.inertia(np.zeros(data.num_modes))[2, 2]
-    check_definite(data, {"mass": data.mass, "J(3, 3)": inertia}, source)
-    check_stresses(data, source)
-    G, M = 0.5 * data.Ge.M0[:, 2::3], data.Me.M0
-    if np.abs(G + G.T).max() > SMALL * np.abs(M).max():
-        raise InputError(f"{source}: the columns 3, 6, ... of Ge must be a skew matrix")
-    return plane_body(
+    first, last = _ends(data, inboard, outboard, source)
+    tips = [last, *(_named(data, name, source) for name in further)]
+    _check_nodes(first, tips, dimension, source)
+    _check_body(data, dimension, source)
+    q, along, about = data.num_modes, *_axes(dimension)
+    K0, K0_outboard = np.zeros((0, q, q)), np.zeros((0, q, q))
+    moments = _plane_moments if dimension == 2 else _spatial_moments
+    W, rotation = moments(data, _is_stiffened(data, tips, dimension, source))
+    if len(rotation):
+        push = -data.Ct.M1.transpose(2, 0, 1)[along]
+        own = [
+            -_first_order(matrix)[rows]
+            for tip in tips
+            for matrix, rows in ((tip.phi, along), (tip.psi, about))
+        ]
+        K0, K0_outboard = np.concatenate([push, rotation]), np.concatenate(own)
+        names = ", ".join(tip.name for tip in tips)
+        loads = {"Ct": push, f"phi, psi of node {names}": K0_outboard}
+        _check_symmetric(loads, source)
+    points = np.stack([tip.origin.M0[along, 0] for tip in tips])
+    modes = [rows for tip in tips for rows in (tip.phi.M0[along], tip.psi.M0[about])]
+    return ShapeIntegrals(
         mass=data.mass,
-        moment=data.mdCM.M0[:2, 0].copy(),
-        inertia=float(inertia),
-        C=data.Ct.M0[:, :2].T.copy(),
-        j=0.0 - data.Oe.M0[:, 2],
-        r=data.Cr.M0[:, 2].copy(),
-        M=0.5 * (M + M.T),
-        G=0.5 * (G - G.T),
+        w=np.column_stack([data.mdCM.M0[along, 0], data.Ct.M0.T[along]]),
+        W=W,
         K=0.5 * (data.Ke.M0 + data.Ke.M0.T),
         D=data.De.M0.copy(),
-        outboard=np.vstack([last.phi.M0[:2], last.psi.M0[2]]),
-        outboard_point=last.origin.M0[:2, 0].copy(),
-        K0=_geometric_stiffness(data, last, source),
+        outboard=np.concatenate(modes),
+        outboard_point=points[0],
+        K0=0.5 * (K0 + K0.swapaxes(1, 2)),
+        K0_outboard=0.5 * (K0_outboard + K0_outboard.swapaxes(1, 2)),
+        further_points=points[1:],
+        along_modes=np.zeros((0, q, q)),
     )
 
 
-def _check_nodes(first: Node, last: Node, source: str) -> None:
-    """Check that the frame is held at the first node, and that the last moves in the plane."""
+def _axes(dimension: int) -> tuple[slice, slice]:
+    """Return the axes along which a body moves, and about which it turns."""
+    return slice(dimension), slice(2 if dimension == 2 else 0, 3)
+
+
+def _first_order(matrix: Taylor) -> np.ndarray:
+    """Return M1 (nrow, nq, ncol), zero of order 0."""
+    nrow, ncol = matrix.M0.shape
+    return matrix.M1 if matrix.order else np.zeros((nrow, matrix.M1.shape[1], ncol))
+
+
+def _plane_moments(data: StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return W (2, 1 + q, 1 + q), and K0 (2, q, q) by wd and -w^2 or none."""
+    q = data.num_modes
+    r, j, G = data.Cr.M0[:, 2], 0.0 - data.Oe.M0[:, 2], 0.5 * data.Ge.M0[:, 2::3]
+    W = np.empty((2, 1 + q, 1 + q))
+    W[:, 0, 0] = data.inertia(np.zeros(q))[2, 2], 0.0
+    W[:, 1:, 0], W[:, 0, 1:] = (j, r), (j, 0.0 - r)
+    W[:, 1:, 1:] = 0.5 * (data.Me.M0 + data.Me.M0.T), 0.5 * (G - G.T)
+    if not stiffened:
+        return W, np.zeros((0, q, q))
+    turn = data.Cr.M1[:, :, 2] if data.Cr.order else np.zeros((q, q))  # its skew part is G
+    return W, np.stack([-turn, _centrifugal_excess(data, 2)])
+
+
+def _spatial_moments(data: StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return W (9, 1 + q, 1 + q), and K0_ab (9, q, q) or none; told apart as above."""
+    q = data.num_modes
+    J = data.inertia(np.zeros(q))
+    symmetric, turned = _from_rows(data.Oe.M1, _first_order(data.Cr))
+    K0 = np.zeros_like(symmetric)
+    if stiffened:
+        # The part of Y_ab - Y_ba that is symmetric in the coordinates is K0_ba - K0_ab.
+        skewed = -0.5 * (turned + turned.swapaxes(2, 3))
+        K0[0, 0] = _centrifugal_excess(data, 3)
+        K0[1, 0], K0[2, 0] = skewed[1, 0], skewed[2, 0]
+        K0[1, 2], K0[2, 1] = 0.5 * skewed[1, 2], 0.5 * skewed[2, 1]
+        symmetric = symmetric + 0.5 * (K0 + K0.swapaxes(0, 1))
+    first, turned = _from_rows(data.Oe.M0, data.Cr.M0)
+    Y = first + 0.5 * turned  # int Phi_a X_b
+    coriolis = data.Ge.M0.reshape(q, q, 3)
+    skewed = np.einsum("abc,klc->abkl", -0.25 * PERMUTATION, coriolis)
+    modes = symmetric + 0.5 * (skewed - skewed.swapaxes(2, 3))
+    W = np.empty((3, 3, 1 + q, 1 + q))
+    W[:, :, 0, 0] = 0.5 * np.trace(J) * ONE - J
+    W[:, :, 1:, 0], W[:, :, 0, 1:] = Y, Y.swapaxes(0, 1)
+    # int Phi_a Phi_b with its coordinates exchanged is int Phi_b Phi_a.
+    W[:, :, 1:, 1:] = 0.5 * (modes + modes.transpose(1, 0, 3, 2))
+    return W.reshape(9, 1 + q, 1 + q), K0.reshape(9, q, q)[: 9 * stiffened]
+
+
+def _from_rows(Oe: np.ndarray, Cr: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (Y_ab + Y_ba) / 2 and Y_ab - Y_ba, both (3, 3, ...), of Oe (..., 6), Cr (..., 3)."""
+    trace = -0.5 * Oe[..., :3].sum(axis=-1)
+    symmetric = np.empty((3, 3, *Oe.shape[:-1]))
+    for column, (a, b) in enumerate(PRODUCTS):
+        value = Oe[..., column] + trace if a == b else 0.5 * Oe[..., column]
+        symmetric[a, b] = symmetric[b, a] = value
+    return symmetric, np.einsum("abc,...c->ab...", -PERMUTATION, Cr)
+
+
+def _centrifugal_excess(data: StandardInputData, dimension: int) -> np.ndarray:
+    """Return sum_a K0_aa (q, q): what Oe has beyond the inertia Me of rotation, a = x, y (, z)."""
+    if data.Oe.order == 0:
+        return np.zeros_like(data.Me.M0)
+    if dimension == 2:
+        return np.asarray(data.Me.M0 + data.Oe.M1[:, :, 2])
+    return np.asarray(data.Me.M0 + 0.5 * data.Oe.M1[:, :, :3].sum(axis=-1))
+
+
+# -- what standard input data must fulfil ------------------------------------------------------
+
+
+def _ends(
+    data: StandardInputData, inboard: str | None, outboard: str | None, source: str
+) -> tuple[Node, Node]:
+    """Return the two interface nodes of a body that bends; by default the first and the last."""
+    if data.num_modes == 0:
+        raise InputError(
+            f"{source}: nelastq = 0, a body that does not bend; state rigid = true, mass and "
+            "inertia in place of the file"
+        )
+    names = [node.name for node in data.nodes]
+    if len(names) < 2:
+        raise InputError(
+            f"{source}: lacks an outboard node, its nodes are: {', '.join(names) or 'none'}; an "
+            "arm needs an inboard node at the origin and an outboard node"
+        )
+    for side, name in (("inboard", inboard), ("outboard", outboard)):
+        if name is not None and name not in names:
+            raise InputError(f"{source}: no {side} node {name!r}; it has {', '.join(names)}")
+    first = data.nodes[0 if inboard is None else names.index(inboard)]
+    last = data.nodes[-1 if outboard is None else names.index(outboard)]
+    if first is last:
+        raise InputError(f"{source}: node {first.name} cannot be both inboard and outboard")
+    return first, last
+
+
+def _named(data: StandardInputData, name: str, source: str) -> Node:
+    """Return the node of that name."""
+    for node in data.nodes:
+        if node.name.casefold() == name.casefold():
+            return node
+    names = ", ".join(node.name for node in data.nodes)
+    raise InputError(f"{source}: no node {name!r}; it has {names}")
+
+
+def _check_nodes(first: Node, tips: Sequence[Node], dimension: int, source: str) -> None:
+    """Check that the frame is held at the first node, and that the others are parallel to it."""
+    last = tips[0]
     if not np.abs(last.origin.M0).max() > 0.0:
         raise InputError(f"{source}: the outboard node {last.name} is at the origin")
-    length, push, turn = scales(last)
+    length = np.abs(last.origin.M0).max()
+    push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
+    # Of the two scales the other follows over the arm's length.
+    push, turn = max(push, length * turn), max(turn, push / length)
     checks = [
         (first, "origin", first.origin.M0, length, "at the origin"),
         (first, "phi", first.phi.M0, push, "held in the frame"),
         (first, "psi", first.psi.M0, turn, "held in the frame"),
-        (last, "origin", last.origin.M0[2], length, "in the plane z = 0"),
-        (last, "phi", last.phi.M0[2], push, "in the plane"),
-        (last, "psi", last.psi.M0[:2], turn, "in the plane"),
     ]
-    checks += [(node, "AP", node.AP.M0 - np.eye(3), 1.0, "parallel") for node in (first, last)]
-    check_deviations(checks, first, source)
+    if dimension == 2:
+        checks += [
+            (last, "origin", last.origin.M0[2], length, "in the plane z = 0"),
+            (last, "phi", last.phi.M0[2], push, "in the plane"),
+            (last, "psi", last.psi.M0[:2], turn, "in the plane"),
+        ]
+    checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, *tips)]
+    for node, name, values, scale, must in checks:
+        if np.abs(values).max() > SMALL * scale:
+            raise InputError(
+                f"{source}: {name} of node {node.name} deviates by {np.abs(values).max():.3g}; the "
+                f"{'inboard' if node is first else 'outboard'} node must be {must}"
+            )
 
 
-def _check_plane(data: StandardInputData, source: str) -> None:
-    """Check that plane motion stays in the plane."""
+def _check_body(data: StandardInputData, dimension: int, source: str) -> None:
+    """Check what any mechanical body fulfils, and that nothing is left out."""
     inertia = data.inertia(np.zeros(data.num_modes))
-    spatial: Iterable[tuple[str, np.ndarray, np.ndarray]] = (
+    coriolis = data.Ge.M0.reshape(data.num_modes, -1, 3)
+    if dimension == 2:
+        _check_plane(data, inertia, source)
+        moment, coriolis = {"J(3, 3)": inertia[2, 2]}, coriolis[:, :, 2:]
+    else:
+        principal = np.linalg.eigvalsh(inertia)
+        if principal[0] < -SMALL * np.abs(principal).max():  # 0 of a thin bar about its axis
+            raise InputError(
+                f"{source}: J has a moment of {principal[0]:g} kg m2; none can be negative"
+            )
+        moment = {"the largest moment of J": principal[-1]}
+    _check_definite(data, {"mass": data.mass} | moment, source)
+    for name, values in (("ksigma", data.ksigma.M0), ("m1 of Ke", data.Ke.M1)):
+        if values.any():
+            raise InputError(
+                f"{source}: {name} holds initial stresses or a stiffness that is not constant, "
+                "which arms do not have here; write the file without"
+            )
+    if dimension == 3 and data.Oe.order == 0:
+        raise InputError(
+            f"{source}: Oe has no m1, by which deflections feel the rotation of the frame; write "
+            "the file with matrices of order 1"
+        )
+    if np.abs(coriolis + coriolis.swapaxes(0, 1)).max() > 2.0 * SMALL * np.abs(data.Me.M0).max():
+        raise InputError(
+            f"{source}: every third column of Ge must make a skew matrix: a block of three columns "
+            "for each coordinate, not one of all coordinates for each axis"
+        )
+    if dimension == 3:
+        _check_symmetric({"Oe": data.Oe.M1.transpose(2, 0, 1)}, source)
+
+
+def _check_plane(data: StandardInputData, inertia: np.ndarray, source: str) -> None:
+    """Check that plane motion stays in the plane."""
+    for name, values, whole in (
         ("row 3 of mdCM", data.mdCM.M0[2], data.mdCM.M0),
         ("J(1, 3), J(2, 3)", inertia[:2, 2], inertia),
         ("column 3 of Ct", data.Ct.M0[:, 2], data.Ct.M0),
         ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
-    )
-    for name, values, whole in spatial:
+    ):
         if np.abs(values).max() > SMALL * np.abs(whole).max():
             raise InputError(
                 f"{source}: {name} reach(es) {np.abs(values).max():.3g}; an arm must move in the "
@@ -318,21 +464,60 @@ def _check_plane(data: StandardInputData, source: str) -> None:
             )
 
 
-def _geometric_stiffness(data: StandardInputData, last: Node, source: str) -> np.ndarray | None:
-    """Return K0 (7, q, q) of the seven loads in the plane, None if the body is linear."""
-    q = data.num_modes
-    excess = data.Oe.M1[:, :, 2] + data.Me.M0 if data.Oe.order > 0 else np.zeros((q, q))
-    rotation = np.abs(excess).max(initial=0.0) > CENTRIFUGAL * np.abs(data.Me.M0).max(initial=0.0)
-    found = {
-        "m1 of Ct": bool(data.Ct.M1[:, :, :2].any()),
-        "m1 of Oe beyond -Me": bool(rotation),
-        f"m1 of phi of node {last.name}": bool(last.phi.M1[:2].any()),
-    }
-    if not is_stiffened(found, source):
-        return None
-    push = list(data.Ct.M1.transpose(2, 0, 1)[:2])
-    tip = [*last.phi.M1[:2], last.psi.M1[2] if last.psi.order else np.zeros((q, q))]
-    check_symmetric({"Ct": push, f"phi, psi of node {last.name}": tip}, source)
-    turn = data.Cr.M1[:, :, 2] if data.Cr.order else np.zeros((q, q))  # its skew part is G
-    K0 = 0.0 - np.array([*push, turn, 0.0 - excess, *tip])
-    return 0.5 * (K0 + K0.transpose(0, 2, 1))
+def _check_definite(data: StandardInputData, numbers: Mapping[str, float], source: str) -> None:
+    """Check that a mechanical body may have these masses and stiffnesses; `numbers` are > 0."""
+    for name, number in numbers.items():
+        if not number > 0.0:
+            raise InputError(f"{source}: {name} = {number:g} must be > 0")
+    for name, matrix in (("Me", data.Me.M0), ("Ke", data.Ke.M0)):
+        if np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] <= 0.0:
+            raise InputError(
+                f"{source}: {name} must be positive definite; the body must be held at its inboard "
+                "node and its coordinates be independent"
+            )
+
+
+def _is_stiffened(
+    data: StandardInputData, tips: Sequence[Node], dimension: int, source: str
+) -> bool:
+    """Return whether matrices hold geometric stiffness: all or none of them.
+
+    A body that its own inertia stiffens, but no load at its outboard node, or the other way round,
+    is taken for one whose file lacks matrices. In space a stubby link's rotation may do little.
+    """
+    along, _ = _axes(dimension)
+    excess, Me = _centrifugal_excess(data, dimension), data.Me.M0
+    rotation = bool(np.abs(excess).max() > CENTRIFUGAL * np.abs(Me).max())
+    found = {"m1 of Ct": bool(_first_order(data.Ct)[:, :, along].any())}
+    if dimension == 2:
+        found["m1 of Oe beyond -Me"] = rotation
+    for tip in tips:
+        found[f"m1 of phi of node {tip.name}"] = bool(_first_order(tip.phi)[along].any())
+    present = [name for name in found if found[name]]
+    lacking = [name for name in found if not found[name]]
+    if present and lacking:
+        raise InputError(
+            f"{source}: {present[0]} holds geometric stiffening, which {lacking[0]} lacks; write "
+            "the file with that of all accelerations and of the outboard node's forces, or with "
+            "none"
+        )
+    if rotation and not present:
+        raise InputError(
+            f"{source}: columns 1 to 3 of m1 of Oe do not add up to -2 Me: either they hold "
+            "geometric stiffness, which m1 of Ct and phi lack, or nodes have moments of inertia of "
+            "their own, which bodies do not have here"
+        )
+    return bool(present)
+
+
+def _check_symmetric(matrices: Mapping[str, np.ndarray], source: str) -> None:
+    """Check that what one load or rotation does to the coordinates (loads, q, q) is symmetric.
+
+    Relative to the largest under the same name: of a load that does nothing rounding is left.
+    """
+    for name, loads in matrices.items():
+        if np.abs(loads - loads.swapaxes(1, 2)).max() > SMALL * np.abs(loads).max():
+            raise InputError(
+                f"{source}: m1 of {name} must be symmetric in coordinates and rows or columns: "
+                "it is what one load or rotation does to the stiffness"
+            )

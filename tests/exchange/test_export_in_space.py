@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.mbdyn import read_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
-from dolfinopt.multibody.spatial.body_of_sid import load_body
+from dolfinopt.multibody.standard_input import load_body
 
 COMM = MPI.COMM_WORLD
 DEMO = ROOT / "demos" / "spatial_arm.toml"
@@ -45,7 +45,7 @@ def test_files_of_every_link(folder):
         assert "6 coordinates, 2 nodes, geometric stiffness" in told
     for name, length in LENGTHS.items():
         path = out / f"{name}.sid"
-        body, element = load_body(path, length), read_fem(path.with_suffix(".fem"))
+        body, element = load_body(path, 3, length), read_fem(path.with_suffix(".fem"))
         assert sid_text(read_sid_npz(out / f"{name}.sid.npz")) == path.read_text()
         mass = 0.6 * 2700.0 * length * 0.04 * 0.02
         assert body.mass == element.mass == pytest.approx(mass, rel=1e-5)  # void: 1e-6 of solid
@@ -104,10 +104,10 @@ def test_stiffness_of_a_file_cannot_be_left_out(folder):
 @pytest.mark.serial
 def test_a_body_that_does_not_bend_needs_no_file(tmp_path):
     from dolfinopt.exchange.sid import write_sid
-    from dolfinopt.multibody.shape_integrals import rigid_bar
+    from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
     from dolfinopt.multibody.standard_input import to_sid
 
-    write_sid(tmp_path / "bar.sid", to_sid(rigid_bar(0.45, 0.04, 0.9)))
+    write_sid(tmp_path / "bar.sid", to_sid(in_space(rigid_bar(0.45, 0.04, 0.9))))
     scene = meshed()
     scene["arms"][2] = {"name": "link2", "sid": str(tmp_path / "bar.sid")}
     with pytest.raises(InputError, match=r"bar\.sid: nelastq = 0, .* rigid = true, mass"):
@@ -121,10 +121,11 @@ def test_a_body_of_the_plane_is_told(tmp_path):
 
     from dolfinopt.cli.shared import doubts_of_files
     from dolfinopt.exchange.sid import write_sid
+    from dolfinopt.multibody.shape_integrals import in_space
     from dolfinopt.multibody.standard_input import to_sid
     from dolfinopt.scene.load import scene_from_dict
 
-    write_sid(tmp_path / "beam.sid", to_sid(beam().body()))
+    write_sid(tmp_path / "beam.sid", to_sid(in_space(beam().body())))
     scene = meshed()
     scene["arms"][2] = {"name": "link2", "sid": str(tmp_path / "beam.sid")}
     told = doubts_of_files(scene_from_dict(scene))

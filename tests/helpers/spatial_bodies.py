@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, in_space
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
     Joint,
@@ -240,34 +240,6 @@ def derivative(function: Callable[[complex], np.ndarray]) -> np.ndarray:
 # -- plane machines in space -----------------------------------------------------------------
 
 
-def posed(body: ShapeIntegrals) -> ShapeIntegrals:
-    """Return a plane body as a spatial one that turns about z.
-
-    Plane motion feels W_xx + W_yy and W_yx - W_xy alone: each half of them is as good as any.
-    """
-    q = body.num_modes
-    W, K0 = np.zeros((9, 1 + q, 1 + q)), np.zeros((12 if body.is_stiffened else 0, q, q))
-    K0_outboard = np.zeros((6 if body.is_stiffened else 0, q, q))
-    W[0] = W[4] = 0.5 * body.W[0]
-    W[3], W[1] = 0.5 * body.W[1], -0.5 * body.W[1]
-    if body.is_stiffened:
-        K0[:2], K0[3], K0[7] = body.K0[:2], 0.5 * body.K0[3], 0.5 * body.K0[3]
-        K0[6], K0[4] = 0.5 * body.K0[2], -0.5 * body.K0[2]
-        K0_outboard[[0, 1, 5]] = body.K0_outboard
-    outboard = np.zeros((6, q))
-    outboard[[0, 1, 5]] = body.outboard
-    return replace(
-        body,
-        w=np.vstack([body.w, np.zeros((1, 1 + q))]),
-        W=W,
-        outboard=outboard,
-        outboard_point=np.append(body.outboard_point, 0.0),
-        K0=K0,
-        K0_outboard=K0_outboard,
-        further_points=np.zeros((0, 3)),
-    )
-
-
 def posed_machine(plane: Mechanism) -> SpatialMechanism:
     """Return a plane machine in space: a cart on the x axis, joints about z."""
     x, _, z = np.eye(3)
@@ -283,7 +255,7 @@ def posed_machine(plane: Mechanism) -> SpatialMechanism:
         load = plane.carried(k)
         inertia = None if load is None else (0.0, 0.0, load[1], 0.0, 0.0, 0.0)
         carried.append(None if load is None else rigid_spatial_body(load[0], np.zeros(3), inertia))
-    bodies = (cart, *map(posed, plane.bodies))
+    bodies = (cart, *map(in_space, plane.bodies))
     gravity = np.array([*plane.gravity, 0.0])
     return SpatialMechanism(bodies, tuple(joints), tuple(carried), gravity, len(plane.bodies))
 

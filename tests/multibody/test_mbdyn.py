@@ -1,28 +1,32 @@
-"""MBDyn's modal element: format, lumped against consistent inertia; the command `export`."""
+"""MBDyn's modal element: its format, forces by its numbers, lumped nodes; the command `export`."""
 
 import os
 from copy import deepcopy
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tomllib
-from mbdyn_reader import mbdyn_stiffening, read_as_mbdyn_does
+from mbdyn_reader import mbdyn_forces, mbdyn_stiffening, read_as_mbdyn_does
 from mpi4py import MPI
 from runs import TWO_ARM
+from spatial_bodies import spatial_cloud, stiffened
+from standard_input import random_state
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.mbdyn import ModalElement, fem_text, read_fem, write_fem
+from dolfinopt.exchange.mbdyn import Invariants, ModalElement, fem_text, read_fem, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
-from dolfinopt.multibody.shape_integrals import shape_integrals, spatial_moments
+from dolfinopt.multibody.shape_integrals import in_space, plate_moments, shape_integrals
+from dolfinopt.multibody.spatial.kinematics import BodyMotion
+from dolfinopt.multibody.spatial.mechanism import constants_of
 from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
@@ -34,7 +38,7 @@ PLACING = 1e-10
 
 
 def reduced(cells, comm=MPI.COMM_SELF, uneven=False, stiffened=False, element="linear"):
-    """Return the body, its moments and nodes; nodes are None but on the first rank."""
+    """Return the body, the same in space, and its nodes, which are None but on the first rank."""
     mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
     operators = ELEMENTS[element].operators(mesh, THICKNESS, 0.33)
     substructure = Substructure(mesh, operators, Profile())
@@ -45,7 +49,8 @@ def reduced(cells, comm=MPI.COMM_SELF, uneven=False, stiffened=False, element="l
     elastic = substructure.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(4))
     body = shape_integrals(elastic, basis, 2e-4, unit_loads(elastic) if stiffened else None)
-    return body, spatial_moments(elastic, basis, THICKNESS), lumped_nodes(elastic, basis)
+    lifted = in_space(body, plate_moments(elastic, basis, THICKNESS))
+    return body, lifted, lumped_nodes(elastic, basis, THICKNESS)
 
 
 @pytest.fixture(scope="module")
@@ -55,15 +60,7 @@ def parts():
 
 @pytest.fixture(scope="module")
 def element(parts):
-    return modal_element(*parts, THICKNESS)
-
-
-def test_round_trip_is_exact(tmp_path, element):
-    write_fem(tmp_path / "a.fem", element)
-    again = read_fem(tmp_path / "a.fem")
-    for field in fields(ModalElement):
-        ours, theirs = getattr(element, field.name), getattr(again, field.name)
-        assert np.shape(ours) == np.shape(theirs) and np.array_equal(ours, theirs), field.name
+    return modal_element(*parts[1:])
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +70,40 @@ def stiff_parts():
 
 @pytest.fixture(scope="module")
 def stiff_element(stiff_parts):
-    return modal_element(*stiff_parts, THICKNESS)
+    return modal_element(*stiff_parts[1:])
 
 
-def test_round_trip_of_a_stiffened_body_is_exact(tmp_path, stiff_element):
-    test_round_trip_is_exact(tmp_path, stiff_element)
-    assert len(stiff_element.loads) == 7
+@pytest.fixture(scope="module")
+def cloud():
+    """Point masses in space without any symmetry."""
+    return spatial_cloud(np.random.default_rng(1), 4)
+
+
+@pytest.fixture(scope="module")
+def stiff_cloud(cloud):
+    """Their body with geometric stiffness by all 18 loads, but not by the modes' inertia."""
+    body = stiffened(np.random.default_rng(2), cloud.body())
+    return replace(body, along_modes=np.zeros((0, 4, 4)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "loads"),
+    [("plane", []), ("stiff plane", [3, 9, 10, 11, 13, 14, 18]), ("space", range(1, 19))],
+)
+def test_round_trip_is_exact(tmp_path, element, stiff_element, stiff_cloud, kind, loads):
+    space = modal_element(stiff_cloud)
+    written = {"plane": element, "stiff plane": stiff_element, "space": space}[kind]
+    write_fem(tmp_path / "a.fem", written)
+    again = read_fem(tmp_path / "a.fem")
+    assert list(again.loads) == list(loads)
+    pairs = [(written, again, field.name) for field in fields(ModalElement)]
+    if kind == "space":
+        couples = written.invariants, again.invariants
+        pairs = [pair for pair in pairs if pair[2] != "invariants"]
+        pairs += [(*couples, field.name) for field in fields(Invariants)]
+    for one, other, name in pairs:
+        ours, theirs = getattr(one, name), getattr(other, name)
+        assert np.shape(ours) == np.shape(theirs) and np.array_equal(ours, theirs), name
 
 
 def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
@@ -131,6 +156,80 @@ def test_interfaces_are_the_first_nodes(parts, element):
     np.testing.assert_allclose(element.modes[2:][edge, 0], expected, atol=1e-9)
 
 
+# -- bodies in space -------------------------------------------------------------------------
+
+ROUNDING = 1e-12
+
+
+def assert_close(found, expected):
+    assert np.abs(found - expected).max() < ROUNDING * max(1.0, np.abs(expected).max())
+
+
+@pytest.mark.parametrize("stiff", [False, True])
+def test_forces_of_mbdyn(cloud, stiff_cloud, stiff):
+    """MBDyn's equations with the file's numbers: rows of any body, forces of a linear one."""
+    body = stiff_cloud if stiff else cloud.body()
+    groups = read_as_mbdyn_does(fem_text(modal_element(body)))
+    assert sorted(groups) == [1, 2, *range(5, 11), *range(12, 19), *[19] * stiff]
+    s = random_state(np.random.default_rng(6), 4)
+    force, moment, rows = mbdyn_forces(groups, s)
+    frame, rates = ((x[None] for x in part) for part in ((s.a, s.w, s.g), (s.q, s.qd, s.qdd)))
+    expected = BodyMotion(constants_of(body), tuple(frame), tuple(rates))
+    assert_close(rows, expected.rows[0])
+    if not stiff:  # motion of the second order is not in the format
+        assert_close(force, expected.load[0][0])
+        assert_close(moment, expected.load[1][0])
+
+
+def test_mbdyn_stiffens_by_loads_outboard(stiff_cloud):
+    """A load on the interface stiffens as in the package, in which it acts from outside."""
+    groups = read_as_mbdyn_does(fem_text(modal_element(stiff_cloud)))
+    load, still = np.random.default_rng(8).normal(size=(2, 3)), np.zeros(3)
+    found = mbdyn_stiffening(groups, still, still, still, *load)
+    assert_close(found, -np.tensordot(load.ravel(), stiff_cloud.K0_outboard, 1))
+
+
+def test_invariants_are_sums_over_points(cloud):
+    """As MBDyn would make them of lumped masses (modal.cc), were the points its nodes."""
+    m, X, Phi = cloud.masses, cloud.points, np.moveaxis(cloud.modes, 2, 1)  # (n, q, 3)
+    tilde = np.cross(np.eye(3), Phi[..., None, :])  # (n, q, 3, 3), v -> Phi x v
+    place = np.cross(np.eye(3), X[:, None])
+    v = np.array([0.3, -1.0, 2.0])
+    assert_close(tilde[2, 1] @ v, np.cross(Phi[2, 1], v))
+    expected = Invariants(
+        three=np.einsum("n,njc->cj", m, Phi),
+        four=np.einsum("n,njc->cj", m, np.cross(X[:, None], Phi)),
+        five=np.einsum("n,njkc->cjk", m, np.cross(Phi[:, :, None], Phi[:, None])),
+        eight=-np.einsum("n,nab,njbc->acj", m, place, tilde),
+        nine=np.einsum("n,njab,nkbc->acjk", m, tilde, tilde),
+    )
+    element = modal_element(cloud.body())
+    for field in fields(Invariants):
+        assert_close(getattr(element.invariants, field.name), getattr(expected, field.name))
+    centre = m @ X / m.sum()
+    assert_close(element.centre, centre)
+    away = X - centre
+    inertia = np.einsum("n,nij->ij", m, [(x @ x) * np.eye(3) - np.outer(x, x) for x in away])
+    assert_close(element.inertia, inertia)
+
+
+@pytest.mark.parametrize("stiff", [False, True])
+def test_several_interfaces(stiff):
+    """A node each, behind the inboard joint; loads on all of them stiffen."""
+    rng = np.random.default_rng(9)
+    body = spatial_cloud(rng, 4, interfaces=2).body()
+    body = stiffened(rng, body) if stiff else body
+    element = modal_element(body)
+    assert element.labels == ("1", "2", "3")
+    assert np.array_equal(element.points, [np.zeros(3), *body.points])
+    assert np.array_equal(np.concatenate(element.modes[1:]), body.outboard)
+    assert list(element.loads) == list(range(1, 25 if stiff else 1))
+    assert np.array_equal(element.stiffening[12:], body.K0_outboard)
+
+
+# -- lumped nodes of the plane -----------------------------------------------------------------
+
+
 def invariants(element):
     """Return what MBDyn makes of the lumped masses (its technical manual's invariants)."""
     m, p, phi = element.lumped[:, 0], element.points, element.modes[:, :3]
@@ -150,9 +249,9 @@ def invariants(element):
 @pytest.mark.parametrize("name", [*ELEMENTS])
 def test_first_moments_are_exact(name):
     """Row sums keep what is linear in the shape functions: mass, centre of mass, int Phi."""
-    body, moments, nodes = reduced((8, 3), uneven=True, element=name)
+    body, lifted, nodes = reduced((8, 3), uneven=True, element=name)
     assert len(nodes.points) == (17 * 7 if name == "quadratic" else 9 * 4)
-    found = invariants(modal_element(body, moments, nodes, THICKNESS))
+    found = invariants(modal_element(lifted, nodes))
     size = body.mass * LENGTH
     assert found["mass"] == pytest.approx(body.mass, rel=PLACING)
     np.testing.assert_allclose(found["moment"], [*body.moment, 0.0], atol=PLACING * size)
@@ -163,8 +262,8 @@ def test_second_moments_converge():
     """What is quadratic in them is right to the square of the cells' size."""
     errors = []
     for n in (1, 2, 4):
-        body, moments, nodes = reduced((8 * n, 2 * n))
-        found = invariants(modal_element(body, moments, nodes, THICKNESS))
+        body, lifted, nodes = reduced((8 * n, 2 * n))
+        found = invariants(modal_element(lifted, nodes))
         errors.append(
             [
                 abs(found["J"][2, 2] / body.inertia - 1.0),
@@ -181,8 +280,8 @@ def test_second_moments_converge():
 
 def test_global_inertia_of_a_uniform_plate():
     """Group 12 is the consistent one: of a cuboid, about its centre."""
-    body, moments, nodes = reduced((4, 2))
-    element = modal_element(body, moments, nodes, THICKNESS)
+    _, lifted, nodes = reduced((4, 2))
+    element = modal_element(lifted, nodes)
     mass, (a, b, c) = 2700.0 * LENGTH * HEIGHT * THICKNESS, (LENGTH, HEIGHT, THICKNESS)
     expected = mass / 12.0 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
     assert element.mass == pytest.approx(mass, rel=PLACING)
@@ -242,6 +341,17 @@ def test_damaged_stiffening(tmp_path, stiff_element, old, new, words):
     test_damaged_file(tmp_path, stiff_element, old, new, words)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("GROUP 16,", "16,", ["record group 16, INVARIANT 8, is missing"]),
+        ("GROUP 18,", "GROUP 11,", ["11 and 14 to 18 exclude each other", "remove one of them"]),
+    ],
+)
+def test_damaged_invariants(tmp_path, cloud, old, new, words):
+    test_damaged_file(tmp_path, modal_element(cloud.body()), old, new, words)
+
+
 def test_no_file(tmp_path):
     with pytest.raises(InputError, match=r"none\.fem: cannot be read"):
         read_fem(tmp_path / "none.fem")
@@ -264,7 +374,7 @@ def test_export_writes_every_arm(shared_tmp_path):
     assert set(os.listdir(shared_tmp_path / "out")) == names
     for arm, length in (("arm1", 1.0), ("arm2", 0.8)):
         path = shared_tmp_path / "out" / f"{arm}.sid"
-        body = load_body(path, length=length)
+        body = load_body(path, 2, length)
         assert body.num_modes == 4
         # Half solid 0.06 m x 0.01 m of aluminium, and void of 1e-6 of it.
         expected = 2700.0 * length * 0.06 * 0.01 * (0.5 + 0.5e-6)
@@ -289,7 +399,7 @@ def test_export_with_geometric_stiffness(shared_tmp_path, stiffening, duration, 
     export(shared_tmp_path / "out", *fast)
     for arm in ("arm1", "arm2"):
         path = shared_tmp_path / "out" / f"{arm}.sid"
-        assert load_body(path).is_stiffened == on
+        assert load_body(path, 2).is_stiffened == on
         assert len(read_fem(path.with_suffix(".fem")).loads) == 7 * on
 
 
@@ -342,7 +452,7 @@ def test_export_of_a_design(shared_tmp_path):
         np.savez(shared_tmp_path / "d.npz", **arrays, **{f"{arm}/density": density for arm in arms})
     COMM.barrier()
     export(shared_tmp_path / "out", "--design", shared_tmp_path / "d.npz", *shared)
-    bodies = [load_body(shared_tmp_path / "out" / f"{arm}.sid") for arm in ("arm1", "arm2")]
+    bodies = [load_body(shared_tmp_path / "out" / f"{arm}.sid", 2) for arm in ("arm1", "arm2")]
     # x = 0.2 weighs a fifth: the two-material law's mass is linear.
     assert bodies[0].mass == pytest.approx(2700.0 * 0.06 * 0.01 * 0.6, rel=1e-5)
     assert bodies[0].moment[0] / bodies[0].mass == pytest.approx((0.125 + 0.075) / 0.6, rel=1e-5)

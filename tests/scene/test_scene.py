@@ -1485,10 +1485,10 @@ def test_limits_of_the_motion_need_what_its_gradient_needs():
 
 def test_length_of_a_body_from_a_file(tmp_path):
     from dolfinopt.exchange.sid import write_sid
-    from dolfinopt.multibody.shape_integrals import rigid_bar
+    from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
     from dolfinopt.multibody.standard_input import to_sid
 
-    write_sid(tmp_path / "bar.sid", to_sid(rigid_bar(0.8, 0.05, 1.08)))
+    write_sid(tmp_path / "bar.sid", to_sid(in_space(rigid_bar(0.8, 0.05, 1.08))))
     data = minimal()
     data["arms"][1]["sid"] = "bar.sid"
     scene = scene_from_dict(data, str(tmp_path / "scene.toml"))

@@ -1,0 +1,574 @@
+"""Wallrapp's standard input data (SID) of one flexible body, and the text file that carries it.
+
+The file is the one of FEMBS, SIMPACK, MatMorembs, Neweul-M2 and DLR's FlexibleBodies (.SID_FEM):
+
+    part
+      new modal =
+        refmod ... end refmod                     mass, number and names of the coordinates
+        frame new node = 1 ... end node end frame origin, phi, psi, AP (and sigma) of the nodes
+        mdCM, J, Ct, Cr, Me, Gr, Ge, Oe, ksigma, Ke, De
+      end modal
+    end part
+
+Every matrix is a Taylor expansion in the elastic coordinates q, of order 0 or 1: entries
+`m0( row, col)` and `m1( row, coordinate, col)`, counted from one; those left out are zero. With
+frame acceleration a, angular velocity w and acceleration g, all in the body frame, the inertia
+force, moment about the origin and elastic rows are
+
+    F = m a + g x s + w x (w x s) + 2 w x (Ct' qd) + Ct' qdd,  s = mdCM(q)
+    T = s x a + J(q) g + w x (J(q) w) + sum_k qd_k Gr_k(q) w + Cr(q)' qdd
+    f = Ct a + Cr(q) g + sum_k qd_k Ge_k w + Oe(q) [w1^2 w2^2 w3^2 w1w2 w2w3 w1w3]' + Me qdd
+
+where Gr_k and Ge_k are the k-th blocks of three columns.
+Source: Wallrapp, Standardization of flexible body modeling in multibody system codes (1994),
+doi:10.1080/08905459408905214; Schwertassek & Wallrapp, Dynamik flexibler Mehrkörpersysteme
+(1999).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from dolfinopt.disk import write_arrays, write_text
+from dolfinopt.errors import InputError
+
+T = TypeVar("T")
+MOST = 500  # coordinates: every matrix is kept with its derivative by all of them
+
+_END = re.compile(r"end\s+(?:of\s+)?(\w+)\s*$", re.IGNORECASE)
+_ITEM = re.compile(
+    r"(?:begin\s+of\s+|new\s+)?([a-z]\w*)\s*(?:\(([^()]*)\))?\s*(?:=(.*))?$", re.IGNORECASE
+)
+
+
+# What a matrix looks like: readers may skip its entries where they follow from this.
+ZERO, DIAGONAL, SYMMETRIC, GENERAL, UNIT = range(5)
+
+
+@dataclass(frozen=True, eq=False)
+class Taylor:
+    """A matrix M(q) = M0 + sum_k q_k M1[:, k, :].
+
+    Attributes:
+        M0: (nrow, ncol).
+        M1: (nrow, nq, ncol), zero for order 0; files of order 0 may have nq = 0.
+        order: 0 or 1.
+        structure: of M0: 0 zero, 1 diagonal, 2 symmetric, 3 general, 4 unit matrix.
+        nqn: dimension of higher orders, which are not read; zero.
+    """
+
+    M0: np.ndarray
+    M1: np.ndarray
+    order: int
+    structure: int
+    nqn: int = 0
+
+    def at(self, q: np.ndarray) -> np.ndarray:
+        """Return M(q) (nrow, ncol)."""
+        if self.order == 0:
+            return self.M0
+        return self.M0 + np.einsum("rkc,k->rc", self.M1, q)
+
+
+def taylor(M0: np.ndarray, M1: np.ndarray | None = None, *, nq: int, structure: int) -> Taylor:
+    """Return the expansion of order 0, or of order 1 where M1 (nrow, nq, ncol) is given.
+
+    A structure that M0 does not have is replaced: one that is zero is called so.
+    """
+    if not M0.any():
+        structure = ZERO
+    higher = np.zeros((M0.shape[0], nq, M0.shape[1])) if M1 is None else M1
+    return Taylor(M0, higher, 0 if M1 is None else 1, structure)
+
+
+def structure_of(matrix: np.ndarray) -> int:
+    """Return whether a square matrix is diagonal, symmetric or neither."""
+    if np.array_equal(matrix, np.diag(np.diag(matrix))):
+        return DIAGONAL
+    return SYMMETRIC if np.array_equal(matrix, matrix.T) else GENERAL
+
+
+@dataclass(frozen=True)
+class Node:
+    """A point of the body where something may be attached.
+
+    Attributes:
+        name: number or name.
+        rframe: name of the frame its data refer to.
+        origin: (3, 1) position, m; its M1 repeats phi.
+        phi: (3, nq) translation by each coordinate.
+        psi: (3, nq) small rotation by each coordinate.
+        AP: (3, 3) orientation, from the node's to the body's frame; M1 = tilde(psi_k).
+        sigma: (6, 1) initial stresses, or None.
+    """
+
+    name: str
+    rframe: str
+    origin: Taylor
+    phi: Taylor
+    psi: Taylor
+    AP: Taylor
+    sigma: Taylor | None = None
+
+
+@dataclass(frozen=True)
+class StandardInputData:
+    """One flexible body; integrals over its mass, r the reference position, Phi the modes.
+
+    Attributes:
+        mass: m, kg.
+        names: (nq,) of the elastic coordinates.
+        nodes: where something may be attached.
+        mdCM: (3, 1) int r, kg m.
+        J: (6, 1) moments xx, yy, zz, xy, xz, yz of the inertia tensor, or (3, 3); kg m2.
+        Ct: (nq, 3) int Phi'.
+        Cr: (nq, 3) int (r x Phi_k)'.
+        Me: (nq, nq) int Phi' Phi.
+        Gr: (3, 3 nq) blocks -2 int tilde(r) tilde(Phi_k).
+        Ge: (nq, 3 nq) block l has rows 2 int (Phi_l x Phi_k)'.
+        Oe: (nq, 6) int of what w1^2, w2^2, w3^2, w1 w2, w2 w3, w1 w3 do to each coordinate.
+        ksigma: (nq, 1) generalised forces of initial stresses.
+        Ke, De: (nq, nq) stiffness and damping.
+        comment: of the file's first line.
+    """
+
+    mass: float
+    names: tuple[str, ...]
+    nodes: tuple[Node, ...]
+    mdCM: Taylor
+    J: Taylor
+    Ct: Taylor
+    Cr: Taylor
+    Me: Taylor
+    Gr: Taylor
+    Ge: Taylor
+    Oe: Taylor
+    ksigma: Taylor
+    Ke: Taylor
+    De: Taylor
+    comment: str = ""
+
+    @property
+    def num_modes(self) -> int:
+        """Number nq of elastic coordinates."""
+        return len(self.names)
+
+    def inertia(self, q: np.ndarray) -> np.ndarray:
+        """Return the inertia tensor J(q) (3, 3) to first order in q, whichever way it is stored."""
+        J = self.J.at(q)
+        if J.shape == (3, 3):
+            return J
+        xx, yy, zz, xy, xz, yz = J[:, 0]
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+# Allowed shapes in the file's order: numbers, or multiples of nq.
+Shapes = tuple[tuple[int | str, int | str], ...]
+BODY: dict[str, Shapes] = {
+    "mdCM": ((3, 1),),
+    "J": ((6, 1), (3, 3)),
+    "Ct": (("nq", 3),),
+    "Cr": (("nq", 3),),
+    "Me": (("nq", "nq"),),
+    "Gr": ((3, "3nq"),),
+    "Ge": (("nq", "3nq"),),
+    "Oe": (("nq", 6),),
+    "ksigma": (("nq", 1),),
+    "Ke": (("nq", "nq"),),
+    "De": (("nq", "nq"),),
+}
+NODE: dict[str, Shapes] = {
+    "origin": ((3, 1),),
+    "phi": ((3, "nq"),),
+    "psi": ((3, "nq"),),
+    "AP": ((3, 3),),
+    "sigma": ((6, 1),),
+}
+HEADER = ("order", "nrow", "ncol", "nq", "nqn", "structure")
+
+
+# -- named arrays, and the .npz file of them ---------------------------------------------------
+
+
+def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
+    """Return the data as named arrays, for an .npz file.
+
+    `mass`, `names`, `comment`, `node_names`, `node_rframes`; of every matrix `Ct/M0` (nrow, ncol),
+    `Ct/M1` (nrow, nq, ncol), `Ct/order`, `Ct/structure`, `Ct/nqn`; of a node's `node1/phi/M0`.
+    """
+    arrays = {
+        "mass": np.array(data.mass),
+        "names": np.array(data.names, dtype=str),
+        "comment": np.array(data.comment, dtype=str),
+        "node_names": np.array([node.name for node in data.nodes], dtype=str),
+        "node_rframes": np.array([node.rframe for node in data.nodes], dtype=str),
+    }
+    matrices = {name: getattr(data, name) for name in BODY}
+    for k, node in enumerate(data.nodes, 1):
+        matrices.update({f"node{k}/{name}": getattr(node, name) for name in NODE})
+    for name, matrix in matrices.items():
+        if matrix is not None:
+            for field in fields(Taylor):
+                arrays[f"{name}/{field.name}"] = np.asarray(getattr(matrix, field.name))
+    return arrays
+
+
+def write_sid_npz(path: Path, data: StandardInputData) -> None:
+    """Write `sid_arrays` to a file."""
+    write_arrays(path, sid_arrays(data))
+
+
+def read_sid_npz(path: Path) -> StandardInputData:
+    """Read what `write_sid_npz` wrote.
+
+    Raises:
+        InputError: the file cannot be read, or an array is missing.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+        return _from_arrays(arrays)
+    except KeyError as error:
+        raise InputError(f"{path}: the array {error.args[0]!r} is missing") from None
+    except Exception as error:  # whatever a foreign file may raise
+        problem = getattr(error, "strerror", None) or type(error).__name__
+        raise InputError(f"{path}: cannot be read ({problem}); give an .sid.npz file") from None
+
+
+def _from_arrays(arrays: Mapping[str, np.ndarray]) -> StandardInputData:
+    def matrix(name: str) -> Taylor:
+        M0, M1, *numbers = (arrays[f"{name}/{field.name}"] for field in fields(Taylor))
+        return Taylor(M0, M1, *map(int, numbers))
+
+    nodes = []
+    pairs = zip(arrays["node_names"], arrays["node_rframes"], strict=True)
+    for k, (name, rframe) in enumerate(pairs, 1):
+        parts = {key: matrix(f"node{k}/{key}") for key in NODE if key != "sigma"}
+        if f"node{k}/sigma/M0" in arrays:
+            parts["sigma"] = matrix(f"node{k}/sigma")
+        nodes.append(Node(str(name), str(rframe), **parts))
+    return StandardInputData(
+        mass=float(arrays["mass"]),
+        names=tuple(map(str, arrays["names"])),
+        nodes=tuple(nodes),
+        comment=str(arrays["comment"]),
+        **{name: matrix(name) for name in BODY},
+    )
+
+
+# -- writing the text file ---------------------------------------------------------------------
+
+
+def write_sid(path: Path, data: StandardInputData) -> None:
+    """Write the text file; `read_sid` gets the same bits back."""
+    write_text(path, sid_text(data))
+
+
+def sid_text(data: StandardInputData) -> str:
+    """Return the content of the text file, numbers with 17 digits and Fortran's exponent."""
+    nq = data.num_modes
+    comment = " ".join(data.comment.split())
+    lines = [
+        f"{len(data.nodes):5d}{nq:5d}    :No. nodes, No. modes:{comment}",
+        " part",
+        _entry(6, "new modal", ""),
+        " " * 11 + "refmod",
+        _entry(16, "mass", _number(data.mass)),
+        _entry(16, "nelastq", f"{nq:5d}"),
+    ]
+    for k, name in enumerate(data.names, 1):
+        lines.append(_entry(16, f"ielastq ({k:4d})", name))
+    lines += [" " * 11 + "end refmod", " " * 11 + "frame"]
+    for node in data.nodes:
+        lines.append(_entry(16, "new node", f"{node.name:>8}"))
+        lines.append(_entry(21, "rframe", node.rframe))
+        for name in NODE:
+            matrix = getattr(node, name)
+            if matrix is not None:
+                lines += _matrix_lines(21, name, matrix)
+        lines.append(" " * 16 + "end node")
+    lines.append(" " * 11 + "end frame")
+    for name in BODY:
+        lines += _matrix_lines(11, name, getattr(data, name))
+    lines += [" " * 6 + "end modal", " end part"]
+    return "\n".join(lines) + "\n"
+
+
+def _entry(indent: int, key: str, value: str) -> str:
+    return f"{' ' * indent + key:<48}= {value}".rstrip()
+
+
+def _number(value: float) -> str:
+    return f"{value: .16E}".replace("E", "D")
+
+
+def _matrix_lines(indent: int, name: str, matrix: Taylor) -> list[str]:
+    """Write what a reader would not guess from a missing entry."""
+    (nrow, ncol), nq, structure = matrix.M0.shape, matrix.M1.shape[1], matrix.structure
+    entries = _filled(matrix.M0)
+    if structure == SYMMETRIC and nrow == ncol:
+        entries |= entries.T  # a half left out would be taken from the other
+    if structure == UNIT and np.array_equal(matrix.M0, np.eye(nrow, ncol)):
+        entries[:] = False
+    elif structure in (ZERO, UNIT):
+        structure = GENERAL if entries.any() else ZERO
+    header = (matrix.order, nrow, ncol, nq, matrix.nqn, structure)
+    lines = [" " * indent + name]
+    lines += [_entry(26, key, f"{value:4d}") for key, value in zip(HEADER, header, strict=True)]
+    for row, col in np.argwhere(entries):
+        lines.append(_entry(26, f"m0( {row + 1}, {col + 1})", _number(matrix.M0[row, col])))
+    for row, k, col in np.argwhere(_filled(matrix.M1)) if matrix.order else ():
+        value = _number(matrix.M1[row, k, col])
+        lines.append(_entry(26, f"m1( {row + 1}, {k + 1}, {col + 1})", value))
+    return [*lines, " " * indent + f"end {name}"]
+
+
+def _filled(values: np.ndarray) -> np.ndarray:
+    """Return True for everything but +0, which is what a missing entry means."""
+    return (values != 0.0) | np.signbit(values)
+
+
+# -- reading it --------------------------------------------------------------------------------
+
+
+def read_sid(path: Path) -> StandardInputData:
+    """Read the text file.
+
+    Spacing and case do not matter, blocks may come in any order, zeros may be left out, as well
+    as the half of a symmetric and the entries of a unit matrix; `begin of x` and `end of x` are
+    as good as `x` and `end x`.
+
+    Raises:
+        InputError: one line with the file, the line, what was found and what was expected.
+    """
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); name an SID file") from None
+    return _Reader(path, text).part()
+
+
+class _Reader:
+    """A file's lines, one looked at at a time."""
+
+    def __init__(self, path: Path, text: str):
+        self.path = path
+        self.lines = text.splitlines()
+        self.number = 0  # of the line looked at, from one
+        self.text = ""
+        self.end: str | None = None  # the block that ends here
+        self.name = ""  # of the item that stands here, in lower case
+        self.indices: str | None = None
+        self.value: str | None = None
+
+    def fail(self, expected: str) -> InputError:
+        shown = self.text if len(self.text) <= 60 else self.text[:57] + "..."
+        return InputError(f"{self.path}, line {self.number}: found {shown!r}, expected {expected}")
+
+    def next(self, expected: str) -> None:
+        """Go to the next line that is not empty."""
+        while self.number < len(self.lines):
+            self.text = self.lines[self.number].strip()
+            self.number += 1
+            if not self.text:
+                continue
+            end, item = _END.match(self.text), _ITEM.match(self.text)
+            self.end = end[1].lower() if end else None
+            self.name, self.indices, self.value = "", None, None
+            if item and not end:
+                self.name, self.indices = item[1].lower(), item[2]
+                self.value = None if item[3] is None else item[3].strip()
+            return
+        raise InputError(f"{self.path}, line {len(self.lines)}: the file ends, expected {expected}")
+
+    def block(self, name: str, items: Mapping[str, Callable[[], None]]) -> None:
+        """Read the items of a block up to its end."""
+        choices = ", ".join(map(repr, [*items, f"end {name}"]))
+        known = {key.lower(): read for key, read in items.items()}
+        while True:
+            self.next(choices)
+            if self.end == name.lower():
+                return
+            if self.name not in known:
+                raise self.fail(choices)
+            known[self.name]()
+
+    def real(self) -> float:
+        value = (self.value or "").lower().replace("d", "e")
+        value = re.sub(r"(?<=[\d.])([+-]\d{3})$", r"e\1", value)  # Fortran prints 1.0-100
+        try:
+            number = float(value)
+        except ValueError:
+            raise self.fail("= and a number") from None
+        if not np.isfinite(number) or "_" in value:
+            raise self.fail("= and a finite number")
+        return number
+
+    def integer(self, low: int, high: int) -> int:
+        value = self.value or ""
+        if not re.fullmatch(r"[+-]?\d+", value) or not low <= int(value) <= high:
+            raise self.fail(f"= and an integer from {low} to {high}")
+        return int(value)
+
+    def place(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the indices in parentheses, counted from zero."""
+        allowed = ", ".join(f"1..{n}" for n in shape)
+        parts = (self.indices or "").split(",")
+        if not all(re.fullmatch(r"\s*\d+\s*", part) for part in parts):
+            raise self.fail(f"indices ({allowed})")
+        index = tuple(int(part) - 1 for part in parts)
+        if len(index) != len(shape) or not all(0 <= i < n for i, n in zip(index, shape)):
+            raise self.fail(f"indices ({allowed})")
+        return index
+
+    def once(self, found: dict[str, T], name: str, read: Callable[[], T]) -> Callable[[], None]:
+        """Return what reads an item that may stand only once."""
+
+        def item() -> None:
+            if name in found:
+                raise self.fail(f"{name!r} only once")
+            found[name] = read()
+
+        return item
+
+    def complete(self, found: Mapping[str, Any], names: Iterable[str], told: str) -> None:
+        for name in names:
+            if name not in found:
+                raise self.fail(f"{name!r} {told}")
+
+    def part(self) -> StandardInputData:
+        """Read the whole file: a comment, then the part."""
+        while self.name != "part" or self.value is not None:
+            self.next("'part'")
+        comment = self.lines[0].split("modes:", 1)[-1].strip() if self.number > 1 else ""
+        found: dict[str, StandardInputData] = {}
+        self.block("part", {"modal": self.once(found, "modal", self.modal)})
+        if not found:
+            raise self.fail("'new modal' before")
+        return replace(found["modal"], comment=comment)
+
+    def modal(self) -> StandardInputData:
+        head: dict[str, tuple[float, tuple[str, ...]]] = {}
+        nodes: dict[str, Node] = {}
+        matrices: dict[str, Any] = {}
+
+        def number() -> int:
+            if not head:
+                raise self.fail("'refmod' first, which has the number of coordinates")
+            return len(head["refmod"][1])
+
+        def matrix(name: str) -> Callable[[], None]:
+            return self.once(matrices, name, lambda: self.taylor(name, number()))
+
+        items = {"refmod": self.once(head, "refmod", self.refmod)}
+        items["frame"] = lambda: self.frame(nodes, number())
+        items |= {name: matrix(name) for name in BODY}
+        self.block("modal", items)
+        self.complete(head | matrices, ("refmod", *BODY), "before")
+        return StandardInputData(*head["refmod"], tuple(nodes.values()), **matrices)
+
+    def refmod(self) -> tuple[float, tuple[str, ...]]:
+        """Return the mass and the names of the coordinates."""
+        mass: dict[str, float] = {}
+        count: dict[str, int] = {}
+        names: dict[int, str] = {}
+
+        def name() -> None:
+            if not count:
+                raise self.fail("'nelastq' before the names")
+            (k,) = self.place((count["nelastq"],))
+            names[k] = self.value or ""
+
+        items = {
+            "mass": self.once(mass, "mass", self.real),
+            "nelastq": self.once(count, "nelastq", partial(self.integer, 0, MOST)),
+            "ielastq": name,
+        }
+        self.block("refmod", items)
+        self.complete(mass | count, ("mass", "nelastq"), "before")
+        return mass["mass"], tuple(names.get(k, "") for k in range(count["nelastq"]))
+
+    def frame(self, nodes: dict[str, Node], nq: int) -> None:
+        """Add the nodes of one frame block."""
+
+        def node() -> None:
+            name = self.value or ""
+            if not name or name in nodes:
+                raise self.fail("'new node =' and a name of its own")
+            nodes[name] = self.node(name, nq)
+
+        self.block("frame", {"node": node})
+
+    def node(self, name: str, nq: int) -> Node:
+        rframe = [""]
+        found: dict[str, Taylor] = {}
+        items: dict[str, Callable[[], None]] = {"rframe": lambda: rframe.append(self.value or "")}
+        items |= {key: self.once(found, key, partial(self.taylor, key, nq)) for key in NODE}
+        self.block("node", items)
+        self.complete(found, (key for key in NODE if key != "sigma"), f"of node {name} before")
+        return Node(name, rframe[-1], **found)
+
+    def taylor(self, name: str, nq: int) -> Taylor:
+        """Read one matrix."""
+        header: dict[str, int] = {}
+        entries: dict[str, dict[tuple[int, ...], float]] = {"m0": {}, "m1": {}}
+
+        def put() -> None:
+            self.complete(header, HEADER, "before the entries")
+            known = entries[self.name]
+            keys = ("nrow", "ncol") if self.name == "m0" else ("nrow", "nq", "ncol")
+            index = self.place(tuple(header[key] for key in keys))
+            if index in known:
+                raise self.fail("every entry only once")
+            known[index] = self.real()
+
+        limits = {"order": 1, "nqn": 0, "structure": UNIT}
+        items = {
+            key: self.once(header, key, partial(self.integer, 0, limits.get(key, 10_000_000)))
+            for key in HEADER
+        }
+        self.block(name, items | {"m0": put, "m1": put})
+        self.complete(header, HEADER, f"of {name} before")
+        return self.assembled(name, nq, header, entries)
+
+    def assembled(
+        self,
+        name: str,
+        nq: int,
+        header: Mapping[str, int],
+        entries: Mapping[str, Mapping[tuple[int, ...], float]],
+    ) -> Taylor:
+        """Check the dimensions and fill the matrices."""
+        size = {"nq": nq, "3nq": 3 * nq}
+        allowed = [
+            tuple(size[n] if isinstance(n, str) else n for n in shape)
+            for shape in (BODY | NODE)[name]
+        ]
+        shape = (header["nrow"], header["ncol"])
+        if shape not in allowed:
+            choices = " or ".join(f"{rows} x {cols}" for rows, cols in allowed)
+            raise self.fail(f"{name} of {choices}, not {shape[0]} x {shape[1]}, for nelastq = {nq}")
+        order, structure = header["order"], header["structure"]
+        if header["nq"] != nq and (order > 0 or header["nq"] != 0):
+            raise self.fail(f"nq = {nq} of {name}, not {header['nq']}")
+        first, second = entries["m0"], entries["m1"]
+        if second and order == 0:
+            raise self.fail(f"no m1 in {name}, which is of order 0")
+        if first and structure == ZERO:
+            raise self.fail(f"no m0 in {name}, whose structure 0 says zero")
+        M0 = np.eye(*shape) if structure == UNIT and not first else np.zeros(shape)
+        M1 = np.zeros((shape[0], header["nq"], shape[1]))
+        for (row, col), value in first.items():
+            M0[row, col] = value
+            if structure == SYMMETRIC and shape[0] == shape[1] and (col, row) not in first:
+                M0[col, row] = value
+        for index, value in second.items():
+            M1[index] = value
+        return Taylor(M0, M1, order, structure, header["nqn"])
