@@ -26,7 +26,8 @@ from dolfinopt.multibody.mechanism import (
 from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
-from dolfinopt.scene.load import Arm, Scene, stamp
+from dolfinopt.scene.duration import stamp
+from dolfinopt.scene.load import Arm, Scene
 
 MAX_ROWS = 50  # of a table of forces whose rows begin steps; more are fine as a curve
 SAME_TIME = 1e-6  # share of the horizon within which two instants are one

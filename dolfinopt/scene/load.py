@@ -16,15 +16,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, get_origin
 
-import numpy as np
 from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.disk import check_regular
 from dolfinopt.errors import InputError
-from dolfinopt.paths.tables import TIME, column_names, last_instant, read_table
-from dolfinopt.paths.time_laws import Law as TimeLaw
-from dolfinopt.paths.time_laws import Limits, law_for
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.messages import (
     Override,
@@ -576,6 +572,8 @@ def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> 
     asked = ("file", "max_speed", "max_acceleration", "max_jerk")
     derived: list[tuple[str, str]] = []
     if any(motion.get(key) is not None for key in asked):
+        from dolfinopt.scene.duration import SAME_TIME, least_duration  # NumPy, only needed here
+
         rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
         try:
             least, limited = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
@@ -637,95 +635,3 @@ def _freeze_loads(tree: dict[str, Any]) -> Keys:
         return ()
     tree["objective"] = {**objective, "gradient": "esl"}
     return (("objective", "gradient"),)
-
-
-# -- how long the scene's motion takes: as stated, by its table, or by limits of speed -----------
-
-POINT = ("x", "y")  # columns of a table of points
-SPACE_POINT = ("x", "y", "z")
-SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
-
-
-def time_law(motion: Motion) -> TimeLaw:
-    """Return the law by which the scene runs along its path.
-
-    Raises:
-        InputError: the table cannot be used, or the limits need more time than there is.
-    """
-    length = path_length(motion) if limits_of(motion).any else 1.0
-    law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
-    if motion.duration < law.least * (1.0 - SAME_TIME):
-        raise InputError(f"motion.duration = {motion.duration:g}: {too_short(law)}")
-    return law
-
-
-known_law = lru_cache(maxsize=64)(law_for)
-
-
-def limits_of(motion: Motion) -> Limits:
-    """Return the scene's limits along the path."""
-    values = (motion.max_speed, motion.max_acceleration, motion.max_jerk)
-    return Limits(*(np.inf if value is None else value for value in values))
-
-
-def too_short(law: TimeLaw) -> str:
-    """Return what is wrong with a duration that the limits do not allow."""
-    return (
-        f"expected at least {law.least:.6g} [s], which motion.max_speed, max_acceleration and "
-        "max_jerk need; leave it out, or raise the limits"
-    )
-
-
-def least_duration(motion: Motion) -> tuple[float | None, bool]:
-    """Return the duration that a table's last row or else the limits ask for, s, if any does.
-
-    Returns:
-        The duration, s, or None; whether the limits ask for it.
-
-    Raises:
-        InputError: the table cannot be read.
-    """
-    if motion.path in ("points", "joints"):
-        last = last_instant(motion.file or "")
-        if last is not None:
-            return last, False
-    limits = limits_of(motion)
-    if not limits.any:
-        return None, False
-    return known_law(motion.law, path_length(motion), limits, motion.acceleration_share).least, True
-
-
-def path_length(motion: Motion) -> float:
-    """Return the length that the limits refer to, m: of the semicircle, the line, the chords."""
-    if motion.path == "arc":
-        return np.pi * motion.radius
-    if motion.path == "line":
-        way = np.subtract(motion.end, motion.start)
-        return float(np.hypot(*way) if len(way) == 2 else np.linalg.norm(way))
-    assert motion.file is not None
-    return _chords(motion.file, file_stamp(motion))
-
-
-@lru_cache(maxsize=64)
-def _chords(file: str, stamp: int) -> float:
-    """Return the length of the straight lines through a table of points, m."""
-    names = [name for name in column_names(file) if name != TIME]
-    if "z" not in names:
-        rows = read_table(file, POINT).rows
-    else:
-        known = names if {*SPACE_POINT} <= {*names} else SPACE_POINT  # or told what is missing
-        rows = read_table(file, known).rows[:, [known.index(name) for name in SPACE_POINT]]
-    return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
-
-
-def file_stamp(motion: Motion) -> int:
-    """Return when the scene's table was last written: a changed one is read anew."""
-    return stamp(motion.file or "")
-
-
-def stamp(file: str) -> int:
-    """Return when a file was last written, ns; 0 where there is none."""
-    try:
-        return os.stat(file).st_mtime_ns
-    except (OSError, ValueError):
-        return 0

@@ -25,7 +25,8 @@ from dolfinopt.multibody.spatial.mechanism import (
     transposed_times,
 )
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
-from dolfinopt.scene.load import SPACE_POINT, Scene, file_stamp
+from dolfinopt.scene.duration import SPACE_POINT, file_stamp
+from dolfinopt.scene.load import Scene
 
 
 class _Chain:
