@@ -26,8 +26,16 @@ from dolfinopt.paths.tables import (
     read_table,
 )
 from dolfinopt.paths.time_laws import Law, Limits
-from dolfinopt.scene.duration import POINT, SAME_TIME, file_stamp, limits_of, time_law, too_short
-from dolfinopt.scene.load import Motion, Scene, known_law
+from dolfinopt.scene.duration import (
+    POINT,
+    SAME_TIME,
+    file_stamp,
+    known_law,
+    limits_of,
+    time_law,
+    too_short,
+)
+from dolfinopt.scene.load import Motion, Scene
 
 # Nearer to a singular position than this share of the largest arm, joint speeds lose their
 # digits: accelerations grow with the inverse cube of sin(elbow angle).
