@@ -433,7 +433,7 @@ class Model:
         Raises:
             InputError: no part can be made of the design, or the folder holds files already.
         """
-        from dolfinopt.output.run_folder import check_sources, check_unused, prepare_folder
+        from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
         from dolfinopt.part.of_scene import names_of, parts_of, write_of
 
         out = None if folder is None else Path(folder)

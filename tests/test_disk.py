@@ -24,7 +24,7 @@ from dolfinopt.errors import InputError, OutputError
 from dolfinopt.locks import working_in
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
-from dolfinopt.output.run_folder import write_question
+from dolfinopt.output.folders import write_question
 from dolfinopt.parallel import abort_together
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study.cases import Case

@@ -17,10 +17,9 @@ import dolfinopt as do
 from dolfinopt.arms import arm, design_state
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
-from dolfinopt.fem import elasticity
+from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
-from dolfinopt.mesh import compat
 from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output import (
     checkpoint,
@@ -418,7 +417,7 @@ def test_taylor_test(name, monkeypatch):
     [
         (mesh, "mesh_geo"),
         (mesh, "_arm_mesh"),
-        (compat, "tabulate_cells"),
+        (elements, "_full"),
         (elasticity, "AffineMatrix"),
         (arm, "interpolate"),
     ],

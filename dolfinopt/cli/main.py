@@ -53,7 +53,7 @@ TEMPLATES = {
 def init(name: Path, template: str) -> None:
     if led_by_another():
         return
-    from dolfinopt.output.run_folder import write_new
+    from dolfinopt.output.folders import write_new
     from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
     from dolfinopt.scene.tables.base import Refusal
 

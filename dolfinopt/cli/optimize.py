@@ -66,8 +66,8 @@ def optimize(
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
+    from dolfinopt.output.folders import working_alone
     from dolfinopt.output.run import optimize as run
-    from dolfinopt.output.run_folder import working_alone
     from dolfinopt.parallel import on_root
 
     if resume:
@@ -147,13 +147,8 @@ def simulate(
     """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
-    from dolfinopt.output.run_folder import (
-        Simulated,
-        check_unused,
-        remove_stale,
-        working_alone,
-        write_simulation,
-    )
+    from dolfinopt.output.folders import check_unused, remove_stale, working_alone
+    from dolfinopt.output.run_folder import Simulated, write_simulation
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate

@@ -152,7 +152,7 @@ def _write(
     plots: bool,
 ) -> None:
     """Write the files and say what was made (root only)."""
-    from dolfinopt.output.run_folder import prepare_folder
+    from dolfinopt.output.folders import prepare_folder
     from dolfinopt.part.files import write_parts
 
     def pictures(folder: Path) -> None:
@@ -279,7 +279,7 @@ def _write_solid(
     plots: bool,
 ) -> None:
     """Write the files (root only)."""
-    from dolfinopt.output.run_folder import prepare_folder
+    from dolfinopt.output.folders import prepare_folder
     from dolfinopt.part.solid_files import write_solid_parts
 
     def pictures(folder: Path) -> None:

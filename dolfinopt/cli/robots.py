@@ -177,7 +177,7 @@ def _write_scene(
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.exchange.urdf.scene import RECORD, TRAJECTORY, trajectory_text
-    from dolfinopt.output.run_folder import check_new, prepare_folder, write_new
+    from dolfinopt.output.folders import check_new, prepare_folder, write_new
     from dolfinopt.scene.load import load_scene
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
@@ -299,7 +299,7 @@ def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
     """Write all files, the robot last: where it is, the others belong to it (root only)."""
     from dolfinopt.disk import write_atomically
     from dolfinopt.locks import working_in
-    from dolfinopt.output.run_folder import prepare_folder, remove_stale
+    from dolfinopt.output.folders import prepare_folder, remove_stale
 
     prepare_folder(folder)
     with working_in(folder):

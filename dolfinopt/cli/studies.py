@@ -58,7 +58,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
     ) -> None:
         world, loaded = load(scene, overrides)
         name, designs, study, question = ask(loaded, **own)
-        from dolfinopt.output.run_folder import check_question, remove_listed, write_question
+        from dolfinopt.output.folders import check_question, remove_listed, write_question
         from dolfinopt.parallel import on_root
         from dolfinopt.study.tables import write_study
 

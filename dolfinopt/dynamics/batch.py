@@ -156,37 +156,35 @@ def _together(
     own = [one is not None for one in known]  # whether a guess is of the system itself
     tuning = replace(RUNS, goal=goal)
     for _ in range(MAX_GRIDS):
-        able, steps = _common_steps(batch, left, guesses, own, more, tolerance, stages)
-        if not able:
-            break
         missing = []
-        most = max(1, MAX_SIZE // (rest.shape[1] * sum(steps)))
-        for first in range(0, len(able), most):
-            members = np.array(able[first : first + most])
-            time_grids = _common_time_grids([batch.members[i] for i in members], steps)
-            solutions = _on_grid(
-                modes.chosen(members),
-                time_grids,
-                stages,
-                rest[members],
-                [guesses[i] for i in members],
-                tolerance,
-                tuning,
-            )
-            for i, solution in zip(members, solutions, strict=True):
-                if solution is None:
-                    continue
-                profile.counts.newton_iterations += solution.iterations
-                guesses[i], own[i] = solution, True
-                if solution.error <= radau.ACCEPT * tolerance:
-                    found[i] = solution
-                else:
-                    missing.append(i)
-        left = np.array(missing, dtype=int)
+        for steps, group in _groups(batch, left, guesses, own, more, tolerance, stages).items():
+            most = max(1, MAX_SIZE // (rest.shape[1] * sum(steps)))
+            for first in range(0, len(group), most):
+                members = np.array(group[first : first + most])
+                time_grids = _common_time_grids([batch.members[i] for i in members], steps)
+                solutions = _on_grid(
+                    modes.chosen(members),
+                    time_grids,
+                    stages,
+                    rest[members],
+                    [guesses[i] for i in members],
+                    tolerance,
+                    tuning,
+                )
+                for i, solution in zip(members, solutions, strict=True):
+                    if solution is None:
+                        continue
+                    profile.counts.newton_iterations += solution.iterations
+                    guesses[i], own[i] = solution, True
+                    if solution.error <= radau.ACCEPT * tolerance:
+                        found[i] = solution
+                    else:
+                        missing.append(i)
+        left = np.array(sorted(missing), dtype=int)
     return found
 
 
-def _common_steps(
+def _groups(
     batch: BatchSystem,
     left: np.ndarray,
     guesses: Sequence[Solution | None],
@@ -194,12 +192,14 @@ def _common_steps(
     more: float,
     tolerance: float,
     stages: int,
-) -> tuple[list[int], list[int]]:
-    """Return who is solved, and the steps between the breakpoints that the worst of them needs.
+) -> dict[tuple[int, ...], list[int]]:
+    """Return the systems that are solved together, by their steps between the breakpoints.
 
-    Those without a guess of their own take `more` steps than the pilot.
+    Those whose own guesses are on as many steps keep them, if the worst allows; those without one
+    take `more` steps than the pilot.
     """
-    able, wanted = [], []
+    alike: dict[tuple[int, ...], list[int]] = {}
+    wanted: dict[int, np.ndarray] = {}
     for i in left:
         system, guess = batch.members[i], guesses[i]
         assert guess is not None
@@ -207,10 +207,16 @@ def _common_steps(
             grid = radau.next_time_grid(system, guess, tolerance, stages)
         except GivenUp:  # more steps than there is room for: left to whoever solves it by itself
             continue
-        steps = steps_between_breakpoints(system, grid)
-        able.append(int(i))
-        wanted.append(steps if own[i] else np.ceil(more * np.asarray(steps)))
-    return able, [int(n) for n in np.max(wanted, axis=0)] if able else []
+        steps = tuple(steps_between_breakpoints(system, guess.time_grid)) if own[i] else ()
+        alike.setdefault(steps, []).append(int(i))
+        wanted[int(i)] = steps_between_breakpoints(system, grid)
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for group in alike.values():
+        most = np.max([wanted[i] for i in group], axis=0)
+        if not own[group[0]]:
+            most = np.ceil(more * most).astype(int)
+        groups.setdefault(tuple(most), []).extend(group)
+    return groups
 
 
 def _pilot(

@@ -165,6 +165,16 @@ def same_corners(corners: np.ndarray) -> np.ndarray:
     return np.broadcast_to(mean, around.shape)
 
 
+def quadrature_corners(mesh: ArmMesh) -> np.ndarray:
+    """Return the corners (n_cells, k, d) that matrices are computed with, m; in space once if alike.
+
+    In the plane every cell's: the mean of all matrices has less rounding than one of them, and
+    with that of one cell floating solids would be held.
+    """
+    corners = cell_corners(mesh)
+    return same_corners(corners) if mesh.dim == 3 else corners
+
+
 def by_cells(function: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
     """Apply a function of arrays (n_cells, ...); once where all cells share the same memory."""
     count = len(arrays[0])
@@ -278,7 +288,7 @@ class LagrangeElement:
         """Return those in the reference cell times the inverse Jacobian, see `Element`."""
         return by_cells(
             lambda part: nodal_gradients(part, self.degree, points),
-            same_corners(cell_corners(mesh)),
+            quadrature_corners(mesh),
         )
 
     def strain_operator(
@@ -349,7 +359,7 @@ class IncompatibleElement:
     ) -> np.ndarray:
         """Return B, the condensed modes' strains included, see `Element`."""
         assert operators.recovery is not None
-        corners = same_corners(cell_corners(mesh))
+        corners = quadrature_corners(mesh)
         own = by_cells(lambda part: strains(mode_gradients(part, points)), corners)
         return by_cells(
             lambda gradients, own, recovery: strains(gradients) + own @ recovery[:, None],
@@ -415,7 +425,7 @@ def quadrature(mesh: ArmMesh, operators: ElementOperators) -> Quadrature:
 
     Exactly so on parallelograms and triangles, see `gauss_order`.
     """
-    corners, element, dim = same_corners(cell_corners(mesh)), operators.element, mesh.dim
+    corners, element, dim = quadrature_corners(mesh), operators.element, mesh.dim
     around = corners.shape[1]
     points, weights = gauss_points(around, gauss_order(element.degree, around, dim), dim)
     law = operators.thickness * elasticity(dim, operators.poisson_ratio)
@@ -474,8 +484,8 @@ def quadrature_operators(
     space = compat.lagrange_space(mesh.mesh, degree, components=dim)
     t = thickness if dim == 2 else 1.0
     with together(mesh.comm):
-        corners = same_corners(cell_corners(mesh))
-        stiffness = by_cells(lambda part: t * _full(part, degree, poisson_ratio, modes), corners)
+        corners = quadrature_corners(mesh)
+        stiffness = by_cells(lambda part: _full(part, degree, poisson_ratio, modes), corners)
         if modes:
             recovery = by_cells(_recovery, stiffness)
             stiffness = by_cells(_condensed, stiffness, recovery)
@@ -483,7 +493,7 @@ def quadrature_operators(
             space=space,
             cells=compat.cell_nodes(space, mesh.num_cells),
             points=space.tabulate_dof_coordinates()[:, :dim].copy(),
-            stiffness=stiffness,
+            stiffness=by_cells(lambda k: t * k, stiffness),
             mass=by_cells(lambda part: t * _mass(part, degree), corners),
             element=element,
             thickness=t,

@@ -17,7 +17,7 @@ from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import FurtherMemory, IterateMemory, Memory
-from dolfinopt.output.run_folder import CHECKPOINT, remove_stale
+from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.load import Scene

@@ -17,7 +17,7 @@ from dolfinopt.optimization.memory import Memory
 from dolfinopt.optimization.result import Result
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import HistoryWriter
-from dolfinopt.output.run_folder import RUN_FILES, check_sources, check_unused, working_alone
+from dolfinopt.output.folders import RUN_FILES, check_sources, check_unused, working_alone
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene

@@ -215,7 +215,7 @@ def reproduce(
     Raises:
         InputError: the scene does not allow what the paper varies, or DIR cannot be written.
     """
-    from dolfinopt.output.run_folder import prepare_folder
+    from dolfinopt.output.folders import prepare_folder
     from dolfinopt.parallel import on_root, together
 
     with together(world):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from dolfinopt.disk import write_bytes, write_text, writing
 from dolfinopt.locks import working_in
-from dolfinopt.output.run_folder import PARTS_LIST, record_of_parts, remove_stale
+from dolfinopt.output.folders import PARTS_LIST, record_of_parts, remove_stale
 from dolfinopt.part.body_mesh import BodyMesh
 from dolfinopt.part.drawings import dxf_text, r12_text, svg_text
 from dolfinopt.part.mesh import write_meshes

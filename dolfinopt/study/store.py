@@ -37,8 +37,9 @@ from dolfinopt.disk import make_folder, write_text
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import read_history
+from dolfinopt.output.folders import working_alone
 from dolfinopt.output.run import optimize
-from dolfinopt.output.run_folder import working_alone, write_result, write_simulation
+from dolfinopt.output.run_folder import write_result, write_simulation
 from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.reduction import BasisErrors

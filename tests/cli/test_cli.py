@@ -19,7 +19,7 @@ import dolfinopt as do
 from dolfinopt.cli import shared
 from dolfinopt.errors import InputError
 from dolfinopt.locks import RUN
-from dolfinopt.output.run_folder import RUN_FILES
+from dolfinopt.output.folders import RUN_FILES
 
 TINY = overrides("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
 SMALL = overrides("arms.cells=[40,4]", "simulation.sample=0.005")

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from dolfinopt.cli.shared import elapsed, plain_lines
+from dolfinopt.cli.live_line import plain_lines
+from dolfinopt.cli.shared import elapsed
 from dolfinopt.optimization.history import FurtherRow, HistoryRow
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

@@ -22,7 +22,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
-from dolfinopt.output.run_folder import remove_stale_parts, stale_parts
+from dolfinopt.output.folders import remove_stale_parts, stale_parts
 
 pytestmark = pytest.mark.serial
 

@@ -1,0 +1,267 @@
+"""Folders of results: one run each. What an earlier run left is never mixed with a new one."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dolfinopt.disk import FULL, unwritten, write_text
+from dolfinopt.errors import InputError
+from dolfinopt.locks import working_in
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import file_digest, named_files
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+
+CHECKPOINT = "checkpoint.npz"
+
+
+# All files that a run writes, the one that says a run is complete first; nothing else is removed.
+RUN_FILES = (
+    "summary.json",
+    "history.csv",
+    "trajectory.npz",
+    "trajectory.csv",
+    "design.npz",
+    "design.xdmf",
+    "design.vtu",
+    "design.png",
+    "history.png",
+    "deviation.png",
+    "drives.png",
+    "motion.gif",
+    "machine.png",
+    "stress.png",
+    CHECKPOINT,
+)
+
+
+# The parts of a run's design, and the file there that lists them.
+PARTS, PARTS_LIST = "part", "part.json"
+
+
+def prepare_folder(folder: Path) -> None:
+    """Create the output folder and make sure that it can be written.
+
+    Raises:
+        InputError: it cannot.
+        OutputError: the disk is full.
+    """
+    probe = folder / f".write-test-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        if error.errno in FULL:
+            raise unwritten(folder, error) from error
+        raise InputError(
+            f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
+        ) from None
+
+
+@contextmanager
+def working_alone(
+    world: MPI.Comm, folder: Path, check: Callable[[], object] | None = None
+) -> Iterator[None]:
+    """Keep other runs out of a folder until the block ends; create it first (collective).
+
+    Args:
+        world: all ranks.
+        folder: of the run.
+        check: on the root once no other run can write there any more.
+
+    Raises:
+        InputError: another run works there, or it cannot be written; what `check` raises.
+    """
+    from dolfinopt.parallel import on_root
+
+    with ExitStack() as held:
+
+        def enter() -> None:
+            prepare_folder(folder)
+            held.enter_context(working_in(folder))
+            if check is not None:
+                check()
+
+        on_root(world, enter)
+        yield
+
+
+def check_sources(folder: Path, names: Iterable[str], scene: Scene) -> None:
+    """Raise InputError if results would replace a file that the scene reads."""
+    written = {(folder / name).resolve() for name in names}
+    for key, row, name in named_files(scene.to_dict()):
+        if Path(row[name]).resolve() in written:
+            raise InputError(
+                f"{row[name]}: the scene reads this file ({key}), and the results would replace "
+                "it; name another --out"
+            )
+
+
+def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: bool = False) -> None:
+    """Raise InputError if the folder holds a file of these names.
+
+    Args:
+        folder: need not exist.
+        names: what the command would write.
+        resume: the command has an option --resume, too.
+    """
+    found = [name for name in names if (folder / name).exists()]
+    if found:
+        more = f" and {len(found) - 1} more files" if len(found) > 1 else ""
+        others = "--resume to go on, " if resume and (folder / CHECKPOINT).exists() else ""
+        raise InputError(
+            f"{folder}: holds results already ({found[0]}{more}); {others}--overwrite to replace "
+            "them, or another --out"
+        )
+
+
+def remove_stale(
+    folder: Path, names: Collection[str] = RUN_FILES, *, keep: Collection[str] = ()
+) -> None:
+    """Remove what an earlier run left, but for `keep`; other files stay.
+
+    Raises:
+        InputError: a file cannot be removed.
+    """
+    for name in names:
+        if name in keep:
+            continue
+        try:
+            with suppress(FileNotFoundError):
+                (folder / name).unlink()
+        except OSError as error:
+            raise InputError(
+                f"{folder / name}: cannot be replaced ({error.strerror}); name another --out"
+            ) from None
+
+
+def check_new(files: Iterable[Path]) -> None:
+    """Raise InputError if one of the files exists."""
+    for path in files:
+        if path.exists():
+            raise InputError(
+                f"{path}: exists already and stays as it is; give another name or folder"
+            )
+
+
+def write_new(new: Mapping[Path, str | bytes], replaced: Mapping[Path, str]) -> None:
+    """Write all files of `new`, none of which may be there yet, and those of `replaced`.
+
+    They get their names, in this order, when all of them are on the disk.
+
+    Raises:
+        InputError: one exists, or cannot be written; then none of `new` is left.
+    """
+    check_new(new)
+    parts: dict[Path, Path] = {}
+    path = Path()
+    try:
+        for path, content in [*new.items(), *replaced.items()]:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            parts[path] = path.with_name(f".{path.name}.{os.getpid()}.part")
+            data = content if isinstance(content, bytes) else content.encode()
+            parts[path].write_bytes(data)
+        for path, part in parts.items():
+            os.replace(part, path)
+    except BaseException as error:
+        for done in (*parts.values(), *(path for path in parts if path in new)):
+            with suppress(OSError):
+                done.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+        raise
+
+
+def record_of_parts(design: Path | None, folder: Path, files: Iterable[str]) -> dict[str, Any]:
+    """Return the entries of part.json that tell the files, and the design they were made of."""
+    record: dict[str, Any] = {"files": sorted(files)}
+    if design is not None:
+        place = Path(os.path.relpath(design, folder.absolute())).as_posix()
+        record["design"] = {"file": place, "sha256": file_digest(design)}
+    return record
+
+
+def stale_parts(folder: Path) -> str:
+    """Return why a folder's parts are not those of the design beside them; "" if they may be."""
+    made_of = _json(folder / PARTS_LIST).get("design")
+    if not isinstance(made_of, dict) or not isinstance(made_of.get("file"), str):
+        return ""
+    design = folder / made_of["file"]
+    if not design.is_file() or file_digest(design) == made_of.get("sha256"):
+        return ""
+    design = Path(os.path.normpath(design))
+    return (
+        f"{folder}: parts of another design than {design} holds now; make them anew: dolfinopt "
+        f"part {design.parent} --overwrite"
+    )
+
+
+def remove_stale_parts(run: Path) -> str:
+    """Remove the parts in a run's folder unless they are of its design; return what was done."""
+    folder = run / PARTS
+    if not stale_parts(folder):
+        return ""
+    names = [name for name in _json(folder / PARTS_LIST).get("files", []) if _is_name(name)]
+    remove_stale(folder, [PARTS_LIST, *names])
+    with suppress(OSError):  # something of the user's is in it
+        folder.rmdir()
+    return f"{folder}: removed, its parts were of another design; new ones: dolfinopt part {run}"
+
+
+def _is_name(name: Any) -> bool:
+    return isinstance(name, str) and Path(name).name == name
+
+
+def check_question(folder: Path, name: str, question: Mapping[str, Any]) -> None:
+    """Raise InputError if the folder's files of this name answer another question.
+
+    Args:
+        folder: need not exist.
+        name: of the study's files.
+        question: JSON data by topic ("scene", "designs").
+    """
+    known = _record(folder, name).get("question")
+    question = json.loads(json.dumps(question))
+    if known is None or known == question:
+        return
+    parts = [part for part in question if known.get(part) != question[part]]
+    what = f"other {' and '.join(parts)}".replace("other scene", "another scene")
+    raise InputError(
+        f"{folder}: {name}.* there belong to {what}; --overwrite to replace them, or another --out"
+    )
+
+
+def remove_listed(folder: Path, name: str) -> None:
+    """Remove what a study of this name has written before."""
+    for file in _record(folder, name).get("files", ()):
+        if _is_name(file):
+            (folder / file).unlink(missing_ok=True)
+
+
+def write_question(
+    folder: Path, name: str, question: Mapping[str, Any], files: Sequence[str]
+) -> None:
+    """Write what a study asked, and its files, as FOLDER/NAME.json."""
+    text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
+    write_text(folder / f"{name}.json", text + "\n")
+
+
+def _record(folder: Path, name: str) -> dict[str, Any]:
+    return _json(folder / f"{name}.json")
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file, nothing if it holds no table."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
