@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from dolfinopt.cli.shared import PATH, claim, design_of, out_option, scene_of, start, warn
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
 
 if TYPE_CHECKING:
+    import numpy as np
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import Arm
@@ -426,6 +426,8 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
         index: of the arm.
         body: its integrals in space.
     """
+    import numpy as np
+
     from dolfinopt.exchange.urdf.robot import Inertia
     from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
 

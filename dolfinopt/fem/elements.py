@@ -166,10 +166,10 @@ def same_corners(corners: np.ndarray) -> np.ndarray:
 
 
 def quadrature_corners(mesh: ArmMesh) -> np.ndarray:
-    """Return the corners (n_cells, k, d) that matrices are computed with, m; in space once if alike.
+    """Return the corners (n_cells, k, d) of cells whose matrices are computed, m.
 
-    In the plane every cell's: the mean of all matrices has less rounding than one of them, and
-    with that of one cell floating solids would be held.
+    In space once if all are alike. In the plane every cell's: the mean of all matrices has less
+    rounding than one of them, with which floating solids would be held.
     """
     corners = cell_corners(mesh)
     return same_corners(corners) if mesh.dim == 3 else corners
