@@ -210,6 +210,7 @@ def site(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_site_builds_without_a_warning(site):
     assert (site / "index.html").exists()
 

@@ -51,6 +51,7 @@ def run(module, tmp_path, *launcher):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("module", MOMENTS)
 def test_alone(module, tmp_path):
@@ -61,6 +62,7 @@ def test_alone(module, tmp_path):
     assert not (tmp_path / "out" / "summary.json").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
 @pytest.mark.parametrize("module", ["click", "mpi4py.MPI", "dolfinx"])

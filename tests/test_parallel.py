@@ -192,6 +192,7 @@ ENDINGS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
 @pytest.mark.parametrize(("body", "status", "line"), ENDINGS)
@@ -254,6 +255,7 @@ def views(folder, *options):
     return run, {p: (folder / f"{p}.txt") for p in VIEWED}
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_petsc_options_reach_every_solver(tmp_path):
     """What PETSC_OPTIONS says of a solver holds for it; every solver has its own prefix."""
@@ -269,6 +271,7 @@ def test_petsc_options_reach_every_solver(tmp_path):
             assert (default in seen) != bool(changes)
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize(
     "option",

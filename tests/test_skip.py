@@ -405,6 +405,7 @@ def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     assert loaded(DRAW | others | {"dolfinx"}, MAIN, *line) == {"dolfinx"}
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_plane_pictures_need_no_renderer(tmp_path: Path) -> None:
     line = ["simulate", TWO_ARM, "--animation", "--out", tmp_path / "out"]

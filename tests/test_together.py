@@ -504,6 +504,7 @@ main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
 @pytest.mark.parametrize(

@@ -502,6 +502,7 @@ def test_exit_status_and_streams(shared_tmp_path, ranks):
         assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [0, 2])
 @pytest.mark.parametrize("words", [[], ["--help"], ["optimize", "--help"]])
@@ -512,6 +513,7 @@ def test_help_is_printed_once(words, ranks):
     assert done.stdout.count("Usage: dolfinopt") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [0, 2])
 @pytest.mark.parametrize(

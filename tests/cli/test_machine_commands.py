@@ -39,6 +39,7 @@ def write_scene(scene, folder):
 SCENES = {"slider": loop, "pin": lambda: loop("pin"), "control": controlled}
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("kind", SCENES)
 def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
@@ -60,6 +61,7 @@ def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     assert (out / "drives.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks: the same in test_optimization
 @pytest.mark.parametrize("kind", SCENES)
 def test_optimisation_goes_on_to_the_same_bits(kind, shared_tmp_path):
@@ -87,6 +89,7 @@ def test_bodies_of_a_loop_are_exported(shared_tmp_path):
     assert written == {arm + kind for arm in arms for kind in kinds}
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("kind", ["slider", "control"])
 def test_gradient_of_machines_is_checked(kind, shared_tmp_path, capsys):

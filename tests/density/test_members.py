@@ -182,6 +182,7 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
         assert gap >= width - cell
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 def test_a_gap_of_its_own_widens_the_gaps():
     """The gaps of a nearly full arm are as wide as asked, and were thinner with members alone."""

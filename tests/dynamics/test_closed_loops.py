@@ -142,6 +142,7 @@ def test_rigid_limit(kind: str) -> None:
     assert apart(trajectory.joint_forces[10:-1, 1], torque) < 1e-4  # measured 5e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gravity", [0.0, -98.1])
 def test_closure_forces_of_rigid_loops(gravity: float) -> None:
     """Bars a thousand times as stiff need the ground's force of rigid ones, by Newton and Euler."""

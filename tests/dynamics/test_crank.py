@@ -240,6 +240,7 @@ def fitted_orders(body: ShapeIntegrals, stages: int, counts: tuple[int, ...]) ->
     return -np.polyfit(np.log(counts), np.log(errors), 1)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stages", "counts"), [(2, (100, 200, 400)), (3, (40, 80, 160)), (4, (20, 40, 80))]
 )

@@ -329,6 +329,7 @@ def test_jumps_of_acceleration_meet_the_tolerance(integrator: str) -> None:
     assert distance(problem, found, exact) <= tolerance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho_inf", [0.0, 0.5, 0.8, 1.0])
 def test_order_of_generalized_alpha(rho_inf: float) -> None:
     """Order two of coordinates and accelerations, against Radau."""
@@ -392,6 +393,7 @@ def test_radau_meets_the_tolerance(stages: int, damping: float) -> None:
         assert 0.5 <= solution.error / true <= 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho_inf", [0.5, 0.8])
 @pytest.mark.parametrize(
     ("bending", "damping", "tolerance"),
@@ -658,6 +660,7 @@ def test_patience_that_ends_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) 
     assert len(grids) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [2, 4])  # 3 takes ten times as long
 def test_motion_that_every_grid_finds_otherwise_is_given_up(
     monkeypatch: pytest.MonkeyPatch, stages: int

@@ -397,6 +397,7 @@ def distance(trajectory: Trajectory, other: Solution) -> float:
     return relative_error(trajectory.mechanism, trajectory.solution.sample(t) - q, q)
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize(
     "overrides",
@@ -803,6 +804,7 @@ def outcome(seed: int, folder: Path) -> str:
     return "right"
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("seed", range(23, 45))

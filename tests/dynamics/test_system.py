@@ -254,6 +254,7 @@ def by_scipy(system: Controlled, t: np.ndarray) -> np.ndarray:
     return np.concatenate(pieces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gravity", [(0.0, -GRAVITY), (0.0, 0.0)])
 def test_controlled_arm_moves_as_scipys(gravity: tuple[float, float]) -> None:
     """Free rigid coordinates beside elastic ones, to 1e-8 of every group, by its own estimate."""
@@ -275,6 +276,7 @@ def test_free_joints_without_gains() -> None:
     assert found[-1, 1] < -0.5  # rad: it has fallen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gains", [1.0, 0.0])
 def test_generalised_alpha_of_a_controlled_arm(gains: float) -> None:
     """The conventional method solves the same systems, free joints that fall at once included."""

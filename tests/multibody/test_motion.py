@@ -642,6 +642,7 @@ def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
     on_root(WORLD, check)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arms", "path", "law", "base"),
     [

@@ -273,6 +273,7 @@ POSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks: test_same_certificate_on_any_number_of_ranks
 @pytest.mark.parametrize("posed", POSED)
 def test_residual_is_of_the_problem_as_posed(posed):
@@ -342,6 +343,7 @@ def test_failing_gradient_does_not_lose_the_design(monkeypatch):
     assert result.certificate.sentence == expected
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_light_payload_pays_for_frozen_loads():
     """With 0.2 kg the loads are the arms' own: frozen, they end half as compliant again.

@@ -37,6 +37,7 @@ def values(result):
     return {one.name: one for one in result.limits if one.quantity != "volume_fraction"}
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("deviation", "settling", "active"),
@@ -66,6 +67,7 @@ def test_lightest_arms_keep_limits_by_their_true_values(deviation, settling, act
     assert 1.7 < evaluation.objective < 3.2
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_demo_of_the_lightest_arms():
     """Coarse, and tighter where only the fine one is at its limit of the stress."""

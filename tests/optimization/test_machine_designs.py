@@ -55,6 +55,7 @@ def test_demo(path):
         assert last.volume_fraction <= 0.5 + 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks: the same of other scenes in test_optimization
 @DEMOS
 def test_resumes_in_the_same_bits(path, shared_tmp_path):
@@ -103,6 +104,7 @@ VARIANTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("name", VARIANTS)
 def test_goes_with(name):

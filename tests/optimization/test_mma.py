@@ -293,6 +293,7 @@ def test_two_volume_steps_agree_with_mmapy():
     assert asymptotes < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("seed", range(15))
 def test_nonconvex_steps_agree_with_mmapy(seed):

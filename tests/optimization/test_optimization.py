@@ -213,6 +213,7 @@ REMEMBERED = [
 OPTIONS = pytest.mark.parametrize("overrides", REMEMBERED, ids=" ".join)
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @OPTIONS
 def test_every_option_resumes_in_the_same_bits(overrides, shared_tmp_path):

@@ -48,6 +48,7 @@ def whole(tmp_path_factory):
         return folder, kept[-1]
 
 
+@pytest.mark.slow
 def test_files(whole):
     """Figures 3 to 15, none of them blank, their data, the table and the page."""
     from PIL import Image

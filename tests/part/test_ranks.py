@@ -38,6 +38,7 @@ def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_two_ranks_write_the_same_bytes(tmp_path):
     folder = two_arms(tmp_path / "run")
     run("part", folder, "--out", tmp_path / "one", *WORDS)

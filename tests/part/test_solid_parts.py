@@ -178,6 +178,7 @@ def random_crisp(cells, seed):
     return 1.0 * (noise > np.quantile(noise, 0.4))
 
 
+@pytest.mark.slow
 def test_surfaces_do_not_cross_themselves(monkeypatch):
     """Smoothing and the correction of the volume made this one do so in 11 places."""
     cells = (20, 6, 4)
@@ -377,6 +378,7 @@ def finished(path, densities, *changes):
     return path
 
 
+@pytest.mark.slow
 def test_two_ranks_write_the_same_solids(tmp_path, capfd):
     """A free-form link and a plate."""
     cells = [f"arms.link{k}.cells=[12,4,4]" for k in (1, 2)]
@@ -418,6 +420,7 @@ def checked(tmp_path_factory):
     return folder, json.loads((folder / "part" / "part.json").read_text())
 
 
+@pytest.mark.slow
 def test_table_of_densities_and_parts(checked):
     table = checked[1]["table"]
     assert {"mass", "first_frequency_link1", "compliance", "deviation", "settling", "stress",

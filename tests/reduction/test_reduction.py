@@ -660,6 +660,7 @@ def test_simulations_agree_between_methods():
             assert np.abs(ours[k] - slope).max() < slope_limit * np.abs(slope).max(), method
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
 def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
@@ -697,6 +698,7 @@ def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
         assert np.abs(ours[k] - slope).max() < 4e-3 * np.abs(slope).max()
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("q", "shifts"), [(3, [0.0]), (4, [0.0]), (8, [0.0]), (13, [0.0]), (8, [0.0, 30.0])], ids=str

@@ -100,6 +100,7 @@ def padded_error(built: Built, x, few: int, many: int) -> float:
     return WORLD.bcast(result, root=0)
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("name", "overrides"),
@@ -161,6 +162,7 @@ def test_scenarios_count():
 # -- the choice ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "tolerance"),
     [

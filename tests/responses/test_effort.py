@@ -187,6 +187,7 @@ def test_weighted_sum_of_peak_forces_as_objective() -> None:
         assert result.objective == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "limit", ["effort=7.4", "peak_force=[100.0,15.0,7.0]"], ids=["effort", "peak force"]

@@ -180,6 +180,7 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert rates(value, built.dot(row, d), (4e-2, 1e-2)) == pytest.approx(2.0, abs=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_deviation_is_limited_and_compliance_minimised() -> None:
     """Through the registry alone: the limit, tighter than the free design is, is met."""

@@ -117,6 +117,7 @@ def test_one_reduction_for_all_scenarios():
     assert counts[0] == counts[1] == counts[2]
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks: scenarios of test_every_option_gives_the_same_bits_...
 @pytest.mark.parametrize("combination", ["sum", "worst"])
 @pytest.mark.parametrize(
@@ -186,6 +187,7 @@ def test_weights_scale_the_worst_case():
     assert value == pytest.approx(2.0, rel=1e-12) and slopes[0] == pytest.approx(2.0, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 def test_robust_against_two_payloads():
     """The worst case of a light and a heavy payload is better than that of the nominal design."""

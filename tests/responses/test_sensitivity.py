@@ -186,6 +186,7 @@ def seen_gradient(
     return add_gradients(trajectory_gradient(problem, solution, t, by_rates), bodies)
 
 
+@pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("arms", "gravity", "stages"),

@@ -99,6 +99,7 @@ SCENARIOS = (
 CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.0]")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "control"),
     [

@@ -124,6 +124,7 @@ def test_both_ways_to_the_loads_agree() -> None:
         np.testing.assert_allclose(whole[n] / scale, other / scale, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", ["incompatible", "quadratic"])
 @pytest.mark.parametrize("method", ["craig-bampton", "modal"])
 def test_static_solution_of_all_loads(method: str, element: str) -> None:
@@ -249,6 +250,7 @@ KINDS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The remainder of Taylor's formula has order 2.
@@ -267,6 +269,7 @@ def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert rates(value, slope, (4e-3, 1e-3)) == pytest.approx(2.0, abs=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "keys",
     [

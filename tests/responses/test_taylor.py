@@ -20,6 +20,7 @@ pytestmark = pytest.mark.serial
 # Limits whose word means another response as objective are tested by that one.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(NEEDS))
 @pytest.mark.usefixtures("three_steps")
 def test_remainders_fall_with_the_square_of_the_step(name: str) -> None:

@@ -83,6 +83,7 @@ def run(overrides):
     assert all(np.isfinite(x).all() for x in result.x_phys.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "value"), limits(), ids=lambda part: str(part))
 def test_a_number_at_its_limit_runs_or_is_refused_in_one_line(key, value):
     try:

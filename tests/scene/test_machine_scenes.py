@@ -180,6 +180,7 @@ def tree_at(key: str, value: float):
     return data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "value"), limits(), ids=str)
 def test_a_number_of_a_machine_at_its_limit_runs_or_is_refused_in_one_line(key, value):
     try:

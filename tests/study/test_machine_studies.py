@@ -20,6 +20,7 @@ SMALL = {
 pytestmark = pytest.mark.serial
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "key", "values", "law"),
     [

@@ -487,6 +487,7 @@ def test_failures_end_with_status_one(folder, monkeypatch):
 # -- killed ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.serial
 def test_killed_study_goes_on(tmp_path, capsys):
     """Killed after some cases, the next call does the rest: all files are those of one run."""
