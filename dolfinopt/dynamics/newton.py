@@ -594,7 +594,8 @@ class _Group:
         self.before = before
         self.norm_before = np.where(np.isnan(norm_before), self.at.norm, norm_before)
         self.ended = np.zeros(stages.runs, dtype=bool)
-        self.rate, self.iterations = np.zeros(stages.runs), np.zeros(stages.runs, dtype=int)
+        self.rate: np.ndarray = np.zeros(stages.runs)
+        self.iterations = np.zeros(stages.runs, dtype=int)
 
     def with_one_matrix(self, slow: np.ndarray, tolerance: float, tuning: Tuning) -> np.ndarray:
         """Iterate until all have ended, or one needs another matrix.

@@ -462,7 +462,7 @@ class ExtendedSystem(InteriorSystem):
         from dolfinopt.fem.multigrid import with_motions
 
         T = self._T
-        parts = [rigid_motions(T.points[T.interior_nodes]).reshape(-1, 6)]
+        parts: list[np.ndarray] = [rigid_motions(T.points[T.interior_nodes]).reshape(-1, 6)]
         if self._is_last:
             for motion in rigid_motions(T.places):
                 parts += [motion, np.eye(6)[3:]]

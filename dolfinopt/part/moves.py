@@ -185,7 +185,8 @@ class OutlineMoves:
         t = np.linspace(0.0, 1.0, 20 * len(curve.points) + 1)
         sharp = t[curvature(curve, t) < -1.0 / max(TIGHT * part.outline.tool_radius, 1e-12)]
         begin, end = _supports(curve)
-        return ((sharp >= begin[:, None]) & (sharp <= end[:, None])).any(axis=1)
+        tight: np.ndarray = (sharp >= begin[:, None]) & (sharp <= end[:, None])
+        return np.any(tight, axis=1)
 
     def _allowed(self, shape: Shape, tolerance: float) -> bool:
         """Return whether the shape has material where it must be, and none where it may not."""

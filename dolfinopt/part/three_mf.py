@@ -37,8 +37,8 @@ def three_mf_bytes(surface: Surface, name: str) -> bytes:
         name: of the object.
     """
     vertices = "".join(
-        '<vertex x="{:.9f}" y="{:.9f}" z="{:.9f}"/>\n'.format(*point)
-        for point in (MM * surface.points + 0.0).tolist()
+        f'<vertex x="{x:.9f}" y="{y:.9f}" z="{z:.9f}"/>\n'
+        for x, y, z in np.asarray(MM * surface.points + 0.0)
     )
     triangles = "".join(
         '<triangle v1="{}" v2="{}" v3="{}"/>\n'.format(*corners)

@@ -127,7 +127,7 @@ def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
     found: dict[str, float] = {}
     for one in constraints_of(scene):
         own = [c for c in columns if c == one.name or c.startswith(f"{one.name}_")]
-        limits = np.broadcast_to(one.limit, len(own)).tolist()
+        limits = [float(limit) for limit in np.broadcast_to(one.limit, len(own))]
         found.update(zip(own, limits, strict=True))
     return found
 

@@ -335,7 +335,7 @@ def _read(case: Case, place: _Place) -> Outcome:
     return Outcome(case, place[case], **found)
 
 
-def _lists(arrays: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
+def _lists(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {name: array.tolist() for name, array in arrays.items()}
 
 

@@ -264,7 +264,7 @@ def _orientations(kind: Sequence[str], rows: np.ndarray) -> np.ndarray:
     """Return the rotations (n, 3, 3) of rows of angles or of rotation vectors (n, 3)."""
     if kind == VECTOR:
         return Rotation.from_rotvec(rows).as_matrix()
-    return np.stack([roll_pitch_yaw((r, p, y)) for r, p, y in rows.tolist()])
+    return np.stack([roll_pitch_yaw((r, p, y)) for r, p, y in np.asarray(rows)])
 
 
 def relative_vectors(R: np.ndarray) -> np.ndarray:
@@ -331,7 +331,7 @@ class Follower:
     def _columns(self) -> np.ndarray:
         """Places of the unknown joints in the chain's Jacobian."""
         places = list(self.chain.coordinates)
-        return np.array([places.index(k) for k in self.unknown.tolist()], dtype=int)
+        return np.array([places.index(int(k)) for k in self.unknown], dtype=int)
 
     @cached_property
     def _weights(self) -> np.ndarray:
@@ -342,7 +342,7 @@ class Follower:
     def _slides(self) -> np.ndarray:
         """Which of the unknowns (k,) are displacements."""
         kinds = {joint.coordinate: joint.kind for joint in self.chain.joints}
-        return np.array([kinds[k] == "prismatic" for k in self.unknown.tolist()], dtype=bool)
+        return np.array([kinds[int(k)] == "prismatic" for k in self.unknown], dtype=bool)
 
     @cached_property
     def _units(self) -> np.ndarray:
