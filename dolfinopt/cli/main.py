@@ -1,4 +1,4 @@
-"""The command and its end: parse, call, exit code."""
+"""The command: parse, call, exit code; and `init`, `keys` and `schema`, which need no solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dolfinopt optimize`."""
+"""`dolfinopt optimize`, `simulate`, `gradient` and `plot`: what is done with one scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dolfinopt part`."""
+"""`dolfinopt part`, of plane and of solid arms."""
 
 from __future__ import annotations
 

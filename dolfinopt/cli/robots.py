@@ -1,4 +1,4 @@
-"""`dolfinopt import`."""
+"""Robots in and out: `dolfinopt import` and `dolfinopt export RUN --urdf`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scene + floating bodies -> the simulated motion, looked at evenly over the horizon."""
+"""Scene + floating bodies -> the simulated motion, with gradients of its forces and loads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Assembly of K(x) and M(x) into fixed sparsity patterns, and their interior parts in PETSc."""
+"""Assembly of K(x) and M(x) into fixed sparsity patterns; products and sums over cells."""
 
 from __future__ import annotations
 

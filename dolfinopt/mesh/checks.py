@@ -1,4 +1,4 @@
-"""Whether the mesh of a file can be an arm: no folds or overlaps, one part, in the arm's frame."""
+"""Whether a file's mesh can be an arm, in the plane or in space: no folds, one part, in place."""
 
 from __future__ import annotations
 

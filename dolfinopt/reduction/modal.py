@@ -1,4 +1,4 @@
-"""Craig-Bampton reduction: constraint modes of the outboard interface plus fixed-interface modes.
+"""Reductions by modes: Craig-Bampton (constraint and fixed-interface modes), modes of a free arm.
 
 Source: Craig & Bampton, AIAA J. 6 (1968) 1313-1319, doi:10.2514/3.4741.
 """

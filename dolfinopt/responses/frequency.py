@@ -1,4 +1,4 @@
-"""First natural frequency of every flexible arm with what it carries."""
+"""First natural frequency of every arm with what it carries, as objective and as limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mass of all arms."""
+"""Mass of all arms, and volume fractions."""
 
 from __future__ import annotations
 

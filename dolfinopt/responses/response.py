@@ -1,10 +1,9 @@
-"""What a response is, and where it is found: one file each, named like its word in the scene.
+"""What a response is, in which file it is found, and what several scenarios make of its values.
 
 Objective and constraints of a scene are responses: `objective.kind = "deviation"`, every key of
 [constraints] and `design.volume_fraction` name one. To add one, write `responses/NAME.py` with a
-subclass of `Response` under `@register`; add NAME to the literal of `objective.kind` in
-scene/tables/objective.py and to the keys in scene/tables/objective.py, and what it needs to
-scene/tables/objective.py.
+subclass of `Response` under `@register`, or name another file in `FILES`; in
+scene/tables/objective.py its word for `objective.kind` or its key, and what it needs.
 
 The one rule of aggregation: an extreme over instants, modes, load cases or scenarios has a true
 value, which reports show and limits hold for, and a smooth one, its p-mean or p-norm with

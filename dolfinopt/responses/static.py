@@ -1,4 +1,4 @@
-"""Compliance under given static loads."""
+"""Compliance and tip deflection under given static loads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`[design]`."""
+"""`[design]`, `[[arms.regions]]`, `[interpolation]` and `[optimizer]`."""
 
 from __future__ import annotations
 

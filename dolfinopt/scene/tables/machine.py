@@ -1,4 +1,4 @@
-"""`[[joints]]`: with this table the machine moves in space."""
+"""Joints, closure, control, damping and payload: the tables of what holds and moves a machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`[simulation]`."""
+"""`[simulation]` and `[reduction]`."""
 
 from __future__ import annotations
 
