@@ -31,11 +31,10 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body, uniform_design
 from dolfinopt.disk import write_arrays
-from dolfinopt.dynamics.build import check_forces
+from dolfinopt.dynamics.build import check_forces, check_motion
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.motion import check_motion
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.design import physical, read_design

@@ -522,8 +522,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
         interfaces = tuple((one.name, one.point) for one in arm.interfaces)
-        dimension = 3 if scene.is_spatial else 2
-        body = _read_body(arm.sid, changed, dimension, arm.length, interfaces)
+        body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body
         if scene.is_spatial:

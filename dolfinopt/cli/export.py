@@ -114,13 +114,14 @@ def export(
 
 
 def _why(scene: Scene, index: int) -> str:
-    """Return why an arm has no files; of a rigid one in space what another program needs of it."""
-    if not (scene.is_spatial and scene.arms[index].rigid):
-        return "it is rigid or comes from a file"
+    """Return why an arm has no files; of a rigid one what another program needs of it."""
+    if not scene.arms[index].rigid:
+        return "it comes from a file"
     from dolfinopt.arms.arm import fixed_body
+    from dolfinopt.multibody.shape_integrals import in_space
     from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
 
-    body = fixed_body(scene, index)
+    body = in_space(fixed_body(scene, index))
     centre, tensor = inertia_about_centre(body)
     place = ", ".join(f"{x:.6g}" for x in centre)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor

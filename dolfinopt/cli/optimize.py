@@ -103,8 +103,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
     written = write_result(scene, folder, result, elapsed(), pictures=drawn)
     if written is not None:
         conclude(written.summary, folder)
-        if not scene.is_spatial:  # parts are outlines of plane arms
-            click.echo(_next(scene, folder, written.summary["grayness"]))
+        click.echo(_next(scene, folder, written.summary["grayness"]))
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
 

@@ -65,8 +65,7 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
-        from dolfinopt.dynamics.build import check_forces
-        from dolfinopt.multibody.motion import check_motion
+        from dolfinopt.dynamics.build import check_forces, check_motion
         from dolfinopt.scene.messages import implausible
 
         scene = load_scene(path, overrides)
@@ -103,7 +102,8 @@ def doubts_of_files(scene: Scene) -> list[str]:
                 f"{arm.sid} holds no geometric stiffness, which simulation.stiffening = true asks "
                 f"for: arm {arm.name!r} is linear"
             )
-        if scene.is_spatial and not body.outboard[2:5].any():
+        out_of_plane = body.outboard[2:-1]  # no rows of plane bodies
+        if len(out_of_plane) and not out_of_plane.any():
             found.append(
                 f"{arm.sid}: its outboard node moves in x and y and turns about z alone; out of "
                 f"that plane arm {arm.name!r} is rigid"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -12,7 +13,7 @@ from scipy.interpolate import make_interp_spline
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.equations import PLANE
+from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
@@ -23,9 +24,15 @@ from dolfinopt.multibody.mechanism import (
     pin,
     slider,
 )
-from dolfinopt.multibody.motion import breakpoints, rigid_motion
+from dolfinopt.multibody.motion import (
+    RigidMotion,
+    breakpoints,
+    check_plane_motion,
+    curve_of_table,
+    rigid_motion,
+)
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.paths.tables import TIME, read_table
+from dolfinopt.paths.tables import TIME, Curve, read_table
 from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.load import Arm, Scene
 
@@ -72,13 +79,51 @@ def is_machine(scene: Scene) -> bool:
     return scene.control is not None or scene.closure is not None or soft
 
 
-def desired_motion(scene: Scene) -> Callable[[np.ndarray], Any]:
-    """Return the scene's motion as a function of instants (n,), s."""
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.mechanism import joint_motion
+@dataclass(frozen=True)
+class Family:
+    """How scenes in the plane, or in space, become machines.
 
-        return partial(joint_motion, scene=scene)
-    return partial(rigid_motion, scene=scene)
+    Attributes:
+        equations: of their mechanisms.
+        build: (scene, bodies): the mechanism.
+        motion: (t, scene): the desired rigid motion at instants t (n,), s.
+        check: (scene): raises `InputError` where that motion is impossible.
+        curve: (scene): the curve through its table, and whether its parameter is time.
+    """
+
+    equations: Equations
+    build: Callable[[Scene, list[ShapeIntegrals]], Any]
+    motion: Callable[[np.ndarray, Scene], RigidMotion]
+    check: Callable[[Scene], None]
+    curve: Callable[[Scene], tuple[Curve, bool]]
+
+
+IN_PLANE = Family(PLANE, build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
+
+
+def family_of(scene: Scene) -> Family:
+    """Return how the scene becomes a machine."""
+    if not scene.is_spatial:
+        return IN_PLANE
+    from dolfinopt.multibody.spatial.end_effector import curve_in_space
+    from dolfinopt.multibody.spatial.equations import SPACE
+    from dolfinopt.multibody.spatial.mechanism import (
+        build_spatial_mechanism,
+        check_joint_motion,
+        joint_motion,
+    )
+
+    return Family(SPACE, build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)
+
+
+def check_motion(scene: Scene) -> None:
+    """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
+    family_of(scene).check(scene)
+
+
+def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
+    """Return the scene's motion as a function of instants (n,), s."""
+    return partial(family_of(scene).motion, scene=scene)
 
 
 def build_system(
@@ -91,21 +136,25 @@ def build_system(
         bodies: from the base outwards.
         motion: the desired rigid motion, shared with other scenes; None: the scene's.
     """
+    family = family_of(scene)
     if motion is None:
         motion = desired_motion(scene)
-    mechanism: ElasticBodies
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.equations import SPACE
-        from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
-
-        mechanism, equations = build_spatial_mechanism(scene, bodies), SPACE
-    else:
-        mechanism, equations = build_mechanism(scene, bodies), PLANE
-    instants = breakpoints(scene)
+    mechanism: ElasticBodies = family.build(scene, bodies)
+    instants = breakpoints(scene, family.curve)
     if not is_machine(scene):
-        return ElasticSystem(mechanism, motion, instants, equations)
+        return ElasticSystem(mechanism, motion, instants, family.equations)
     instants, closure = _with_rows(instants, scene), closure_of(scene)
-    return MachineSystem(mechanism, motion, instants, _drives(scene), closure, equations)
+    return MachineSystem(mechanism, motion, instants, _drives(scene), closure, family.equations)
+
+
+def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
+    """Return the largest |eigenvalue| of K^-1 sum_p p K0_p over bodies and instants t (n,), s.
+
+    The loads p are those of the machine with rigid arms on the desired motion.
+    """
+    family = family_of(scene)
+    mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
+    return family.equations.largest_change(mechanism, motion, closure_of(scene))
 
 
 def closure_of(scene: Scene) -> Closure | None:
@@ -126,7 +175,7 @@ def _drives(scene: Scene) -> Drives:
     have no drive, and joints with a spring between drive and arm.
     """
     first = scene.driven_columns.start  # a fixed base has no coordinate
-    count = _num_rigid(scene)
+    count = len(scene.rigid_units)
     last = count - scene.dependent_joints
     stiffness, damping = np.zeros((2, count))
     limits = np.full(count, np.inf)
@@ -165,11 +214,6 @@ def _drives(scene: Scene) -> Drives:
     )
 
 
-def _num_rigid(scene: Scene) -> int:
-    """Return the number of rigid coordinates: cart and arms, or the joints in space that move."""
-    return len(scene.movable) if scene.is_spatial else 1 + len(scene.arms)
-
-
 def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     """Return the scene's table of forces as a function of time (n, 1 + arms), or None."""
     if scene.control is None or scene.control.forces is None:
@@ -178,7 +222,7 @@ def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     first = scene.driven_columns.start
 
     def forces(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), _num_rigid(scene)))
+        out = np.zeros((len(t), len(scene.rigid_units)))
         inside = t <= times[-1]
         out[inside, first : first + len(scene.driven)] = curve(t[inside])
         return out

@@ -6,6 +6,7 @@ Plane vectors are complex numbers, v = v_x + i v_y, where arms are turned.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -113,19 +114,21 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     return bare
 
 
-def check_motion(scene: Scene) -> None:
+def check_plane_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
     motion = scene.motion
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.mechanism import joint_motion
-
-        joint_motion(np.zeros(1), scene)
-        return
     end = motion.horizon if motion.path == "rotation" else motion.duration
     rigid_motion(np.linspace(0.0, end, DENSE), scene)
 
 
-def breakpoints(scene: Scene) -> tuple[float, ...]:
+def curve_of_table(scene: Scene) -> tuple[Curve, bool]:
+    """Return the curve through the scene's table, and whether its parameter is time."""
+    return _curve(scene.motion, columns_of(scene), file_stamp(scene.motion))
+
+
+def breakpoints(
+    scene: Scene, curve_of: Callable[[Scene], tuple[Curve, bool]] = curve_of_table
+) -> tuple[float, ...]:
     """Return the instants between which the motion is smooth, first 0, last the horizon; s.
 
     They are the end of the path, where the law's phases end, beginnings and ends of stops, and the
@@ -134,7 +137,7 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     motion = scene.motion
     corners, timed = np.zeros(0), False
     if motion.path in ("points", "joints"):
-        curve, timed = curve_of_table(scene)
+        curve, timed = curve_of(scene)
         corners = np.array(curve.kinks)
     if not timed:
         rows = _when(corners, motion) if 0 < len(corners) <= MAX_CORNERS else []
@@ -143,15 +146,6 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
     apart &= instants < motion.horizon * (1.0 - SAME_TIME)
     return (0.0, *instants[apart].tolist(), motion.horizon)
-
-
-def curve_of_table(scene: Scene) -> tuple[Curve, bool]:
-    """Return the curve through the scene's table, and whether its parameter is time."""
-    if scene.is_spatial and scene.motion.path == "points":
-        from dolfinopt.multibody.spatial.end_effector import end_curve
-
-        return end_curve(scene)
-    return _curve(scene.motion, columns_of(scene), file_stamp(scene.motion))
 
 
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
@@ -485,17 +479,13 @@ def columns_of(scene: Scene) -> tuple[str, ...]:
     """Return the columns of the scene's table."""
     if scene.motion.path == "points":
         return POINT
-    if scene.is_spatial:
-        return scene.driven
-    names = tuple(arm.name for arm in scene.arms)
-    names = names[: len(names) - scene.dependent_joints]
     for reserved in (TIME, CART):
-        if reserved in names:
+        if (TIME, *scene.driven).count(reserved) > 1:
             raise InputError(
                 f"{scene.source}: motion.path = 'joints' with an arm named {reserved!r}, which "
                 "means another column of the table; give the arm another name"
             )
-    return names if scene.motion.base == "fixed" else (CART, *names)
+    return scene.driven
 
 
 # -- continuity and reach --------------------------------------------------------------------

@@ -516,6 +516,8 @@ def first_frequency(body: ShapeIntegrals) -> float:
 def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegrals:
     """Return a plane body as one in space: the same motion in x-y, none out of it.
 
+    A body in space is returned as it is.
+
     Geometric stiffness of the seven loads is spread over the eighteen,
 
         K0_yx = -K0_xy = K0_wd / 2,   K0_xx = K0_yy = -K0_zz = K0_-ww / 2,
@@ -528,6 +530,8 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
         W: (9, 1 + q, 1 + q) of the body, see `plate_moments`. By default a guess from the planar
             integrals, all mass on the x axis and moving across it: out of the plane a thin bar.
     """
+    if len(body.w) == 3:
+        return body
     q = body.num_modes
     w, point, K0, loads = np.zeros((3, 1 + q)), np.zeros(3), np.zeros((3, 3, q, q)), body.K0
     w[:2], point[:2] = body.w, body.outboard_point

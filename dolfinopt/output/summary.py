@@ -23,7 +23,6 @@ from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
-    rigid_units,
     trajectory_units,
 )
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
@@ -295,7 +294,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     units["certificate"] = {**CERTIFICATE, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
-        rigid = rigid_units(scene)
+        rigid = scene.rigid_units
         units["drive_error_peak"] = {name: rigid[name] for name in free}
     if scene.closure is not None:
         units["closure_force_peak"] = "N"

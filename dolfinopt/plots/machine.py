@@ -133,7 +133,7 @@ def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str)
         trajectory: how it moves.
         title: above the picture.
     """
-    if trajectory.scene.is_spatial:
+    if trajectory.scene.dimension == 3:  # PyVista is imported where solids are drawn
         from dolfinopt.plots.solid_machine import solid_machine_figure
 
         space: Any = trajectory.mechanism

@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import chain_of, stiffening_of
-from dolfinopt.dynamics.build import build_mechanism, closure_of
+from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.multibody.inverse_dynamics import Stiffening, largest_change, stiffness_change
-from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     linear_part,
-    rigid_part,
     shape_integrals,
 )
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
@@ -489,7 +487,7 @@ def stiffening_of_each(
         arms: this rank's, with a design.
     """
     stated = not any(group[0].simulation.stiffening == "auto" for group in groups)
-    if stated and groups[0][0].is_spatial:  # where it takes most of the memory of a solid arm
+    if stated and not groups[0][0].estimates_stiffening:
         return [Stiffening(None, group[0].simulation.stiffening is True) for group in groups]
     with together(partition.world):
         mine = {k: _static_body(arm, simulated=not stated) for k, arm in arms.items()}
@@ -539,18 +537,7 @@ def _decided(
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
     """Return the largest change of an arm's stiffness by the loads of the motion."""
     t = np.linspace(0.0, scene.motion.horizon, INSTANTS)
-    if not scene.is_spatial:
-        mechanism = build_mechanism(scene, bodies)
-        return largest_change(mechanism, rigid_motion(t, scene), closure_of(scene))
-    from dolfinopt.multibody.spatial import inverse_dynamics as space
-    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, joint_motion
-
-    stiffened, motion = build_spatial_mechanism(scene, bodies), joint_motion(t, scene)
-    rigid, none = replace(stiffened, bodies=tuple(map(rigid_part, bodies))), np.zeros((len(t), 0))
-    links = space.outward_pass(rigid, motion, (none, none, none))
-    loads = space.body_loads(links, space.inward_pass(rigid, links).outboard)
-    pairs = zip(stiffened.bodies, loads, strict=True)
-    return max((stiffness_change(body, p) for body, p in pairs), default=0.0)
+    return largest_stiffness_change(scene, bodies, t)
 
 
 def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> float | None:

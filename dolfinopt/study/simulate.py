@@ -28,8 +28,10 @@ from dolfinopt.study import variants
 MODES = 3  # natural modes that `compare` looks at
 # Keys that leave the reduced bodies as they are, or scale them: in plane stress mass and stiffness
 # are linear in the thickness.
-SCALING = r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
-THICKNESS = r"arms\.(.+\.)?thickness"
+SCALING = (
+    r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
+    r"|arms\.(.+\.)?thickness"
+)
 
 
 def simulate_scenarios(
@@ -115,8 +117,9 @@ def compare(
 
 def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    known = SCALING if scene.is_spatial else f"{SCALING}|{THICKNESS}"
-    return all(re.fullmatch(known, key) for key in keys)
+    return all(
+        re.fullmatch(SCALING, key) and key.split(".")[-1] not in scene.arm_sizes for key in keys
+    )
 
 
 def with_sample(scene: Scene, changes: Sequence[str], number: int) -> Scene:
