@@ -149,14 +149,39 @@ def breakpoints(
 
 
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
-    """Return the instants at which the time law reaches s, in (0, 1), by bisection."""
-    law = time_law(motion)
-    low, high = np.zeros_like(s), np.full_like(s, motion.duration)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        late = law(middle, motion.duration)[0] >= s
-        low, high = np.where(late, low, middle), np.where(late, middle, high)
-    return [float(t) for t in high]
+    """Return the instants at which the time law reaches s, in (0, 1)."""
+    law, last = time_law(motion), motion.duration
+    return inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0).tolist()
+
+
+def inverse(
+    function: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    values: np.ndarray,
+    guess: np.ndarray,
+    ends: tuple[float, float],
+    accuracy: float,
+) -> np.ndarray:
+    """Return where an increasing function has these values (n,), all at once.
+
+    Newton's method, halving the bracket instead where a step would leave it.
+
+    Args:
+        function: x (n,) -> values and slopes (n,).
+        values: wanted, within those at the ends.
+        guess: (n,) first x.
+        ends: least and largest x.
+        accuracy: of the values; 0 of x to rounding.
+    """
+    u, low, high = guess, np.full_like(guess, ends[0]), np.full_like(guess, ends[1])
+    for _ in range(60):  # halving alone would need as many
+        found, slope = function(u)
+        excess = found - values
+        if np.abs(excess).max(initial=0.0) <= accuracy:
+            break
+        low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
+        u = u - excess / np.where(slope > 0.0, slope, np.inf)
+        u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
+    return u
 
 
 # -- paths --------------------------------------------------------------------------------------
@@ -315,24 +340,17 @@ class Bend:
         return self.square(u), u
 
     def cosine(self, square: np.ndarray) -> np.ndarray:
-        """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding.
-
-        Newton's method, halving the bracket instead where a step would leave it.
-        """
+        """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding."""
         if len(self.lengths) == 2:
             return (square - self.series[0]) / self.series[1]
-        u = np.interp(square, *self._guess)
-        low, high = np.full_like(u, self.least), np.ones_like(u)
         slopes = chebyshev.chebder(self.series)
-        for _ in range(60):  # halving alone would need as many
-            excess = self.square(u) - square
-            if np.abs(excess).max(initial=0.0) <= 4.0 * np.finfo(float).eps * self.reach[1] ** 2:
-                break
-            low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
-            slope = chebyshev.chebval(u, slopes)
-            u = u - excess / np.where(slope > 0.0, slope, np.inf)
-            u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
-        return u
+
+        def squares(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return self.square(u), chebyshev.chebval(u, slopes)
+
+        rounding = 4.0 * np.finfo(float).eps * self.reach[1] ** 2
+        guess = np.interp(square, *self._guess)
+        return inverse(squares, square, guess, (self.least, 1.0), rounding)
 
     def lever(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return z and its two derivatives by beta (n,), complex."""
