@@ -32,6 +32,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint, add_gradients, trajectory_gradient
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.dynamics.collocation import Solution, even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import drive_force_gradient
@@ -39,7 +40,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.multibody.end_effector import end_effector, end_effector_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion, check_motion
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, scaled
 from dolfinopt.multibody.tangent import body_gradient
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
