@@ -503,10 +503,8 @@ class Model:
         return uniform_design(self.scene, partition, arms, density)
 
     def _prepared(self, x: Design) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
-        """Return the arms, which forget earlier designs, and the densities of this rank's cells.
-
-        A search for modes that set out from another design's would end in other last digits.
-        """
+        """Return the arms, which forget earlier designs, and the densities of this rank's cells."""
+        # A search for modes that set out from another design's would end in other last digits.
         partition, arms = self._arms()
         for arm in arms.values():
             arm.forget_modes()

@@ -452,10 +452,7 @@ def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> d
 
 
 def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, Arm]) -> None:
-    """Raise InputError if solid cells exceed the volume limit, which a scene cannot know.
-
-    Collective on `partition.world`.
-    """
+    """Raise InputError if solid cells exceed the volume limit, unknown to a scene (collective)."""
     limit, least = scene.design.volume_fraction, scene.design.minimum
     if limit is None:
         return

@@ -169,11 +169,9 @@ def closure_of(scene: Scene) -> Closure | None:
 
 
 def _drives(scene: Scene) -> Drives:
-    """Return the drives of all rigid coordinates that are not prescribed.
-
-    With control all of them are free; without it those of a loop that follow from the others, which
-    have no drive, and joints with a spring between drive and arm.
-    """
+    """Return the drives of all rigid coordinates that are not prescribed."""
+    # With control all of them are free; without it those of a loop that follow from the others,
+    # which have no drive, and joints with a spring between drive and arm.
     first = scene.driven_columns.start  # a fixed base has no coordinate
     count = len(scene.rigid_units)
     last = count - scene.dependent_joints
@@ -236,10 +234,8 @@ def check_forces(scene: Scene) -> None:
 
 
 def _with_rows(instants: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
-    """Return the breakpoints, s, and among them those of a table of forces that is not long.
-
-    Its slope jumps at every row, and at the last one the force itself.
-    """
+    """Return the breakpoints, s, and among them those of a table of forces that is not long."""
+    # Its slope jumps at every row, and at the last one the force itself.
     if scene.control is None or scene.control.forces is None:
         return instants
     times = _forces(scene.control.forces, scene.driven)[0]

@@ -492,13 +492,6 @@ CHUNK = 512  # instants whose matrices are made at once
 KEPT_BYTES = 64e6  # of matrices that are kept for further functions of the same forces
 
 
-def drive_force_gradient(
-    system: Problem, t: np.ndarray, rates: Rates, weights: np.ndarray
-) -> tuple[np.ndarray, list[ShapeIntegrals]]:
-    """Return what `DriveForces.gradient` does, of a single function."""
-    return DriveForces(system, t, rates).gradient(weights)
-
-
 class DriveForces:
     """The forces of all drives at some instants, to be differentiated.
 

@@ -703,12 +703,8 @@ class StiffenedModes:
             yield run, found.reshape(len(found), q * q, count)
 
     def _by_modes(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives by differences a (r, d, q, cells), given those by products.
-
-        Args:
-            a: of the modes.
-            weights: (bc, q q, cells), symmetric in the modes, doubled for b = c.
-        """
+        """Return the derivatives by differences a (r, d, q, cells), given those by products."""
+        # The weights (bc, q q, cells) are symmetric in the modes, doubled for b = c.
         q, found, term = a.shape[2], np.empty_like(a), np.empty_like(a[0])
         each = list(zip(weights.reshape(-1, q, q, a.shape[3]), self._pairs, strict=True))
         for weight, (b, c) in each:

@@ -259,10 +259,7 @@ class UnitLoads:
         )
 
     def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
-        """Yield runs of cells: cells, points, modes' gradients there.
-
-        The gradients are d_a phi_c as (d, d, q, points).
-        """
+        """Yield runs of cells: cells, points, modes' gradients d_a phi_c as (d, d, q, points)."""
         derivatives = self.arm.substructure.quadrature.derivatives
         count, (dim, q) = len(derivatives), V.shape[1:]
         p = derivatives.shape[1] // dim
@@ -347,10 +344,8 @@ def _fold(
 
 
 def _by_inertia(adjoint: np.ndarray) -> np.ndarray:
-    """Return what the adjoints of the inertial loads multiply dM 1_x and dM X by (n_nodes, d, 2).
-
-    M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
-    """
+    """Return what the inertial loads' adjoints multiply dM 1_x and dM X by (n_nodes, d, 2)."""
+    # M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
     out = np.zeros((*adjoint.shape[:2], 2))
     if adjoint.shape[1] == 3:
         for a in range(3):
@@ -377,12 +372,10 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
 
 
 def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them.
-
-    1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
-    space. Of 1 and X (n_nodes, d), or M times these: M knows no direction.
-    M (-y, x) is (-(M X)_y, (M X)_x), as M treats the components alike.
-    """
+    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them."""
+    # 1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
+    # space. Of 1 and X (n_nodes, d), or M times these: M knows no direction. M (-y, x) is (-(M
+    # X)_y, (M X)_x), as M treats the components alike.
     dim = ones.shape[1]
     fields = np.zeros((*ones.shape, NUM_INERTIAL[dim]))
     if dim == 3:
@@ -572,10 +565,8 @@ class FaceRotation:
 
 
 def _levers(rigid: np.ndarray) -> np.ndarray:
-    """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere.
-
-    Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
-    """
+    """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere."""
+    # Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
     if rigid.shape[1] == 2:
         about_z = rigid[:, :, 2::3]
         return np.stack([about_z[:, 1], -about_z[:, 0]], axis=-1).swapaxes(0, 1)

@@ -88,11 +88,7 @@ class InterfaceTransformation:
         return field
 
     def _add_further(self, mesh: ArmMesh) -> None:
-        """Add the further outboard interfaces.
-
-        Raises:
-            InputError: two interfaces share a node: rigid both, they could not move.
-        """
+        """Add the further outboard interfaces; two that share a node, rigid both, are refused."""
         for one in mesh.further:
             self.ends.append(self._nodes_of(mesh, one.facets, one.name))
         names = ["inboard", "outboard", *(one.name for one in mesh.further)]
@@ -218,15 +214,9 @@ def rigid_motions(points: np.ndarray) -> np.ndarray:
 
 
 def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's.
-
-    The narrower one; on the grid of a slender arm the first, row by row across it, which is half as
-    wide as the other one, which begins at a corner.
-
-    Args:
-        graph: (n, n) with an entry where two nodes share a cell.
-        points: (n, d) m.
-    """
+    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
+    # The narrower one; on the grid of a slender arm the first, row by row across it, which is half
+    # as wide as the other one, which begins at a corner.
     nearest = SAME_PLACE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
     orders = (
@@ -372,11 +362,9 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
 
 
 def _new_directions(known: np.ndarray, loads: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return an orthonormal basis (b, j) of what loads (b, k) have beside that of known ones.
-
-    In the order of the loads, so that unit loads stay what they are. Less than the tolerance of
-    a load is nothing.
-    """
+    """Return an orthonormal basis (b, j) of what loads (b, k) have beside that of known ones."""
+    # In the order of the loads, so that unit loads stay what they are. Less than the tolerance of a
+    # load is nothing.
     basis = known
     for load in loads.T:
         rest = load
@@ -402,15 +390,10 @@ def _with_energies(
 
 
 def _refined(arm: ElasticArm, modes: ConstraintModes) -> ConstraintModes:
-    """Return constraint modes after one step of iterative refinement, if rounding allows.
-
-    Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below
-    the rounding of their own. The residual is summed cell by cell without rigid motion, which
-    knows them better than the assembled matrix.
-
-    Raises:
-        ConvergenceError: the void's stiffness is lost in the rounding of the solid's.
-    """
+    """Return constraint modes after one step of iterative refinement, if rounding allows."""
+    # Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below the
+    # rounding of their own. The residual is summed cell by cell without rigid motion, which knows
+    # them better than the assembled matrix.
     if not _is_stiffness(modes.stiffness):
         raise _lost_in_rounding(arm)
     operators = arm.operators

@@ -94,11 +94,9 @@ def _rotations(mechanism: Mechanism, q: np.ndarray) -> np.ndarray:
 
 
 def _softness(bodies: Sequence[ShapeIntegrals]) -> float:
-    """Return that of the arms' ends, m/N.
-
-    Or a third of the arm's length squared times the end's rotation by a unit moment, which is the
-    same of a cantilever, and not zero of an arm whose frame is its chord.
-    """
+    """Return that of the arms' ends, m/N."""
+    # Or a third of the arm's length squared times the end's rotation by a unit moment, which is the
+    # same of a cantilever, and not zero of an arm whose frame is its chord.
     found = [0.0]
     for body in bodies:
         if body.num_modes:

@@ -266,11 +266,7 @@ def curve_through(table: Table, motion: Motion, measured: int | None = None) -> 
 
 
 def _stop_to_stop(motion: Motion, table: Table, measured: int | None = None) -> Curve:
-    """Return the motion through a table with times that runs straight by the law between stops.
-
-    Raises:
-        InputError: a row between two stops, or the limits need more time; names file and line.
-    """
+    """Return the motion through a table with times that runs straight by the law between stops."""
     assert table.t is not None
     laws = []
     for line, i, j in ((table.lines[j], i, j) for i, j in moves(table.rows)):
@@ -365,11 +361,9 @@ def _bend(lengths: tuple[float, ...]) -> Bend:
 
 
 def _chain(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
-    """Return the motion of two and more arms, the shoulder's angle up to whole turns.
-
-    With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
-    accelerations from its derivatives, two real equations each for the rates of alpha and beta.
-    """
+    """Return the motion of two and more arms, the shoulder's angle up to whole turns."""
+    # With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
+    # accelerations from its derivatives, two real equations each for the rates of alpha and beta.
     motion, bend = scene.motion, _bend(tuple(arm.length for arm in scene.arms))
     cart = _cart(path, motion)
     r, rd, rdd = (
@@ -415,10 +409,8 @@ def _cart(path: Path, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _one_arm(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
-    """Return the motion of one arm: L sin(alpha) is the path's height, and the cart below it.
-
-    The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
-    """
+    """Return the motion of one arm: L sin(alpha) is the path's height, and the cart below it."""
+    # The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
     motion, length = scene.motion, scene.arms[0].length
     height = path.p[:, 1] - motion.joint_height
     _check_height(t, height, length, scene)
@@ -719,10 +711,8 @@ def _chosen(angles: tuple[float, ...], side: int) -> int:
 
 
 def _pinned(t: np.ndarray, place: Derivatives, loop: Loop, way: int, source: str) -> Derivatives:
-    """Return the absolute angles of the last two arms (n, 2), whose end is at the pin.
-
-    Up to whole turns.
-    """
+    """Return the absolute angles of the last two arms (n, 2), whose end is at the pin."""
+    # Up to whole turns.
     a, b = loop.lengths[-2:]
     p, pd, pdd = place
     r = loop.point - p

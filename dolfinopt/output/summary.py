@@ -310,10 +310,8 @@ def _frequencies(
     x_phys: Mapping[int, np.ndarray],
     profile: Profile,
 ) -> dict[int, tuple[float, float]]:
-    """Return the first frequency of every design that is reduced, Hz, and the reduced one's excess.
-
-    On the root (collective). It is not counted: nothing depends on it.
-    """
+    """Return every reduced design's first frequency, Hz, and the reduced model's excess."""
+    # On the root (collective). It is not counted: nothing depends on it.
     counts, found = replace(profile.counts), {}
     with together(partition.world):
         for index, arm in arms.items():
@@ -328,10 +326,8 @@ def _frequencies(
 def _widths(
     partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, tuple[float | None, float | None]]:
-    """Return the widths of member and gap of the designs cut at one half, m; on the root.
-
-    Those of arms in the plane: members of solid ones are not measured.
-    """
+    """Return the widths of member and gap of the designs cut at one half, m; on the root."""
+    # Those of arms in the plane: members of solid ones are not measured.
     corners, solid = {}, {}
     with together(partition.world):
         for k, arm in arms.items():
@@ -388,10 +384,8 @@ def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
 
 
 def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
-    """Return the number of coordinates and, where it was chosen, by which errors.
-
-    For a given number there is no estimate: it would cost a simulation with more coordinates.
-    """
+    """Return the number of coordinates and, where it was chosen, by which errors."""
+    # For a given number there is no estimate: it would cost a simulation with more coordinates.
     if choice is None:
         return {"coordinates": scene.reduction.coordinates, "error_estimate": None, "tried": []}
     return {

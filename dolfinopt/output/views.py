@@ -183,11 +183,9 @@ def _box_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
 
 
 def _bar_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
-    """Return a body whose shape is not known as a bar from joint to joint.
-
-    Between them it bends like a beam without loads: cubic polynomials that fit the outboard
-    interface's displacement and rotation.
-    """
+    """Return a body whose shape is not known as a bar from joint to joint."""
+    # Between them it bends like a beam without loads: cubic polynomials that fit the outboard
+    # interface's displacement and rotation.
     length = float(np.hypot(*body.outboard_point))
     axis = np.array([*body.outboard_point]) / length
     across = np.array([-axis[1], axis[0]])

@@ -119,11 +119,9 @@ def _delay(count: int, duration: float) -> float:
 
 
 def _write(path: Path, stage: Stage, count: int, delay: float) -> Path:
-    """Write all frames in the same few colours.
-
-    A palette of each frame's own would take longer to find than the frame to draw, and would let
-    the colours flicker.
-    """
+    """Write all frames in the same few colours."""
+    # A palette of each frame's own would take longer to find than the frame to draw, and would let
+    # the colours flicker.
     palette = Image.new("P", (1, 1))
     samples = np.stack([stage.draw(frame) for frame in (0, count // 2, count - 1)])
     palette.putpalette(common_colours(samples).tobytes())

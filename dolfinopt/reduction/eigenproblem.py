@@ -84,10 +84,8 @@ def complement_solve(
 def _without_factor(
     pencil: Pencil, operators: Operators, modes: np.ndarray, values: np.ndarray, right: np.ndarray
 ) -> np.ndarray:
-    """Do what `complement_solve` does with an approximation of K^-1 alone.
-
-    Conjugate gradients for each mode's own matrix; products and cycles work on all of them.
-    """
+    """Do what `complement_solve` does with an approximation of K^-1 alone."""
+    # Conjugate gradients for each mode's own matrix; products and cycles work on all of them.
     weighted = operators.mass(modes)
 
     def lengths(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -362,11 +360,9 @@ def _is_dense(pairs: Pairs, count: int) -> bool:
 
 
 def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
-    """Return whether the nearby modes hold one more below the highest of those that were found.
-
-    What of a vector r is M-orthogonal to all lowest modes has r'M K^-1 M r <= r'M r / lambda. Of
-    several modes of one frequency, as of equal windows, a Krylov sequence finds the sum alone.
-    """
+    """Return whether the nearby modes hold one more below the highest of those that were found."""
+    # What of a vector r is M-orthogonal to all lowest modes has r'M K^-1 M r <= r'M r / lambda. Of
+    # several modes of one frequency, as of equal windows, a Krylov sequence finds the sum alone.
     values, vectors = pairs
     if len(values) < 2:  # any of several equal modes will do
         return False
@@ -384,22 +380,18 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
 
 
 def _initial(pencil: Pencil, start: np.ndarray) -> np.ndarray:
-    """Return the sum of nearby modes, with a share of the ramp.
-
-    The sum of the wanted modes spans their space in one Krylov sequence. Old modes of a symmetric
-    design stay within their symmetry for ever, even when a mode of another one has become the
-    lowest.
-    """
+    """Return the sum of nearby modes, with a share of the ramp."""
+    # The sum of the wanted modes spans their space in one Krylov sequence. Old modes of a symmetric
+    # design stay within their symmetry for ever, even when a mode of another one has become the
+    # lowest.
     vector, up = start.sum(axis=1), _ramp(pencil, len(start))
     norms = np.sqrt(pencil.total(np.array([vector @ vector, up @ up])))
     return vector + RAMP_SHARE * norms[0] / norms[1] * up
 
 
 def _ramp(pencil: Pencil, rows: int) -> np.ndarray:
-    """Return values that rise from 1 to 2 over the rows of all ranks.
-
-    Rows run along the arm: the ramp has no symmetry of an arm, so that no mode is missed.
-    """
+    """Return values that rise from 1 to 2 over the rows of all ranks."""
+    # Rows run along the arm: the ramp has no symmetry of an arm, so that no mode is missed.
     comm = pencil.arm.comm
     first, size = (0, rows) if comm.size == 1 else (comm.exscan(rows) or 0, comm.allreduce(rows))
     return 1.0 + np.arange(first, first + rows) / max(size, 1)

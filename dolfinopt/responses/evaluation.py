@@ -342,16 +342,9 @@ def _simulated(
     profile: Profile,
     starts: Sequence[Sequence[Solution]],
 ) -> list[tuple[Motion | ConvergenceError, Trajectory | None]]:
-    """Simulate the scenes and their scenarios in one batch (collective).
-
-    Args:
-        scenes: the bodies are those of the first one.
-        partition, owned, profile: as elsewhere.
-        starts: of every scene, see `evaluate`.
-
-    Returns:
-        What became of every scene, on all ranks, and on the root its trajectory.
-    """
+    """Simulate the scenes and their scenarios in one batch (collective)."""
+    # The bodies are those of the first scene. What became of every scene is returned on all ranks,
+    # its trajectory on the root.
     kept: list[Trajectory | ConvergenceError] = []
 
     def run() -> list[Motion | ConvergenceError]:
@@ -497,10 +490,8 @@ def stiffening_of_each(
 
 
 def _static_body(arm: Arm, simulated: bool) -> ShapeIntegrals:
-    """Return the body in the static modes of its outboard interface: they need no eigenproblem.
-
-    What the inertia of the modes stiffens is not needed for the estimate alone.
-    """
+    """Return the body in the static modes of its outboard interface: they need no eigenproblem."""
+    # What the inertia of the modes stiffens is not needed for the estimate alone.
     state = arm.current
     elastic, static = state.elastic, state.elastic.constraint_modes()
     none = np.empty((len(static.interior), 0))
@@ -541,10 +532,8 @@ def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
 
 
 def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> float | None:
-    """Return the share of the largest deviation that linear bodies miss; None if one cannot move.
-
-    Simulated beside the run: the comparison is none of its simulations.
-    """
+    """Return what share of the largest deviation linear bodies miss; None if one cannot move."""
+    # Simulated beside the run: the comparison is none of its simulations.
     profile = Profile()
     linear = [[linear_part(body) for body in chain] for chain in bodies]
     largest = 0.0
