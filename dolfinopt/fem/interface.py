@@ -16,7 +16,6 @@ from mpi4py import MPI
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.fem.assembly import cell_values, sum_at_nodes
 from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -396,11 +395,9 @@ def _refined(arm: ElasticArm, modes: ConstraintModes) -> ConstraintModes:
     # them better than the assembled matrix.
     if not _is_stiffness(modes.stiffness):
         raise _lost_in_rounding(arm)
-    operators = arm.operators
-    values = cell_values(operators, modes.field)
-    forces = (operators.stiffness @ values) * arm.young[:, None, None]
-    forces = forces.reshape(*operators.cells.shape, *modes.field.shape[1:])
-    residual, _ = arm.restrict(sum_at_nodes(operators, forces))
+    cells = arm.substructure.cells
+    forces = cells.stiffness_times(cells.centred(modes.field)) * arm.young
+    residual, _ = arm.restrict(cells.sum_at_nodes(forces))
     better = modes.interior - arm.solve(residual)
     refined = _with_energies(arm, better, modes.coupling, modes.corner)
     if not (_is_stiffness(refined.stiffness) and rounding_error(arm, refined) <= MOST_ROUNDING):
@@ -417,16 +414,16 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
     orders of magnitude apart from all others. What it returns is too small only where mu
     exceeds 1 / eps, far beyond `MOST_ROUNDING`, because the factorised matrix is off by then.
     """
-    operators = arm.operators
-    diagonal = np.einsum("eii->ei", operators.stiffness) * arm.young[:, None]
-    diagonal = diagonal.reshape(*operators.cells.shape, arm.mesh.dim, 1)
+    cells = arm.substructure.cells
+    diagonal = np.einsum("eii->ie", cells.stiffness) * arm.young
+    diagonal = diagonal.reshape(-1, arm.mesh.dim, 1, len(arm.young))
 
     def weighted(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return T' D T u."""
-        values = field[operators.cells]
-        forces = diagonal * (values - kept * values.mean(axis=1, keepdims=True))
-        forces -= kept * forces.mean(axis=1, keepdims=True)
-        return arm.restrict(sum_at_nodes(operators, forces))
+        values = cells.values(field)
+        forces = diagonal * (values - kept * values.mean(axis=0))
+        forces -= kept * forces.mean(axis=0)
+        return arm.restrict(cells.sum_at_nodes(forces))
 
     kept = 1.0 - TRANSLATION
     places = arm.points.T / arm.mesh.outboard_point[0]
