@@ -57,10 +57,10 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     )
 
 
-def _rotors(scene: Scene) -> np.ndarray:
-    """Return the inertia of rotors behind springs (1 + arms,), kg m2."""
-    soft = [rotor_inertia(arm) * (arm.joint_stiffness > 0.0) for arm in scene.arms]
-    return np.array([0.0, *soft])
+def soft_joints(scene: Scene) -> dict[int, Arm]:
+    """Return the arms with a spring between drive and arm, by their joint's rigid coordinate."""
+    pairs = zip(scene.joint_columns, scene.arms, strict=True)
+    return {k: arm for k, arm in pairs if k is not None and arm.joint_stiffness > 0.0}
 
 
 def reflected_inertia(arm: Arm) -> float:
@@ -75,8 +75,7 @@ def rotor_inertia(arm: Arm) -> float:
 
 def is_machine(scene: Scene) -> bool:
     """Return whether rigid coordinates are unknown: by control, a closed loop, soft joints."""
-    soft = any(arm.joint_stiffness > 0.0 for arm in scene.arms)
-    return scene.control is not None or scene.closure is not None or soft
+    return scene.control is not None or scene.closure is not None or bool(soft_joints(scene))
 
 
 @dataclass(frozen=True)
@@ -173,16 +172,17 @@ def _drives(scene: Scene) -> Drives:
     # With control all of them are free; without it those of a loop that follow from the others,
     # which have no drive, and joints with a spring between drive and arm.
     first = scene.driven_columns.start  # a fixed base has no coordinate
-    count = len(scene.rigid_units)
+    count = scene.num_rigid
     last = count - scene.dependent_joints
     stiffness, damping = np.zeros((2, count))
     limits = np.full(count, np.inf)
     free = np.zeros(count, dtype=bool)
     free[last:] = True
-    for k, arm in enumerate(scene.arms[: max(last - 1, 0)]):
-        if arm.joint_stiffness > 0.0:  # in the plane
-            free[1 + k], stiffness[1 + k], damping[1 + k] = True, arm.joint_stiffness, 0.0
-            damping[1 + k] = arm.joint_damping
+    rotors, soft = np.zeros(count), soft_joints(scene)
+    for k, arm in soft.items():
+        rotors[k] = rotor_inertia(arm)
+        if k < last:
+            free[k], stiffness[k], damping[k] = True, arm.joint_stiffness, arm.joint_damping
     control, driven = scene.control, slice(first, last)
     if control is not None:
         free[driven] = True
@@ -191,12 +191,12 @@ def _drives(scene: Scene) -> Drives:
         if control.limits is not None:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
-    soft = [k for k, arm in enumerate(scene.arms) if arm.joint_stiffness > 0.0 and control]
+    motors = list(soft) if control else []
     springs = Springs(
-        joints=np.searchsorted(rows, 1 + np.array(soft, dtype=int)),
-        stiffness=np.array([scene.arms[k].joint_stiffness for k in soft]),
-        damping=np.array([scene.arms[k].joint_damping for k in soft]),
-        rotor=np.array([rotor_inertia(scene.arms[k]) for k in soft]),
+        joints=np.searchsorted(rows, np.array(motors, dtype=int)),
+        stiffness=np.array([soft[k].joint_stiffness for k in motors]),
+        damping=np.array([soft[k].joint_damping for k in motors]),
+        rotor=rotors[motors],
     )
     table = _table_of_forces(scene)
     return Drives(
@@ -208,7 +208,7 @@ def _drives(scene: Scene) -> Drives:
         rigid_feed_forward=control is not None and control.feed_forward == "rigid",
         table=None if table is None else lambda t: table(t)[:, rows],
         springs=springs,
-        rotors=None if control else _rotors(scene)[rows],
+        rotors=None if control else rotors[rows],
     )
 
 
@@ -220,7 +220,7 @@ def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     first = scene.driven_columns.start
 
     def forces(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), len(scene.rigid_units)))
+        out = np.zeros((len(t), scene.num_rigid))
         inside = t <= times[-1]
         out[inside, first : first + len(scene.driven)] = curve(t[inside])
         return out

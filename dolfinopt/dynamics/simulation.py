@@ -614,9 +614,10 @@ class _Machine:
         motion, q, rigid = self.prescribed.motion, self.prescribed.rates[0], weights.shape[1]
         here = interface_place(system.mechanism, motion, q, second=True)
         assert here.hessian is not None
-        pull = -system.ground_force(self.instants.split(self.rates[2])[2])
+        multipliers = self.instants.split(self.rates[2])[2]
         turned = np.einsum("ni,nic->nc", weights, here.hessian[:, :rigid, system.columns])
-        by[0][:, :moving] += (np.conj(pull)[:, None] * turned).real
+        by[0][:, :moving] -= system.ground_work(multipliers, turned)
+        pull = -system.ground_force(multipliers)
         J = system.closure.project(here.jacobian[:, :rigid])
         by[2][:, moving:last] -= np.einsum("nmi,ni->nm", J, weights)
         moved = np.concatenate([weights, np.zeros_like(q)], axis=1)

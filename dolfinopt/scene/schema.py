@@ -196,6 +196,19 @@ class Scene(Table):
         return {"cart": "m", **{arm.name: "rad" for arm in self.arms}}
 
     @property
+    def num_rigid(self) -> int:
+        """Number of rigid coordinates: cart and arms, or the joints in space that move."""
+        return len(self.movable) if self.is_spatial else 1 + len(self.arms)
+
+    @property
+    def joint_columns(self) -> tuple[int | None, ...]:
+        """Place of every arm's inboard joint among the rigid coordinates; None of a fixed one."""
+        if not self.is_spatial:
+            return tuple(range(1, 1 + len(self.arms)))
+        places = {joint.child: i for i, joint in enumerate(self.movable)}
+        return tuple(places.get(arm.name) for arm in self.arms)
+
+    @property
     def driven_columns(self) -> slice:
         """Where the drives stand among all rigid coordinates: cart, then the arms.
 
