@@ -92,7 +92,7 @@ class Family:
 
     equations: Equations
     build: Callable[[Scene, list[ShapeIntegrals]], Any]
-    motion: Callable[[np.ndarray, Scene], RigidMotion]
+    motion: Callable[..., RigidMotion]
     check: Callable[[Scene], None]
     curve: Callable[[Scene], tuple[Curve, bool]]
 

@@ -525,7 +525,7 @@ class StressTensor:
         b, c = np.triu_indices(n - 1)
         twice = np.where(b == c, 1.0, 2.0)
         self.tensor = np.empty((count, len(b), S.shape[3]))
-        pairs = [((k, k),) for k in range(dim)]
+        pairs: list[tuple[tuple[int, int], ...]] = [((k, k),) for k in range(dim)]
         pairs += [((x, y), (y, x)) for x, y in ((0, 1), (1, 2), (2, 0))[: kinds - dim]]
         step = max(1, CHUNK // (D.shape[1] * len(b) * kinds))
         for run in (slice(i, i + step) for i in range(0, count, step)):

@@ -344,7 +344,7 @@ class Bend:
         def squares(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return self.square(u), chebyshev.chebval(u, slopes)
 
-        rounding = 4.0 * np.finfo(float).eps * self.reach[1] ** 2
+        rounding = float(4.0 * np.finfo(float).eps * self.reach[1] ** 2)
         guess = np.interp(square, *self._guess)
         return inverse(squares, square, guess, (self.least, 1.0), rounding)
 
