@@ -31,11 +31,10 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body, uniform_design
 from dolfinopt.disk import write_arrays
-from dolfinopt.dynamics.build import check_forces
+from dolfinopt.dynamics.build import check_forces, check_motion
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.motion import check_motion
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.output.design import physical, read_design
@@ -504,10 +503,8 @@ class Model:
         return uniform_design(self.scene, partition, arms, density)
 
     def _prepared(self, x: Design) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
-        """Return the arms, which forget earlier designs, and the densities of this rank's cells.
-
-        A search for modes that set out from another design's would end in other last digits.
-        """
+        """Return the arms, which forget earlier designs, and the densities of this rank's cells."""
+        # A search for modes that set out from another design's would end in other last digits.
         partition, arms = self._arms()
         for arm in arms.values():
             arm.forget_modes()

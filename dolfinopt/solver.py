@@ -110,10 +110,8 @@ class PetscFactor:
 
     @property
     def _takes_blocks(self) -> bool:
-        """Whether several right-hand sides at once take less time: MUMPS, 18 a seventh.
-
-        Not of a factor that failed: its solution is to be infinite, in place of PETSc's error.
-        """
+        """Whether several right-hand sides at once take less time: MUMPS, 18 a seventh."""
+        # Not of a factor that failed: its solution is to be infinite, in place of PETSc's error.
         if self.ksp.getType() != PETSc.KSP.Type.PREONLY or self.ksp.getConvergedReason() < 0:
             return False
         return self.ksp.getPC().getFactorSolverType() == "mumps"

@@ -452,10 +452,7 @@ def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> d
 
 
 def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, Arm]) -> None:
-    """Raise InputError if solid cells exceed the volume limit, which a scene cannot know.
-
-    Collective on `partition.world`.
-    """
+    """Raise InputError if solid cells exceed the volume limit, unknown to a scene (collective)."""
     limit, least = scene.design.volume_fraction, scene.design.minimum
     if limit is None:
         return
@@ -522,8 +519,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
         interfaces = tuple((one.name, one.point) for one in arm.interfaces)
-        dimension = 3 if scene.is_spatial else 2
-        body = _read_body(arm.sid, changed, dimension, arm.length, interfaces)
+        body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body
         if scene.is_spatial:

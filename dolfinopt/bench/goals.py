@@ -66,11 +66,9 @@ def _simulation(coordinates: int, frame: Frame) -> Figure:
 
 
 def _superiority(coordinates: int, frame: Frame) -> Figure:
-    """Return how many times as long SciPy takes to our error, of the less superior design.
-
-    A method that did not get there takes longer than its finest setting did: a bound. One that is
-    too low tells nothing.
-    """
+    """Return how many times as long SciPy takes to our error, of the less superior design."""
+    # A method that did not get there takes longer than its finest setting did: a bound. One that is
+    # too low tells nothing.
     here, ratios, bounds, shown = _at(frame, coordinates_per_arm=coordinates), [], 0, []
     for design, seconds, error in _at(here, **motion.USUAL)[["design", SECONDS, ERROR]].values:
         theirs = here[here["method"].str.startswith("SciPy") & (here["design"] == design)]

@@ -10,7 +10,6 @@ import click
 from dolfinopt.cli.shared import (
     PATH,
     claim,
-    design_of,
     design_option,
     load,
     out_option,
@@ -79,6 +78,7 @@ def export(
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.exchange.mbdyn import write_fem
     from dolfinopt.exchange.sid import write_sid, write_sid_npz
+    from dolfinopt.output.design import arms_with_design
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import decide_stiffening
@@ -87,7 +87,7 @@ def export(
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
     claim(world, folder, overwrite, names, scene=loaded)
-    partition, arms, x_phys = design_of(world, loaded, design, Profile())
+    partition, arms, x_phys = arms_with_design(world, loaded, design, Profile())
     prepare(world, folder)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))
     with together(world):
@@ -114,13 +114,14 @@ def export(
 
 
 def _why(scene: Scene, index: int) -> str:
-    """Return why an arm has no files; of a rigid one in space what another program needs of it."""
-    if not (scene.is_spatial and scene.arms[index].rigid):
-        return "it is rigid or comes from a file"
+    """Return why an arm has no files; of a rigid one what another program needs of it."""
+    if not scene.arms[index].rigid:
+        return "it comes from a file"
     from dolfinopt.arms.arm import fixed_body
+    from dolfinopt.multibody.shape_integrals import in_space
     from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
 
-    body = fixed_body(scene, index)
+    body = in_space(fixed_body(scene, index))
     centre, tensor = inertia_about_centre(body)
     place = ", ".join(f"{x:.6g}" for x in centre)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor

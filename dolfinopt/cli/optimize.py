@@ -14,7 +14,6 @@ from dolfinopt.cli.shared import (
     animation_option,
     claim,
     conclude,
-    design_of,
     design_option,
     draw,
     elapsed,
@@ -87,11 +86,7 @@ def optimize(
 
 
 def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, animation: bool) -> None:
-    """Write everything an optimisation leaves behind (collective).
-
-    Raises:
-        ConvergenceError: the design does not meet a constraint; everything is written.
-    """
+    """Write all that an optimisation leaves behind; raise if it misses a limit (collective)."""
     from dolfinopt.output.run_folder import write_result
 
     def pictures(views: list[ArmView]) -> None:
@@ -103,8 +98,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
     written = write_result(scene, folder, result, elapsed(), pictures=drawn)
     if written is not None:
         conclude(written.summary, folder)
-        if not scene.is_spatial:  # parts are outlines of plane arms
-            click.echo(_next(scene, folder, written.summary["grayness"]))
+        click.echo(_next(scene, folder, written.summary["grayness"]))
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
 
@@ -147,6 +141,7 @@ def simulate(
     """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
+    from dolfinopt.output.design import arms_with_design
     from dolfinopt.output.folders import check_unused, remove_stale, working_alone
     from dolfinopt.output.run_folder import Simulated, write_simulation
     from dolfinopt.parallel import on_root
@@ -156,7 +151,7 @@ def simulate(
 
     claim(world, folder, overwrite, scene=loaded)
     profile = Profile()
-    partition, arms, x_phys = design_of(world, loaded, design, profile)
+    partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
         choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
         evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
@@ -216,7 +211,7 @@ def gradient(
         overrides = (*overrides, f'objective.gradient="{kind}"')
     world, loaded = load(scene, overrides)
     from dolfinopt.optimization.gradient_check import check_exact
-    from dolfinopt.output.design import write_gradient
+    from dolfinopt.output.design import arms_with_design, write_gradient
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes
@@ -227,7 +222,7 @@ def gradient(
     if check:
         check_exact(loaded)
     profile = Profile()
-    partition, arms, x_phys = design_of(world, loaded, design, profile)
+    partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     prepare(world, out.parent)
     moves = needs(loaded, "motion")
     if moves:
@@ -284,7 +279,7 @@ def _check_gradient(
 def plot(folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""
     world = start()
-    from dolfinopt.output.design import read_history
+    from dolfinopt.output.design import arms_with_design, read_history
     from dolfinopt.output.trajectory import read_initial_deviation
     from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import on_root
@@ -294,7 +289,7 @@ def plot(folder: Path, animation: bool) -> None:
 
     loaded = on_root(world, scene_of, folder)
     profile = Profile()
-    partition, arms, x_phys = design_of(world, loaded, folder / "design.npz", profile)
+    partition, arms, x_phys = arms_with_design(world, loaded, folder / "design.npz", profile)
     _, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
     stress = stress_report(partition, arms, trajectory, profile)
     views = gather_views(loaded, partition, arms, x_phys, stress)

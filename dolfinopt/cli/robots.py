@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.shared import PATH, claim, design_of, out_option, scene_of, start, warn
+from dolfinopt.cli.shared import PATH, claim, out_option, scene_of, start, warn
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
 
@@ -117,10 +117,8 @@ def _read(
 
 
 def _meshed(model: Robot, body: SceneBody) -> SceneBody:
-    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be.
-
-    The shape is that of the collision elements; of the visual ones where those are no solid.
-    """
+    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
+    # The shape is that of the collision elements; of the visual ones where those are no solid.
     from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
     from dolfinopt.exchange.urdf.robot import SolidMesh
     from dolfinopt.mesh.geometry import msh_bytes
@@ -285,10 +283,11 @@ def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
 
 def _reduced(world: MPI.Comm, run: Path, scene: Scene) -> _Run:
     """Return a finished run's arms, reduced (collective)."""
+    from dolfinopt.output.design import arms_with_design
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
 
-    partition, arms, x_phys = design_of(world, scene, run / "design.npz", Profile())
+    partition, arms, x_phys = arms_with_design(world, scene, run / "design.npz", Profile())
     with together(world):
         mine = {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}
     own = {k: x_phys[k] for k in arms}
@@ -438,11 +437,7 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
 
 
 def _surface(title: str, frame: np.ndarray, corners: np.ndarray, density: np.ndarray) -> bytes:
-    """Return an arm's design as STL in its link's frame, in metres.
-
-    Raises:
-        InputError: the design is too grey for a surface.
-    """
+    """Return an arm's design as STL in its link's frame, in metres."""
     from dolfinopt.part.isosurface import design_surface
     from dolfinopt.part.solid import triangle_bytes
 

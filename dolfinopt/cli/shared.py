@@ -43,11 +43,9 @@ from dolfinopt.units import NOT_MET, with_unit
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.optimization.history import HistoryRow
     from dolfinopt.output.views import ArmView
-    from dolfinopt.parallel import Partition
     from dolfinopt.responses.order_selection import OrderSelection
     from dolfinopt.scene.load import Scene
 
@@ -65,8 +63,7 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
-        from dolfinopt.dynamics.build import check_forces
-        from dolfinopt.multibody.motion import check_motion
+        from dolfinopt.dynamics.build import check_forces, check_motion
         from dolfinopt.scene.messages import implausible
 
         scene = load_scene(path, overrides)
@@ -103,7 +100,8 @@ def doubts_of_files(scene: Scene) -> list[str]:
                 f"{arm.sid} holds no geometric stiffness, which simulation.stiffening = true asks "
                 f"for: arm {arm.name!r} is linear"
             )
-        if scene.is_spatial and not body.outboard[2:5].any():
+        out_of_plane = body.outboard[2:-1]  # no rows of plane bodies
+        if len(out_of_plane) and not out_of_plane.any():
             found.append(
                 f"{arm.sid}: its outboard node moves in x and y and turns about z alone; out of "
                 f"that plane arm {arm.name!r} is rigid"
@@ -181,21 +179,6 @@ def _instead(folder: Path) -> str:
     if (folder / "cases").is_dir():
         return f"this is a study: name the folder of one of its cases, {folder / 'cases'}/..."
     return "name the folder of a finished optimize or simulate run"
-
-
-def design_of(
-    world: MPI.Comm, scene: Scene, design: Path | None, profile: Any
-) -> tuple[Partition, dict[int, Arm], dict[int, Any]]:
-    """Build the arms and return them with the physical densities of a file or the initial ones."""
-    from dolfinopt.arms.arm import build_arms, uniform_design
-    from dolfinopt.output.design import read_design
-    from dolfinopt.parallel import partition_arms
-
-    partition = partition_arms(world, scene.cell_counts)
-    arms = build_arms(scene, partition, profile)
-    if design is not None:
-        return partition, arms, read_design(design, partition, arms)
-    return partition, arms, uniform_design(scene, partition, arms, scene.design.initial)
 
 
 def draw(
@@ -353,10 +336,8 @@ def elapsed() -> float:
 
 
 def _age() -> float:
-    """Return how long ago this process was started, s; 0 where the system does not tell.
-
-    The launcher's process becomes this one after its set-up, which does not count.
-    """
+    """Return how long ago this process was started, s; 0 where the system does not tell."""
+    # The launcher's process becomes this one after its set-up, which does not count.
     try:
         words = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(words[19]) / os.sysconf("SC_CLK_TCK")

@@ -279,14 +279,9 @@ class _Hybrid:
 
 
 def _matrix(mesh: ArmMesh, blocks: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> PETSc.Mat:
-    """Assemble a matrix by facets' global numbers from blocks (n, i, j) of owned cells.
-
-    Args:
-        mesh: the arm.
-        blocks: of every cell.
-        rows: (n, i) global numbers of facets; or (n, 1) local ones of the cells themselves.
-        columns: (n, j) global numbers of facets.
-    """
+    """Assemble a matrix by facets' global numbers from blocks (n, i, j) of owned cells."""
+    # Rows are (n, i) global numbers of facets, or (n, 1) local ones of the cells themselves;
+    # columns (n, j) global numbers of facets.
     facets = mesh.mesh.topology.index_map(mesh.dim - 1)
     by_cell = rows.shape[1] == 1
     owned = mesh.num_cells if by_cell else facets.size_local

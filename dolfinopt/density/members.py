@@ -81,13 +81,8 @@ def _sampled(corners: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, float]
 
 
 def _width(inside: np.ndarray, most: int, hinges: bool) -> int:
-    """Return the largest diameter of discs whose opening leaves no member out, in samples.
-
-    Args:
-        inside: raster.
-        most: diameter beyond which nothing is thin.
-        hinges: whether touching in corners is a width of 0.
-    """
+    """Return the largest diameter of discs whose opening leaves no member out, in samples."""
+    # Beyond the diameter `most` nothing is thin; with `hinges` touching in corners is a width of 0.
     if hinges and _touches_in_corners(inside):
         return 0
     # From sample to sample: as far as the middle of a strip of so many samples in diameter.

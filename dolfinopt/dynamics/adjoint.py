@@ -45,13 +45,6 @@ KEPT_BYTES = 64e6  # of factors that are kept for further functions
 _Factors = tuple[NewtonMatrix, Linearisation]
 
 
-def trajectory_gradient(
-    system: ElasticSystem | MachineSystem, solution: Solution, t: np.ndarray, by_q: np.ndarray
-) -> list[ShapeIntegrals]:
-    """Return what `Adjoint.gradient` does, of a single function."""
-    return Adjoint(system, solution).gradient(t, by_q)
-
-
 class Adjoint:
     """The transposed recursion of one trajectory: factorised once for all functions of it.
 
@@ -91,11 +84,9 @@ class Adjoint:
         return add_gradients(gradient, through_start) if through_start else gradient
 
     def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,).
-
-        Newton's matrix is not the derivative where coordinates are treated as fast: what its answer
-        leaves, by the exact derivative, is answered again until nothing is left.
-        """
+        """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,)."""
+        # Newton's matrix is not the derivative where coordinates are treated as fast: what its
+        # answer leaves, by the exact derivative, is answered again until nothing is left.
         stages = self._stages
         slow, limits = next_slow_coordinates(stages, limits_for(stages), 0)
         while True:
@@ -134,13 +125,8 @@ def add_gradients(
 def _sampled(
     solution: Solution, t: np.ndarray, by_rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return dJ by the steps' accelerations (n, s, N) and states (n, 2, N); undoes `sample`.
-
-    Args:
-        solution: with the time grid.
-        t: (m,) ascending instants, s.
-        by_rates: (k, m, N) dJ by q, qd and qdd there, or by the first k of them.
-    """
+    """Return dJ by the steps' accelerations (n, s, N) and states (n, 2, N); undoes `sample`."""
+    # by_rates: (k, m, N) dJ by q, qd and qdd at the instants t, or by the first k of them.
     step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(solution.a) - 1)
     h = np.diff(solution.time_grid)[step]
     tau = (t - solution.time_grid[step]) / h
@@ -165,10 +151,8 @@ def _answered(
     by_y: np.ndarray,
     after: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return a window's multipliers and dJ by the state (2, N) at its beginning.
-
-    None where corrections do not shrink by `POOR`.
-    """
+    """Return a window's multipliers and dJ by the state (2, N) at its beginning, or None."""
+    # None where corrections do not shrink by `POOR`.
     multipliers = matrix.solve_transposed(by_a, by_y, after)
     size = np.abs(multipliers).max()
     enough = ENOUGH * size

@@ -140,10 +140,8 @@ def _together(
     known: Sequence[Solution | None],
     goal: float,
 ) -> list[Solution | None]:
-    """Return the solutions of a batch; None where it takes `radau.integrate`.
-
-    From cold a middle one is solved roughly first: it gives the steps and first guess of all.
-    """
+    """Return the solutions of a batch; None where it takes `radau.integrate`."""
+    # From cold a middle one is solved roughly first: it gives the steps and first guess of all.
     modes = batch.preconditioner()
     found: list[Solution | None] = [None] * batch.runs
     rest, starts = static_equilibrium(batch)
@@ -193,11 +191,9 @@ def _groups(
     tolerance: float,
     stages: int,
 ) -> dict[tuple[int, ...], list[int]]:
-    """Return the systems that are solved together, by their steps between the breakpoints.
-
-    Those whose own guesses are on as many steps keep them, if the worst allows; those without one
-    take `more` steps than the pilot.
-    """
+    """Return the systems that are solved together, by their steps between the breakpoints."""
+    # Those whose own guesses are on as many steps keep them, if the worst allows; those without one
+    # take `more` steps than the pilot.
     alike: dict[tuple[int, ...], list[int]] = {}
     wanted: dict[int, np.ndarray] = {}
     for i in left:
@@ -227,11 +223,8 @@ def _pilot(
     stages: int,
     profile: Profile,
 ) -> tuple[Solution | None, float]:
-    """Solve the middle one of the systems, or one beside it, on a first grid.
-
-    Returns:
-        The solution, if there is one, and how many times more steps the fastest one may need.
-    """
+    """Solve the middle one of the systems, or one beside it, on a first grid; None if it fails."""
+    # The second value is how many times more steps the fastest one may need.
     batch, tuning = modes.system, replace(RUNS, goal=PILOT_GOAL)
     horizons = np.array([batch.members[i].breakpoints[-1] for i in members])
     speeds = horizons * modes.frequencies[members].min(axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -12,7 +13,7 @@ from scipy.interpolate import make_interp_spline
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.equations import PLANE
+from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
@@ -23,9 +24,15 @@ from dolfinopt.multibody.mechanism import (
     pin,
     slider,
 )
-from dolfinopt.multibody.motion import breakpoints, rigid_motion
+from dolfinopt.multibody.motion import (
+    RigidMotion,
+    breakpoints,
+    check_plane_motion,
+    curve_of_table,
+    rigid_motion,
+)
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.paths.tables import TIME, read_table
+from dolfinopt.paths.tables import TIME, Curve, read_table
 from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.load import Arm, Scene
 
@@ -50,10 +57,10 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     )
 
 
-def _rotors(scene: Scene) -> np.ndarray:
-    """Return the inertia of rotors behind springs (1 + arms,), kg m2."""
-    soft = [rotor_inertia(arm) * (arm.joint_stiffness > 0.0) for arm in scene.arms]
-    return np.array([0.0, *soft])
+def soft_joints(scene: Scene) -> dict[int, Arm]:
+    """Return the arms with a spring between drive and arm, by their joint's rigid coordinate."""
+    pairs = zip(scene.joint_columns, scene.arms, strict=True)
+    return {k: arm for k, arm in pairs if k is not None and arm.joint_stiffness > 0.0}
 
 
 def reflected_inertia(arm: Arm) -> float:
@@ -68,17 +75,54 @@ def rotor_inertia(arm: Arm) -> float:
 
 def is_machine(scene: Scene) -> bool:
     """Return whether rigid coordinates are unknown: by control, a closed loop, soft joints."""
-    soft = any(arm.joint_stiffness > 0.0 for arm in scene.arms)
-    return scene.control is not None or scene.closure is not None or soft
+    return scene.control is not None or scene.closure is not None or bool(soft_joints(scene))
 
 
-def desired_motion(scene: Scene) -> Callable[[np.ndarray], Any]:
+@dataclass(frozen=True)
+class Family:
+    """How scenes in the plane, or in space, become machines.
+
+    Attributes:
+        equations: of their mechanisms.
+        build: (scene, bodies): the mechanism.
+        motion: (t, scene): the desired rigid motion at instants t (n,), s.
+        check: (scene): raises `InputError` where that motion is impossible.
+        curve: (scene): the curve through its table, and whether its parameter is time.
+    """
+
+    equations: Equations
+    build: Callable[[Scene, list[ShapeIntegrals]], Any]
+    motion: Callable[..., RigidMotion]
+    check: Callable[[Scene], None]
+    curve: Callable[[Scene], tuple[Curve, bool]]
+
+
+IN_PLANE = Family(PLANE, build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
+
+
+def family_of(scene: Scene) -> Family:
+    """Return how the scene becomes a machine."""
+    if not scene.is_spatial:
+        return IN_PLANE
+    from dolfinopt.multibody.spatial.end_effector import curve_in_space
+    from dolfinopt.multibody.spatial.equations import SPACE
+    from dolfinopt.multibody.spatial.mechanism import (
+        build_spatial_mechanism,
+        check_joint_motion,
+        joint_motion,
+    )
+
+    return Family(SPACE, build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)
+
+
+def check_motion(scene: Scene) -> None:
+    """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
+    family_of(scene).check(scene)
+
+
+def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
     """Return the scene's motion as a function of instants (n,), s."""
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.mechanism import joint_motion
-
-        return partial(joint_motion, scene=scene)
-    return partial(rigid_motion, scene=scene)
+    return partial(family_of(scene).motion, scene=scene)
 
 
 def build_system(
@@ -91,21 +135,25 @@ def build_system(
         bodies: from the base outwards.
         motion: the desired rigid motion, shared with other scenes; None: the scene's.
     """
+    family = family_of(scene)
     if motion is None:
         motion = desired_motion(scene)
-    mechanism: ElasticBodies
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.equations import SPACE
-        from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
-
-        mechanism, equations = build_spatial_mechanism(scene, bodies), SPACE
-    else:
-        mechanism, equations = build_mechanism(scene, bodies), PLANE
-    instants = breakpoints(scene)
+    mechanism: ElasticBodies = family.build(scene, bodies)
+    instants = breakpoints(scene, family.curve)
     if not is_machine(scene):
-        return ElasticSystem(mechanism, motion, instants, equations)
+        return ElasticSystem(mechanism, motion, instants, family.equations)
     instants, closure = _with_rows(instants, scene), closure_of(scene)
-    return MachineSystem(mechanism, motion, instants, _drives(scene), closure, equations)
+    return MachineSystem(mechanism, motion, instants, _drives(scene), closure, family.equations)
+
+
+def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
+    """Return the largest |eigenvalue| of K^-1 sum_p p K0_p over bodies and instants t (n,), s.
+
+    The loads p are those of the machine with rigid arms on the desired motion.
+    """
+    family = family_of(scene)
+    mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
+    return family.equations.largest_change(mechanism, motion, closure_of(scene))
 
 
 def closure_of(scene: Scene) -> Closure | None:
@@ -120,22 +168,21 @@ def closure_of(scene: Scene) -> Closure | None:
 
 
 def _drives(scene: Scene) -> Drives:
-    """Return the drives of all rigid coordinates that are not prescribed.
-
-    With control all of them are free; without it those of a loop that follow from the others, which
-    have no drive, and joints with a spring between drive and arm.
-    """
+    """Return the drives of all rigid coordinates that are not prescribed."""
+    # With control all of them are free; without it those of a loop that follow from the others,
+    # which have no drive, and joints with a spring between drive and arm.
     first = scene.driven_columns.start  # a fixed base has no coordinate
-    count = _num_rigid(scene)
+    count = scene.num_rigid
     last = count - scene.dependent_joints
     stiffness, damping = np.zeros((2, count))
     limits = np.full(count, np.inf)
     free = np.zeros(count, dtype=bool)
     free[last:] = True
-    for k, arm in enumerate(scene.arms[: max(last - 1, 0)]):
-        if arm.joint_stiffness > 0.0:  # in the plane
-            free[1 + k], stiffness[1 + k], damping[1 + k] = True, arm.joint_stiffness, 0.0
-            damping[1 + k] = arm.joint_damping
+    rotors, soft = np.zeros(count), soft_joints(scene)
+    for k, arm in soft.items():
+        rotors[k] = rotor_inertia(arm)
+        if k < last:
+            free[k], stiffness[k], damping[k] = True, arm.joint_stiffness, arm.joint_damping
     control, driven = scene.control, slice(first, last)
     if control is not None:
         free[driven] = True
@@ -144,12 +191,12 @@ def _drives(scene: Scene) -> Drives:
         if control.limits is not None:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
-    soft = [k for k, arm in enumerate(scene.arms) if arm.joint_stiffness > 0.0 and control]
+    motors = list(soft) if control else []
     springs = Springs(
-        joints=np.searchsorted(rows, 1 + np.array(soft, dtype=int)),
-        stiffness=np.array([scene.arms[k].joint_stiffness for k in soft]),
-        damping=np.array([scene.arms[k].joint_damping for k in soft]),
-        rotor=np.array([rotor_inertia(scene.arms[k]) for k in soft]),
+        joints=np.searchsorted(rows, np.array(motors, dtype=int)),
+        stiffness=np.array([soft[k].joint_stiffness for k in motors]),
+        damping=np.array([soft[k].joint_damping for k in motors]),
+        rotor=rotors[motors],
     )
     table = _table_of_forces(scene)
     return Drives(
@@ -161,13 +208,8 @@ def _drives(scene: Scene) -> Drives:
         rigid_feed_forward=control is not None and control.feed_forward == "rigid",
         table=None if table is None else lambda t: table(t)[:, rows],
         springs=springs,
-        rotors=None if control else _rotors(scene)[rows],
+        rotors=None if control else rotors[rows],
     )
-
-
-def _num_rigid(scene: Scene) -> int:
-    """Return the number of rigid coordinates: cart and arms, or the joints in space that move."""
-    return len(scene.movable) if scene.is_spatial else 1 + len(scene.arms)
 
 
 def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -178,7 +220,7 @@ def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     first = scene.driven_columns.start
 
     def forces(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), _num_rigid(scene)))
+        out = np.zeros((len(t), scene.num_rigid))
         inside = t <= times[-1]
         out[inside, first : first + len(scene.driven)] = curve(t[inside])
         return out
@@ -192,10 +234,8 @@ def check_forces(scene: Scene) -> None:
 
 
 def _with_rows(instants: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
-    """Return the breakpoints, s, and among them those of a table of forces that is not long.
-
-    Its slope jumps at every row, and at the last one the force itself.
-    """
+    """Return the breakpoints, s, and among them those of a table of forces that is not long."""
+    # Its slope jumps at every row, and at the last one the force itself.
     if scene.control is None or scene.control.forces is None:
         return instants
     times = _forces(scene.control.forces, scene.driven)[0]

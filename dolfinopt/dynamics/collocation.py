@@ -517,15 +517,9 @@ def _jumps(
 
 
 def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return the largest |exp(j z) - R(z)^j| of free vibrations, j steps on.
-
-    R is the method's stability function, 1 + z b' (1 - z A)^-1 1.
-
-    Args:
-        method: collocation.
-        z: (runs, P, N) eigenvalues times step.
-        steps: (P,) that follow.
-    """
+    """Return the largest |exp(j z) - R(z)^j| of free vibrations, j steps on."""
+    # R(z) = 1 + z b' (1 - z A)^-1 1 is the method's stability function, z (runs, P, N) are
+    # eigenvalues times step.
     values, X = np.linalg.eig(method.A)
     weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
     R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)

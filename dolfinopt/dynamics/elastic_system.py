@@ -290,11 +290,9 @@ def _vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
-    """Return the body in other coordinates.
-
-    Stiffness, and damping in proportion to it, lose the rounding beside their diagonals: whoever
-    uses them sees that the coordinates are uncoupled by them.
-    """
+    """Return the body in other coordinates."""
+    # Stiffness, and damping in proportion to it, lose the rounding beside their diagonals: whoever
+    # uses them sees that the coordinates are uncoupled by them.
     changed = in_basis(body, T)
     one = np.eye(len(changed.K))
     if np.abs(changed.K - one).max(initial=0.0) > MODE_ROUNDING:

@@ -166,12 +166,10 @@ def _difference(system: System, coarse: Solution, fine: Solution) -> float:
 
 
 def _error(difference: float, before: float, ratio: int) -> float:
-    """Return Richardson's estimate of the finer grid's error: difference / (ratio^p - 1).
-
-    The order p is 2 where the `difference` is what the one `before`, brought to this pair of
-    grids, foretells. It is taken as 1 elsewhere, while vibrations are not resolved yet:
-    estimates with 2 were seen five times too small there.
-    """
+    """Return Richardson's estimate of the finer grid's error: difference / (ratio^p - 1)."""
+    # The order p is 2 where the `difference` is what the one `before`, brought to this pair of
+    # grids, foretells. It is taken as 1 elsewhere, while vibrations are not resolved yet: estimates
+    # with 2 were seen five times too small there.
     order = 2 if difference <= 1.2 * before else 1  # and where there is none before: nan
     return difference / (ratio**order - 1)
 
@@ -268,10 +266,8 @@ class _Newton:
         return float(np.sqrt(max((residual @ self._flexibility * residual).sum(), 0.0)))
 
     def _renew(self, at: Instants, h: float, state: State, a: np.ndarray) -> None:
-        """Invert the derivative of the residual with respect to the acceleration at the end.
-
-        An inverse and no factorisation: with N in the tens, two triangular solves cost the calls.
-        """
+        """Invert the derivative of the residual with respect to the acceleration at the end."""
+        # An inverse and no factorisation: with N in the tens, two triangular solves cost the calls.
         w = self._weights
         derivative = at.linearise(*self._midpoint(h, state, a)).dense()[0]
         by_q, by_v, by_a = np.split(derivative, 3, axis=1)
@@ -289,10 +285,8 @@ class _Newton:
 
 
 def _flexibility(system: System, free: bool) -> np.ndarray:
-    """Return the inverse (N, N) of the stiffness of the system at rest at t = 0.
-
-    Where coordinates may be free, of the stiffness and the mass at the slowest frequency.
-    """
+    """Return the inverse (N, N) of the stiffness of the system at rest at t = 0."""
+    # Where coordinates may be free, of the stiffness and the mass at the slowest frequency.
     size = system.num_coordinates
     rest = np.zeros((1, size))
     derivative = system.at(np.zeros(1)).linearise(rest, rest, rest).dense()[0]
@@ -303,11 +297,9 @@ def _flexibility(system: System, free: bool) -> np.ndarray:
 
 
 def _first_acceleration(system: System, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Return qdd (1, N) at t = 0, at which free coordinates set out.
-
-    Zero of those without inertia, as of a motor without rotor inertia behind a spring: their
-    equations hold no acceleration.
-    """
+    """Return qdd (1, N) at t = 0, at which free coordinates set out."""
+    # Zero of those without inertia, as of a motor without rotor inertia behind a spring: their
+    # equations hold no acceleration.
     instants, rest = system.at(np.zeros(1)), np.zeros_like(q)
     mass = instants.linearise(q, qd, rest).dense()[0, :, 2 * q.shape[1] :]
     heavy = np.flatnonzero(mass.any(axis=1))
@@ -333,12 +325,10 @@ def _static_size(instants: Instants, flexibility: np.ndarray) -> float:
 def _interpolated(
     time_grid: np.ndarray, q: np.ndarray, qd_0: np.ndarray, iterations: int
 ) -> Solution:
-    """Return the cubic spline through q (n + 1, N) with velocity qd_0 (N,) at first.
-
-    Twice differentiable as the motion is. A cubic through both q and qd of a step would have
-    accelerations of first order only: Newmark's qd is the derivative of his q up to h^2, a
-    difference that a further derivative turns into h.
-    """
+    """Return the cubic spline through q (n + 1, N) with velocity qd_0 (N,) at first."""
+    # Twice differentiable as the motion is. A cubic through both q and qd of a step would have
+    # accelerations of first order only: Newmark's qd is the derivative of his q up to h^2, a
+    # difference that a further derivative turns into h.
     spline = CubicSpline(time_grid, q, bc_type=((1, qd_0), "not-a-knot"))
     a = spline(time_grid, 2)
     ends = np.stack([a[:-1], a[1:]], axis=1)

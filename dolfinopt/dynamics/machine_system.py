@@ -147,8 +147,7 @@ class MachineInstants:
         forces = machine.equations.forces(machine.mechanism, motion, q, qd, qdd)[1]
         if machine.closure is not None:
             jacobian = interface_place(machine.mechanism, motion, q).jacobian
-            pull = machine.ground_force(multipliers)
-            forces -= (np.conj(pull)[:, None] * jacobian[:, : forces.shape[1]]).real
+            forces -= machine.ground_work(multipliers, jacobian[:, : forces.shape[1]])
         free, rotors = machine.drives.free, machine.drives.rotors
         forces[:, free] = self.drive_forces(y, yd)
         if rotors is not None:
@@ -174,10 +173,8 @@ class MachineInstants:
         if machine.closure is None:
             return out
         here = interface_place(machine.mechanism, motion, q)
-        pull = machine.ground_force(multipliers)
-        out[:, : machine.ends[1]] -= (
-            np.conj(pull)[:, None] * here.jacobian[:, machine.columns]
-        ).real
+        jacobian = here.jacobian[:, machine.columns]
+        out[:, : machine.ends[1]] -= machine.ground_work(multipliers, jacobian)
         gaps = slice(*machine.ends[1:])
         out[:, gaps] = machine.gap_scale * machine.closure.gap(here.place)
         return out
@@ -212,8 +209,7 @@ class MachineInstants:
             assert here.hessian is not None
             J = machine.closure.project(here.jacobian[:, machine.columns])  # (n, m, R + N)
             H = here.hessian[:, machine.columns[:, None], machine.columns]
-            pull = np.conj(machine.ground_force(multipliers))
-            matrix[:, :moving, 0, :moving] -= (pull[:, None, None] * H).real
+            matrix[:, :moving, 0, :moving] -= machine.ground_work(multipliers, H)
             matrix[:, :moving, 2, moving:last] -= J.swapaxes(1, 2)
             matrix[:, moving:last, 0, :moving] += machine.gap_scale * J
         return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
@@ -301,6 +297,11 @@ class MachineSystem:
         """Return the force (n,) on the interface, complex, N, by the multipliers (n, m)."""
         assert self.closure is not None
         return multipliers @ self.closure.normals + self.closure.force
+
+    def ground_work(self, multipliers: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
+        """Return the work (n, ...) of `ground_force` along complex derivatives of the place."""
+        pull = self.ground_force(multipliers).reshape(-1, *(1,) * (derivatives.ndim - 1))
+        return (np.conj(pull) * derivatives).real
 
     def at(self, t: np.ndarray) -> MachineInstants:
         """Return the machine at instants t (n,), s."""

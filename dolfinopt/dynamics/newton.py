@@ -287,11 +287,7 @@ def factorise(
 
 
 def _blocks(stages: Stages, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivative of every step's residual by its accelerations and first state.
-
-    Returns:
-        (n, s S, s S) and (n, s S, 2 S).
-    """
+    """Return the steps' residuals by accelerations (n, s S, s S) and first state (n, s S, 2 S)."""
     method, size = stages.method, jacobian.shape[1]
     count, s = len(stages.h), len(method.c)
     by_q, by_v, by_a = np.split(jacobian.reshape(count, s, size, 3 * size), 3, axis=3)
@@ -760,10 +756,8 @@ def _eigenvectors(method: Collocation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: bool) -> np.ndarray:
-    """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of the derivative by q, qd, qdd.
-
-    Without pivots where M and K are definite, which takes a third of the time.
-    """
+    """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of the derivative by q, qd, qdd."""
+    # Without pivots where M and K are definite, which takes a third of the time.
     values = np.linalg.eigvals(method.A)
     values = values[values.imag >= -1e-12]
     count, size = jacobian.shape[:2]

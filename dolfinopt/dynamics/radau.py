@@ -171,10 +171,8 @@ def _least_growth(found: Solution, before: float, coarse: int, tolerance: float)
 
 
 def _most_steps(preconditioner: Preconditioner, stages: int) -> int:
-    """Return how many steps have room: of machines every coordinate has dense blocks.
-
-    Measured: 19 to 75 kB a step with 8 coordinates, 104 with 64, of a four-bar with 18 200.
-    """
+    """Return how many steps have room: of machines every coordinate has dense blocks."""
+    # Measured: 19 to 75 kB a step with 8 coordinates, 104 with 64, of a four-bar with 18 200.
     definite, size = preconditioner.definite, preconditioner.system.num_coordinates
     dense, copies = (min(size, MOST), 1) if definite else (size, 4)
     values = copies * (stages * stages + 2 * stages + 8) * dense * dense + 2500
@@ -494,19 +492,10 @@ def _corrected(
     residual: np.ndarray,
     q: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative size of what takes the residual away, and whether it can be believed.
-
-    Corrected by what it leaves, as long as that shrinks: without damping the first answer may be
-    7 % off.
-
-    Args:
-        stages, matrix: of one stage more.
-        begin: q, qd (n, N) at the steps' beginnings.
-        a, residual, q: (n, s + 1, N).
-
-    Returns:
-        Both (runs,).
-    """
+    """Return the relative size of what takes the residual away, and whether it can be believed."""
+    # Corrected by what it leaves, as long as that shrinks: without damping the first answer may be
+    # 7 % off. Stages and matrix are of one stage more; residual and q (n, s + 1, N); both results
+    # (runs,).
     rest = np.zeros((2, a.shape[2]))
     state = (begin[0][:: stages.length], begin[1][:: stages.length])
     step, shift = matrix.solve(residual, rest)
@@ -581,10 +570,8 @@ class March:
         return Iterate(a, np.ones(1, dtype=bool), np.zeros(1), np.array([spent]))
 
     def _from_nothing(self, stages: Stages, state: State, tuning: Tuning) -> tuple[np.ndarray, int]:
-        """Solve a few steps after the other, each from the accelerations that the last end with.
-
-        Free rigid coordinates go far: no guess holds over the whole horizon.
-        """
+        """Solve a few steps after the other, each from the accelerations that the last end with."""
+        # Free rigid coordinates go far: no guess holds over the whole horizon.
         count = len(stages.h)
         size, s = stages.preconditioner.system.num_coordinates, len(stages.method.c)
         pieces: list[np.ndarray] = []

@@ -492,13 +492,6 @@ CHUNK = 512  # instants whose matrices are made at once
 KEPT_BYTES = 64e6  # of matrices that are kept for further functions of the same forces
 
 
-def drive_force_gradient(
-    system: Problem, t: np.ndarray, rates: Rates, weights: np.ndarray
-) -> tuple[np.ndarray, list[ShapeIntegrals]]:
-    """Return what `DriveForces.gradient` does, of a single function."""
-    return DriveForces(system, t, rates).gradient(weights)
-
-
 class DriveForces:
     """The forces of all drives at some instants, to be differentiated.
 
@@ -621,9 +614,10 @@ class _Machine:
         motion, q, rigid = self.prescribed.motion, self.prescribed.rates[0], weights.shape[1]
         here = interface_place(system.mechanism, motion, q, second=True)
         assert here.hessian is not None
-        pull = -system.ground_force(self.instants.split(self.rates[2])[2])
+        multipliers = self.instants.split(self.rates[2])[2]
         turned = np.einsum("ni,nic->nc", weights, here.hessian[:, :rigid, system.columns])
-        by[0][:, :moving] += (np.conj(pull)[:, None] * turned).real
+        by[0][:, :moving] -= system.ground_work(multipliers, turned)
+        pull = -system.ground_force(multipliers)
         J = system.closure.project(here.jacobian[:, :rigid])
         by[2][:, moving:last] -= np.einsum("nmi,ni->nm", J, weights)
         moved = np.concatenate([weights, np.zeros_like(q)], axis=1)

@@ -26,15 +26,13 @@ group 19 modalad.cc.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dolfinopt.disk import write_text
-from dolfinopt.errors import InputError
 
 _TITLES = {
     1: "HEADER",
@@ -117,7 +115,7 @@ class ModalElement:
 
 
 def write_fem(path: Path, element: ModalElement) -> None:
-    """Write the file; `read_fem` gets the same numbers back."""
+    """Write the file; its numbers lose no digit."""
     write_text(path, fem_text(element))
 
 
@@ -160,10 +158,8 @@ def fem_text(element: ModalElement) -> str:
 
 
 def _packed(invariants: Invariants) -> tuple[np.ndarray, ...]:
-    """Return the numbers of groups 14 to 18 in MBDyn's order, as rows of the file.
-
-    Rows of the invariants are outermost; within them modes j, then k, then columns.
-    """
+    """Return the numbers of groups 14 to 18 in MBDyn's order, as rows of the file."""
+    # Rows of the invariants are outermost; within them modes j, then k, then columns.
     one, q = invariants, invariants.three.shape[1]
     return (
         one.three,
@@ -176,115 +172,3 @@ def _packed(invariants: Invariants) -> tuple[np.ndarray, ...]:
 
 def _rows(values: np.ndarray) -> list[str]:
     return [" ".join(f"{v: .16e}" if v != 0.0 else " 0." for v in row) for row in values]
-
-
-# -- reading ---------------------------------------------------------------------------------
-
-
-def read_fem(path: Path) -> ModalElement:
-    """Read a .fem file with the record groups that `write_fem` writes.
-
-    Groups may come in any order after the first; others are passed over. Without group 19 the body
-    is linear.
-
-    Raises:
-        InputError: one line with the file, the group and what is wrong.
-    """
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); name a .fem file") from None
-    groups: dict[int, list[str]] = {}
-    number = 0
-    for line in text.splitlines():
-        title = re.match(r"\*\* RECORD GROUP\s+(\d+)", line)
-        if title:
-            number = int(title[1])
-            if number in groups:
-                raise InputError(f"{path}: record group {number} appears twice")
-            groups[number] = []
-        elif number and not line.startswith("**"):
-            groups[number] += line.split()
-    coupling = INVARIANTS if any(k in groups for k in INVARIANTS) else (LUMPED,)
-    if LUMPED in groups and coupling != (LUMPED,):
-        raise InputError(
-            f"{path}: record groups {LUMPED} and {INVARIANTS[0]} to {INVARIANTS[-1]} exclude each "
-            "other: MBDyn would add up what both say; remove one of them"
-        )
-    needed = [k for k in _TITLES if k not in (LUMPED, *INVARIANTS, STIFFENING)]
-    missing = [k for k in sorted([*needed, *coupling]) if k not in groups]
-    if missing:
-        raise InputError(f"{path}: record group {missing[0]}, {_TITLES[missing[0]]}, is missing")
-    return _element(path, groups)
-
-
-def _element(path: Path, groups: dict[int, list[str]]) -> ModalElement:
-    sizes = groups[1][1:]
-    if len(sizes) != 5 or not all(word.isdecimal() for word in sizes):
-        raise InputError(
-            f"{path}: record group 1 has {' '.join(groups[1])!r}, expected REV0 and five integers"
-        )
-    count = int(sizes[0])
-    q = int(sizes[1]) + int(sizes[2]) + int(sizes[3]) - int(sizes[4])
-    if len(groups[2]) != count:
-        raise InputError(f"{path}: record group 2 has {len(groups[2])} labels, expected {count}")
-
-    def numbers(group: int, *shape: int) -> np.ndarray:
-        words = groups[group]
-        if len(words) != np.prod(shape):
-            raise InputError(
-                f"{path}: record group {group} has {len(words)} numbers, expected {np.prod(shape)}"
-            )
-        try:
-            values = np.array([float(word) for word in words])
-        except ValueError as error:
-            raise InputError(f"{path}: record group {group}: {error}") from None
-        return values.reshape(shape)
-
-    loads, stiffening = _stiffening(path, groups, q, numbers)
-    inertia = numbers(12, 13)
-    return ModalElement(
-        labels=tuple(groups[2]),
-        points=np.column_stack([numbers(5 + axis, count) for axis in range(3)]),
-        modes=numbers(8, q, count, 6).transpose(1, 2, 0),
-        M=numbers(9, q, q),
-        K=numbers(10, q, q),
-        D=numbers(13, q, q),
-        lumped=numbers(LUMPED, count, 6) if LUMPED in groups else None,
-        mass=float(inertia[0]),
-        centre=inertia[1:4],
-        inertia=inertia[4:].reshape(3, 3),
-        loads=loads,
-        stiffening=stiffening,
-        invariants=None if LUMPED in groups else _invariants(q, numbers),
-    )
-
-
-def _invariants(q: int, numbers: Callable[..., np.ndarray]) -> Invariants:
-    """Return what groups 14 to 18 hold, see `_packed`."""
-    return Invariants(
-        three=numbers(14, 3, q),
-        four=numbers(15, 3, q),
-        five=numbers(17, 3, q, q),
-        eight=numbers(16, 3, q, 3).transpose(0, 2, 1),
-        nine=numbers(18, 3, q, q, 3).transpose(0, 3, 1, 2),
-    )
-
-
-def _stiffening(
-    path: Path, groups: dict[int, list[str]], q: int, numbers: Callable[..., np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return places (k,) and matrices (k, q, q) of group 19; k = 0 without it."""
-    if STIFFENING not in groups:
-        return np.zeros(0, dtype=int), np.zeros((0, q, q))
-    words = groups[STIFFENING]
-    known = int(words[0]) if words and words[0].isdecimal() else 0
-    stride = 1 + q * q
-    table = numbers(STIFFENING, 1 + known * stride)[1:].reshape(known, stride)
-    loads, stiffening = table[:, 0].astype(int), table[:, 1:].reshape(known, q, q)
-    if not known or (loads != table[:, 0]).any() or loads.min() < 1:
-        raise InputError(
-            f"{path}: record group {STIFFENING} must hold a number of matrices >= 1 and, "
-            "before each of them, the place of its load, an integer >= 1"
-        )
-    return loads, stiffening

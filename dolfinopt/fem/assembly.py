@@ -18,7 +18,8 @@ from dolfinopt.fem.elements import ElementOperators
 class AffineMatrix:
     """sum_e s_e A_e as a SciPy CSR matrix over local dofs, assembled by one sparse product.
 
-    `values = P @ s`: column e of P holds the entries of A_e at their places in the pattern.
+    `values = P @ s`: column e of P holds the entries of A_e at their places in the pattern. In the
+    plane this takes 0.6 of what `CellMatrix` does, in space too much memory.
 
     Attributes:
         pattern: (size, size) matrix of ones.
@@ -76,24 +77,28 @@ class NodePairs:
         self.pattern = sp.csr_matrix(data, shape=(num_nodes, num_nodes))
 
 
-class UniformMatrix:
-    """sum_e s_e A of cells that are all alike, as a matrix of blocks that couple two nodes.
+class CellMatrix:
+    """sum_e s_e A_e as a matrix of blocks that couple two nodes; A_e of cells may all be the same.
 
-    A sparse matrix of s_e, by pairs of nodes and places in A, times the blocks of A: it holds
-    b x b times fewer numbers than those of `AffineMatrix`.
+    A sparse matrix of s_e, by pairs of nodes and places in A, times the blocks of A: one matrix for
+    all cells, or the blocks of each cell's own, sorted.
 
     Attributes:
         pattern: of the pairs of nodes.
         block: b, components of A to a node.
     """
 
-    def __init__(self, pairs: NodePairs, element: np.ndarray):
-        """Set up for A (b n, b n) of cells with n nodes."""
+    def __init__(self, pairs: NodePairs, elements: np.ndarray):
+        """Set up for A_e (1 or n_cells, b n, b n) of cells with n nodes."""
         self._pairs, self.pattern = pairs, pairs.pattern
-        n = pairs.width
-        self.block = b = len(element) // n
-        self._blocks = element.reshape(n, b, n, b).swapaxes(1, 2).reshape(n * n, b * b).copy()
-        self._places = pairs.place
+        size, n = elements.shape[1], pairs.width
+        self.block = b = size // n
+        blocks = elements.reshape(-1, n, b, n, b).swapaxes(2, 3).reshape(-1, b * b)
+        self._blocks, self._places = blocks.copy(), pairs.place
+        if len(elements) != 1:
+            # In the order of the entries that they add to: read from one end to the other.
+            self._blocks = blocks[pairs.cell.astype(np.int64) * n * n + pairs.place]
+            self._places = np.arange(len(self._blocks), dtype=np.int32)
 
     def assemble(self, scale: np.ndarray) -> sp.csr_matrix | sp.bsr_matrix:
         """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""
@@ -108,23 +113,6 @@ class UniformMatrix:
         size = b * pattern.shape[0]
         values = values.reshape(-1, b, b)
         return sp.bsr_matrix((values, pattern.indices, pattern.indptr), (size, size))
-
-
-class BlockMatrix(UniformMatrix):
-    """sum_e s_e A_e as a matrix of blocks that couple two nodes, where every cell has its own A_e.
-
-    A ninth of the places that `AffineMatrix` sorts in space.
-    """
-
-    def __init__(self, pairs: NodePairs, elements: np.ndarray):
-        """Set up for A_e (n_cells, b n, b n) of cells with n nodes."""
-        self._pairs, self.pattern = pairs, pairs.pattern
-        count, size, n = len(elements), elements.shape[1], pairs.width
-        self.block = b = size // n
-        blocks = elements.reshape(count, n, b, n, b).swapaxes(2, 3).reshape(-1, b * b)
-        # In the order of the entries that they add to: read from one end to the other.
-        self._blocks = blocks[pairs.cell.astype(np.int64) * n * n + pairs.place]
-        self._places = np.arange(len(self._blocks), dtype=np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,75 +274,17 @@ class InteriorMatrix:
         self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
 
-# -- nodal fields on cells, and energies cell by cell: derivatives by the material of each cell
-#
-# d is the number of directions.
-
-
-def cell_values(operators: ElementOperators, field: np.ndarray) -> np.ndarray:
-    """Return the cells' nodal values (n_cells, dn, k) less their mean, which has no energy.
-
-    Rounding is then relative to the differences within a cell, not to its displacement.
-
-    Args:
-        operators: of the arm.
-        field: (n_nodes, d, k).
-    """
-    num_cells, num_nodes = operators.cells.shape
-    flat = field.reshape(len(field), -1)
-    # Node by node: rows are contiguous, which a mean over the nodes' axis is not.
-    corners = [flat[nodes] for nodes in operators.cells.T]
-    mean = corners[0].copy()
-    for corner in corners[1:]:
-        mean += corner
-    mean /= num_nodes
-    values = np.empty((num_cells, num_nodes, flat.shape[1]))
-    for k, corner in enumerate(corners):
-        np.subtract(corner, mean, out=values[:, k])
-    return values.reshape(num_cells, field.shape[1] * num_nodes, field.shape[2])
-
-
 def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Return nodal fields (n_nodes, d, k) times coefficients (k, m), as one matrix product."""
     flat = field.reshape(field.shape[0] * field.shape[1], field.shape[2]) @ coefficients
     return flat.reshape(*field.shape[:2], coefficients.shape[1])
 
 
-def sum_at_nodes(operators: ElementOperators, forces: np.ndarray) -> np.ndarray:
-    """Return the nodal field (n_nodes, d, k) of the cells' forces (n_cells, n, d, k)."""
-    cells, shape = operators.cells, forces.shape[2:]
-    corners = sp.csr_matrix(
-        (np.ones(cells.size), cells.ravel(), np.arange(cells.size + 1)),
-        shape=(cells.size, len(operators.points)),
-    )
-    return (corners.T @ forces.reshape(cells.size, -1)).reshape(-1, *shape)
-
-
-def stiffness_products(
-    operators: ElementOperators, left: np.ndarray, right: np.ndarray
-) -> np.ndarray:
-    """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
-    return _products(
-        operators.stiffness, cell_values(operators, left), cell_values(operators, right)
-    )
-
-
-def mass_products(operators: ElementOperators, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
-    cells = operators.cells
-    shape = (*cells.shape, -1)  # all components and columns alike
-    return _products(operators.mass, left[cells].reshape(shape), right[cells].reshape(shape))
-
-
-def _products(elements: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return sum_k left' A_e right (n_cells,) for (n_cells, n, n) and (n_cells, n, k)."""
-    return np.einsum("eik,eik->e", left, elements @ right)
-
-
-# -- meshes whose cells are all alike: one element matrix for all, and dense products with it ----
+# -- nodal fields on cells, and energies cell by cell: derivatives by the material of each cell ----
 #
-# Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells;
-# d is the number of directions.
+# Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells
+# that are alike; their element matrices (1 or n_cells, ...) stand first. d is the number of
+# directions.
 
 # Largest difference of the cells' matrices from their mean, in its largest entry: rounding of the
 # nodes' places, 1e-16 m in cells of 1 mm, and what Gmsh adds to it in a file's grid.
@@ -380,13 +310,27 @@ def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
     return mean if error <= ALIKE * np.abs(mean).max() else None
 
 
-class UniformCells:
-    """The cells of one rank, all alike; n nodes a cell.
+def times(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return A_e v_e (rows, k, n_cells) of (1 or n_cells, rows, n) and (n, k, n_cells)."""
+    if len(matrices) == 1:
+        rows, (_, k, count) = matrices.shape[1], values.shape
+        return (matrices[0] @ values.reshape(len(values), -1)).reshape(rows, k, count)
+    by_cell = np.ascontiguousarray(values.transpose(2, 0, 1))  # as BLAS takes them
+    return np.ascontiguousarray((matrices @ by_cell).transpose(1, 2, 0))
+
+
+def of_cells(matrices: np.ndarray, cells: slice) -> np.ndarray:
+    """Return those of some cells; what all share as it is."""
+    return matrices if len(matrices) == 1 else matrices[cells]
+
+
+class Cells:
+    """The cells of one rank; n nodes a cell.
 
     Attributes:
         operators: of the arm.
-        stiffness: (dn, dn) of any cell, see `ElementOperators`.
-        mass: (n, n).
+        stiffness: (1 or n_cells, dn, dn), one for all cells where those of all ranks are alike.
+        mass: (1 or n_cells, n, n).
     """
 
     def __init__(self, operators: ElementOperators, stiffness: np.ndarray, mass: np.ndarray):
@@ -463,57 +407,78 @@ class UniformCells:
         first = self._sum[:, : self.count]
         return sp.csr_matrix(self._sum[:, self.count :] - sp.hstack([first] * (self.num_nodes - 1)))
 
-    def difference_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return what `stiffness_products` does, given both fields' `differences`."""
+    def difference_products(self, left: np.ndarray, right: np.ndarray, cells: slice) -> np.ndarray:
+        """Return what `stiffness_products` does, given both fields' `differences` of some cells."""
         dim = self.operators.points.shape[1]
-        stiffness = self.stiffness[dim:, dim:]
-        return _sum_of_products(left, stiffness @ right.reshape(len(stiffness), -1))
+        stiffness = of_cells(self.stiffness[:, dim:, dim:], cells)
+        values = right.reshape(stiffness.shape[1], -1, right.shape[-1])
+        return _sum_of_products(left, times(stiffness, values))
 
     # -- energies ----------------------------------------------------------------------------
 
-    def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
+    def stiffness_products(
+        self, left: np.ndarray, right: np.ndarray, stiffness: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
+
+        Args:
+            left, right: fields.
+            stiffness: (n_cells, dn, dn) in place of k_e.
+        """
         values = self.centred(right)
-        products = self.stiffness @ values.reshape(len(self.stiffness), -1)
+        products = self.stiffness_times(values, stiffness)
         if left is not right:
             values = self.centred(left)
         return _sum_of_products(values, products)
 
-    def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
-        values = self.values(right)
-        return _sum_of_products(self.values(left), self.mass @ values.reshape(len(values), -1))
+    def mass_products(
+        self, left: np.ndarray, right: np.ndarray, mass: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return sum_k left_k' m_e right_k (n_cells,) likewise; `mass` in place of m_e."""
+        values, count = self.values(right), self.count
+        flat = values.reshape(len(values), -1, count)
+        return _sum_of_products(self.values(left), times(self.mass if mass is None else mass, flat))
+
+    def stiffness_times(
+        self, values: np.ndarray, stiffness: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return k_e times nodal values (n, d, k, n_cells), see `values`."""
+        flat = values.reshape(-1, *values.shape[2:])
+        return times(self.stiffness if stiffness is None else stiffness, flat).reshape(values.shape)
 
     def energy_matrix(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Return field' K field (k, k) of this rank's cells."""
-        values = self.centred(field).reshape(-1, field.shape[2], len(young))
-        products = self.stiffness @ values.reshape(len(values), -1)
-        products = products.reshape(values.shape) * young
-        return np.matmul(values, products.swapaxes(1, 2)).sum(axis=0)
+        values = self.centred(field)
+        products = self.stiffness_times(values) * young
+        flat = (-1, field.shape[2], len(young))
+        return np.matmul(values.reshape(flat), products.reshape(flat).swapaxes(1, 2)).sum(axis=0)
 
     def centred(self, field: np.ndarray) -> np.ndarray:
-        """Return `values` less their mean, which has no energy, see `cells.cell_values`."""
+        """Return `values` less their mean, which has no energy.
+
+        Rounding is then relative to the differences within a cell, not to its displacement.
+        """
         values = self.values(field)
         values -= values.mean(axis=0)
         return values
 
 
-def uniform_cells(comm: MPI.Comm, operators: ElementOperators) -> UniformCells | None:
-    """Return the cells of this rank, if those of all ranks are alike (collective).
+def cells_of(comm: MPI.Comm, operators: ElementOperators) -> Cells:
+    """Return the cells of this rank (collective).
 
-    Their operators then have exactly the same matrices. What is assembled from these knows no
-    rounding of the nodes' places; and the same mean belongs in the other operators of a cell, or
-    rotations of a cell would strain it by that rounding.
+    If those of all ranks are alike, their operators then have exactly the same matrices. What is
+    assembled from these knows no rounding of the nodes' places; and the same mean belongs in the
+    other operators of a cell, or rotations of a cell would strain it by that rounding.
     """
     stiffness, mass = single(comm, operators.stiffness), single(comm, operators.mass)
     if stiffness is None or mass is None:
-        return None
+        return Cells(operators, operators.stiffness, operators.mass)
     same = replace(
         operators,
         stiffness=np.broadcast_to(stiffness, operators.stiffness.shape),
         mass=np.broadcast_to(mass, operators.mass.shape),
     )
-    return UniformCells(same, stiffness, mass)
+    return Cells(same, stiffness[None], mass[None])
 
 
 def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -522,7 +487,7 @@ def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.einsum("ie,ie->e", rows, right.reshape(rows.shape))
 
 
-# -- geometric stiffness of cells that are all alike: one tensor of third order for all of them
+# -- geometric stiffness: a tensor of third order of each cell, one for all cells that are alike
 #
 # What strains a cell are the differences of its nodes' displacements from its first node's, n - 1
 # of each component for n nodes. With those a of the modes and u of the fields whose stress stiffens
@@ -540,30 +505,36 @@ CHUNK, LEAST = 120_000, 256
 BUFFER = 256
 
 
-class UniformStress:
-    """The tensor T of cells that are all alike; r = n - 1 differences of each component.
+class StressTensor:
+    """The tensor T of cells; r = n - 1 differences of each component.
 
     Attributes:
         cells: which.
-        tensor: (r (r + 1) / 2, d r) T, b <= c; of b < c twice as much, for c and b.
+        tensor: (1 or n_cells, r (r + 1) / 2, d r) T, b <= c; of b < c twice as much, for c and b.
     """
 
-    def __init__(self, cells: UniformCells, derivatives: np.ndarray, stress: np.ndarray):
-        """Set up from the operators of one cell, see `Quadrature`: (dp, n) and (sp, dn)."""
+    def __init__(self, cells: Cells, derivatives: np.ndarray, stress: np.ndarray):
+        """Set up from the cells' operators, see `Quadrature`; (1, dp, n), (1, sp, dn) of all."""
         self.cells = cells
         dim = cells.operators.points.shape[1]
         kinds = 3 if dim == 2 else 6
         # Of a translation neither is left: the first node's columns are minus the others' sum.
-        D = derivatives.reshape(-1, dim, derivatives.shape[1])[:, :, 1:]
-        S = stress.reshape(len(D), kinds, -1)[:, :, dim:]
-        products = np.einsum("pxb,pyc->pxybc", D, D)
-        T = np.einsum("pd,pbc->bcd", S[:, 0], products[:, 0, 0])
-        for k in range(1, dim):
-            T += np.einsum("pd,pbc->bcd", S[:, k], products[:, k, k])
-        for k, (x, y) in enumerate(((0, 1), (1, 2), (2, 0))[: kinds - dim], dim):
-            T += np.einsum("pd,pbc->bcd", S[:, k], products[:, x, y] + products[:, y, x])
-        b, c = np.triu_indices(D.shape[2])
-        self.tensor = np.where(b == c, 1.0, 2.0)[:, None] * T[b, c]
+        count, n = len(derivatives), derivatives.shape[2]
+        D = derivatives.reshape(count, -1, dim, n)[:, :, :, 1:]
+        S = stress.reshape(*D.shape[:2], kinds, -1)[:, :, :, dim:]
+        b, c = np.triu_indices(n - 1)
+        twice = np.where(b == c, 1.0, 2.0)
+        self.tensor = np.empty((count, len(b), S.shape[3]))
+        pairs: list[tuple[tuple[int, int], ...]] = [((k, k),) for k in range(dim)]
+        pairs += [((x, y), (y, x)) for x, y in ((0, 1), (1, 2), (2, 0))[: kinds - dim]]
+        step = max(1, CHUNK // (D.shape[1] * len(b) * kinds))
+        for run in (slice(i, i + step) for i in range(0, count, step)):
+            d = D[run]
+            products = np.stack(
+                [sum(d[:, :, x, b] * d[:, :, y, c] for x, y in terms) for terms in pairs], axis=2
+            ).reshape(len(d), -1, len(b))
+            weighted = (twice * products).swapaxes(1, 2)
+            self.tensor[run] = weighted @ S[run].reshape(len(d), -1, S.shape[3])
 
     def of(self, fields: np.ndarray, young: np.ndarray, V: np.ndarray) -> StiffenedModes:
         """Return the geometric stiffness of modes by the stress of fields.
@@ -601,8 +572,8 @@ class StiffenedModes:
     What the value has gathered its derivatives do not gather again.
     """
 
-    def __init__(self, tensor: UniformStress, fields: np.ndarray, young: np.ndarray, V: np.ndarray):
-        """See `UniformStress.of`."""
+    def __init__(self, tensor: StressTensor, fields: np.ndarray, young: np.ndarray, V: np.ndarray):
+        """See `StressTensor.of`."""
         self._tensor, self._shape = tensor, (V.shape[2], fields.shape[2])
         cells, count = tensor.cells, len(young)
         b, c = np.triu_indices(cells.num_nodes - 1)
@@ -613,12 +584,11 @@ class StiffenedModes:
         self._runs = [self._run(run, rows, young[run]) for run in runs]
 
     def _run(self, cells: slice, rows: np.ndarray, young: np.ndarray) -> _Run:
-        (q, loads), T = self._shape, self._tensor.tensor
+        (q, loads), T = self._shape, of_cells(self._tensor.tensor, cells)
         values = self._tensor.cells.differences(rows, cells)
         values = values.reshape(len(values), -1, q + loads, len(young))
         a, u = values[:, :, :q].copy(), values[:, :, q:].copy()
-        force = T @ u.reshape(T.shape[1], -1)
-        return _Run(cells, young, a, u, force.reshape(len(T), loads, -1))
+        return _Run(cells, young, a, u, times(T, u.reshape(T.shape[2], loads, -1)))
 
     def stiffness(self) -> np.ndarray:
         """Return K0 (loads, q, q) of this rank's cells."""
@@ -656,8 +626,8 @@ class StiffenedModes:
         for run, products in self._products():
             count = len(run.young)
             by = np.empty((*run.u.shape[:2], columns, count))
-            by_u = T.T @ np.matmul(symmetric, products).reshape(len(T), -1)
-            by_u = by_u.reshape(run.u.shape)
+            transposed = of_cells(T, run.cells).swapaxes(1, 2)
+            by_u = times(transposed, np.matmul(symmetric, products)).reshape(run.u.shape)
             by[:, :, q:] = by_u[:, :, : loads - b]
             by_a = self._by_modes(run.a, np.matmul(weighted, run.force))
             # Of second degree in a: a times the derivative by it is twice the value.
@@ -684,7 +654,9 @@ class StiffenedModes:
         for run in self._runs:
             values = cells.differences(rows, run.cells)
             right = np.concatenate([run.a, -run.u[:, :, :k]], axis=2)
-            out[run.cells] = cells.difference_products(values, right.reshape(values.shape))
+            out[run.cells] = cells.difference_products(
+                values, right.reshape(values.shape), run.cells
+            )
         return out
 
     def _products(self) -> Iterator[tuple[_Run, np.ndarray]]:
@@ -703,12 +675,8 @@ class StiffenedModes:
             yield run, found.reshape(len(found), q * q, count)
 
     def _by_modes(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives by differences a (r, d, q, cells), given those by products.
-
-        Args:
-            a: of the modes.
-            weights: (bc, q q, cells), symmetric in the modes, doubled for b = c.
-        """
+        """Return the derivatives by differences a (r, d, q, cells), given those by products."""
+        # The weights (bc, q q, cells) are symmetric in the modes, doubled for b = c.
         q, found, term = a.shape[2], np.empty_like(a), np.empty_like(a[0])
         each = list(zip(weights.reshape(-1, q, q, a.shape[3]), self._pairs, strict=True))
         for weight, (b, c) in each:

@@ -8,7 +8,6 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -21,15 +20,11 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import (
     AffineMatrix,
-    BlockMatrix,
+    CellMatrix,
     NodePairs,
-    UniformMatrix,
-    UniformStress,
-    cell_values,
-    mass_products,
+    StressTensor,
+    cells_of,
     single,
-    stiffness_products,
-    uniform_cells,
 )
 from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
 from dolfinopt.fem.interface import (
@@ -62,7 +57,7 @@ class Substructure:
     Attributes:
         mesh: the arm.
         operators: its element operators.
-        uniform: the cells of this rank where those of all ranks are alike, as in a grid.
+        cells: those of this rank, with one element matrix where all are alike, as in a grid.
         profile: of this rank.
         T: the interface transformation.
         interior: the interior block in PETSc; one factorisation, of the design that asked last.
@@ -87,27 +82,21 @@ class Substructure:
             InputError: the mesh lacks an interface.
         """
         self.mesh = mesh
-        self.uniform = uniform_cells(mesh.comm, operators)
-        self.operators = operators = self.uniform.operators if self.uniform else operators
+        self.cells = cells_of(mesh.comm, operators)
+        self.operators = operators = self.cells.operators
         self.profile = profile
-        size = len(operators.points)
-        dim = mesh.dim
-        self._stiffness: AffineMatrix | UniformMatrix
-        self._mass: AffineMatrix | UniformMatrix
         with together(mesh.comm):
+            cells, size, dim = operators.cells, len(operators.points), mesh.dim
+            self._stiffness: AffineMatrix | CellMatrix
+            self._mass: AffineMatrix | CellMatrix
             if dim == 3:  # where memory counts
-                pairs = NodePairs(operators.cells, size)
-                if self.uniform is not None:
-                    self._stiffness = UniformMatrix(pairs, self.uniform.stiffness)
-                    self._mass = UniformMatrix(pairs, self.uniform.mass)
-                else:
-                    self._stiffness = BlockMatrix(pairs, operators.stiffness)
-                    self._mass = BlockMatrix(pairs, operators.mass)
+                pairs = NodePairs(cells, size)
+                self._stiffness = CellMatrix(pairs, self.cells.stiffness)
+                self._mass = CellMatrix(pairs, self.cells.mass)
             else:
-                self._stiffness = AffineMatrix(
-                    _dofs(operators.cells, dim), operators.stiffness, dim * size
-                )
-                self._mass = AffineMatrix(operators.cells, operators.mass, size)
+                dofs = (dim * cells[:, :, None] + np.arange(dim)).reshape(len(cells), -1)
+                self._stiffness = AffineMatrix(dofs, operators.stiffness, dim * size)
+                self._mass = AffineMatrix(cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
         wider = TETRAHEDRA if operators.cells.shape[1] == 10 else 1.0  # quadratic ones
         self.interior = InteriorSystem(
@@ -196,15 +185,14 @@ class Substructure:
         return cKDTree(nodes).query(self.mesh.centroid)[0]
 
     @cached_property
-    def uniform_stress(self) -> UniformStress | None:
-        """How stress stiffens cells that are all alike; None otherwise (collective)."""
-        if self.uniform is None:
-            return None
-        operators = self.quadrature.derivatives, self.quadrature.stress
-        derivatives, stress = (single(self.mesh.comm, operator) for operator in operators)
-        if derivatives is None or stress is None:  # turned by half a turn k_e and m_e are the same
-            return None
-        return UniformStress(self.uniform, derivatives, stress)
+    def stress_tensor(self) -> StressTensor:
+        """How stress stiffens cells (collective)."""
+        every = self.quadrature.derivatives, self.quadrature.stress
+        # Turned by half a turn k_e and m_e are the same, but not these.
+        derivatives, stress = (single(self.mesh.comm, operator) for operator in every)
+        if len(self.cells.stiffness) != 1 or derivatives is None or stress is None:
+            return StressTensor(self.cells, *every)
+        return StressTensor(self.cells, derivatives[None], stress[None])
 
     def extend(self, K: sp.csr_matrix, young: np.ndarray) -> ExtendedStiffness:
         """Return what `extended` takes of K of a design, which has this modulus (collective)."""
@@ -252,14 +240,6 @@ class Substructure:
         return bool(same[0]), bool(same[1])
 
 
-def _dofs(cells: np.ndarray, dim: int) -> np.ndarray:
-    """Return the local dofs (n_cells, d n) of cells, given their nodes."""
-    dofs = np.repeat(dim * cells, dim, axis=1)
-    for component in range(1, dim):
-        dofs[:, component::dim] += component
-    return dofs
-
-
 class AssembledMatrix:
     """sum_e s_e A_e of one design, assembled when it is first asked for.
 
@@ -267,7 +247,7 @@ class AssembledMatrix:
         scale: (n_cells,) s, not to be changed.
     """
 
-    def __init__(self, affine: AffineMatrix | UniformMatrix, scale: np.ndarray, profile: Profile):
+    def __init__(self, affine: AffineMatrix | CellMatrix, scale: np.ndarray, profile: Profile):
         self.scale = scale.copy()
         self._affine, self._profile = affine, profile
 
@@ -347,13 +327,7 @@ class ElasticArm:
         of the field, and nothing cancels. K_bb + K_bI Psi, its algebraic equal for constraint
         modes, loses (length / cell)^3 in digits.
         """
-        uniform = self.substructure.uniform
-        if uniform is not None:
-            part = uniform.energy_matrix(field, self.young)
-        else:
-            values = cell_values(self.operators, field)
-            products = (self.operators.stiffness @ values) * self.young[:, None, None]
-            part = values.reshape(-1, field.shape[2]).T @ products.reshape(-1, field.shape[2])
+        part = self.substructure.cells.energy_matrix(field, self.young)
         energy = self.comm.allreduce(part)
         return 0.5 * (energy + energy.T)
 
@@ -363,9 +337,8 @@ class ElasticArm:
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
-        if (uniform := self.substructure.uniform) is not None and self.weighed is None:
-            return uniform.stiffness_products(left, right)
-        return stiffness_products(self._weighed_operators, left, right)
+        stiffness = None if self.weighed is None else self.weighed[0]
+        return self.substructure.cells.stiffness_products(left, right, stiffness)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
@@ -373,16 +346,8 @@ class ElasticArm:
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
-        if (uniform := self.substructure.uniform) is not None and self.weighed is None:
-            return uniform.mass_products(left, right)
-        return mass_products(self._weighed_operators, left, right)
-
-    @property
-    def _weighed_operators(self) -> ElementOperators:
-        if self.weighed is None:
-            return self.operators
-        stiffness, mass = self.weighed
-        return replace(self.operators, stiffness=stiffness, mass=mass)
+        mass = None if self.weighed is None else self.weighed[1]
+        return self.substructure.cells.mass_products(left, right, mass)
 
     # -- the interior ------------------------------------------------------------------------
 

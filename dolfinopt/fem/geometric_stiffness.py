@@ -18,34 +18,19 @@ doi:10.1002/nme.1620320818; Schwertassek & Wallrapp (1999).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.fem.assembly import StiffenedModes, combine, sum_at_nodes
+from dolfinopt.fem.assembly import StiffenedModes, combine
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
 
 # Loads by the arm's own inertia, which come first, by the number of directions.
 NUM_INERTIAL = {2: 4, 3: 12}
-# Entries of the products of gradients that are held at a time, so that they stay in the cache.
-CHUNK = 200_000
-STRESS_CELLS = 1000  # likewise, at a time
-# Directions a, b and component c of every term of stress xx, yy, xy.
-PLANE_TERMS = (
-    ((0, 0, 0), (0, 0, 1)),
-    ((1, 1, 0), (1, 1, 1)),
-    ((0, 1, 0), (0, 1, 1), (1, 0, 0), (1, 0, 1)),
-)
-# Of stress xx, yy, zz, xy, yz, zx.
-SOLID_TERMS = tuple(
-    tuple((d, e, c) for d, e in sorted({(a, b), (b, a)}) for c in range(3))
-    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,30 +73,10 @@ class UnitLoads:
         parts = [self.fields[:, :, : self.num_frame], modal, self.fields[:, :, self.num_frame :]]
         return UnitLoads(self.arm, np.concatenate(parts, axis=2), V)
 
-    @cached_property
-    def _terms(self) -> Sequence[Sequence[tuple[int, int, int]]]:
-        return PLANE_TERMS if self.fields.shape[1] == 2 else SOLID_TERMS
-
-    @cached_property
-    def stresses(self) -> np.ndarray:
-        """Stress times t dA at the quadrature points (s, p, n_cells points), N; N m in space."""
-        operator, young = self.arm.substructure.quadrature.stress, self.arm.young
-        kinds = len(self._terms)
-        count, p = len(operator), operator.shape[1] // kinds
-        out = np.empty((kinds * self.num_loads, count * p))
-        for cells in _runs(count, STRESS_CELLS):
-            stress = operator[cells] @ self._cell_values(cells)
-            stress *= young[cells, None, None]
-            out[:, p * cells.start : p * cells.stop] = stress.reshape(-1, len(out)).T
-        return out.reshape(kinds, self.num_loads, -1)
-
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (p, q, q) in modes V (n_nodes, d, q) (collective on the arm's ranks)."""
         arm = self.arm
-        if arm.substructure.uniform_stress is not None:
-            own = self._stiffened(V).stiffness()
-        else:
-            own = self._stiffness(V)
+        own = self._stiffened(V).stiffness()
         K0 = own if arm.comm.size == 1 else arm.comm.allreduce(own)
         return K0 + self._face.stiffness(self._face_tensors, V)
 
@@ -133,26 +98,12 @@ class UnitLoads:
         return {}
 
     def _stiffened(self, V: np.ndarray) -> StiffenedModes:
-        """Return what is known of these modes where cells are all alike; for the last, the same."""
+        """Return what is known of these modes; for the last ones the same."""
         known = self._last.get("modes")
         if known is None or known[0] is not V:
-            tensor = self.arm.substructure.uniform_stress
-            assert tensor is not None
+            tensor = self.arm.substructure.stress_tensor
             known = self._last["modes"] = V, tensor.of(self.fields, self.arm.young, V)
         return known[1]
-
-    def _stiffness(self, V: np.ndarray) -> np.ndarray:
-        """Return K0 (p, q, q) of this rank's cells."""
-        q = V.shape[2]
-        i, j = np.triu_indices(q)
-        packed = np.zeros((self.num_loads, len(i)))
-        for _, points, H in self._parts(V):
-            products = np.empty((packed.shape[1], H.shape[3]))
-            for stress, terms in zip(self.stresses[:, :, points], self._terms, strict=True):
-                packed += stress @ pairs(H, terms, products).T
-        K0 = np.empty((self.num_loads, q, q))
-        K0[:, i, j] = K0[:, j, i] = packed
-        return K0
 
     def gradient(
         self,
@@ -183,11 +134,9 @@ class UnitLoads:
             assert by_fields is not None
             forces = np.zeros_like(by_fields)
             by_V, direct = np.zeros_like(V), np.zeros_like(arm.young)
-        elif arm.substructure.uniform_stress is not None:
+        else:
             known, fold = self._stiffened(V), static and by_fields is None
             by_V, forces, direct, work = known.gradient(by_K0, compliance if fold else None)
-        else:
-            by_V, forces, direct = self._gradient(V, by_K0)
         if by_fields is not None:
             forces = forces + by_fields
         by_stiffness, face = np.zeros_like(compliance), None
@@ -218,59 +167,12 @@ class UnitLoads:
             adjoint: (n_nodes, d, k) of the first fields.
         """
         known, arm = self._last.get("modes"), self.arm
-        if known is not None and known[0] is V:
+        if known is not None and known[0] is V and arm.weighed is None:
             arm.profile.counts.energy_fields += left.shape[2] + adjoint.shape[2]
             return known[1].stiffness_products(left, adjoint)
         fields = self.fields[:, :, : adjoint.shape[2]]
         products = arm.cell_stiffness_products(left, V)
         return products - arm.cell_stiffness_products(adjoint, fields)
-
-    def _gradient(
-        self, V: np.ndarray, by_K0: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Differentiate by modes, fields and Young's modulus, see `UniformStress.gradient`."""
-        arm, q = self.arm, V.shape[2]
-        quadrature, (count, n) = arm.substructure.quadrature, arm.operators.cells.shape
-        dim, loads = V.shape[1], self.num_loads
-        i, j = np.triu_indices(q)
-        by_pairs = by_K0[:, i, j] + np.where(i == j, 0.0, by_K0[:, j, i])
-        by_young = np.empty(count)
-        by_modes, by_nodes = np.empty((count, n, dim, q)), np.empty((count, n, dim, loads))
-        for cells, points, H in self._parts(V):
-            size, products = cells.stop - cells.start, np.empty((len(i), H.shape[3]))
-            by_stress = [by_pairs @ pairs(H, terms, products) for terms in self._terms]
-            forces = np.concatenate(by_stress).T.reshape(size, -1, loads)
-            nodal = quadrature.stress[cells].swapaxes(1, 2) @ forces
-            by_young[cells] = np.einsum("ekp,ekp->e", self._cell_values(cells), nodal)
-            nodal *= arm.young[cells, None, None]
-            by_nodes[cells] = nodal.reshape(size, n, dim, loads)
-            by_H = pairs_transposed(H, by_pairs.T @ self.stresses[:, :, points], self._terms)
-            by_H = np.moveaxis(by_H, (0, 1, 2, 3), (1, 2, 3, 0)).reshape(size, -1, dim * q)
-            nodal = quadrature.derivatives[cells].swapaxes(1, 2) @ by_H
-            by_modes[cells] = nodal.reshape(size, n, dim, q)
-        by_V = sum_at_nodes(arm.operators, by_modes)
-        return by_V, sum_at_nodes(arm.operators, by_nodes), by_young
-
-    def _cell_values(self, cells: slice) -> np.ndarray:
-        """Return the fields at the nodes of these cells (cells, dn, p)."""
-        nodes = self.arm.operators.cells[cells]
-        return _centred(self.fields[nodes]).reshape(
-            len(nodes), nodes.shape[1] * self.fields.shape[1], self.num_loads
-        )
-
-    def _parts(self, V: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
-        """Yield runs of cells: cells, points, modes' gradients there.
-
-        The gradients are d_a phi_c as (d, d, q, points).
-        """
-        derivatives = self.arm.substructure.quadrature.derivatives
-        count, (dim, q) = len(derivatives), V.shape[1:]
-        p = derivatives.shape[1] // dim
-        for cells in _runs(count, max(1, CHUNK // (p * q * (q + 1)))):
-            values = _centred(V[self.arm.operators.cells[cells]])
-            H = derivatives[cells] @ values.reshape(*values.shape[:2], dim * q)
-            H = np.ascontiguousarray(np.moveaxis(H.reshape(-1, dim, dim, q), 0, 3))
-            yield cells, slice(p * cells.start, p * cells.stop), H
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,10 +249,8 @@ def _fold(
 
 
 def _by_inertia(adjoint: np.ndarray) -> np.ndarray:
-    """Return what the adjoints of the inertial loads multiply dM 1_x and dM X by (n_nodes, d, 2).
-
-    M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
-    """
+    """Return what the inertial loads' adjoints multiply dM 1_x and dM X by (n_nodes, d, 2)."""
+    # M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
     out = np.zeros((*adjoint.shape[:2], 2))
     if adjoint.shape[1] == 3:
         for a in range(3):
@@ -377,12 +277,10 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
 
 
 def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them.
-
-    1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
-    space. Of 1 and X (n_nodes, d), or M times these: M knows no direction.
-    M (-y, x) is (-(M X)_y, (M X)_x), as M treats the components alike.
-    """
+    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them."""
+    # 1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
+    # space. Of 1 and X (n_nodes, d), or M times these: M knows no direction. M (-y, x) is (-(M
+    # X)_y, (M X)_x), as M treats the components alike.
     dim = ones.shape[1]
     fields = np.zeros((*ones.shape, NUM_INERTIAL[dim]))
     if dim == 3:
@@ -417,54 +315,6 @@ def static_response(
     load = outboard + arm.comm.allreduce(modes.interior.T @ interior)
     tip = np.linalg.solve(modes.stiffness, load)
     return arm.expand(particular + modes.interior @ tip, tip)
-
-
-def _centred(values: np.ndarray) -> np.ndarray:
-    """Return nodal values (n_cells, n, d, k) less their mean, see `cells.cell_values`."""
-    return values - values.mean(axis=1, keepdims=True)
-
-
-def _runs(count: int, step: int) -> Iterator[slice]:
-    """Yield slices of `step` cells each, the last one shorter, that together are all of them."""
-    for first in range(0, count, step):
-        yield slice(first, min(first + step, count))
-
-
-# -- products of the modes' gradients that stresses multiply, and their transpose; s stresses -----
-# Gradients are d_a phi_c as (d, d, q, points); pairs of modes i <= j as by `np.triu_indices`.
-
-
-def pairs(H: np.ndarray, terms: Sequence[tuple[int, int, int]], out: np.ndarray) -> np.ndarray:
-    """Return d_a phi_i . d_b phi_j (pairs, points), what one stress multiplies, in `out`.
-
-    Mode by mode in place: index arrays would take ten times as long.
-    """
-    (a, b, c), *others = terms
-    term = np.empty(H.shape[3])
-    for one, i, j in zip(out, *np.triu_indices(H.shape[2]), strict=True):
-        np.multiply(H[a, c, i], H[b, c, j], out=one)
-        for d, e, f in others:
-            one += np.multiply(H[d, f, i], H[e, f, j], out=term)
-    return out
-
-
-def pairs_transposed(
-    H: np.ndarray, by_pairs: np.ndarray, kinds: Sequence[Sequence[tuple[int, int, int]]]
-) -> np.ndarray:
-    """Return the derivatives (d, d, q, points) by H, given those by `pairs` (s, pairs, points).
-
-    The latter are scaled in place.
-    """
-    by_H, term = np.zeros_like(H), np.empty(H.shape[3])
-    for place, (i, j) in enumerate(zip(*np.triu_indices(H.shape[2]), strict=True)):
-        for weight, terms in zip(by_pairs[:, place], kinds, strict=True):
-            if i == j:  # both factors are the same: once, twice as heavy
-                weight *= 2.0
-            for a, b, c in terms:
-                by_H[a, c, i] += np.multiply(weight, H[b, c, j], out=term)
-                if i != j:
-                    by_H[b, c, j] += np.multiply(weight, H[a, c, i], out=term)
-    return by_H
 
 
 # -- what the rotation of second order of a rigid interface adds to the geometric stiffness ------
@@ -572,10 +422,8 @@ class FaceRotation:
 
 
 def _levers(rigid: np.ndarray) -> np.ndarray:
-    """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere.
-
-    Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
-    """
+    """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere."""
+    # Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
     if rigid.shape[1] == 2:
         about_z = rigid[:, :, 2::3]
         return np.stack([about_z[:, 1], -about_z[:, 0]], axis=-1).swapaxes(0, 1)

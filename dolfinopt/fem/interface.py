@@ -16,7 +16,6 @@ from mpi4py import MPI
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.fem.assembly import cell_values, sum_at_nodes
 from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -88,11 +87,7 @@ class InterfaceTransformation:
         return field
 
     def _add_further(self, mesh: ArmMesh) -> None:
-        """Add the further outboard interfaces.
-
-        Raises:
-            InputError: two interfaces share a node: rigid both, they could not move.
-        """
+        """Add the further outboard interfaces; two that share a node, rigid both, are refused."""
         for one in mesh.further:
             self.ends.append(self._nodes_of(mesh, one.facets, one.name))
         names = ["inboard", "outboard", *(one.name for one in mesh.further)]
@@ -218,15 +213,9 @@ def rigid_motions(points: np.ndarray) -> np.ndarray:
 
 
 def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's.
-
-    The narrower one; on the grid of a slender arm the first, row by row across it, which is half as
-    wide as the other one, which begins at a corner.
-
-    Args:
-        graph: (n, n) with an entry where two nodes share a cell.
-        points: (n, d) m.
-    """
+    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
+    # The narrower one; on the grid of a slender arm the first, row by row across it, which is half
+    # as wide as the other one, which begins at a corner.
     nearest = SAME_PLACE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
     orders = (
@@ -372,11 +361,9 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
 
 
 def _new_directions(known: np.ndarray, loads: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return an orthonormal basis (b, j) of what loads (b, k) have beside that of known ones.
-
-    In the order of the loads, so that unit loads stay what they are. Less than the tolerance of
-    a load is nothing.
-    """
+    """Return an orthonormal basis (b, j) of what loads (b, k) have beside that of known ones."""
+    # In the order of the loads, so that unit loads stay what they are. Less than the tolerance of a
+    # load is nothing.
     basis = known
     for load in loads.T:
         rest = load
@@ -402,22 +389,15 @@ def _with_energies(
 
 
 def _refined(arm: ElasticArm, modes: ConstraintModes) -> ConstraintModes:
-    """Return constraint modes after one step of iterative refinement, if rounding allows.
-
-    Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below
-    the rounding of their own. The residual is summed cell by cell without rigid motion, which
-    knows them better than the assembled matrix.
-
-    Raises:
-        ConvergenceError: the void's stiffness is lost in the rounding of the solid's.
-    """
+    """Return constraint modes after one step of iterative refinement, if rounding allows."""
+    # Solids that float in void, as checkerboards and islands do, rest on stiffnesses far below the
+    # rounding of their own. The residual is summed cell by cell without rigid motion, which knows
+    # them better than the assembled matrix.
     if not _is_stiffness(modes.stiffness):
         raise _lost_in_rounding(arm)
-    operators = arm.operators
-    values = cell_values(operators, modes.field)
-    forces = (operators.stiffness @ values) * arm.young[:, None, None]
-    forces = forces.reshape(*operators.cells.shape, *modes.field.shape[1:])
-    residual, _ = arm.restrict(sum_at_nodes(operators, forces))
+    cells = arm.substructure.cells
+    forces = cells.stiffness_times(cells.centred(modes.field)) * arm.young
+    residual, _ = arm.restrict(cells.sum_at_nodes(forces))
     better = modes.interior - arm.solve(residual)
     refined = _with_energies(arm, better, modes.coupling, modes.corner)
     if not (_is_stiffness(refined.stiffness) and rounding_error(arm, refined) <= MOST_ROUNDING):
@@ -434,16 +414,16 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
     orders of magnitude apart from all others. What it returns is too small only where mu
     exceeds 1 / eps, far beyond `MOST_ROUNDING`, because the factorised matrix is off by then.
     """
-    operators = arm.operators
-    diagonal = np.einsum("eii->ei", operators.stiffness) * arm.young[:, None]
-    diagonal = diagonal.reshape(*operators.cells.shape, arm.mesh.dim, 1)
+    cells = arm.substructure.cells
+    diagonal = np.einsum("eii->ie", cells.stiffness) * arm.young
+    diagonal = diagonal.reshape(-1, arm.mesh.dim, 1, len(arm.young))
 
     def weighted(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return T' D T u."""
-        values = field[operators.cells]
-        forces = diagonal * (values - kept * values.mean(axis=1, keepdims=True))
-        forces -= kept * forces.mean(axis=1, keepdims=True)
-        return arm.restrict(sum_at_nodes(operators, forces))
+        values = cells.values(field)
+        forces = diagonal * (values - kept * values.mean(axis=0))
+        forces -= kept * forces.mean(axis=0)
+        return arm.restrict(cells.sum_at_nodes(forces))
 
     kept = 1.0 - TRANSLATION
     places = arm.points.T / arm.mesh.outboard_point[0]

@@ -14,9 +14,9 @@ from petsc4py import PETSc
 
 from dolfinopt.fem.assembly import (
     AffineMatrix,
+    CellMatrix,
     InteriorEntries,
     InteriorMatrix,
-    UniformMatrix,
     interior_blocks,
     interior_entries,
 )
@@ -99,8 +99,8 @@ class InteriorSystem:
     def __init__(
         self,
         T: InterfaceTransformation,
-        stiffness: AffineMatrix | UniformMatrix,
-        mass: AffineMatrix | UniformMatrix,
+        stiffness: AffineMatrix | CellMatrix,
+        mass: AffineMatrix | CellMatrix,
         profile: Profile,
         tolerance: float | None = None,
         wider: float = 1.0,
@@ -402,8 +402,8 @@ class ExtendedSystem(InteriorSystem):
     def __init__(
         self,
         T: InterfaceTransformation,
-        stiffness: AffineMatrix | UniformMatrix,
-        mass: AffineMatrix | UniformMatrix,
+        stiffness: AffineMatrix | CellMatrix,
+        mass: AffineMatrix | CellMatrix,
         profile: Profile,
         tolerance: float | None,
         wider: float,

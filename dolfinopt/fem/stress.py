@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import basix
 import numpy as np
 
-from dolfinopt.fem.assembly import sum_at_nodes
 from dolfinopt.fem.elements import KINDS, ElementOperators, by_cells, elasticity, gauss_points
 from dolfinopt.fem.geometric_stiffness import UnitLoads, static_response
 from dolfinopt.mesh import compat
@@ -157,7 +156,8 @@ class LoadFields:
         count, (kinds, _, columns) = len(operator), by_stress.shape
         forces = np.moveaxis(by_stress.reshape(kinds, count, -1, columns), 0, 2)
         nodal = operator.swapaxes(1, 2) @ forces.reshape(count, -1, columns)
-        return sum_at_nodes(self.arm.operators, nodal.reshape(count, -1, self.V.shape[1], columns))
+        nodal = nodal.reshape(count, -1, self.V.shape[1], columns)
+        return self.arm.substructure.cells.sum_at_nodes(np.moveaxis(nodal, 0, 3))
 
     def gradient(self, by_elastic: np.ndarray) -> ElasticFieldGradient:
         """Differentiate a function of `elastic`, given its derivatives (collective on the arm).

@@ -111,15 +111,11 @@ def _check_cells(flat: FlatMesh) -> None:
 
 
 def _check_overlap(flat: FlatMesh, corner: np.ndarray) -> None:
-    """Raise InputError where cells, convex each, cover a place twice.
-
-    The way round a cell does not tell: surfaces may be oriented either way. But neighbours lie on
-    different sides of what they share, the angles about a point add up to a full turn at most, and
-    then a connected mesh overlaps only where its outline crosses itself or cells lie in others.
-
-    Args:
-        corner: (n_cells, 3 or 4, 2) m.
-    """
+    """Raise InputError where cells, convex each, cover a place twice."""
+    # The way round a cell does not tell: surfaces may be oriented either way. But neighbours lie on
+    # different sides of what they share, the angles about a point add up to a full turn at most,
+    # and then a connected mesh overlaps only where its outline crosses itself or cells lie in
+    # others.
     count, around = flat.cells.shape
     centre = corner.mean(axis=1)
     sides = np.sort(np.stack([flat.cells, np.roll(flat.cells, -1, axis=1)], axis=2), axis=2)
@@ -277,12 +273,7 @@ def keys_of(facets: np.ndarray, largest: int) -> np.ndarray:
 
 
 def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Return (n,) True for cells that lie on one side of a facet with a neighbour.
-
-    Args:
-        corners: (n, 4 or 8, 3) m.
-        keys: (facets, n) of the cells' facets.
-    """
+    """Return (n,) True for cells (n, 4 or 8, 3) that lie on a neighbour's side of a facet."""
     count, bad = len(corners), np.zeros(len(corners), dtype=bool)
     order = np.argsort(keys.ravel(), kind="stable")
     known = keys.ravel()[order]

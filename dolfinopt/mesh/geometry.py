@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,24 @@ LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (
 SIZE, SHAPE = SIZE_PARAMETER, "cell shape"
 
 
+def _where(arm: Arm) -> str:
+    return f"{arm.mesh}: mesh of arm {arm.name!r}"
+
+
+@contextmanager
+def _telling_where(where: str) -> Iterator[None]:
+    """Put file and arm before what is wrong with them, and before what Gmsh says."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except Exception as error:
+        if type(error) is not Exception:  # Gmsh raises no other
+            raise
+        text = " ".join(str(error).split()) or "Gmsh failed"
+        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
+
+
 def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     """Make the Gmsh model of an arm with a mesh file: read, mesh, name the groups, check.
 
@@ -66,23 +85,16 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
         InputError: one line that names file, arm and remedy. Other errors are this program's.
     """
     assert arm.mesh is not None
-    where = f"{arm.mesh}: mesh of arm {arm.name!r}"
+    where = _where(arm)
     readers = {".geo": _read_geo, ".msh": _read_msh, ".step": read_step, ".stp": read_step}
     unknown: list[str] = []
-    try:
+    with _telling_where(where):
         with silent_terminal():
             solid_done = readers[Path(arm.mesh).suffix.lower()](gmsh, arm, unknown)
         groups = find_groups(gmsh, unknown)
         rename_groups(gmsh, groups)
         flat = flatten(gmsh)
         check_mesh(flat, arm)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    except Exception as error:
-        if type(error) is not Exception:  # Gmsh raises no other
-            raise
-        text = " ".join(str(error).split()) or "Gmsh failed"
-        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
     notes = (unknown_names(where, unknown),) if unknown else ()
     if solid_done or arm.solid_ends == 0.0:
         return np.empty((0, 2, 2)), notes
@@ -189,11 +201,7 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
 def _prism_faces(
     model: Any, arm: Arm
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]], float]:
-    """Return the end faces of prismatic solids nearest to z = 0, the solid of each, and their z, m.
-
-    Raises:
-        InputError: a solid whose section is not constant along z, or not `arm.thickness` thick.
-    """
+    """Return the end faces nearest to z = 0 of prisms, the solid of each, and their z, m."""
     near = NEAR * arm.height
     found: list[tuple[float, float, list[tuple[tuple[int, int], float]], tuple[int, int]]] = []
     for solid in model.getEntities(3):
@@ -261,11 +269,9 @@ def _ends(model: Any, curves: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _joint_curves(model: Any, x: float, height: float) -> list[int]:
-    """Return the curves of the interface at the joint axis (x, 0).
-
-    The bore: the smallest full circle about the axis. Where there is none, the end: all straight
-    curves on the upright line through it.
-    """
+    """Return the curves of the interface at the joint axis (x, 0)."""
+    # The bore: the smallest full circle about the axis. Where there is none, the end: all straight
+    # curves on the upright line through it.
     near = NEAR * height
     arcs: list[tuple[float, float, int]] = []  # radius, angle, curve
     upright = []
@@ -419,19 +425,11 @@ def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
     Raises:
         InputError: one line that names file, arm and remedy.
     """
-    where = f"{arm.mesh}: mesh of arm {arm.name!r}"
-    try:
+    with _telling_where(_where(arm)):
         with silent_terminal():
             groups = (_read_step if _is_step(arm) else _read_groups)(gmsh, arm)
         _set_groups(gmsh, groups, arm)
         return _checked(gmsh, groups, arm)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    except Exception as error:
-        if type(error) is not Exception:  # Gmsh raises no other
-            raise
-        text = " ".join(str(error).split()) or "Gmsh failed"
-        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
 
 
 def _is_step(arm: Arm) -> bool:
@@ -552,11 +550,9 @@ def _named(
 
 
 def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -> list[int]:
-    """Return the faces of the interface at the joint axis (x, y), which runs along z.
-
-    The bore: the cylinder about the axis with the smallest radius, in one or more faces; where
-    there is none, the flat end in the plane through it, of the arm's two ends.
-    """
+    """Return the faces of the interface at the joint axis (x, y), which runs along z."""
+    # The bore: the cylinder about the axis with the smallest radius, in one or more faces; where
+    # there is none, the flat end in the plane through it, of the arm's two ends.
     x, y = place
     near = FACE_NEAR * arm.height
     bores: list[tuple[float, int]] = []
@@ -617,12 +613,7 @@ def _set_groups(gmsh: Any, groups: Entities, arm: Arm) -> None:
 
 
 def _checked(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
-    """Check that a mesh can be the arm of a scene, and return points of its interfaces.
-
-    Raises:
-        InputError: flat, folded or overlapping cells; several parts; an interface that is no face
-            of cells, or is not at its joint; another height or thickness than the arm's.
-    """
+    """Check that a mesh can be the arm of a scene, and return points of its interfaces."""
     tags, places, _ = gmsh.model.mesh.getNodes()
     points = np.zeros((int(tags.max()) + 1, 3))
     points[tags.astype(int)] = places.reshape(-1, 3)

@@ -45,11 +45,9 @@ def gmsh_on_root(comm: MPI.Comm) -> Iterator[Any]:
 
 @contextmanager
 def _interrupts_kept() -> Iterator[None]:
-    """Keep what Ctrl-C does: Gmsh would have it kill the process without a word.
-
-    4.8 from its import, which takes 0.2 s, until a session ends, which only the root has; later
-    ones during a session.
-    """
+    """Keep what Ctrl-C does: Gmsh would have it kill the process without a word."""
+    # 4.8 from its import, which takes 0.2 s, until a session ends, which only the root has; later
+    # ones during a session.
     change = signal.signal
 
     def keep(number: int, handler: Any) -> Any:
@@ -70,10 +68,8 @@ def _begin(gmsh: Any) -> None:
 
 
 def _finish_reading(gmsh: Any) -> None:
-    """Have Gmsh's parser come to the end of a text it gave up, a statement a session.
-
-    It would go on with the rest of it when it is asked to read the next file.
-    """
+    """Have Gmsh's parser come to the end of a text it gave up, a statement a session."""
+    # It would go on with the rest of it when it is asked to read the next file.
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder) / "empty.geo"
         empty.write_text("\n")

@@ -250,13 +250,8 @@ def _virtual_motion(
     rigid: np.ndarray,
     virtual: list[np.ndarray],
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return how far virtual displacements turn every frame, and shift every origin (complex).
-
-    Args:
-        origins, rotations, shifts: see `_frames`.
-        rigid: (n, 1 + arms) virtual displacements of the rigid coordinates.
-        virtual: (n, q) of every arm's elastic coordinates.
-    """
+    """Return how far virtual displacements turn every frame, and shift every origin (complex)."""
+    # Virtual displacements: of rigid coordinates (n, 1 + arms), of every arm's elastic ones (n, q).
     turns, swept = [], [rigid[:, 0].astype(complex)]
     turn = np.zeros(len(rigid))
     for k, ((B, rotation), v) in enumerate(zip(shifts, virtual, strict=True)):

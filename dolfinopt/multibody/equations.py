@@ -22,6 +22,7 @@ from dolfinopt.multibody.inverse_dynamics import (
     body_loads,
     elastic_residual,
     inverse_dynamics,
+    largest_change,
     load_coefficients,
 )
 from dolfinopt.multibody.mechanism import Mechanism
@@ -49,6 +50,8 @@ class Equations:
         rotations: (mechanism, q): largest rotation of every body's interfaces (bodies,), rad.
         softness: (bodies): largest static deflection of a body by a unit force across it, m/N.
         levers: (mechanism): deflection of the end by unit rigid coordinates (R,), m.
+        largest_change: (mechanism, motion, closure): largest relative change of a body's stiffness
+            by the loads of the motion with rigid bodies.
     """
 
     residual: Callable[..., np.ndarray]
@@ -65,6 +68,7 @@ class Equations:
     rotations: Callable[..., np.ndarray]
     softness: Callable[[Sequence[ShapeIntegrals]], float]
     levers: Callable[..., np.ndarray]
+    largest_change: Callable[..., float]
 
 
 def _is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
@@ -90,11 +94,9 @@ def _rotations(mechanism: Mechanism, q: np.ndarray) -> np.ndarray:
 
 
 def _softness(bodies: Sequence[ShapeIntegrals]) -> float:
-    """Return that of the arms' ends, m/N.
-
-    Or a third of the arm's length squared times the end's rotation by a unit moment, which is the
-    same of a cantilever, and not zero of an arm whose frame is its chord.
-    """
+    """Return that of the arms' ends, m/N."""
+    # Or a third of the arm's length squared times the end's rotation by a unit moment, which is the
+    # same of a cantilever, and not zero of an arm whose frame is its chord.
     found = [0.0]
     for body in bodies:
         if body.num_modes:
@@ -122,4 +124,5 @@ PLANE = Equations(
     rotations=_rotations,
     softness=_softness,
     levers=_levers,
+    largest_change=largest_change,
 )

@@ -6,6 +6,7 @@ Plane vectors are complex numbers, v = v_x + i v_y, where arms are turned.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -113,19 +114,21 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     return bare
 
 
-def check_motion(scene: Scene) -> None:
+def check_plane_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
     motion = scene.motion
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.mechanism import joint_motion
-
-        joint_motion(np.zeros(1), scene)
-        return
     end = motion.horizon if motion.path == "rotation" else motion.duration
     rigid_motion(np.linspace(0.0, end, DENSE), scene)
 
 
-def breakpoints(scene: Scene) -> tuple[float, ...]:
+def curve_of_table(scene: Scene) -> tuple[Curve, bool]:
+    """Return the curve through the scene's table, and whether its parameter is time."""
+    return _curve(scene.motion, columns_of(scene), file_stamp(scene.motion))
+
+
+def breakpoints(
+    scene: Scene, curve_of: Callable[[Scene], tuple[Curve, bool]] = curve_of_table
+) -> tuple[float, ...]:
     """Return the instants between which the motion is smooth, first 0, last the horizon; s.
 
     They are the end of the path, where the law's phases end, beginnings and ends of stops, and the
@@ -134,7 +137,7 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     motion = scene.motion
     corners, timed = np.zeros(0), False
     if motion.path in ("points", "joints"):
-        curve, timed = curve_of_table(scene)
+        curve, timed = curve_of(scene)
         corners = np.array(curve.kinks)
     if not timed:
         rows = _when(corners, motion) if 0 < len(corners) <= MAX_CORNERS else []
@@ -145,24 +148,40 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     return (0.0, *instants[apart].tolist(), motion.horizon)
 
 
-def curve_of_table(scene: Scene) -> tuple[Curve, bool]:
-    """Return the curve through the scene's table, and whether its parameter is time."""
-    if scene.is_spatial and scene.motion.path == "points":
-        from dolfinopt.multibody.spatial.end_effector import end_curve
-
-        return end_curve(scene)
-    return _curve(scene.motion, columns_of(scene), file_stamp(scene.motion))
-
-
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
-    """Return the instants at which the time law reaches s, in (0, 1), by bisection."""
-    law = time_law(motion)
-    low, high = np.zeros_like(s), np.full_like(s, motion.duration)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        late = law(middle, motion.duration)[0] >= s
-        low, high = np.where(late, low, middle), np.where(late, middle, high)
-    return [float(t) for t in high]
+    """Return the instants at which the time law reaches s, in (0, 1)."""
+    law, last = time_law(motion), motion.duration
+    return inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0).tolist()
+
+
+def inverse(
+    function: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    values: np.ndarray,
+    guess: np.ndarray,
+    ends: tuple[float, float],
+    accuracy: float,
+) -> np.ndarray:
+    """Return where an increasing function has these values (n,), all at once.
+
+    Newton's method, halving the bracket instead where a step would leave it.
+
+    Args:
+        function: x (n,) -> values and slopes (n,).
+        values: wanted, within those at the ends.
+        guess: (n,) first x.
+        ends: least and largest x.
+        accuracy: of the values; 0 of x to rounding.
+    """
+    u, low, high = guess, np.full_like(guess, ends[0]), np.full_like(guess, ends[1])
+    for _ in range(60):  # halving alone would need as many
+        found, slope = function(u)
+        excess = found - values
+        if np.abs(excess).max(initial=0.0) <= accuracy:
+            break
+        low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
+        u = u - excess / np.where(slope > 0.0, slope, np.inf)
+        u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
+    return u
 
 
 # -- paths --------------------------------------------------------------------------------------
@@ -247,11 +266,7 @@ def curve_through(table: Table, motion: Motion, measured: int | None = None) -> 
 
 
 def _stop_to_stop(motion: Motion, table: Table, measured: int | None = None) -> Curve:
-    """Return the motion through a table with times that runs straight by the law between stops.
-
-    Raises:
-        InputError: a row between two stops, or the limits need more time; names file and line.
-    """
+    """Return the motion through a table with times that runs straight by the law between stops."""
     assert table.t is not None
     laws = []
     for line, i, j in ((table.lines[j], i, j) for i, j in moves(table.rows)):
@@ -321,24 +336,17 @@ class Bend:
         return self.square(u), u
 
     def cosine(self, square: np.ndarray) -> np.ndarray:
-        """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding.
-
-        Newton's method, halving the bracket instead where a step would leave it.
-        """
+        """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding."""
         if len(self.lengths) == 2:
             return (square - self.series[0]) / self.series[1]
-        u = np.interp(square, *self._guess)
-        low, high = np.full_like(u, self.least), np.ones_like(u)
         slopes = chebyshev.chebder(self.series)
-        for _ in range(60):  # halving alone would need as many
-            excess = self.square(u) - square
-            if np.abs(excess).max(initial=0.0) <= 4.0 * np.finfo(float).eps * self.reach[1] ** 2:
-                break
-            low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
-            slope = chebyshev.chebval(u, slopes)
-            u = u - excess / np.where(slope > 0.0, slope, np.inf)
-            u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
-        return u
+
+        def squares(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return self.square(u), chebyshev.chebval(u, slopes)
+
+        rounding = float(4.0 * np.finfo(float).eps * self.reach[1] ** 2)
+        guess = np.interp(square, *self._guess)
+        return inverse(squares, square, guess, (self.least, 1.0), rounding)
 
     def lever(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return z and its two derivatives by beta (n,), complex."""
@@ -353,11 +361,9 @@ def _bend(lengths: tuple[float, ...]) -> Bend:
 
 
 def _chain(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
-    """Return the motion of two and more arms, the shoulder's angle up to whole turns.
-
-    With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
-    accelerations from its derivatives, two real equations each for the rates of alpha and beta.
-    """
+    """Return the motion of two and more arms, the shoulder's angle up to whole turns."""
+    # With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
+    # accelerations from its derivatives, two real equations each for the rates of alpha and beta.
     motion, bend = scene.motion, _bend(tuple(arm.length for arm in scene.arms))
     cart = _cart(path, motion)
     r, rd, rdd = (
@@ -403,10 +409,8 @@ def _cart(path: Path, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def _one_arm(t: np.ndarray, path: Path, scene: Scene) -> RigidMotion:
-    """Return the motion of one arm: L sin(alpha) is the path's height, and the cart below it.
-
-    The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
-    """
+    """Return the motion of one arm: L sin(alpha) is the path's height, and the cart below it."""
+    # The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
     motion, length = scene.motion, scene.arms[0].length
     height = path.p[:, 1] - motion.joint_height
     _check_height(t, height, length, scene)
@@ -485,17 +489,13 @@ def columns_of(scene: Scene) -> tuple[str, ...]:
     """Return the columns of the scene's table."""
     if scene.motion.path == "points":
         return POINT
-    if scene.is_spatial:
-        return scene.driven
-    names = tuple(arm.name for arm in scene.arms)
-    names = names[: len(names) - scene.dependent_joints]
     for reserved in (TIME, CART):
-        if reserved in names:
+        if (TIME, *scene.driven).count(reserved) > 1:
             raise InputError(
                 f"{scene.source}: motion.path = 'joints' with an arm named {reserved!r}, which "
                 "means another column of the table; give the arm another name"
             )
-    return names if scene.motion.base == "fixed" else (CART, *names)
+    return scene.driven
 
 
 # -- continuity and reach --------------------------------------------------------------------
@@ -711,10 +711,8 @@ def _chosen(angles: tuple[float, ...], side: int) -> int:
 
 
 def _pinned(t: np.ndarray, place: Derivatives, loop: Loop, way: int, source: str) -> Derivatives:
-    """Return the absolute angles of the last two arms (n, 2), whose end is at the pin.
-
-    Up to whole turns.
-    """
+    """Return the absolute angles of the last two arms (n, 2), whose end is at the pin."""
+    # Up to whole turns.
     a, b = loop.lengths[-2:]
     p, pd, pdd = place
     r = loop.point - p

@@ -242,10 +242,8 @@ def in_basis(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
 
 
 def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.ndarray:
-    """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay.
-
-    Of three axes the first one is that of coordinates themselves: T^-1 x.
-    """
+    """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay."""
+    # Of three axes the first one is that of coordinates themselves: T^-1 x.
     if rank == 3:
         if len(value) == 0:
             return np.zeros((0, T.shape[1], T.shape[1]))
@@ -391,10 +389,8 @@ def _applied(E: np.ndarray, field: np.ndarray) -> np.ndarray:
 def _assembled(
     E: np.ndarray, second: np.ndarray, first: np.ndarray, modes: np.ndarray
 ) -> np.ndarray:
-    """Return W (g, 1 + q, 1 + q) of int X' E_c X, int Phi' E_c X and int Phi' E_c Phi.
-
-    The integral with E_c' is the transposed one: exactly, so that rounding goes.
-    """
+    """Return W (g, 1 + q, 1 + q) of int X' E_c X, int Phi' E_c X and int Phi' E_c Phi."""
+    # The integral with E_c' is the transposed one: exactly, so that rounding goes.
     partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
     q = first.shape[1]
     W = np.empty((len(E), 1 + q, 1 + q))
@@ -516,6 +512,8 @@ def first_frequency(body: ShapeIntegrals) -> float:
 def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegrals:
     """Return a plane body as one in space: the same motion in x-y, none out of it.
 
+    A body in space is returned as it is.
+
     Geometric stiffness of the seven loads is spread over the eighteen,
 
         K0_yx = -K0_xy = K0_wd / 2,   K0_xx = K0_yy = -K0_zz = K0_-ww / 2,
@@ -528,6 +526,8 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
         W: (9, 1 + q, 1 + q) of the body, see `plate_moments`. By default a guess from the planar
             integrals, all mass on the x axis and moving across it: out of the plane a thin bar.
     """
+    if len(body.w) == 3:
+        return body
     q = body.num_modes
     w, point, K0, loads = np.zeros((3, 1 + q)), np.zeros(3), np.zeros((3, 3, q, q)), body.K0
     w[:2], point[:2] = body.w, body.outboard_point

@@ -480,11 +480,10 @@ def _check_definite(data: StandardInputData, numbers: Mapping[str, float], sourc
 def _is_stiffened(
     data: StandardInputData, tips: Sequence[Node], dimension: int, source: str
 ) -> bool:
-    """Return whether matrices hold geometric stiffness: all or none of them.
-
-    A body that its own inertia stiffens, but no load at its outboard node, or the other way round,
-    is taken for one whose file lacks matrices. In space a stubby link's rotation may do little.
-    """
+    """Return whether matrices hold geometric stiffness: all or none of them."""
+    # A body that its own inertia stiffens, but no load at its outboard node, or the other way
+    # round, is taken for one whose file lacks matrices. In space a stubby link's rotation may do
+    # little.
     along, _ = _axes(dimension)
     excess, Me = _centrifugal_excess(data, dimension), data.Me.M0
     rotation = bool(np.abs(excess).max() > CENTRIFUGAL * np.abs(Me).max())
@@ -511,10 +510,8 @@ def _is_stiffened(
 
 
 def _check_symmetric(matrices: Mapping[str, np.ndarray], source: str) -> None:
-    """Check that what one load or rotation does to the coordinates (loads, q, q) is symmetric.
-
-    Relative to the largest under the same name: of a load that does nothing rounding is left.
-    """
+    """Check that what one load or rotation does to the coordinates (loads, q, q) is symmetric."""
+    # Relative to the largest under the same name: of a load that does nothing rounding is left.
     for name, loads in matrices.items():
         if np.abs(loads - loads.swapaxes(1, 2)).max() > SMALL * np.abs(loads).max():
             raise InputError(

@@ -27,8 +27,11 @@ from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from dolfinopt.arms.arm import Arm
     from dolfinopt.mesh.arm_mesh import ArmMesh
+    from dolfinopt.profiling import Profile
 
 # Of the arrays of design.npz.
 UNITS = {"centroid": "m", "density": "-", "filtered": "-"}
@@ -87,13 +90,27 @@ def read_views(scene: Scene, path: Path) -> list[ArmView]:
     """
     from mpi4py import MPI
 
-    from dolfinopt.arms.arm import build_arms
-    from dolfinopt.parallel import partition_arms
     from dolfinopt.profiling import Profile
 
-    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = build_arms(scene, partition, Profile())
-    return gather_views(scene, partition, arms, read_design(path, partition, arms))
+    return gather_views(scene, *arms_with_design(MPI.COMM_SELF, scene, path, Profile()))
+
+
+def arms_with_design(
+    world: MPI.Comm, scene: Scene, design: Path | None, profile: Profile
+) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
+    """Build the arms; return them with the physical densities of a file, or the initial ones.
+
+    Raises:
+        InputError: the design does not fit the arms.
+    """
+    from dolfinopt.arms.arm import build_arms, uniform_design
+    from dolfinopt.parallel import partition_arms
+
+    partition = partition_arms(world, scene.cell_counts)
+    arms = build_arms(scene, partition, profile)
+    if design is not None:
+        return partition, arms, read_design(design, partition, arms)
+    return partition, arms, uniform_design(scene, partition, arms, scene.design.initial)
 
 
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:

@@ -23,7 +23,6 @@ from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
-    rigid_units,
     trajectory_units,
 )
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
@@ -295,7 +294,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     units["certificate"] = {**CERTIFICATE, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
-        rigid = rigid_units(scene)
+        rigid = scene.rigid_units
         units["drive_error_peak"] = {name: rigid[name] for name in free}
     if scene.closure is not None:
         units["closure_force_peak"] = "N"
@@ -311,10 +310,8 @@ def _frequencies(
     x_phys: Mapping[int, np.ndarray],
     profile: Profile,
 ) -> dict[int, tuple[float, float]]:
-    """Return the first frequency of every design that is reduced, Hz, and the reduced one's excess.
-
-    On the root (collective). It is not counted: nothing depends on it.
-    """
+    """Return every reduced design's first frequency, Hz, and the reduced model's excess."""
+    # On the root (collective). It is not counted: nothing depends on it.
     counts, found = replace(profile.counts), {}
     with together(partition.world):
         for index, arm in arms.items():
@@ -329,10 +326,8 @@ def _frequencies(
 def _widths(
     partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, tuple[float | None, float | None]]:
-    """Return the widths of member and gap of the designs cut at one half, m; on the root.
-
-    Those of arms in the plane: members of solid ones are not measured.
-    """
+    """Return the widths of member and gap of the designs cut at one half, m; on the root."""
+    # Those of arms in the plane: members of solid ones are not measured.
     corners, solid = {}, {}
     with together(partition.world):
         for k, arm in arms.items():
@@ -389,10 +384,8 @@ def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
 
 
 def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
-    """Return the number of coordinates and, where it was chosen, by which errors.
-
-    For a given number there is no estimate: it would cost a simulation with more coordinates.
-    """
+    """Return the number of coordinates and, where it was chosen, by which errors."""
+    # For a given number there is no estimate: it would cost a simulation with more coordinates.
     if choice is None:
         return {"coordinates": scene.reduction.coordinates, "error_estimate": None, "tried": []}
     return {

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.disk import read_arrays, write_arrays, write_text
-from dolfinopt.multibody.motion import CART
 from dolfinopt.scene.load import Scene
 
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
@@ -41,7 +40,7 @@ def write_trajectory(
     if initial is not None and len(initial):
         even = np.linspace(0.0, scene.motion.horizon, len(initial))
         arrays["initial_deviation"] = _between(even, initial, trajectory.t)
-    rigid = ", ".join(rigid_units(scene).values())
+    rigid = ", ".join(scene.rigid_units.values())
     units = {
         "t": "s",
         "q_r": rigid,
@@ -50,7 +49,7 @@ def write_trajectory(
         "q_e": "m or rad: times V is a displacement in m",
         "deviation": "m",
         "compliance": "N m",
-        "joint_forces": ", ".join(FORCE_OF[unit] for unit in rigid_units(scene).values()),
+        "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
         "closure_force": "N, " + _directions(scene),
         "slider_position": "m, from closure.point along closure.direction",
         "initial_deviation": "m",
@@ -94,16 +93,9 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
     ]
 
 
-def rigid_units(scene: Scene) -> dict[str, str]:
-    """Return the unit of every rigid coordinate by its name: cart, then the arms; or the joints."""
-    if scene.is_spatial:
-        return {one.name: "m" if one.type == "prismatic" else "rad" for one in scene.movable}
-    return {CART: "m", **{arm.name: "rad" for arm in scene.arms}}
-
-
 def drive_units(scene: Scene) -> dict[str, str]:
     """Return the unit of every drive by the name of its coordinate, see `Scene.driven`."""
-    units = rigid_units(scene)
+    units = scene.rigid_units
     return {name: FORCE_OF[units[name]] for name in scene.driven}
 
 
@@ -118,17 +110,17 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
 def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     """Return the unit of every column of trajectory.csv, in their order."""
     scene, slices = trajectory.scene, trajectory.mechanism.slices
-    axes = "xyz" if scene.is_spatial else "xy"
+    axes = "xyz"[: scene.dimension]
     units = {"t": "s", **{f"deviation_{axis}": "m" for axis in axes}, "deviation": "m"}
     units |= {"compliance": "N m"}
-    units |= {f"q_r_{name}": unit for name, unit in rigid_units(scene).items()}
+    units |= {f"q_r_{name}": unit for name, unit in scene.rigid_units.items()}
     for arm, part in zip(scene.arms, slices, strict=True):
         # Of normalised modes: a unit of their own, which times the mode is a displacement.
         units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
     units |= {f"compliance_{arm.name}": "N m" for arm in scene.arms}
     units |= {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
     if trajectory.is_machine:
-        units |= {f"q_r_desired_{name}": unit for name, unit in rigid_units(scene).items()}
+        units |= {f"q_r_desired_{name}": unit for name, unit in scene.rigid_units.items()}
         names = [trajectory.scene.arms[k].name for k in trajectory.motor_joints]
         units |= {f"q_motor_{name}": "rad" for name in names}
     if scene.closure is not None:

@@ -12,6 +12,7 @@ from dolfinopt.arms.arm import fixed_body
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_cells, together
+from dolfinopt.scene.load import Arm as SceneArm
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -166,9 +167,11 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
 
 def _fixed_view(scene: Scene, index: int) -> ArmView:
     """Return an arm without a design: a bar, in space a box from inboard to outboard."""
-    arm, body = scene.arms[index], fixed_body(scene, index)
-    if not scene.is_spatial:
-        return _bar_view(arm.name, arm.height, body)
+    return FIXED_VIEWS[scene.dimension](scene.arms[index], fixed_body(scene, index))
+
+
+def _box_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
+    """Return a rigid box from inboard to outboard."""
     side = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # of y and z
     faces = [
         np.column_stack([np.full(4, x), side * [arm.height, arm.thickness]])
@@ -179,18 +182,16 @@ def _fixed_view(scene: Scene, index: int) -> ArmView:
     return ArmView(arm.name, corners, corners.mean(axis=1), np.ones(1), modes, False, arm.length)
 
 
-def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
-    """Return a body whose shape is not known as a bar from joint to joint.
-
-    Between them it bends like a beam without loads: cubic polynomials that fit the outboard
-    interface's displacement and rotation.
-    """
+def _bar_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
+    """Return a body whose shape is not known as a bar from joint to joint."""
+    # Between them it bends like a beam without loads: cubic polynomials that fit the outboard
+    # interface's displacement and rotation.
     length = float(np.hypot(*body.outboard_point))
     axis = np.array([*body.outboard_point]) / length
     across = np.array([-axis[1], axis[0]])
     s = np.linspace(0.0, 1.0, 21)
     station = np.stack([s[:-1], s[1:], s[1:], s[:-1]], axis=1)  # (n_cells, 4)
-    side = 0.5 * height * np.array([-1.0, -1.0, 1.0, 1.0])
+    side = 0.5 * arm.height * np.array([-1.0, -1.0, 1.0, 1.0])
     corners = length * station[..., None] * axis + side[:, None] * across
     u, v = axis @ body.outboard[:2], across @ body.outboard[:2]
     bend, turn = 3.0 * station**2 - 2.0 * station**3, length * (station**3 - station**2)
@@ -200,7 +201,10 @@ def _bar_view(name: str, height: float, body: ShapeIntegrals) -> ArmView:
     along = station[..., None] * u - side[:, None] * rotation
     modes = along[:, :, None] * axis[:, None] + deflection[:, :, None] * across[:, None]
     density = np.ones(len(corners))
-    return ArmView(name, corners, corners.mean(axis=1), density, modes, False, length)
+    return ArmView(arm.name, corners, corners.mean(axis=1), density, modes, False, length)
+
+
+FIXED_VIEWS = {2: _bar_view, 3: _box_view}
 
 
 def canonical_order(points: np.ndarray) -> np.ndarray:

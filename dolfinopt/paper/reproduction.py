@@ -82,7 +82,7 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     Raises:
         InputError: there is no such key, or it does not allow the value.
     """
-    from dolfinopt.multibody.motion import check_motion
+    from dolfinopt.dynamics.build import check_motion
 
     scene = load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
     asked = {text.partition("=")[0].strip() for text in overrides}

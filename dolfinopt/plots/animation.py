@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -93,16 +93,15 @@ def draw_motion(
     Returns:
         The path.
     """
-    stage: Stage
-    t = trajectory.t
-    if trajectory.scene.is_spatial:
+    films: tuple[Callable[..., Any], Callable[..., Stage]] = make_film, PlaneStage
+    if trajectory.scene.dimension == 3:  # PyVista is imported where solids are drawn
         from dolfinopt.plots.solid_machine import SolidStage, make_solid_film
 
-        solid = make_solid_film(views, trajectory, magnification, frames)
-        at, stage = solid.at, SolidStage(solid, film_speed(t, solid.at, duration))
-    else:
-        film = make_film(views, trajectory, magnification, frames)
-        at, stage = film.at, PlaneStage(film, film_speed(t, film.at, duration))
+        films = make_solid_film, SolidStage
+    make, staged = films
+    film = make(views, trajectory, magnification, frames)
+    at = film.at
+    stage = staged(film, film_speed(trajectory.t, at, duration))
     try:
         return _write(Path(path), stage, len(at), _delay(len(at), duration))
     finally:
@@ -120,11 +119,9 @@ def _delay(count: int, duration: float) -> float:
 
 
 def _write(path: Path, stage: Stage, count: int, delay: float) -> Path:
-    """Write all frames in the same few colours.
-
-    A palette of each frame's own would take longer to find than the frame to draw, and would let
-    the colours flicker.
-    """
+    """Write all frames in the same few colours."""
+    # A palette of each frame's own would take longer to find than the frame to draw, and would let
+    # the colours flicker.
     palette = Image.new("P", (1, 1))
     samples = np.stack([stage.draw(frame) for frame in (0, count // 2, count - 1)])
     palette.putpalette(common_colours(samples).tobytes())

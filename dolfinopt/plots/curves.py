@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.output.trajectory import drive_units, free_drives, rigid_units
+from dolfinopt.output.trajectory import drive_units, free_drives
 from dolfinopt.plots.style import (
     BLUE,
     INITIAL,
@@ -339,7 +339,7 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
     scene, rows = trajectory.scene, []
     places = range(*scene.driven_columns.indices(trajectory.q_r.shape[1]))
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
-    units, loads = rigid_units(scene), drive_units(scene)
+    units, loads = scene.rigid_units, drive_units(scene)
     for name, k in zip(scene.driven, places, strict=True):
         word = "force" if loads[name] == "N" else "moment"
         row: list[Panel] = [(f"{name}: {word}", loads[name], {"": trajectory.joint_forces[:, k]})]

@@ -133,7 +133,7 @@ def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str)
         trajectory: how it moves.
         title: above the picture.
     """
-    if trajectory.scene.is_spatial:
+    if trajectory.scene.dimension == 3:  # PyVista is imported where solids are drawn
         from dolfinopt.plots.solid_machine import solid_machine_figure
 
         space: Any = trajectory.mechanism
@@ -216,11 +216,9 @@ def draw_ground(axes: Axes, motion: PlaneMotion) -> None:
 
 
 def _paths(motion: PlaneMotion, trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return the paths (n, 2), m, that are worth a line, by what they are.
-
-    Of an open chain the end-effector's, desired and, where joints may leave the desired motion, as
-    it moves; of a pinned loop that of the joint before the pin.
-    """
+    """Return the paths (n, 2), m, that are worth a line, by what they are."""
+    # Of an open chain the end-effector's, desired and, where joints may leave the desired motion,
+    # as it moves; of a pinned loop that of the joint before the pin.
     if motion.closure is not None:
         return {} if motion.slides else {"last moving joint": plane(motion.place[:, -2])}
     if not trajectory.is_machine:
@@ -244,10 +242,8 @@ def _framed(low: np.ndarray, high: np.ndarray, below: float) -> tuple[Figure, Ax
 
 
 def _name_instant(axes: Axes, motion: PlaneMotion, n: int, words: str) -> None:
-    """Write the instant beyond the end-effector; of a loop, beyond the first arm's end.
-
-    That tells poses of a loop apart: a slider comes back.
-    """
+    """Write the instant beyond the end-effector; of a loop, beyond the first arm's end."""
+    # That tells poses of a loop apart: a slider comes back.
     place = motion.place[n]
     end, away = place[-1], place[-1] - place[-2]
     if motion.closure is not None:

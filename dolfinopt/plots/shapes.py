@@ -242,10 +242,8 @@ def block_corners(place: complex, size: float, closure: Closure) -> np.ndarray:
 
 
 def _slender(view: ArmView, size: float) -> ArmView:
-    """Return a rigid arm as a thin bar; one that bends keeps its height, which its modes go with.
-
-    `size` is the reach of all arms together, m.
-    """
+    """Return a rigid arm as a thin bar; one that bends keeps the height its modes go with."""
+    # `size` is the reach of all arms together, m.
     height = float(np.ptp(view.corners[..., 1]))
     if view.designed or view.modes.shape[-1] or height <= BAR * size:
         return view

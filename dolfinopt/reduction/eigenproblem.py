@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,10 +84,8 @@ def complement_solve(
 def _without_factor(
     pencil: Pencil, operators: Operators, modes: np.ndarray, values: np.ndarray, right: np.ndarray
 ) -> np.ndarray:
-    """Do what `complement_solve` does with an approximation of K^-1 alone.
-
-    Conjugate gradients for each mode's own matrix; products and cycles work on all of them.
-    """
+    """Do what `complement_solve` does with an approximation of K^-1 alone."""
+    # Conjugate gradients for each mode's own matrix; products and cycles work on all of them.
     weighted = operators.mass(modes)
 
     def lengths(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -271,7 +269,7 @@ def _ritz(operators: Operators, space: list[np.ndarray]) -> tuple[np.ndarray, np
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
-# equal to 1e-8 on any number of ranks; each further digit costs a fraction of a Lanczos step.
+# equal to 1e-8 on any number of ranks; each further digit costs a fraction of a step.
 EIGEN_TOLERANCE = 1e-12
 # Relative distance of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
@@ -284,11 +282,6 @@ WIDE = 1e6
 # Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
 # finds modes of another symmetry, up to 1e-4 it is not slower.
 RAMP_SHARE = 1e-6
-
-
-# Steps of a search from nearby modes, beyond two for each that is wanted: at rough designs of an
-# optimisation four to seven are enough; a search that takes more begins anew in SLEPc.
-MOST_STEPS = 16
 
 Pairs = tuple[np.ndarray, np.ndarray]  # eigenvalues (k,) ascending, vectors (owned rows, k)
 
@@ -330,8 +323,8 @@ def interior_pencil(arm: ElasticArm) -> Pencil:
 def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> Pairs:
     """Return the `count` smallest eigenvalues of K phi = lambda M phi and their vectors.
 
-    From the modes of a nearby problem by `modes_from`, otherwise or where that gives up by SLEPc's
-    Krylov-Schur on K^-1 M; both with the factorisation at hand and to the same residual.
+    By SLEPc's Krylov-Schur on K^-1 M with the factorisation at hand, from the modes of a nearby
+    problem where there are some; where no factor is at hand by `lobpcg`.
 
     Args:
         pencil: K and M, symmetric positive definite.
@@ -349,10 +342,6 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
         pairs = None
         if pencil.operators is not None and not has_options(OPTIONS):
             pairs = lowest_without_factor(arm, pencil.operators, count, start)
-        elif start is not None and start.shape[1] > 0 and not has_options(OPTIONS):
-            pairs = modes_from(pencil, count, start)
-            if pairs is not None and _passes_over(pencil, pairs, start):
-                pairs = None
         if pairs is None or _is_dense(pairs, count):
             pairs = _Eigenproblem(pencil).lowest(count, start)
     arm.profile.counts.eigenproblems += 1
@@ -371,11 +360,9 @@ def _is_dense(pairs: Pairs, count: int) -> bool:
 
 
 def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
-    """Return whether the nearby modes hold one more below the highest of those that were found.
-
-    What of a vector r is M-orthogonal to all lowest modes has r'M K^-1 M r <= r'M r / lambda. Of
-    several modes of one frequency, as of equal windows, a Krylov sequence finds the sum alone.
-    """
+    """Return whether the nearby modes hold one more below the highest of those that were found."""
+    # What of a vector r is M-orthogonal to all lowest modes has r'M K^-1 M r <= r'M r / lambda. Of
+    # several modes of one frequency, as of equal windows, a Krylov sequence finds the sum alone.
     values, vectors = pairs
     if len(values) < 2:  # any of several equal modes will do
         return False
@@ -392,66 +379,19 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
     return False
 
 
-# -- from the modes of a nearby design ---------------------------------------------------------
-
-
-def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
-    """Return the lowest modes by Lanczos' method from the sum of nearby ones, None if it gives up.
-
-    K^-1 M in the inner product of M, with full orthogonalisation; it looks at its residuals after
-    every step, so that none is made in vain. Eigenvalues of slender bodies grow with the fourth
-    power of their number: each step takes two digits more than the one before.
-
-    Args:
-        pencil: K and M.
-        count: number of eigenpairs.
-        start: (rows, k) vectors of a nearby problem.
-    """
-    most = MOST_STEPS + 2 * count
-    Q, MQ = np.empty((most, len(start))), np.empty((most, len(start)))
-    T = np.zeros((most, most))
-    w = _initial(pencil, start)
-    Mw = pencil.mass(w)
-    length = np.sqrt(float(pencil.total(w @ Mw)))
-    for m in range(most):
-        if not length > 0.0:  # neither of zero nor of nan
-            return None
-        np.divide(w, length, out=Q[m])
-        np.divide(Mw, length, out=MQ[m])
-        w = pencil.inverse(MQ[m])
-        for _ in range(2):
-            overlap = pencil.total(MQ[: m + 1] @ w)
-            w -= overlap @ Q[: m + 1]
-            T[: m + 1, m] += overlap
-        Mw = pencil.mass(w)
-        length = np.sqrt(max(float(pencil.total(w @ Mw)), 0.0))
-        if m + 1 < count:
-            continue
-        # One rank decides when the search ends: another's LAPACK may round differently.
-        theta, y = on_root(pencil.arm.comm, np.linalg.eigh, T[: m + 1, : m + 1], "U")
-        theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
-        if (length * np.abs(y[-1]) <= EIGEN_TOLERANCE * theta).all():
-            return 1.0 / theta, (y.T @ Q[: m + 1]).T
-    return None
-
-
 def _initial(pencil: Pencil, start: np.ndarray) -> np.ndarray:
-    """Return the sum of nearby modes, with a share of the ramp.
-
-    The sum of the wanted modes spans their space in one Krylov sequence. Old modes of a symmetric
-    design stay within their symmetry for ever, even when a mode of another one has become the
-    lowest.
-    """
+    """Return the sum of nearby modes, with a share of the ramp."""
+    # The sum of the wanted modes spans their space in one Krylov sequence. Old modes of a symmetric
+    # design stay within their symmetry for ever, even when a mode of another one has become the
+    # lowest.
     vector, up = start.sum(axis=1), _ramp(pencil, len(start))
     norms = np.sqrt(pencil.total(np.array([vector @ vector, up @ up])))
     return vector + RAMP_SHARE * norms[0] / norms[1] * up
 
 
 def _ramp(pencil: Pencil, rows: int) -> np.ndarray:
-    """Return values that rise from 1 to 2 over the rows of all ranks.
-
-    Rows run along the arm: the ramp has no symmetry of an arm, so that no mode is missed.
-    """
+    """Return values that rise from 1 to 2 over the rows of all ranks."""
+    # Rows run along the arm: the ramp has no symmetry of an arm, so that no mode is missed.
     comm = pencil.arm.comm
     first, size = (0, rows) if comm.size == 1 else (comm.exscan(rows) or 0, comm.allreduce(rows))
     return 1.0 + np.arange(first, first + rows) / max(size, 1)
@@ -464,16 +404,11 @@ def orthonormal(pencil: Pencil, vectors: np.ndarray) -> np.ndarray:
     return vectors @ np.linalg.inv(np.linalg.cholesky(gram)).T
 
 
-# -- from cold, and where modes lie close together ---------------------------------------------
-
-
 def _searches(count: int, warm: bool) -> tuple[tuple[int, int], ...]:
-    """Return vectors and restarts of the searches to try in turn for `count` eigenpairs.
-
-    Few extra vectors at first, as the search looks at its residuals once a sweep: 4 from cold and
-    5 with an initial guess take the fewest solves. Bundles of modes equal to 1e-7, as equal windows
-    of nearly no material have, need more vectors, not more restarts.
-    """
+    """Return vectors and restarts of the searches to try in turn for `count` eigenpairs."""
+    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 from cold and
+    # 5 with an initial guess take the fewest solves. Bundles of modes equal to 1e-7, as equal
+    # windows of nearly no material have, need more vectors, not more restarts.
     extra = 5 if warm else 4
     return (max(count + extra, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100)
 
@@ -487,18 +422,28 @@ class _Eigenproblem:
 
     def lowest(self, count: int, start: np.ndarray | None) -> Pairs:
         """Return up to `count` pairs; see `lowest_eigenpairs`."""
-        warm = start is not None and start.shape[1] > 0
-        first, *others = _searches(count, warm)
-        pairs = self.search(count, *first, start)
+        start = None if start is None or start.shape[1] == 0 else start
+        pairs = self.found(_searches(count, start is not None), count, start)
         # From cold nothing tells how many modes have one frequency: it costs one search more.
-        dense = not warm or _is_dense(pairs, count)
-        for search in others:
-            if len(pairs[0]) < count:
-                pairs = self.search(count, *search, start)
+        dense = start is None or _is_dense(pairs, count) or _passes_over(self.pencil, pairs, start)
         if dense and len(pairs[0]) == count:
             pairs = self.without_gaps(*pairs)
         if len(pairs[0]) == count and pairs[0][-1] > WIDE * pairs[0][0]:
             pairs = pairs[0], orthonormal(self.pencil, pairs[1])
+        return pairs
+
+    def found(
+        self,
+        searches: Sequence[tuple[int, int]],
+        count: int,
+        start: np.ndarray | None,
+        beside: np.ndarray | None = None,
+    ) -> Pairs:
+        """Return what the first search that finds all finds, or the last one; see `search`."""
+        for space, restarts in searches:
+            pairs = self.search(count, space, restarts, start, beside)
+            if len(pairs[0]) == count:
+                break
         return pairs
 
     def search(
@@ -507,7 +452,7 @@ class _Eigenproblem:
         space: int,
         restarts: int,
         start: np.ndarray | None,
-        beside: np.ndarray | None = None,
+        beside: np.ndarray | None,
     ) -> Pairs:
         """Return what a subspace of `space` vectors finds: up to `count` values and vectors.
 
@@ -530,10 +475,7 @@ class _Eigenproblem:
         transform.setKSP(_as_ksp(self.stiffness, self.pencil.inverse))
         vector = self.stiffness.createVecLeft()
         rows = vector.getLocalSize()
-        if start is None or start.shape[1] == 0:
-            first = _ramp(self.pencil, rows)
-        else:
-            first = _initial(self.pencil, start)
+        first = _ramp(self.pencil, rows) if start is None else _initial(self.pencil, start)
         eps.setInitialSpace([_filled(vector, first)])
         if beside is not None:
             eps.setDeflationSpace([_filled(vector, column) for column in beside.T])
@@ -563,11 +505,9 @@ class _Eigenproblem:
         for _ in range(len(values)):
             if self.stiffness.getSize()[0] == len(values):
                 break  # all there are
-            for space, restarts in _searches(1, warm=False)[1:]:
-                more, vector = self.search(1, space, restarts, noise[0][:, None] - 0.5, vectors)
-                if len(more):
-                    break
-            else:
+            wider = _searches(1, warm=False)[1:]
+            more, vector = self.found(wider, 1, noise[0][:, None] - 0.5, vectors)
+            if len(more) == 0:
                 raise ConvergenceError(
                     f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
                     "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"

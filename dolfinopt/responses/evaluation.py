@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import chain_of, stiffening_of
-from dolfinopt.dynamics.build import build_mechanism, closure_of
+from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.multibody.inverse_dynamics import Stiffening, largest_change, stiffness_change
-from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     linear_part,
-    rigid_part,
     shape_integrals,
 )
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
@@ -344,16 +342,9 @@ def _simulated(
     profile: Profile,
     starts: Sequence[Sequence[Solution]],
 ) -> list[tuple[Motion | ConvergenceError, Trajectory | None]]:
-    """Simulate the scenes and their scenarios in one batch (collective).
-
-    Args:
-        scenes: the bodies are those of the first one.
-        partition, owned, profile: as elsewhere.
-        starts: of every scene, see `evaluate`.
-
-    Returns:
-        What became of every scene, on all ranks, and on the root its trajectory.
-    """
+    """Simulate the scenes and their scenarios in one batch (collective)."""
+    # The bodies are those of the first scene. What became of every scene is returned on all ranks,
+    # its trajectory on the root.
     kept: list[Trajectory | ConvergenceError] = []
 
     def run() -> list[Motion | ConvergenceError]:
@@ -489,7 +480,7 @@ def stiffening_of_each(
         arms: this rank's, with a design.
     """
     stated = not any(group[0].simulation.stiffening == "auto" for group in groups)
-    if stated and groups[0][0].is_spatial:  # where it takes most of the memory of a solid arm
+    if stated and not groups[0][0].estimates_stiffening:
         return [Stiffening(None, group[0].simulation.stiffening is True) for group in groups]
     with together(partition.world):
         mine = {k: _static_body(arm, simulated=not stated) for k, arm in arms.items()}
@@ -499,10 +490,8 @@ def stiffening_of_each(
 
 
 def _static_body(arm: Arm, simulated: bool) -> ShapeIntegrals:
-    """Return the body in the static modes of its outboard interface: they need no eigenproblem.
-
-    What the inertia of the modes stiffens is not needed for the estimate alone.
-    """
+    """Return the body in the static modes of its outboard interface: they need no eigenproblem."""
+    # What the inertia of the modes stiffens is not needed for the estimate alone.
     state = arm.current
     elastic, static = state.elastic, state.elastic.constraint_modes()
     none = np.empty((len(static.interior), 0))
@@ -539,25 +528,12 @@ def _decided(
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
     """Return the largest change of an arm's stiffness by the loads of the motion."""
     t = np.linspace(0.0, scene.motion.horizon, INSTANTS)
-    if not scene.is_spatial:
-        mechanism = build_mechanism(scene, bodies)
-        return largest_change(mechanism, rigid_motion(t, scene), closure_of(scene))
-    from dolfinopt.multibody.spatial import inverse_dynamics as space
-    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, joint_motion
-
-    stiffened, motion = build_spatial_mechanism(scene, bodies), joint_motion(t, scene)
-    rigid, none = replace(stiffened, bodies=tuple(map(rigid_part, bodies))), np.zeros((len(t), 0))
-    links = space.outward_pass(rigid, motion, (none, none, none))
-    loads = space.body_loads(links, space.inward_pass(rigid, links).outboard)
-    pairs = zip(stiffened.bodies, loads, strict=True)
-    return max((stiffness_change(body, p) for body, p in pairs), default=0.0)
+    return largest_stiffness_change(scene, bodies, t)
 
 
 def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> float | None:
-    """Return the share of the largest deviation that linear bodies miss; None if one cannot move.
-
-    Simulated beside the run: the comparison is none of its simulations.
-    """
+    """Return what share of the largest deviation linear bodies miss; None if one cannot move."""
+    # Simulated beside the run: the comparison is none of its simulations.
     profile = Profile()
     linear = [[linear_part(body) for body in chain] for chain in bodies]
     largest = 0.0

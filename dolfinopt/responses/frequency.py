@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,7 +65,7 @@ class Eigenfrequency(Response):
     def measure(self, analysis: Analysis) -> Measured:
         """Return squared period and first frequency of every flexible arm (collective)."""
         scene, partition, designs = analysis.scene, analysis.partition, analysis.designs
-        chain = _chain(analysis)
+        chain = _frozen(analysis)
         with together(partition.world):
             mine = {
                 place: (squared_period(one, self.options.exponent, self.follow)[0], one.frequency)
@@ -82,7 +82,7 @@ class Eigenfrequency(Response):
         What an arm carries depends on the designs outboard of it.
         """
         scene, partition, designs = analysis.scene, analysis.partition, analysis.designs
-        chain = _chain(analysis)
+        chain = _frozen(analysis)
         with together(partition.world):
             by_place = _by_place(scene, designs)
             modes = _modes(by_place, chain)
@@ -92,8 +92,7 @@ class Eigenfrequency(Response):
                 own[place] = period_gradient(by_place[place], one, by_values)
         by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
-        sizes = [6 * len(arm.interface_points) if scene.is_spatial else 3 for arm in scene.arms]
-        zero = [np.zeros((size, size)) for size in sizes]
+        zero = [np.zeros_like(one.matrix()) for one in chain.carried()]
         with together(partition.world):
             for place, matrix in by_carried.items():
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
@@ -124,11 +123,14 @@ def _counts(by_body: Any) -> bool:
     return bool(by_body.mass or by_body.w.any() or by_body.W.any())
 
 
-def _chain(analysis: Analysis) -> Chain | FrozenTree:
-    """Freeze the mechanism at the elbow angle at which its arms vibrate (collective)."""
+def _frozen(analysis: Analysis) -> Chain | FrozenTree:
+    """Freeze the mechanism in the pose in which its arms vibrate (collective)."""
+    return FROZEN[analysis.scene.dimension](analysis)
+
+
+def _chain(analysis: Analysis) -> Chain:
+    """Freeze the arms of the plane at the elbow angle at which they vibrate (collective)."""
     scene, partition = analysis.scene, analysis.partition
-    if scene.is_spatial:
-        return _tree(analysis)
     with together(partition.world):
         mine = {k: rigid_integrals(one.elastic) for k, one in analysis.designs.items()}
     owned = on_all_ranks(partition, mine)
@@ -175,6 +177,9 @@ def _tree(analysis: Analysis) -> FrozenTree:
         return FrozenTree(build_spatial_mechanism(scene, bodies), motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)
+
+
+FROZEN: dict[int, Callable[[Analysis], Chain | FrozenTree]] = {2: _chain, 3: _tree}
 
 
 def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, DesignState]:

@@ -250,13 +250,8 @@ def _largest(
     many: Sequence[Trajectory],
     energy: Mapping[int, np.ndarray],
 ) -> float:
-    """Return the error of the worst scenario.
-
-    Args:
-        scenes: the scene and its scenarios.
-        few, many: their motions.
-        energy: of every design V' K V of both bases, one behind the other.
-    """
+    """Return the error of the worst scenario."""
+    # energy: of every design V' K V of both bases, one behind the other.
     return max(_distance(scenes[0], *pair, energy) for pair in zip(few, many, strict=True))
 
 

@@ -299,9 +299,8 @@ class Factors:
 def factors(scene: Scene, other: Scene, index: int) -> Factors:
     """Return what makes the body of arm `index` in `scene` that of the same design in `other`."""
     here, there = scene.material_of(index), other.material_of(index)
-    thicker = 1.0
-    if not scene.is_spatial:  # in plane stress
-        thicker = other.arms[index].thickness / scene.arms[index].thickness
+    # Only of plane arms may it differ: solid ones would be other bodies.
+    thicker = other.arms[index].thickness / scene.arms[index].thickness
     return Factors(
         thicker * there.density / here.density,
         thicker * there.young_modulus / here.young_modulus,

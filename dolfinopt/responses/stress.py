@@ -374,10 +374,7 @@ class Stress(Response):
 def _screened(
     partition: Partition, cells: CellStress, loads: Sequence[ArmLoads]
 ) -> tuple[list[_Chosen], float]:
-    """Return the evenly spaced instants of every motion, and the largest stress of all instants.
-
-    Collective on the arm's ranks.
-    """
+    """Return every motion's evenly spaced instants, and the largest stress of all (collective)."""
     found, largest = [], 0.0
     for one in loads:
         coarse = every(len(one.coefficients))
@@ -505,11 +502,9 @@ def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[in
 
 
 def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
-    """Return the derivative by x_phys of one arm with all loads of its instants frozen (n_cells,).
-
-    With K u_n = f_n held, dJ = dJ/dx - sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n: as many
-    solves as the loads have directions.
-    """
+    """Return the derivative by x_phys of one arm, all loads of its instants frozen (n_cells,)."""
+    # With K u_n = f_n held, dJ = dJ/dx - sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n: as many
+    # solves as the loads have directions.
     state = cells.state
     arm, fields = state.elastic, state.load_fields.columns
     a = np.concatenate([one.a for one in part.chosen])
@@ -687,10 +682,8 @@ class _Condensed:
 
 
 def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
-    """Return the directions in which A a_n varies along the motion, the strongest first.
-
-    By the singular values of a in the metric of A'A, so that columns that cancel do no harm.
-    """
+    """Return the directions in which A a_n varies along the motion, the strongest first."""
+    # By the singular values of a in the metric of A'A, so that columns that cancel do no harm.
     flat = A.reshape(-1, A.shape[2])
     gram = comm.allreduce(flat.T @ flat)
     scale = np.sqrt(np.diagonal(gram))

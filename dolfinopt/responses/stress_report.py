@@ -139,10 +139,7 @@ def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
 def _arm_stress(
     partition: Partition, cells: CellStress, loads: ArmLoads
 ) -> tuple[_Peaks, np.ndarray]:
-    """Return the peaks of one arm; of every cell largest value and instant's number (n_cells, 2).
-
-    Collective on the arm's ranks.
-    """
+    """Return one arm's peaks; of cells largest value and instant's number (n, 2) (collective)."""
     comm, a, coarse = partition.comm, loads.coefficients, every(len(loads.coefficients))
     by_cell, when = maxima(comm, cells.A, a)
     largest = screen(comm, cells.A, a, coarse)

@@ -177,11 +177,7 @@ def _name_material(tree: dict[str, Any]) -> None:
 
 
 def _fill_material(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
-    """Complete [material] by the catalogue where it names one.
-
-    Raises:
-        InputError: the catalogue has no such material.
-    """
+    """Complete [material] by the catalogue where it names one."""
     _name_material(tree)
     material = tree.get("material")
     if not isinstance(material, dict) or not isinstance(name := material.get("name"), str):
@@ -193,10 +189,8 @@ def _fill_material(tree: dict[str, Any], source: str, changes: list[Override]) -
 
 
 def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
-    """Put absolute paths in place of the files that `tree` names.
-
-    What is no string and keys that a table does not have are left for validation to refuse.
-    """
+    """Put absolute paths in place of the files that `tree` names."""
+    # What is no string and keys that a table does not have are left for validation to refuse.
     for table, key in FILE_KEYS:
         model, node = model_at((table,)), tree.get(table)
         if model is None or key not in model.model_fields:
@@ -211,14 +205,8 @@ def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -
 
 
 def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
-    """Leave out sizes and shapes of cells of the arm before that an arm's own file cannot have.
-
-    A .msh file has its cells; a .geo file in the plane a size only where it has the parameter.
-
-    Args:
-        tree: with absolute paths.
-        sizes: paths of the keys that arms have from the arm before.
-    """
+    """Leave out sizes and shapes of cells of the arm before that an arm's own file cannot have."""
+    # A .msh file has its cells; a .geo file in the plane a size only where it has the parameter.
     for table, i, key in sizes:
         arm = tree[table][i]
         if not isinstance(arm, dict) or not isinstance(mesh := arm.get("mesh"), str):
@@ -232,10 +220,8 @@ def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
 
 
 def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
-    """Take the length of arms with standard input data from their files, unless it is stated.
-
-    Height and thickness are only drawn then: a twentieth of the length unless stated.
-    """
+    """Take the length of arms with standard input data from their files, unless it is stated."""
+    # Height and thickness are only drawn then: a twentieth of the length unless stated.
     arms = tree.get("arms")
     for i, arm in enumerate(arms if isinstance(arms, list) else []):
         if not isinstance(arm, dict) or not isinstance(arm.get("sid"), str):
@@ -270,10 +256,8 @@ def _share_interfaces(tree: dict[str, Any]) -> None:
 
 
 def _size_rigid(tree: dict[str, Any]) -> None:
-    """Give rigid arms in space that state their inertia a size to be drawn with.
-
-    A point has no inertia to state; of other arms mass and inertia would follow from the size.
-    """
+    """Give rigid arms in space that state their inertia a size to be drawn with."""
+    # A point has no inertia to state; of other arms mass and inertia would follow from the size.
     arms = tree.get("arms")
     if not tree.get("joints") or not isinstance(arms, list):
         return
@@ -529,11 +513,7 @@ def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys
 
 
 def _count_coordinates(tree: dict[str, Any]) -> Keys:
-    """Give solid arms as many elastic coordinates as their interfaces need, six each.
-
-    Returns:
-        Its key, as (table, key), where it is not stated.
-    """
+    """Give solid arms six coordinates an interface; return (table, key) if it was not stated."""
     reduction, arms = tree.get("reduction", {}), tree.get("arms")
     if not (isinstance(reduction, dict) and isinstance(arms, list)):
         return ()
@@ -558,14 +538,7 @@ def _length(value: Any) -> int:
 
 
 def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
-    """Complete duration and horizon of the motion where they follow from other values.
-
-    Returns:
-        The keys that do, as (table, key).
-
-    Raises:
-        InputError: a stated duration is too short for the limits.
-    """
+    """Complete duration and horizon where they follow from others; return their (table, key)."""
     motion = tree.get("motion")
     if not isinstance(motion, dict):
         return ()
@@ -602,11 +575,7 @@ def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> 
 
 
 def _limit_volume(tree: dict[str, Any]) -> Keys:
-    """Leave out the limit of the volume where mass is asked for and none is stated.
-
-    Returns:
-        Its key, as (table, key), where it is not stated.
-    """
+    """Leave out the volume's limit where mass is asked for; return (table, key) if not stated."""
     tables = {key: tree.get(key) for key in ("design", "objective", "constraints")}
     design, objective, limits = (one if isinstance(one, dict) else {} for one in tables.values())
     if design.get("volume_fraction") is not None:
@@ -620,11 +589,7 @@ def _limit_volume(tree: dict[str, Any]) -> Keys:
 
 
 def _freeze_loads(tree: dict[str, Any]) -> Keys:
-    """Hold the loads in the gradient of `kind = "esl"`, unless a limit follows the motion.
-
-    Returns:
-        Its key, as (table, key), where it is not stated.
-    """
+    """Hold the loads in the gradient of "esl" without limits of the motion; return (table, key)."""
     objective, limits = tree.get("objective", {}), tree.get("constraints", {})
     if not (isinstance(objective, dict) and isinstance(limits, dict)) or "gradient" in objective:
         return ()

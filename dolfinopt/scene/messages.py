@@ -122,10 +122,8 @@ def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
 
 
 def _key_loc(raw: Loc) -> Loc:
-    """Return the path of the key at or above `raw`.
-
-    Below a key there are only the elements of its value, which messages show as a whole.
-    """
+    """Return the path of the key at or above `raw`."""
+    # Below a key there are only the elements of its value, which messages show as a whole.
     for depth in range(1, len(raw)):
         if not isinstance(raw[depth - 1], int) and model_at(raw[:depth]) is None:
             return raw[:depth]

@@ -135,6 +135,22 @@ class Scene(Table):
         return bool(self.joints)
 
     @property
+    def dimension(self) -> int:
+        """Number of directions in which the machine moves: 2, or 3 in space."""
+        return 3 if self.is_spatial else 2
+
+    @property
+    def estimates_stiffening(self) -> bool:
+        """Whether its effect is told where it is stated; most of a solid arm's memory would go."""
+        return not self.is_spatial
+
+    @property
+    def arm_sizes(self) -> tuple[str, ...]:
+        """Keys of an arm that give its cells other sizes; in the plane thickness is a factor."""
+        plane = ("length", "height", "mesh_size", "passive")
+        return (*plane, "thickness") if self.is_spatial else plane
+
+    @property
     def movable(self) -> tuple[Joint, ...]:
         """Joints in space that have a coordinate, in their order."""
         return tuple(joint for joint in self.joints if joint.moves)
@@ -171,6 +187,26 @@ class Scene(Table):
             return tuple(joint.name for joint in self.movable)
         names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
         return names if self.motion.base == "fixed" else ("cart", *names)
+
+    @property
+    def rigid_units(self) -> dict[str, str]:
+        """Unit of every rigid coordinate by its name: cart, then the arms; in space the joints."""
+        if self.is_spatial:
+            return {one.name: "m" if one.type == "prismatic" else "rad" for one in self.movable}
+        return {"cart": "m", **{arm.name: "rad" for arm in self.arms}}
+
+    @property
+    def num_rigid(self) -> int:
+        """Number of rigid coordinates: cart and arms, or the joints in space that move."""
+        return len(self.movable) if self.is_spatial else 1 + len(self.arms)
+
+    @property
+    def joint_columns(self) -> tuple[int | None, ...]:
+        """Place of every arm's inboard joint among the rigid coordinates; None of a fixed one."""
+        if not self.is_spatial:
+            return tuple(range(1, 1 + len(self.arms)))
+        places = {joint.child: i for i, joint in enumerate(self.movable)}
+        return tuple(places.get(arm.name) for arm in self.arms)
 
     @property
     def driven_columns(self) -> slice:

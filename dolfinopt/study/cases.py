@@ -102,7 +102,7 @@ class Case:
         motion_alone = scene.objective.needs("motion") and not any(vars(scene.constraints).values())
         if motion_alone and scene.reduction.method in SCALABLE:
             for row in (kept["material"], *kept["arms"]):
-                for key in SCALING[:2] if scene.is_spatial else SCALING:
+                for key in set(SCALING) - set(scene.arm_sizes):
                     row.pop(key, None)
         return _digest([kept, self.design_key])
 

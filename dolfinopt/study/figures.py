@@ -320,7 +320,7 @@ def design_figure(figure: tables.DesignFigure) -> Figure:
     from matplotlib.collections import PolyCollection
 
     views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
-    if figure.designs[0][1].is_spatial:
+    if figure.designs[0][1].dimension == 3:  # PyVista is imported where solids are drawn
         from dolfinopt.plots.solid_design import solid_designs_figure
 
         return solid_designs_figure([label for label, _, _ in figure.designs], views, figure.title)

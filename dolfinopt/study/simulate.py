@@ -8,15 +8,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm, build_arms, uniform_design
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.output.design import read_design
+from dolfinopt.output.design import arms_with_design
 from dolfinopt.output.run_folder import Simulated
-from dolfinopt.parallel import Partition, partition_arms
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.reduction import METHODS, BasisErrors, Options, basis_errors
 from dolfinopt.responses.evaluation import Evaluation, evaluate_batch
@@ -28,8 +25,10 @@ from dolfinopt.study import variants
 MODES = 3  # natural modes that `compare` looks at
 # Keys that leave the reduced bodies as they are, or scale them: in plane stress mass and stiffness
 # are linear in the thickness.
-SCALING = r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
-THICKNESS = r"arms\.(.+\.)?thickness"
+SCALING = (
+    r"(motion|payload|damping)\..+|(material|arms|arms\..+)\.(young_modulus|density)"
+    r"|arms\.(.+\.)?thickness"
+)
 
 
 def simulate_scenarios(
@@ -49,8 +48,7 @@ def simulate_scenarios(
         InputError: the design does not fit the arms.
     """
     profile = Profile()
-    partition, arms = build_alone(scenes[0], profile)
-    x_phys = _densities(scenes[0], design, partition, arms)
+    partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
     for _, neighbours in groupby(enumerate(scenes), key=lambda numbered: _basis(*numbered)):
         batch = [scene for _, scene in neighbours]
         arms = {k: arm.under(batch[0]) for k, arm in arms.items()}
@@ -87,8 +85,7 @@ def compare(
     interface miss.
     """
     profile = Profile()
-    partition, arms = build_alone(scenes[0], profile)
-    x_phys = _densities(scenes[0], design, partition, arms)
+    partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
     richer = {}
     for k, arm in arms.items():
         arm.set_design(x_phys[k])
@@ -115,8 +112,9 @@ def compare(
 
 def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    known = SCALING if scene.is_spatial else f"{SCALING}|{THICKNESS}"
-    return all(re.fullmatch(known, key) for key in keys)
+    return all(
+        re.fullmatch(SCALING, key) and key.split(".")[-1] not in scene.arm_sizes for key in keys
+    )
 
 
 def with_sample(scene: Scene, changes: Sequence[str], number: int) -> Scene:
@@ -157,18 +155,3 @@ def simulate_samples(
         # At once: less than half the time of one after the other.
         starts = [nominal.trajectory.solution] * len(scenes)
         yield from simulate_batch(scenes, bodies, Profile(), starts)
-
-
-def build_alone(scene: Scene, profile: Profile) -> tuple[Partition, dict[int, Arm]]:
-    """Build the arms on this rank alone."""
-    partition = partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    return partition, build_arms(scene, partition, profile)
-
-
-def _densities(
-    scene: Scene, design: Path | None, partition: Partition, arms: dict[int, Arm]
-) -> dict[int, np.ndarray]:
-    """Return the physical densities of a design, by default of the initial one."""
-    if design is not None:
-        return read_design(design, partition, arms)
-    return uniform_design(scene, partition, arms, scene.design.initial)

@@ -329,12 +329,9 @@ def _powers(dimensions: int, degree: int) -> np.ndarray:
 
 
 def _fit(basis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Fit values (n,) by least squares in a basis (n, terms).
-
-    Returns:
-        Coefficients (terms,), those (n, terms) without each of the samples, and the relative
-        squared error at each sample of the fit to all others.
-    """
+    """Fit values (n,) by least squares in a basis (n, terms)."""
+    # Returned are coefficients (terms,), those (n, terms) without each of the samples, and the
+    # relative squared error at each sample of the fit to all others.
     q, r = np.linalg.qr(basis)
     diagonal = np.abs(np.diag(r))
     if len(basis) <= basis.shape[1] or diagonal.min() < DEPENDENT * diagonal.max():
@@ -356,10 +353,8 @@ def _shares(powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
-    """Return an index within [0, 1] with an interval from those (n,) that leave a sample out.
-
-    Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
-    """
+    """Return an index within [0, 1] with an interval from those (n,) that leave a sample out."""
+    # Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
     n = len(leaving)
     half = WIDE * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
     return Estimate(float(value), max(float(value) - half, 0.0), min(float(value) + half, 1.0))

@@ -167,10 +167,8 @@ def _is_complete(folder: Path) -> bool:
 
 
 def _jobs(missing: Iterable[Case], ranks: int) -> list[Job]:
-    """Return the jobs, optimisations first, as others wait for them.
-
-    All of the same arms and design is one job for each rank, which builds these once.
-    """
+    """Return the jobs, optimisations first, as others wait for them."""
+    # All of the same arms and design is one job for each rank, which builds these once.
     batches: dict[str, list[Case]] = {}
     for case in missing:
         batches.setdefault(case.batch_key, []).append(case)
@@ -348,10 +346,8 @@ def _arrays(lists: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
 
 @contextmanager
 def _told(missing: Sequence[Case], place: _Place, shown: bool) -> Iterator[None]:
-    """Tell of every case when it has ended, on a terminal also how far the others are.
-
-    A thread looks at the files of all ranks; nothing that is computed depends on it.
-    """
+    """Tell of every case when it has ended, on a terminal also how far the others are."""
+    # A thread looks at the files of all ranks; nothing that is computed depends on it.
     if not (shown and missing):
         yield
         return

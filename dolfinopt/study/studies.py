@@ -20,13 +20,12 @@ import pandas as pd
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.output.design import read_design
+from dolfinopt.output.design import arms_with_design, read_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import need_of
 from dolfinopt.study.cases import Action, Case, Outcome, Outcomes
-from dolfinopt.study.simulate import build_alone
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.tables import (
     DesignFigure,
@@ -218,7 +217,7 @@ def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
         for path in designs:
             if not path.is_file():
                 raise InputError(f"{path}: --design: no such file; give design.npz files")
-        partition, arms = build_alone(scene, Profile())
+        partition, arms, _ = arms_with_design(MPI.COMM_SELF, scene, None, Profile())
         for path in designs:
             read_design(path, partition, arms)
         names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
@@ -339,11 +338,9 @@ def sweep_plan(
 def _sweep(
     scene: Scene, keys: Sequence[Vary], given: Mapping[str, Design], reoptimize: bool, fits: bool
 ) -> Rows:
-    """Return all scenarios of the keys' values for every design.
-
-    Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
-    "made for" in scenario "point", where it fits their arms; "optimum" its optimisation.
-    """
+    """Return all scenarios of the keys' values for every design."""
+    # Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
+    # "made for" in scenario "point", where it fits their arms; "optimum" its optimisation.
     swept = ", ".join(vary.key for vary in keys)
     points, labels, columns = [], [], []
     for j, values in enumerate(product(*(vary.values for vary in keys))):

@@ -38,7 +38,6 @@ from dolfinopt.study.variants import asked_by, axis_of, changed
 TABLES = (
     "motion", "control", "closure", "payload", "damping", "material", "arms", "interpolation",
 )  # fmt: skip
-SIZES = ("length", "height", "mesh_size", "passive")
 LEAST = 10  # samples: fewer tell nothing of the scatter
 CHUNK = 25  # samples that an interruption may cost
 REDUCED = 5  # of those that are meshed and reduced anew, which take longer
@@ -195,8 +194,7 @@ def parse_input(scene: Scene, text: str) -> Input:
             raise InputError(
                 f"does not change what a given design does; expected a key of {', '.join(TABLES)}"
             )
-        sizes = (*SIZES, "thickness") if scene.is_spatial else SIZES
-        if parts[0] == "arms" and parts[-1] in sizes:
+        if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
         field = field_at(("arms", 0, parts[-1]) if parts[0] == "arms" else tuple(parts))
         try:

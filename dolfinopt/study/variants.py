@@ -121,8 +121,7 @@ def changed(scene: Scene, *overrides: str) -> Scene:
     Raises:
         InputError: there is no such key, or it does not allow the value.
     """
-    from dolfinopt.dynamics.build import check_forces
-    from dolfinopt.multibody.motion import check_motion
+    from dolfinopt.dynamics.build import check_forces, check_motion
 
     other = scene_from_dict(scene.to_tree(), scene.source, overrides)
     check_motion(other)

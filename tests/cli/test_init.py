@@ -12,8 +12,8 @@ from runs import ROOT, run, shell
 import dolfinopt
 from dolfinopt.cli.main import TEMPLATES
 from dolfinopt.data import template_folder
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import check_motion
 from dolfinopt.scene.load import describe_keys, load_scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.schema import scene_schema

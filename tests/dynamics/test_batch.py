@@ -9,7 +9,7 @@ import pytest
 from bodies import beam, random_cloud
 
 from dolfinopt.dynamics import batch, radau
-from dolfinopt.dynamics.adjoint import trajectory_gradient
+from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
     Solution,
     even_steps,
@@ -343,7 +343,7 @@ def test_adjoint_of_a_solution_from_the_batch():
     same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
     t = np.linspace(0.1, 1.0, 7)
     by_q = np.random.default_rng(4).normal(size=(7, 6))
-    here, there = (trajectory_gradient(problem, x, t, by_q) for x in (one, same))
+    here, there = (Adjoint(problem, x).gradient(t, by_q) for x in (one, same))
     for mine, theirs in zip(here, there, strict=True):
         for name in ("K", "M", "C", "outboard"):
             expected = getattr(theirs, name)

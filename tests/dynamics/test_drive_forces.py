@@ -14,7 +14,7 @@ from machines import controlled, loop
 from dolfinopt import Model
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.simulation import Trajectory, drive_force_gradient
+from dolfinopt.dynamics.simulation import DriveForces, Trajectory
 from dolfinopt.multibody.inverse_dynamics import Rates, inverse_dynamics
 from dolfinopt.scene.load import Scene
 
@@ -93,7 +93,7 @@ def test_by_coordinates_and_rates(kind: str, count: int, folder: Path) -> None:
     t, rates, sizes = state(trajectory, count)
     rng = np.random.default_rng(1)
     weights = rng.normal(size=trajectory.joint_forces[:1].shape) * np.ones((count, 1))
-    by, _ = drive_force_gradient(trajectory.problem, t, rates, weights)
+    by, _ = DriveForces(trajectory.problem, t, rates).gradient(weights)
     assert by.shape == (3, count, trajectory.problem.num_coordinates)
     for order, size in enumerate(sizes):
         direction = 0.1 * size * rng.uniform(-1.0, 1.0, size=rates[order].shape)
@@ -117,7 +117,7 @@ def test_by_bodies(kind: str, folder: Path) -> None:
     t, rates, _ = state(trajectory, 5)
     rng = np.random.default_rng(3)
     weights = rng.normal(size=(5, trajectory.joint_forces.shape[1]))
-    _, found = drive_force_gradient(system, t, rates, weights)
+    _, found = DriveForces(system, t, rates).gradient(weights)
     here = np.abs(weights * forces(system, t, rates)).sum()
     slopes = []
     for arm, body in enumerate(system.mechanism.bodies):

@@ -17,7 +17,7 @@ import dolfinopt as do
 from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics import newton as factors
 from dolfinopt.dynamics import radau as march
-from dolfinopt.dynamics.adjoint import trajectory_gradient
+from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
     Solution,
     Stages,
@@ -1025,11 +1025,11 @@ def test_dense_matrices_are_kept_small(
     t = np.linspace(0.0, 1.0, 21)
     dense(monkeypatch)
     whole = radau.on_grid(problem, edges, 1e-8, 3)
-    slopes = trajectory_gradient(problem, whole, t, whole.sample(t))
+    slopes = Adjoint(problem, whole).gradient(t, whole.sample(t))
     monkeypatch.setattr(factors, "MEMORY_BYTES", 1e6)
     matrices.clear()
     parts = radau.on_grid(problem, edges, 1e-8, 3)
-    again = trajectory_gradient(problem, whole, t, whole.sample(t))
+    again = Adjoint(problem, whole).gradient(t, whole.sample(t))
     assert max(count for count, _ in matrices) < 60
     assert distance(problem, parts, whole) <= 1e-12
     # Of the tangents at the stages here, held ones there, whose answer is corrected once.
@@ -1051,11 +1051,11 @@ def test_adjoint_is_exact_with_fast_coordinates(
     by_q = solution.sample(t) @ problem.mechanism.stiffness()
     monkeypatch.setattr(factors, "LIMITS", limits)
     matrices.clear()
-    found = trajectory_gradient(problem, solution, t, by_q)
+    found = Adjoint(problem, solution).gradient(t, by_q)
     assert min(size for _, size in matrices) < 16
     assert (max(size for _, size in matrices) == 16) == (limits[0] < 1.0)
     dense(monkeypatch)
-    for a, b in zip(found, trajectory_gradient(problem, solution, t, by_q), strict=True):
+    for a, b in zip(found, Adjoint(problem, solution).gradient(t, by_q), strict=True):
         for name in ("C", "M", "G", "K", "outboard"):
             # Multipliers are corrected to 1e-8, largest component.
             assert_close(getattr(a, name), getattr(b, name), 1e-8)

@@ -198,7 +198,8 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     assert same_kinematics(before, after)
     fore = after.links["forearm"]
     assert fore.own.mass == pytest.approx(summary["mass"]["forearm"], rel=1e-12)
-    assert fore.is_closed and fore.volume == pytest.approx(fore.own.mass / 2700.0, rel=0.01)
+    assert all(one.is_watertight for one in fore.shapes)
+    assert fore.volume == pytest.approx(fore.own.mass / 2700.0, rel=0.01)
     # Its frame is the link's: the rod's middle beside the elbow, from it to the wrist.
     assert fore.own.centre == pytest.approx([-0.36435, 0.0, 0.06], abs=1e-9)
     assert fore.points.min(axis=0) == pytest.approx([-0.7287, -0.055, 0.005], abs=1e-3)

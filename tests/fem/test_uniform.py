@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from dolfinopt.fem import assembly
-from dolfinopt.fem.assembly import AffineMatrix, BlockMatrix, NodePairs
+from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs, StressTensor
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
@@ -35,9 +35,10 @@ def make_arm(element: str, shift: float = 0.0) -> ElasticArm:
 def cell_by_cell(arm: ElasticArm) -> ElasticArm:
     """Return the same arm, its cells told apart."""
     other = copy.copy(arm)
-    other.substructure = copy.copy(arm.substructure)
-    other.substructure.uniform = None
-    other.substructure.__dict__.pop("uniform_stress", None)
+    own = other.substructure = copy.copy(arm.substructure)
+    operators, quadrature = arm.operators, own.quadrature
+    own.cells = Cells(operators, operators.stiffness.copy(), operators.mass.copy())
+    own.stress_tensor = StressTensor(own.cells, quadrature.derivatives, quadrature.stress)
     return other
 
 
@@ -55,7 +56,7 @@ def largest(values: np.ndarray) -> float:
 def test_one_matrix_for_all_cells(element: str) -> None:
     arm = make_arm(element)
     other = cell_by_cell(arm)
-    assert arm.substructure.uniform is not None
+    assert len(arm.substructure.cells.stiffness) == 1
     u, v = fields(arm, 1.0, 3), fields(arm, 2.5, 3)
     for found, expected in (
         (arm.energy_matrix(u), other.energy_matrix(u)),
@@ -76,7 +77,7 @@ def test_one_tensor_for_all_cells(
     monkeypatch.setattr(assembly, "LEAST", 7)
     arm = make_arm(element)
     other = cell_by_cell(arm)
-    assert arm.substructure.uniform_stress is not None
+    assert len(arm.substructure.stress_tensor.tensor) == 1
     V = np.concatenate([arm.constraint_modes().field, fields(arm, 1.0, 2)], axis=2)
     loads, others = unit_loads(arm), unit_loads(other)
     K0, expected = loads.geometric_stiffness(V), others.geometric_stiffness(V)
@@ -96,9 +97,10 @@ def test_one_tensor_for_all_cells(
 def test_cells_that_are_not_alike() -> None:
     """A node that is off its place by a thousandth of a cell makes its cells their own."""
     arm = make_arm("linear", 1e-3)
-    assert arm.substructure.uniform is None
-    assert arm.substructure.uniform_stress is None
-    assert make_arm("linear", 1e-13).substructure.uniform is not None
+    count = arm.mesh.num_cells
+    assert len(arm.substructure.cells.stiffness) == count
+    assert len(arm.substructure.stress_tensor.tensor) == count
+    assert len(make_arm("linear", 1e-13).substructure.cells.stiffness) == 1
 
 
 def test_nodes_of_a_grid_lie_on_its_lines() -> None:
@@ -111,13 +113,16 @@ def test_nodes_of_a_grid_lie_on_its_lines() -> None:
 
 @pytest.mark.serial
 def test_matrices_of_blocks():
-    """By pairs of nodes, with matrices of every cell's own: what the entries one by one give."""
+    """By pairs of nodes, of one matrix or each cell's own: what the entries one by one give."""
     cells = np.array([[0, 1, 2, 4], [4, 2, 3, 5], [1, 2, 3, 0]])
     rng = np.random.default_rng(1)
     for b in (1, 3):
         elements = rng.standard_normal((3, 4 * b, 4 * b))
         dofs = (b * cells[:, :, None] + np.arange(b)).reshape(3, 4 * b)
         scale = np.array([2.0, 0.0, -1.0])
-        found = BlockMatrix(NodePairs(cells, 6), elements).assemble(scale)
-        right = AffineMatrix(dofs, elements, 6 * b).assemble(scale)
-        assert np.allclose(found.toarray(), right.toarray(), rtol=1e-14, atol=1e-14)
+        for given in (elements, elements[:1]):
+            found = CellMatrix(NodePairs(cells, 6), given).assemble(scale)
+            right = np.zeros((6 * b, 6 * b))
+            for own, s, A in zip(dofs, scale, np.broadcast_to(given, elements.shape), strict=True):
+                right[np.ix_(own, own)] += s * A
+            assert np.allclose(found.toarray(), right, rtol=1e-14, atol=1e-14)

@@ -10,8 +10,9 @@ import pytest
 import tomllib
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import breakpoints, check_motion
+from dolfinopt.multibody.motion import breakpoints
 from dolfinopt.multibody.spatial.end_effector import Follower, end_path, relative_vectors
 from dolfinopt.multibody.spatial.mechanism import end_chain, exponential, joint_motion
 from dolfinopt.scene.load import load_scene, scene_from_dict

@@ -17,6 +17,7 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 import dolfinopt as do
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
@@ -26,7 +27,6 @@ from dolfinopt.multibody.motion import (
     RigidMotion,
     arc,
     breakpoints,
-    check_motion,
     desired_path,
     line,
     rigid_motion,

@@ -14,8 +14,9 @@ from runs import TWO_ARM
 from scipy.integrate import quad
 
 import dolfinopt as do
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import breakpoints, check_motion, desired_path, rigid_motion
+from dolfinopt.multibody.motion import breakpoints, desired_path, rigid_motion
 from dolfinopt.paths.time_laws import Law, Limits, law_for
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import evaluate_batch

@@ -81,7 +81,7 @@ def motion(
     """Return what pictures ask of a trajectory."""
     end = end_effector(mechanism, still(q_r), q_e)
     return SimpleNamespace(
-        scene=SimpleNamespace(is_spatial=False), mechanism=mechanism, t=t, q_r=q_r, q_e=q_e,
+        scene=SimpleNamespace(dimension=2), mechanism=mechanism, t=t, q_r=q_r, q_e=q_e,
         desired=still(q_r if desired is None else desired), is_machine=desired is not None,
         closure=closure, end=end,
     )  # fmt: skip

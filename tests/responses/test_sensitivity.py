@@ -31,15 +31,16 @@ from scipy.optimize import brentq
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.adjoint import Adjoint, add_gradients, trajectory_gradient
+from dolfinopt.dynamics.adjoint import Adjoint, add_gradients
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.dynamics.collocation import Solution, even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.simulation import drive_force_gradient
+from dolfinopt.dynamics.simulation import DriveForces
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.end_effector import end_effector, end_effector_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion, check_motion
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, scaled
 from dolfinopt.multibody.tangent import body_gradient
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
@@ -180,10 +181,10 @@ def seen_gradient(
 ) -> list[ShapeIntegrals]:
     """Return the gradient by the bodies of a function of `seen`, by its derivative (k, n, m)."""
     if what != "forces":
-        return trajectory_gradient(problem, solution, t, by[0] if len(by) == 1 else by)
+        return Adjoint(problem, solution).gradient(t, by[0] if len(by) == 1 else by)
     rates = (solution.sample(t, 0), solution.sample(t, 1), solution.sample(t, 2))
-    by_rates, bodies = drive_force_gradient(problem, t, rates, by[0])
-    return add_gradients(trajectory_gradient(problem, solution, t, by_rates), bodies)
+    by_rates, bodies = DriveForces(problem, t, rates).gradient(by[0])
+    return add_gradients(Adjoint(problem, solution).gradient(t, by_rates), bodies)
 
 
 @pytest.mark.slow

@@ -92,7 +92,9 @@ def geometric_matrix(arm, c):
     p = np.concatenate([frame, modes, outboard])
     quadrature = elastic.substructure.quadrature
     count, n = elastic.operators.cells.shape
-    xx, yy, xy = np.tensordot(loads.stresses, p, (1, 0)).reshape(3, count, -1)
+    values = (loads.fields @ p)[elastic.operators.cells].reshape(count, -1, 1)
+    stress = elastic.young[:, None, None] * (quadrature.stress @ values)
+    xx, yy, xy = np.moveaxis(stress.reshape(count, -1, 3), 2, 0)
     D = quadrature.derivatives.reshape(count, -1, 2, n)
     tensor = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
     blocks = np.einsum("epai,epab,epbj->eij", D, tensor, D)

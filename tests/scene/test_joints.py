@@ -7,8 +7,8 @@ import copy
 import numpy as np
 import pytest
 
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import check_motion
 from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 

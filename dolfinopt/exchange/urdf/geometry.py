@@ -563,11 +563,9 @@ def _on_surface(
     held: Sequence[np.ndarray],
     flat: bool,
 ) -> np.ndarray:
-    """Move the outer points onto the surface, as far as the cells stay good.
-
-    The way comes from the voxels, and how far from the surfaces of closed pieces; where there are
-    open ones from the voxels, too. Points of flat ends stay in their plane.
-    """
+    """Move the outer points onto the surface, as far as the cells stay good."""
+    # The way comes from the voxels, and how far from the surfaces of closed pieces; where there are
+    # open ones from the voxels, too. Points of flat ends stay in their plane.
     pad = 2
     # Beyond a flat end the geometry goes on: there its surface is no surface.
     inside = np.pad(region, ((pad, pad),) * 3, mode="edge" if flat else "constant")

@@ -299,12 +299,7 @@ def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
 
 
 def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -> Trimesh:
-    """Return the surface of a geometry element of a link.
-
-    Raises:
-        FileNotFoundError: its mesh is not there, or no mesh.
-        InputError: its size is none.
-    """
+    """Return the surface of a geometry element of a link."""
     from trimesh import creation
 
     for kind, names in SIZES.items():

@@ -126,11 +126,6 @@ class RobotLink:
         """Its inertia; zero where the file has none."""
         return MASSLESS if self.inertia is None else self.inertia
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether its surfaces enclose a volume."""
-        return bool(self.shapes) and all(one.is_watertight for one in self.shapes)
-
     @cached_property
     def volume(self) -> float:
         """Volume in m3 within its surfaces; within their convex hulls if they are open."""
@@ -290,10 +285,8 @@ def solid_of(robot: Robot, name: str, tool: str) -> Solid:
 
 
 def _next_joint(robot: Robot, name: str, tool: str) -> tuple[RobotJoint, np.ndarray]:
-    """Return the joint at a link's outboard end, and its pose in the link's frame.
-
-    On the way to the tool if the link carries it; a joint that moves rather than a fixed one.
-    """
+    """Return the joint at a link's outboard end, and its pose in the link's frame."""
+    # On the way to the tool if the link carries it; a joint that moves rather than a fixed one.
     onward = robot.path(tool)
     found: list[tuple[int, RobotJoint, np.ndarray]] = []
     waiting = [(joint, joint.pose) for joint in robot.children(name)]
@@ -317,10 +310,8 @@ def _next_joint(robot: Robot, name: str, tool: str) -> tuple[RobotJoint, np.ndar
 def _interfaces(
     robot: Robot, inner: RobotJoint, outer: RobotJoint, pose: np.ndarray, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reference points (3,) of a link's interfaces in its frame, on its joints' axes.
-
-    Between parallel axes they lie in one plane across, in the middle of the link's geometry.
-    """
+    """Return the reference points (3,) of a link's interfaces in its frame, on its joints' axes."""
+    # Between parallel axes they lie in one plane across, in the middle of the link's geometry.
     first, last = np.zeros(3), pose[:3, 3]
     axis = pose[:3, :3] @ outer.axis
     turning = all(joint.kind in ("revolute", "continuous") for joint in (inner, outer))
@@ -508,10 +499,8 @@ def default_tool(robot: Robot, chosen: tuple[str, ...]) -> str:
 
 
 def _places(robot: Robot, chosen: tuple[str, ...], tool: str) -> dict[str, tuple[str, np.ndarray]]:
-    """Return for every link the body it belongs to and its pose in the frame of that body's link.
-
-    Without mass a link on a fixed joint at a solid is only a place on it.
-    """
+    """Return of every link the body it belongs to and its pose in the frame of that body's link."""
+    # Without mass a link on a fixed joint at a solid is only a place on it.
     places = {robot.root: (GROUND, np.eye(4))}
     for joint in robot.joints:
         body, at = places[joint.parent]

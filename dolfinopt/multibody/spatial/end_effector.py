@@ -11,7 +11,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import RigidMotion, along_curve, curve_through
+from dolfinopt.multibody.motion import RigidMotion, along_curve, curve_of_table, curve_through
 from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface, MovingJoint
 from dolfinopt.multibody.spatial.mechanism import (
     Pose,
@@ -174,7 +174,7 @@ def end_path(t: np.ndarray, scene: Scene) -> EndPath:
         InputError: the table cannot be used; names file and line.
     """
     found = _rows_of(scene)
-    values = along_curve(t, scene.motion, *end_curve(scene))
+    values = along_curve(t, scene.motion, *_curve(scene, file_stamp(scene.motion)))
     (p, v, a), first = (x[:, :3] for x in values), 3
     turning = None
     if found.start is not None:
@@ -185,8 +185,13 @@ def end_path(t: np.ndarray, scene: Scene) -> EndPath:
     return EndPath(p, v, a, turning, (q, qd, qdd))
 
 
-def end_curve(scene: Scene) -> tuple[Curve, bool]:
-    """Return the curve through points, rotation vectors and joints; whether it runs in time."""
+def curve_in_space(scene: Scene) -> tuple[Curve, bool]:
+    """Return the curve through the scene's table, and whether its parameter is time.
+
+    Through joints, or through points with rotation vectors and further joints.
+    """
+    if scene.motion.path == "joints":
+        return curve_of_table(scene)
     return _curve(scene, file_stamp(scene.motion))
 
 

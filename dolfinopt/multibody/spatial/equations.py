@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dolfinopt.multibody.equations import Equations
+from dolfinopt.multibody.inverse_dynamics import stiffness_change
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_part
 from dolfinopt.multibody.spatial.end_effector import deviation, end_effector, end_effector_gradient
 from dolfinopt.multibody.spatial.inverse_dynamics import (
     body_gradient,
+    body_loads,
     elastic_residual,
     inverse_dynamics,
+    inward_pass,
     linearise,
     load_coefficients,
+    outward_pass,
 )
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 
@@ -60,6 +65,15 @@ def _levers(mechanism: SpatialMechanism) -> np.ndarray:
     return np.where(slides, 1.0, reach)
 
 
+def _largest_change(mechanism: SpatialMechanism, motion: RigidMotion, closure: None) -> float:
+    rigid = replace(mechanism, bodies=tuple(map(rigid_part, mechanism.bodies)))
+    none = np.zeros((len(motion.q), 0))
+    links = outward_pass(rigid, motion, (none, none, none))
+    loads = body_loads(links, inward_pass(rigid, links).outboard)
+    pairs = zip(mechanism.bodies, loads, strict=True)
+    return max((stiffness_change(body, p) for body, p in pairs), default=0.0)
+
+
 SPACE = Equations(
     residual=elastic_residual,
     forces=inverse_dynamics,
@@ -73,4 +87,5 @@ SPACE = Equations(
     rotations=_rotations,
     softness=_softness,
     levers=_levers,
+    largest_change=_largest_change,
 )

@@ -690,3 +690,8 @@ def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 
         return RigidMotion(*follower(scene).at(t))
     return RigidMotion(*along_table(t, scene.motion, columns_of(scene)))
+
+
+def check_joint_motion(scene: Scene) -> None:
+    """Raise `InputError` when the scene's table or path cannot be followed."""
+    joint_motion(np.zeros(1), scene)
