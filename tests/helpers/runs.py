@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.cli.main import commands
+from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -27,6 +30,19 @@ def scene(*changes: str) -> Scene:
 def overrides(*changes: str) -> list[str]:
     """Return the options of a command that change the scene."""
     return [word for change in changes for word in ("--set", change)]
+
+
+def refusal(make: Callable[[], object], *words: str) -> str:
+    """Check that a call is refused in one line that has all the words; return the line."""
+    with pytest.raises(InputError) as caught:
+        make()
+    error, message = caught.value, str(caught.value)
+    assert len(message.splitlines()) == 1 and message.isprintable()
+    # No other exception would be printed above it.
+    assert error.__context__ is None or error.__suppress_context__
+    for word in words:
+        assert word in message
+    return message
 
 
 def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:
