@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import click
 import pytest
 from mpi4py import MPI
 
@@ -34,9 +35,10 @@ def overrides(*changes: str) -> list[str]:
 
 def refusal(make: Callable[[], object], *words: str) -> str:
     """Check that a call is refused in one line that has all the words; return the line."""
-    with pytest.raises(InputError) as caught:
+    with pytest.raises((InputError, click.UsageError)) as caught:
         make()
-    error, message = caught.value, str(caught.value)
+    error = caught.value
+    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
     assert len(message.splitlines()) == 1 and message.isprintable()
     # No other exception would be printed above it.
     assert error.__context__ is None or error.__suppress_context__

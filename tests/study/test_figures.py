@@ -125,22 +125,18 @@ def test_names_stand_where_curves_end():
     """In the only row, of a quantity in each panel, that nothing has asked for its limits yet."""
     x = np.array([0.1, 1.0])
     ends = {"initial design": 55.9, "optimised design": 38.4}
-    panels = tuple(
-        Panel(
-            "", "factor [-]", label, tuple(Line(name, x, y - 1.0 + x) for name, y in ends.items())
-        )
-        for label in ("compliance [N m]", "deviation [mm]")
-    )
+    lines = tuple(Line(name, x, y - 1.0 + x) for name, y in ends.items())
+    labels = ("compliance [N m]", "deviation [mm]")
+    panels = tuple(Panel("", "factor [-]", label, lines) for label in labels)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # Matplotlib's, where nothing is left of the axes
         drawn = line_figure(LineFigure("", "Title", (panels,)))
         drawn.canvas.draw()
     axes = drawn.axes[1]
-    top, bottom = axes.get_ylim()[::-1]
+    bottom, top = axes.get_ylim()
     places = {text.get_text(): text.xy[1] for text in axes.texts}
-    assert places == pytest.approx(
-        {name: (y - bottom) / (top - bottom) for name, y in ends.items()}, abs=1e-6
-    )
+    expected = {name: (y - bottom) / (top - bottom) for name, y in ends.items()}
+    assert places == pytest.approx(expected, abs=1e-6)
 
 
 def test_pairs_share_their_axes():
