@@ -2,16 +2,17 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from runs import run
+from runs import refusal, run
 
 from dolfinopt.bench import goals, iterations, measure, motion, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, curves, fastest, fitted_power
 from dolfinopt.bench.goals import Goal, goal_table
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.paper.reproduction import load_paper
 
@@ -147,20 +148,12 @@ def test_ended_bench_keeps_what_is_finished(measured, monkeypatch, tmp_path):
     assert cells == ["error [-]", "at most 0.1", "0.01 (why)", "yes"]
 
 
-def test_names():
+def test_names_and_ranks():
     chosen = [one.name for one in benches.named([])]
     assert chosen == ["time", "peers", "whole", "mesh", "reduction", "tolerance", "solvers"]
     assert [one.name for one in benches.named(["solid", "time"])] == ["solid", "time"]
-    with pytest.raises(InputError, match=r"'plane'.*solid"):
-        benches.named(["plane"])
-
-
-def test_bench_refuses_ranks():
-    class Two:
-        size, rank = 2, 0
-
-    with pytest.raises(InputError, match="without mpirun"):
-        run("bench", world=Two())
+    refusal(lambda: benches.named(["plane"]), "'plane'", "solid")
+    refusal(lambda: run("bench", world=SimpleNamespace(size=2, rank=0)), "without mpirun")
 
 
 def test_processes_that_fail_are_an_error(monkeypatch):
