@@ -1,7 +1,5 @@
 """Disks that are full, and file systems without locks: one line, and nothing half-written."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io

@@ -1,7 +1,5 @@
 """Ctrl-C at any moment of a command: one line, status 130."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

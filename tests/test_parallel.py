@@ -1,7 +1,5 @@
 """Arms dealt out over ranks, collection on the root, and one ending for all ranks."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Whatever fails on one rank alone fails on all: none waits for ever, wherever it happens."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """`dolfinopt export` of a machine in space, and scenes that take its files."""
 
-from __future__ import annotations
-
 import io
 from contextlib import redirect_stdout
 

@@ -1,7 +1,5 @@
 """The import of robots: what it says, refuses and finds doubtful."""
 
-from __future__ import annotations
-
 import re
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Element operators, K(x) and M(x), the factorised interior, and the energies of cells."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import dolfinx.fem.petsc

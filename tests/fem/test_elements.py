@@ -1,7 +1,5 @@
 """The elements: patch test, bending, rates of convergence; and one of a test's own beside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What does not fit the memory is refused before it is meshed."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """What the rest of the package counts on, whatever the version of DOLFINx."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -21,11 +19,6 @@ COMM = MPI.COMM_WORLD
 def mesh():
     corners = [np.zeros(2), np.array([2.0, 1.0])]
     return dolfinx.mesh.create_rectangle(COMM, corners, [6, 4], dolfinx.mesh.CellType.quadrilateral)
-
-
-def test_version():
-    assert compat.dolfinx_version().startswith(f"{compat.VERSION[0]}.{compat.VERSION[1]}")
-    assert compat.VERSION >= (0, 5)
 
 
 @pytest.mark.parametrize(("degree", "nodes"), [(1, 7 * 5), (2, 13 * 9)])

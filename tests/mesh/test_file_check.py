@@ -1,7 +1,5 @@
 """Geometry files of strangers: nothing in them runs a program, or reads or writes another file."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

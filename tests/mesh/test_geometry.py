@@ -1,7 +1,5 @@
 """Geometry files: arms with bores, a user's own, and one line for each that cannot be an arm."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names in STEP files: a text written out by hand, a square with a hole, in millimetres."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Scenes of machines in space: [[joints]], rigid arms with their inertia, and what is refused."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

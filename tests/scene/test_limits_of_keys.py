@@ -1,7 +1,5 @@
 """Every number of a scene at the limits of its range: it runs, or one line says why not."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

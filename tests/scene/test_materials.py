@@ -3,7 +3,6 @@
 import json
 import sys
 
-import numpy as np
 import pytest
 from runs import TWO_ARM, refusal, run
 
@@ -126,13 +125,3 @@ def test_editors_know_the_names():
     assert not validate.is_valid(tomllib.loads(good.replace("PEEK", "PEAK")))
     assert not validate.is_valid(tomllib.loads(good.replace("POM", "POOM")))
     assert not validate.is_valid(tomllib.loads(good.replace('= "PEEK"', "= {density = 1.0}")))
-
-
-def test_values_are_those_of_the_scene_written_in_numbers():
-    """A name is another way to write numbers, to the bit."""
-    named = load_scene(TWO_ARM, ["material=aluminium 2024-T3"])
-    numbers = [f"material.{key}={v!r}" for key, v in CATALOGUE["aluminium 2024-T3"].values.items()]
-    plain = load_scene(TWO_ARM, numbers)
-    for i in range(2):
-        ours, theirs = (one.material_of(i).model_dump() for one in (named, plain))
-        assert np.array_equal(list(ours.values())[1:], list(theirs.values())[1:])

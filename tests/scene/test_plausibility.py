@@ -1,7 +1,5 @@
 """Warnings for what a scene may say, but hardly means."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

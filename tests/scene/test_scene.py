@@ -1,7 +1,5 @@
 """The scene: defaults, inheritance, overrides, and one helpful line for every kind of bad input."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

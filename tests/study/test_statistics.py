@@ -150,14 +150,6 @@ def test_sobol_fills_every_box():
         assert len(boxes) == 64
 
 
-def test_samples_follow_the_distributions():
-    laws = [parse_distribution(text) for text in TEXTS]
-    samples = draw(laws, unit_points(4096, len(laws), "sobol", 2))
-    for law, column in zip(laws, samples.T, strict=True):
-        # 4096 net points: the distribution function is right to some 1/4096.
-        assert stats.kstest(column, law.law.cdf).statistic < 2e-3
-
-
 def test_saltelli_points():
     points = saltelli_points(16, 3, "sobol", 1).reshape(5, 16, 3)
     A, B, mixed = points[0], points[1], points[2:]
@@ -293,16 +285,6 @@ def test_linear_model(texts):
     direct = saltelli_indices(5.0 + points @ slopes, 3, 1)
     for one in (direct.first, direct.total):
         np.testing.assert_allclose([share.value for share in one], exact, atol=0.03)
-
-
-def test_product_has_an_interaction():
-    """(1 + z1) (1 + z2 / 2): variances 1, 1/4, 1/4 of the parts."""
-    laws = [parse_distribution("normal:0:1")] * 2
-    z = draw(laws, unit_points(200, 2, "sobol", 1))
-    found = polynomial_indices(z, (1.0 + z[:, 0]) * (1.0 + 0.5 * z[:, 1]), laws)
-    first, total = ([one.value for one in rows] for rows in (found.first, found.total))
-    np.testing.assert_allclose(first, [1.0 / 1.5, 0.25 / 1.5], rtol=1e-8)
-    np.testing.assert_allclose(total, [1.25 / 1.5, 0.5 / 1.5], rtol=1e-8)
 
 
 def test_noise_is_left_unexplained():

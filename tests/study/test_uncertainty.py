@@ -1,7 +1,5 @@
 """Random uncertainties: what is asked, what each sample gives, tables and pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
