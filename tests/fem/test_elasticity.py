@@ -74,51 +74,6 @@ def owned_rows(arm, field):
     return total.x.array[: 2 * owned].reshape(owned, 2).copy()
 
 
-# -- element matrices -----------------------------------------------------------------------------
-
-
-def q4_matrices(corners):
-    """Return stiffness (8, 8) and mass (4, 4) by hand: bilinear, 2 x 2 Gauss points, E = rho = 1.
-
-    Corners (4, 2) in tensor-product order.
-    """
-    elastic = np.array([[1.0, POISSON, 0.0], [POISSON, 1.0, 0.0], [0.0, 0.0, 0.5 * (1 - POISSON)]])
-    elastic /= 1.0 - POISSON**2
-    k, m = np.zeros((8, 8)), np.zeros((4, 4))
-    gauss = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])
-    for a in gauss:
-        for b in gauss:
-            shape = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
-            local = np.array([[b - 1, 1 - b, -b, b], [a - 1, -a, 1 - a, a]])
-            jacobian = local @ corners
-            weight = 0.25 * abs(np.linalg.det(jacobian)) * THICKNESS
-            slope = np.linalg.solve(jacobian, local)
-            strain = np.zeros((3, 8))
-            strain[0, 0::2] = strain[2, 1::2] = slope[0]
-            strain[1, 1::2] = strain[2, 0::2] = slope[1]
-            k += weight * strain.T @ elastic @ strain
-            m += weight * np.outer(shape, shape)
-    return k, m
-
-
-@pytest.mark.serial  # ranks: test_ranks of test_elements
-@pytest.mark.parametrize("shear", [0.0, 0.4])
-def test_element_matrices_against_hand_coded_quadrilateral(shear):
-    # On parallelograms 2 x 2 points integrate both matrices exactly, as FFCx does.
-    mesh = make_mesh((5, 2), distort=lambda x: np.stack([shear * x[:, 1], 0.1 * x[:, 0]], axis=1))
-    operators = LagrangeElement().operators(mesh, THICKNESS, POISSON)
-    assert np.allclose(operators.points[operators.cells], _corners(mesh), atol=1e-15)
-    assert len(operators.cells) == mesh.num_cells
-    for corners, k_e, m_e in zip(_corners(mesh), operators.stiffness, operators.mass):
-        k, m = q4_matrices(corners)
-        assert np.abs(k_e - k).max() < 1e-12 * np.abs(k).max()
-        assert np.abs(m_e - m).max() < 1e-12 * np.abs(m).max()
-
-
-def _corners(mesh):
-    return compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, :2]
-
-
 # -- stiffness and mass ---------------------------------------------------------------------------
 
 

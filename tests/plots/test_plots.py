@@ -439,8 +439,8 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
 
 
 def test_real_arms_join():
-    cells = ["arms.0.cells=[20,4]", "arms.1.cells=[16,4]", "simulation.tolerance=1e-2"]
-    result = do.Model(do.load_scene(TWO_ARM, cells)).simulate()
+    changes = ["arms.cells=[10,2]", "simulation.tolerance=0.1", "motion.horizon=1.9"]
+    result = do.Model(do.load_scene(TWO_ARM, changes)).simulate()
     film = animation.make_film(result.views, result.trajectory, 2.0, 3)
     for frame in range(3):
         for k, view in enumerate(result.views):
