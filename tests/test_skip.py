@@ -87,40 +87,24 @@ ONE_ARM = {key: value // ARMS for key, value in ONCE.items()}
 SHARED, RIGID = "arms.arm2.design=arm1", "arms.arm1.rigid=true"
 EXACT = "objective.gradient=exact"
 
+
+EVERYTHING = (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0")
+STATIC = STILL | {"assemblies": EACH, "factorisations": EACH, "solves": 3 * EACH}
+STATIC |= {"eigenproblems": 0}
+
 CASES: dict[tuple[str, ...], Counts] = {
     # Nothing twice for one design: a factor an arm and design; frozen loads need no adjoint.
     (): {**ONCE, "eigenproblems": EACH, "simulations": DESIGNS, "adjoints": 0},
-    ("objective.kind=deviation",): {"simulations": DESIGNS, "adjoints": 0},
-    # With everything a scene may ask for the factor is the same.
-    (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0"): {
-        **ONCE,
-        "eigenproblems": 2 * EACH,  # of the basis, and with what the arm carries
-        "simulations": DESIGNS,
-        "adjoints": DESIGNS,
-    },
+    # With everything a scene may ask for the factor is the same; modes are those of the basis, and
+    # with what the arm carries.
+    EVERYTHING: {**ONCE, "eigenproblems": 2 * EACH, "simulations": DESIGNS, "adjoints": DESIGNS},
     # q = 3: no eigenproblem, three solves for the constraint modes, three more for their adjoints.
     ("reduction.coordinates=3",): {**ONCE, "eigenproblems": 0, "solves": 3 * EACH + LOADS},
-    ("reduction.coordinates=3", EXACT): {
-        **ONCE,
-        "eigenproblems": 0,
-        "solves": 3 * EACH + 3 * EACH + LOADS,
-    },
+    ("reduction.coordinates=3", EXACT): {**ONCE, "eigenproblems": 0, "solves": 6 * EACH + LOADS},
     ("reduction.method=krylov",): {**ONCE, "eigenproblems": 0, "solves": 4 * EACH + LOADS},
     # Static: no simulation, no basis, no mass matrix, whatever the damping, payload and motion.
-    ("objective.kind=static",): {
-        **STILL,
-        "assemblies": EACH,
-        "factorisations": EACH,
-        "solves": 3 * EACH,
-        "eigenproblems": 0,
-    },
-    ("objective.kind=static", "constraints.tip_deflection=1.0", EXACT): {
-        **STILL,
-        "assemblies": EACH,
-        "factorisations": EACH,
-        "solves": 3 * EACH,
-        "eigenproblems": 0,
-    },
+    ("objective.kind=static",): STATIC,
+    ("objective.kind=static", "constraints.tip_deflection=1.0", EXACT): STATIC,
     # Eigenfrequency: mass, but no simulation and no basis. Three modes of every arm have elastic
     # and kinetic energy, and only the outer arm is carried, as two fields (mass and inertia).
     ("objective.kind=eigenfrequency",): {
@@ -152,8 +136,7 @@ CASES: dict[tuple[str, ...], Counts] = {
 
 
 # What ranks add up, and designs that belong to one of them.
-ON_RANKS = [(), (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0"),
-            (SHARED, EXACT), (RIGID,)]  # fmt: skip
+ON_RANKS = [(), EVERYTHING, (SHARED, EXACT), (RIGID,)]
 
 
 @pytest.mark.parametrize(
