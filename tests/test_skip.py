@@ -53,15 +53,13 @@ Run = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(folder: Path) -> Run:
     """Run a command on the small scene with overrides; return its folder. Once for each."""
-    path = tmp_path_factory.mktemp("skip") if WORLD.rank == 0 else None
-    root = WORLD.bcast(path, root=0)
     made: list[Path] = []
 
     @cache
     def once(command: str, *overrides: str, design: Path | None = None) -> Path:
-        made.append(root / str(len(made)))
+        made.append(folder / str(len(made)))
         line = [command, str(TWO_ARM), "--no-plots", "--out", str(made[-1])]
         line += ["--design", str(design)] if design else []
         line += set_keys(*QUICK, f"optimizer.max_iterations={ITERATIONS}", *overrides)

@@ -40,8 +40,9 @@ def refusal(make: Callable[[], object], *words: str) -> str:
     error = caught.value
     message = error.format_message() if isinstance(error, click.UsageError) else str(error)
     assert len(message.splitlines()) == 1 and message.isprintable()
-    # No other exception would be printed above it.
-    assert error.__context__ is None or error.__suppress_context__
+    # No other exception would be printed above it; those of click have their own.
+    if isinstance(error, InputError):
+        assert error.__context__ is None or error.__suppress_context__
     for word in words:
         assert word in message
     return message

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import TWO_ARM, refusal
+from studies import COARSE
 
 import dolfinopt as do
 from dolfinopt import locks
@@ -22,8 +23,7 @@ from dolfinopt.study.store import run_cases
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 TOLERANCE = 1e-3  # of the coordinates
-SMALL = ("arms.cells=[12,3]", "optimizer.max_iterations=3", "simulation.sample=0.01",
-         f"simulation.tolerance={TOLERANCE}", "motion.horizon=2.2")  # fmt: skip
+SMALL = [*COARSE, "optimizer.max_iterations=3", f"simulation.tolerance={TOLERANCE}"]
 alone = pytest.mark.serial  # ranks have no part in it
 
 
@@ -156,10 +156,8 @@ def plan():
 
 
 @pytest.fixture(scope="module")
-def done(plan, tmp_path_factory):
+def done(plan, folder):
     """The plan done on all ranks together, and its folder."""
-    path = tmp_path_factory.mktemp("cases") if WORLD.rank == 0 else None
-    folder = WORLD.bcast(path, root=0)
     return folder, run_cases(plan, folder, WORLD, shown=False)
 
 

@@ -5,13 +5,14 @@ import re
 import subprocess
 import time
 
+import click
 import numpy as np
 import pandas as pd
 import pytest
 from mpi4py import MPI
 from runs import ROOT, TWO_ARM, command, environment, overrides, refusal
 from runs import run as run_command
-from studies import cells_of, column, rows_of, write_uniform
+from studies import COARSE, cells_of, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
@@ -24,8 +25,7 @@ WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 # Of the coordinates, whose square is the compliance. A batch's steps are not those of one scene:
 # both results are right to it.
 TOLERANCE = 1e-3
-SMALL = ["arms.cells=[12,3]", "optimizer.max_iterations=2", "simulation.sample=0.01",
-         f"simulation.tolerance={TOLERANCE}", "motion.horizon=2.2"]  # fmt: skip
+SMALL = [*COARSE, "optimizer.max_iterations=2", f"simulation.tolerance={TOLERANCE}"]
 SETTINGS = overrides(*SMALL)
 alone = pytest.mark.serial  # ranks: test_ranks_do_not_matter
 
@@ -43,13 +43,6 @@ def is_drawn(path):
     from PIL import Image
 
     return np.asarray(Image.open(path).convert("L")).std() > 5.0
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Where the studies of this file keep their cases."""
-    path = tmp_path_factory.mktemp("studies") if WORLD.rank == 0 else None
-    return WORLD.bcast(path, root=0)
 
 
 # -- what is asked ---------------------------------------------------------------------------
@@ -103,7 +96,6 @@ BAD = [
     ([*SWEEP, "coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
     ([*SWEEP, "--design", "a.npz", "b.npz"], "b.npz"),  # a file that looks like a preset
     ([*SWEEP, "coordinates", "--reoptimize"], "compare reductions"),
-    (["compare", TWO_ARM], "WHAT"),
     (["compare", TWO_ARM, "designs"], "objectives"),
     ([*OBJECTIVES, "--coordinates", "4"], "--coordinates"),
     ([*REDUCTIONS, "--coordinates", "100000"], "100000"),
@@ -124,8 +116,10 @@ def test_bad_input_is_one_line(words, word, shared_tmp_path):
     assert not (shared_tmp_path / "o").exists()
 
 
-def test_the_command_of_before_names_todays():
+def test_missing_words_and_the_command_of_before():
     refusal(lambda: run_command("study", TWO_ARM, "payload", "--designs", "a.npz"), "sweep")
+    with pytest.raises(click.UsageError, match="what"):
+        run_command("compare", TWO_ARM)
 
 
 # -- sweeps ----------------------------------------------------------------------------------

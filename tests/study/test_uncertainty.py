@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 from runs import TWO_ARM, overrides, refusal
 from runs import run as run_command
-from studies import cells_of, column, rows_of, write_uniform
+from studies import COARSE, cells_of, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
@@ -23,8 +23,7 @@ from dolfinopt.study.uncertainty import (
 )
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
-SMALL = ["arms.cells=[12,3]", "optimizer.max_iterations=2", "simulation.sample=0.01",
-         "simulation.tolerance=1e-2", "motion.horizon=2.2"]  # fmt: skip
+SMALL = [*COARSE, "optimizer.max_iterations=2", "simulation.tolerance=1e-2"]
 MASS, YOUNG = "payload.mass=normal:6:0.3", "material.young_modulus=normal:70e9:2e9"
 TWO = "uncertainty_payload.mass_material.young_modulus"
 CHUNK = 6
@@ -37,13 +36,6 @@ def scene(*overrides):
 
 def run(*arguments):
     run_command("uncertainty", *arguments)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Where the studies of this file keep what they compute."""
-    path = tmp_path_factory.mktemp("random") if WORLD.rank == 0 else None
-    return WORLD.bcast(path, root=0)
 
 
 @pytest.fixture(scope="module")
