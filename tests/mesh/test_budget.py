@@ -45,7 +45,8 @@ def test_what_exceeds_the_memory_is_refused(changes, shared_tmp_path):
         (lambda: load_scene(TWO_ARM, ["arms.cells=[800,48]", "arms.element=quadratic"]),
          2.6, 3.4, "7.68e+04 cells"),
         # By conjugate gradients 8.2 GB for a link of 996 000 degrees of freedom.
-        (lambda: solid_scene(cells=(360, 36, 24)), 8.0, 9.5, "3.11e+05 cells"),
+        pytest.param(lambda: solid_scene(cells=(360, 36, 24)), 8.0, 9.5, "3.11e+05 cells",
+                     marks=pytest.mark.serial),  # ranks share it otherwise
     ],
     ids=["plane", "quadratic", "solid"],
 )  # fmt: skip
