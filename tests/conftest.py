@@ -62,6 +62,15 @@ def shared_tmp_path(tmp_path: Path) -> Path:
     return MPI.COMM_WORLD.bcast(tmp_path, root=0)
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a file's tests keep what they share: rank 0's temporary folder, on all ranks."""
+    from mpi4py import MPI
+
+    world = MPI.COMM_WORLD
+    return world.bcast(tmp_path_factory.mktemp("kept") if world.rank == 0 else None, root=0)
+
+
 @pytest.fixture
 def three_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Taylor tests with the command's middle steps alone: every step is four simulations."""

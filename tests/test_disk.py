@@ -1,20 +1,18 @@
 """Disks that are full, and file systems without locks: one line, and nothing half-written."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io
 import os
+import re
 import subprocess
-import sys
 import zipfile
 
 import click
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, environment, overrides, run
+from runs import ROOT, TWO_ARM, command, environment, overrides, refusal, run
 
 import dolfinopt as do
 from dolfinopt import disk, locks
@@ -65,27 +63,20 @@ def small_files():
 def test_what_does_not_fit_leaves_what_was_there(write, tmp_path, small_files):
     path = tmp_path / "file"
     write_text(path, "before\n")
-    with pytest.raises(OutputError, match=r"file: cannot be written \(File too large\); make room"):
-        write(path)
+    not_written(lambda: write(path), "file", "File too large", "make room")
     assert path.read_text() == "before\n"
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 
-def test_errors_of_a_format_are_not_the_disks(tmp_path):
-    def write(stream):
-        raise OSError("no such format")
-
-    with pytest.raises(OSError, match="no such format"):
-        write_atomically(tmp_path / "picture", write)
-    assert list(tmp_path.iterdir()) == []
+def not_written(write, *words):
+    with pytest.raises(OutputError) as caught:
+        write()
+    assert all(word in str(caught.value) for word in words)
 
 
 def test_folders(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(
-        OutputError, match=r"a: cannot be written \(Not a directory\); name a folder"
-    ):
-        make_folder(tmp_path / "file" / "a")
+    not_written(lambda: make_folder(tmp_path / "file" / "a"), "a: ", "Not a directory", "a folder")
 
 
 @pytest.mark.parametrize("step", ["open", "fsync", "replace"])
@@ -96,10 +87,18 @@ def test_every_step_of_writing(step, tmp_path, monkeypatch):
         monkeypatch.setattr(disk, "open", full, raising=False)
     else:
         monkeypatch.setattr(os, step, full)
-    with pytest.raises(OutputError, match="No space left on device"):
-        write_text(path, "after\n")
+    not_written(lambda: write_text(path, "after\n"), "No space left on device")
     monkeypatch.undo()
     assert path.read_text() == "before\n" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_errors_of_a_format_are_not_the_disks(tmp_path):
+    def write(stream):
+        raise OSError("no such format")
+
+    with pytest.raises(OSError, match="no such format"):
+        write_atomically(tmp_path / "picture", write)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.serial
@@ -121,28 +120,21 @@ def test_a_full_disk_ends_a_run_in_one_line(after, tmp_path, monkeypatch, capsys
     monkeypatch.undo()
     assert ending.value.code == 1
     told = capsys.readouterr().err
-    lines = [one for one in told.splitlines() if one.startswith("dolfinopt: ")]
-    (line,) = [one for one in lines if not one.startswith("dolfinopt: warning: ")]
-    assert "cannot be written (No space left on device); make room" in line
-    assert "Traceback" not in told
+    (line,) = re.findall(r"^dolfinopt: (?!warning: ).*$", told, re.M)
+    assert "No space left on device" in line and "make room" in line and "Traceback" not in told
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
     assert not (tmp_path / "summary.json").exists()
     if after > 0:
         checkpoint.check(tmp_path, load_scene(paper_scene(), COARSE))
 
 
-@pytest.mark.serial
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
 def test_standard_output_without_room(tmp_path):
-    command = [sys.executable, "-m", "dolfinopt", "simulate", str(paper_scene()), "--no-plots"]
-    command += ["--out", str(tmp_path), "--set", COARSE[0], "--set", COARSE[1]]
+    line = command("simulate", paper_scene(), "--no-plots", "--out", tmp_path)
+    line += overrides(*COARSE[:2])
     with open("/dev/full", "w") as nowhere:
-        done = subprocess.run(
-            command, stdout=nowhere, stderr=subprocess.PIPE, text=True, timeout=120
-        )
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == "dolfinopt: standard output: No space left on device"
-    assert "Traceback" not in done.stderr
+        done = subprocess.run(line, stdout=nowhere, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "standard output: No space left on device" in done.stderr.splitlines()[-1]
 
 
 # -- locks -----------------------------------------------------------------------------------
@@ -232,16 +224,16 @@ def design(tmp_path_factory):
 
 @pytest.mark.serial
 @pytest.mark.parametrize(
-    ("kind", "reason"),
+    ("kind", "word"),
     [
-        ("npy", r"no readable \.npz file"),
-        ("8 TiB", r"no readable \.npz file"),
-        ("complex", "density holds complex128, not real numbers"),
-        ("text", "density holds <U3, not real numbers"),
+        ("npy", ".npz file"),
+        ("8 TiB", ".npz file"),
+        ("complex", "complex128"),
+        ("text", "<U3"),
         ("pipe", "no regular file"),
     ],
 )
-def test_designs_that_are_none(design, tmp_path, kind, reason):
+def test_designs_that_are_none(design, tmp_path, kind, word):
     path = tmp_path / "design.npz"
     if kind == "npy":
         with open(path, "wb") as stream:
@@ -253,8 +245,8 @@ def test_designs_that_are_none(design, tmp_path, kind, reason):
     else:
         change = {"complex": lambda x: x + 1j, "text": lambda x: np.full(x.shape, "0.5")}[kind]
         np.savez(path, **design | {"arm1/density": change(design["arm1/density"])})
-    with pytest.raises(InputError, match=reason):
-        run("simulate", TWO_ARM, *overrides(*ROUGH), "--design", path, "--out", tmp_path / "o")
+    line = ["simulate", TWO_ARM, *overrides(*ROUGH), "--design", path, "--out", tmp_path / "o"]
+    refusal(lambda: run(*line), str(path), word)
     assert not (tmp_path / "o").exists()
 
 
@@ -265,9 +257,9 @@ def test_densities_from_python(design):
     full = {name: np.ones(36) for name in ("arm1", "arm2")}
     expected = model.simulate(full).compliance
     assert model.simulate({k: x + 1e-12 for k, x in full.items()}).compliance == expected
-    for x, reason in ((1.0 + 1e-6, "lie in"), (-0.1, "lie in"), (1.0 + 1j, "complex128")):
-        with pytest.raises(InputError, match=rf"density of arm 'arm2'.*{reason}"):
-            model.simulate(full | {"arm2": np.full(36, x)})
+    for x, word in ((1.0 + 1e-6, "lie in"), (-0.1, "lie in"), (1.0 + 1j, "complex128")):
+        wrong = full | {"arm2": np.full(36, x)}
+        refusal(lambda: model.simulate(wrong), "arm 'arm2'", word)  # noqa: B023
 
 
 @pytest.mark.serial
@@ -279,23 +271,21 @@ def test_edited_checkpoints(tmp_path):
         arrays = dict(data)
     for key in ("last", "history", "history_columns", "arm0/cells"):
         np.savez(path, **arrays | {key: np.zeros((2, 2, 2))})
-        with pytest.raises(InputError, match="cannot read this checkpoint"):
-            run(*words, "--set", "optimizer.max_iterations=2", "--resume")
+        line = *words, "--set", "optimizer.max_iterations=2", "--resume"
+        refusal(lambda: run(*line), checkpoint.NAME, "cannot read")  # noqa: B023
 
 
 def test_a_pipe_is_no_scene(tmp_path):
     """Opening it would wait for ever."""
     path = tmp_path / f"{COMM.rank}.toml"
     os.mkfifo(path)
-    with pytest.raises(InputError, match="no regular file"):
-        load_scene(path)
+    refusal(lambda: load_scene(path), str(path), "no regular file")
 
 
 def test_folder_for_forms_that_cannot_be_made(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     compat.check_form_cache.cache_clear()
-    with pytest.raises(InputError, match=r"/dev/null: compiled forms .*XDG_CACHE_HOME"):
-        compat.check_form_cache()
+    refusal(compat.check_form_cache, "/dev/null", "XDG_CACHE_HOME")
     compat.check_form_cache.cache_clear()
 
 
@@ -306,20 +296,16 @@ def test_a_package_that_is_missing_is_named(tmp_path, name):
     text = f"raise ModuleNotFoundError('No module named {name}', name={name!r})\n"
     (tmp_path / f"{name}.py").write_text(text)
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-m", "dolfinopt", "simulate", TWO_ARM, "--out", tmp_path / "o"],
-        env=environment() | {"PYTHONPATH": path},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    line = command("simulate", TWO_ARM, "--out", tmp_path / "o")
+    env = environment() | {"PYTHONPATH": path}
+    done = subprocess.run(line, env=env, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
-    assert f"the Python package {name} is not installed" in done.stderr
+    assert name in done.stderr and "not installed" in done.stderr
 
 
 def test_question_on_a_full_disk(tmp_path, small_files):
-    with pytest.raises(OutputError, match=r"sweep\.json: cannot be written"):
-        write_question(tmp_path, "sweep", {"scene": 5000 * "x"}, [])
+    question = {"scene": 5000 * "x"}
+    not_written(lambda: write_question(tmp_path, "sweep", question, []), "sweep.json")
     assert not list(tmp_path.iterdir())
 
 

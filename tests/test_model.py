@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM
+from runs import TWO_ARM, refusal
 
 import dolfinopt as do
 from dolfinopt import Model, OptimizationResult
@@ -151,20 +151,16 @@ def test_scenes_from_dictionaries_and_scenes() -> None:
 @pytest.mark.parametrize(
     ("x", "words"),
     [
-        ({"arm1": np.zeros(96)}, "expected densities of arm1, arm2"),
-        ({"arm1": np.zeros(95), "arm2": np.zeros(96)}, r"arm 'arm1'.*\(96,\).*\(95,\)"),
-        ({"arm1": np.full(96, 2.0), "arm2": np.zeros(96)}, "density of arm 'arm1' = 2 at cell 0"),
+        ({"arm1": np.zeros(96)}, ["arm1, arm2"]),
+        ({"arm1": np.zeros(95), "arm2": np.zeros(96)}, ["arm 'arm1'", "(96,)", "(95,)"]),
+        ({"arm1": np.full(96, 2.0), "arm2": np.zeros(96)}, ["arm 'arm1' = 2 at cell 0"]),
     ],
 )
 def test_designs_that_do_not_fit_are_refused_on_all_ranks(model: Model, x, words) -> None:
-    with pytest.raises(do.InputError, match=words):
-        model.simulate(x)
+    refusal(lambda: model.simulate(x), *words)
 
 
 def test_bad_arguments_are_refused(model: Model) -> None:
-    with pytest.raises(do.InputError, match="kind 'fast': expected one of esl, exact"):
-        model.gradient(kind="fast")
-    with pytest.raises(do.InputError, match="density"):
-        model.uniform(1.5)
-    with pytest.raises(do.InputError, match=r"payload\.masse"):
-        Model(TWO_ARM, "payload.masse=4")
+    refusal(lambda: model.gradient(kind="fast"), "'fast'", "esl, exact")
+    refusal(lambda: model.uniform(1.5), "density")
+    refusal(lambda: Model(TWO_ARM, "payload.masse=4"), "payload.masse", "payload.mass")

@@ -25,6 +25,7 @@ import pytest
 from mpi4py import MPI
 from remainders import build, wave
 from runs import ROOT, TWO_ARM
+from runs import overrides as set_keys
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
@@ -52,19 +53,16 @@ Run = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(folder: Path) -> Run:
     """Run a command on the small scene with overrides; return its folder. Once for each."""
-    path = tmp_path_factory.mktemp("skip") if WORLD.rank == 0 else None
-    root = WORLD.bcast(path, root=0)
     made: list[Path] = []
 
     @cache
     def once(command: str, *overrides: str, design: Path | None = None) -> Path:
-        made.append(root / str(len(made)))
+        made.append(folder / str(len(made)))
         line = [command, str(TWO_ARM), "--no-plots", "--out", str(made[-1])]
         line += ["--design", str(design)] if design else []
-        for override in (*QUICK, f"optimizer.max_iterations={ITERATIONS}", *overrides):
-            line += ["--set", override]
+        line += set_keys(*QUICK, f"optimizer.max_iterations={ITERATIONS}", *overrides)
         commands.main(line, standalone_mode=False, obj=WORLD)
         WORLD.barrier()
         return made[-1]
@@ -87,40 +85,24 @@ ONE_ARM = {key: value // ARMS for key, value in ONCE.items()}
 SHARED, RIGID = "arms.arm2.design=arm1", "arms.arm1.rigid=true"
 EXACT = "objective.gradient=exact"
 
+
+EVERYTHING = (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0")
+STATIC = STILL | {"assemblies": EACH, "factorisations": EACH, "solves": 3 * EACH}
+STATIC |= {"eigenproblems": 0}
+
 CASES: dict[tuple[str, ...], Counts] = {
     # Nothing twice for one design: a factor an arm and design; frozen loads need no adjoint.
     (): {**ONCE, "eigenproblems": EACH, "simulations": DESIGNS, "adjoints": 0},
-    ("objective.kind=deviation",): {"simulations": DESIGNS, "adjoints": 0},
-    # With everything a scene may ask for the factor is the same.
-    (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0"): {
-        **ONCE,
-        "eigenproblems": 2 * EACH,  # of the basis, and with what the arm carries
-        "simulations": DESIGNS,
-        "adjoints": DESIGNS,
-    },
+    # With everything a scene may ask for the factor is the same; modes are those of the basis, and
+    # with what the arm carries.
+    EVERYTHING: {**ONCE, "eigenproblems": 2 * EACH, "simulations": DESIGNS, "adjoints": DESIGNS},
     # q = 3: no eigenproblem, three solves for the constraint modes, three more for their adjoints.
     ("reduction.coordinates=3",): {**ONCE, "eigenproblems": 0, "solves": 3 * EACH + LOADS},
-    ("reduction.coordinates=3", EXACT): {
-        **ONCE,
-        "eigenproblems": 0,
-        "solves": 3 * EACH + 3 * EACH + LOADS,
-    },
+    ("reduction.coordinates=3", EXACT): {**ONCE, "eigenproblems": 0, "solves": 6 * EACH + LOADS},
     ("reduction.method=krylov",): {**ONCE, "eigenproblems": 0, "solves": 4 * EACH + LOADS},
     # Static: no simulation, no basis, no mass matrix, whatever the damping, payload and motion.
-    ("objective.kind=static",): {
-        **STILL,
-        "assemblies": EACH,
-        "factorisations": EACH,
-        "solves": 3 * EACH,
-        "eigenproblems": 0,
-    },
-    ("objective.kind=static", "constraints.tip_deflection=1.0", EXACT): {
-        **STILL,
-        "assemblies": EACH,
-        "factorisations": EACH,
-        "solves": 3 * EACH,
-        "eigenproblems": 0,
-    },
+    ("objective.kind=static",): STATIC,
+    ("objective.kind=static", "constraints.tip_deflection=1.0", EXACT): STATIC,
     # Eigenfrequency: mass, but no simulation and no basis. Three modes of every arm have elastic
     # and kinetic energy, and only the outer arm is carried, as two fields (mass and inertia).
     ("objective.kind=eigenfrequency",): {
@@ -152,8 +134,7 @@ CASES: dict[tuple[str, ...], Counts] = {
 
 
 # What ranks add up, and designs that belong to one of them.
-ON_RANKS = [(), (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0"),
-            (SHARED, EXACT), (RIGID,)]  # fmt: skip
+ON_RANKS = [(), EVERYTHING, (SHARED, EXACT), (RIGID,)]
 
 
 @pytest.mark.parametrize(
@@ -195,8 +176,7 @@ def test_static_loads_of_solids(
     kept = ("arms.link1.cells=[6,2,2]", "arms.link2.cells=[6,2,2]", "arms.passive=0.08",
             "simulation.sample=0.05", "simulation.tolerance=1e-2", "objective.load_cases=3",
             "objective.kind=static", f"optimizer.max_iterations={ITERATIONS}")  # fmt: skip
-    for override in (*kept, *overrides):
-        line += ["--set", override]
+    line += set_keys(*kept, *overrides)
     commands.main(line, standalone_mode=False, obj=MPI.COMM_SELF)
     found = counts(tmp_path / "out")
     assert found["factorisations"] == EACH and found["reductions"] == 0
@@ -306,24 +286,24 @@ def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_a_trajectory_starts_from_the_last_designs(run: Run) -> None:
-    """Half of the iterations or fewer: from cold it takes a second grid, too."""
-    warm, cold = warm_and_cold(run)
-    assert warm["simulations"] == cold["simulations"] == 1
-    assert 0 < 2 * warm["newton_iterations"] <= cold["newton_iterations"]
-
-
-@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "overrides",
     [(), ("reduction.method=modal", "arms.cells=[50,4]"), ("reduction.coordinates=6",)],
     ids=" ".join,
 )
-def test_modes_start_from_the_last_designs(run: Run, overrides: tuple[str, ...]) -> None:
-    """Residuals are looked at after every step of a search from the last design's modes."""
+def test_modes_and_trajectory_start_from_the_last_designs(
+    run: Run, overrides: tuple[str, ...]
+) -> None:
+    """Residuals are looked at after every step of a search from the last design's modes.
+
+    Half of Newton's iterations or fewer: from cold it takes a second grid, too.
+    """
     warm, cold = warm_and_cold(run, *overrides)
     assert warm["factorisations"] == cold["factorisations"] == ARMS
     assert 3 * ARMS < warm["solves"] < cold["solves"]
+    assert warm["simulations"] == cold["simulations"] == 1
+    if not overrides:
+        assert 0 < 2 * warm["newton_iterations"] <= cold["newton_iterations"]
 
 
 # -- what is not asked for -------------------------------------------------------------------
@@ -358,34 +338,38 @@ def test_the_package_imports_nothing() -> None:
 
 
 # What can be answered before MPI and PETSc are loaded, which takes a second.
-WORDS = {
-    "nothing": [],
-    "help": ["--help"],
-    "version": ["--version"],
-    "help of a command": ["optimize", "--help"],
-    "unknown command": ["optimise", TWO_ARM],
-    "unknown option": ["optimize", TWO_ARM, "--nonsense"],
-    "no scene": ["simulate"],
-    "unknown choice": ["gradient", TWO_ARM, "--kind", "fast"],
-    "unknown key": ["optimize", TWO_ARM, "--set", "payload.mas=1"],
-    "value out of range": ["simulate", TWO_ARM, "--set", "payload.mass=-1"],
-    "no such file": ["simulate", "nowhere.toml"],
-}
+WORDS = [
+    [],
+    ["--help"],
+    ["--version"],
+    ["optimize", "--help"],
+    ["optimise", TWO_ARM],
+    ["optimize", TWO_ARM, "--nonsense"],
+    ["simulate"],
+    ["gradient", TWO_ARM, "--kind", "fast"],
+    ["optimize", TWO_ARM, "--set", "payload.mas=1"],
+    ["simulate", TWO_ARM, "--set", "payload.mass=-1"],
+    ["simulate", "nowhere.toml"],
+]
+ONE_BY_ONE = """
+from dolfinopt.cli import main
+for line in {!r}:
+    sys.argv[1:] = line
+    try:
+        main()
+    except SystemExit:
+        pass
+"""
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("name", WORDS)
-def test_words_need_no_solver(name: str) -> None:
+def test_words_and_completion_need_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     names = DRAW | SOLVE | {"petsc4py", "mpi4py", "numpy", "click"}
-    assert loaded(names, MAIN, *WORDS[name]) == {"click"}
-
-
-@pytest.mark.serial
-def test_completion_needs_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("_DOLFINOPT_COMPLETE", "bash_complete")
-    monkeypatch.setenv("COMP_WORDS", "dolfinopt opt")
-    monkeypatch.setenv("COMP_CWORD", "1")
-    names = DRAW | SOLVE | {"petsc4py", "mpi4py", "numpy", "click"}
+    lines = [[str(word) for word in words] for words in WORDS]
+    assert loaded(names, ONE_BY_ONE.format(lines).replace("\n", "\n    ")) == {"click"}
+    completion = {"_DOLFINOPT_COMPLETE": "bash_complete", "COMP_WORDS": "dolfinopt opt"}
+    for name, value in (completion | {"COMP_CWORD": "1"}).items():
+        monkeypatch.setenv(name, value)
     assert loaded(names, MAIN) == {"click"}
 
 
@@ -400,17 +384,14 @@ def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
         "dolfinopt.multibody.mbdyn",
     }
     line = ["optimize", TWO_ARM, "--no-plots", "--out", tmp_path / "out"]
-    for override in (*QUICK, "optimizer.max_iterations=1"):
-        line += ["--set", override]
+    line += set_keys(*QUICK, "optimizer.max_iterations=1")
     assert loaded(DRAW | others | {"dolfinx"}, MAIN, *line) == {"dolfinx"}
 
 
 @pytest.mark.slow
 @pytest.mark.serial
 def test_plane_pictures_need_no_renderer(tmp_path: Path) -> None:
-    line = ["simulate", TWO_ARM, "--animation", "--out", tmp_path / "out"]
-    for override in QUICK:
-        line += ["--set", override]
+    line = ["simulate", TWO_ARM, "--animation", "--out", tmp_path / "out", *set_keys(*QUICK)]
     assert loaded(DRAW, MAIN, *line) == {"matplotlib", "PIL"}
     assert (tmp_path / "out" / "motion.gif").exists()
 

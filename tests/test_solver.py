@@ -1,7 +1,5 @@
 """The direct solver of symmetric positive definite systems."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI

@@ -1,8 +1,5 @@
 """Whatever fails on one rank alone fails on all: none waits for ever, wherever it happens."""
 
-from __future__ import annotations
-
-import os
 import pickle
 import shutil
 import subprocess
@@ -12,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import environment, overrides
 
 import dolfinopt as do
 from dolfinopt.arms import arm, design_state
@@ -21,19 +19,7 @@ from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.output import (
-    checkpoint,
-    design,
-    run,
-    summary,
-    views,
-)
-from dolfinopt.output import (
-    checkpoint as iterate_arrays,
-)
-from dolfinopt.output import (
-    design as history,
-)
+from dolfinopt.output import checkpoint, design, run, summary, views
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import (
@@ -45,7 +31,6 @@ from dolfinopt.parallel import (
 )
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.responses import static as tip_deflection
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study import store
 from dolfinopt.study import studies as study
@@ -194,33 +179,154 @@ class Model:
         return do.gradient(*self.place, trajectory, self.profile)
 
 
-EVALUATIONS = {
-    "interpolation": (arm, "interpolate", ()),
-    "reduction": (design_state, "shape_integrals", ()),
-    "statics": (static, "static_response", ('objective.kind="static"',)),
-    "deflections": (tip_deflection, "static_response", ("constraints.tip_deflection=1.0",)),
-    "rigid integrals": (frequency, "rigid_integrals", ('objective.kind="eigenfrequency"',)),
-    "loaded modes": (design_state, "loaded_modes", ("constraints.first_frequency=1.0",)),
-    "squared period": (frequency, "squared_period", ('objective.kind="eigenfrequency"',)),
-}
+# What the work needs first, with overrides of its scene; the work itself is returned.
 
 
-@pytest.mark.parametrize("place", EVALUATIONS)
-def test_evaluation(place, monkeypatch):
-    owner, name, overrides = EVALUATIONS[place]
+def building(_, *overrides):
+    return lambda: Model(*overrides)
+
+
+def evaluating(_, *overrides):
+    return Model(*overrides).evaluate
+
+
+def a_batch(_, *overrides):
     model = Model(*overrides)
-    fail_on(monkeypatch, LONE, owner, name)
+    return lambda: evaluation.evaluate_batch([model.scene], *model.place[1:], model.x, do.Profile())
+
+
+def gradients(_, *overrides):
+    model = Model(*overrides)
+    _, trajectory = model.evaluate()
+
+    def work():
+        model.gradient(trajectory)
+        evaluation.constraint_gradients(*model.place)
+
+    return work
+
+
+def choosing(_):
+    model = Model('reduction.coordinates="auto"', "reduction.tolerance=0.1")
+    return lambda: do.choose_coordinates(*model.place, model.x, model.profile)
+
+
+def optimising(folder):
+    scene = load_scene(paper_scene(), (*COARSE, 'design.projection="heaviside"'))
+    return lambda: do.optimize(scene, folder, world=COMM)
+
+
+def resuming(folder):
+    scene = load_scene(paper_scene(), COARSE)
+    do.optimize(scene, folder, world=COMM)
+    return lambda: do.optimize(scene, folder, resume=True, world=COMM)
+
+
+def writing(folder):
+    model = Model()
+    simulated = Simulated(*model.place, model.x, *model.evaluate(), model.profile)
+    return lambda: write_simulation(folder, simulated, 1.0)
+
+
+def writing_designs(folder):
+    scene = load_scene(paper_scene(), COARSE)
+    result = do.optimize(scene, world=COMM)
+    return lambda: write_result(scene, folder, result, 1.0)
+
+
+def writing_gradients(folder):
+    model = Model()
+    return lambda: design.write_gradient(folder / "g.npz", *model.place, model.x, 1.0)
+
+
+def reading_designs(folder):
+    model = Model()
+    found = do.gather_views(*model.place, model.x)
+    if COMM.rank == 0:
+        design.write_design(folder, found)
+    COMM.Barrier()
+    return lambda: design.read_design(folder / "design.npz", model.partition, model.arms)
+
+
+def taylor(_):
+    model = Model()
+    return lambda: taylor_test(*model.place, model.x, model.profile)
+
+
+EXACT, STATIC = 'objective.gradient="exact"', 'objective.kind="static"'
+PERIOD, TIP = 'objective.kind="eigenfrequency"', "constraints.tip_deflection=1.0"
+FREQUENCY = "constraints.first_frequency=1.0"
+PLACES = [
+    (building, LONE, mesh, "mesh_geo"),
+    (building, LONE, mesh, "_arm_mesh"),
+    (building, LONE, IncompatibleElement, "operators"),
+    (building, LONE, arm, "Substructure"),
+    (evaluating, LONE, arm, "interpolate"),
+    (evaluating, LONE, design_state, "shape_integrals"),
+    (evaluating, LONE, static, "static_response", STATIC),
+    (evaluating, LONE, static, "static_response", TIP),
+    (evaluating, LONE, frequency, "rigid_integrals", PERIOD),
+    (evaluating, LONE, design_state, "loaded_modes", FREQUENCY),
+    (evaluating, LONE, frequency, "squared_period", PERIOD),
+    (evaluating, 0, evaluation, "simulate_batch"),
+    (evaluating, 0, evaluation, "_motion"),
+    (a_batch, LONE, arm.Arm, "under", STATIC),
+    (gradients, LONE, motion, "esl_gradient"),
+    (gradients, 0, motion, "_load_case_moments"),
+    (gradients, LONE, motion, "exact_gradient", EXACT),
+    (gradients, 0, motion, "_cotangents", EXACT),
+    (gradients, LONE, static, "static_gradient", STATIC),
+    (gradients, LONE, frequency, "period_gradient", PERIOD),
+    (gradients, LONE, frequency, "rigid_gradient", PERIOD),
+    (gradients, LONE, static, "deflection_gradient", TIP),
+    (gradients, LONE, frequency, "period_gradient", FREQUENCY),
+    (choosing, LONE, arm.Arm, "set_design"),
+    (choosing, LONE, coordinates, "shape_integrals"),
+    (choosing, LONE, coordinates, "_leading"),
+    (choosing, 0, coordinates, "_largest"),
+    (optimising, LONE, arm.Arm, "physical_designs"),
+    (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes
+    (optimising, LONE, arm.Arm, "preserving_threshold"),
+    (optimising, 0, run, "HistoryWriter"),
+    (optimising, 0, design.HistoryWriter, "append", 1),
+    (optimising, 0, checkpoint, "write_arrays", 0),
+    (optimising, 0, checkpoint, "write_arrays", 1),
+    (optimising, LONE, checkpoint, "_rows"),
+    (resuming, LONE, checkpoint, "_match"),
+    (writing, LONE, arm.Arm, "volume_fraction"),
+    (writing, 0, views, "_views"),
+    (writing, 0, results, "write_design"),
+    (writing, 0, results, "write_trajectory"),
+    (writing, 0, summary, "versions"),
+    (writing, 0, results, "write_summary"),
+    (writing_designs, 0, results, "write_fields"),
+    (writing_gradients, 0, design, "write_arrays"),
+    (reading_designs, LONE, design, "_fit"),
+    (taylor, LONE, arm.Arm, "physical"),
+    (taylor, LONE, arm.Arm, "backward"),
+]
+
+
+@pytest.mark.parametrize(
+    ("prepare", "rank", "owner", "name", "more"),
+    [(*place[:4], place[4:]) for place in PLACES],
+    ids=lambda part: getattr(part, "__name__", str(part)),
+)
+def test_what_fails_on_one_rank(prepare, rank, owner, name, more, monkeypatch, shared_tmp_path):
+    work = prepare(shared_tmp_path, *(one for one in more if isinstance(one, str)))
+    fail_on(monkeypatch, rank, owner, name, sum(one for one in more if isinstance(one, int)))
     with pytest.raises(Unusual, match=f"^{name}$"):
-        model.evaluate()
+        work()
     COMM.Barrier()
 
 
-@pytest.mark.parametrize("name", ["simulate_batch", "_motion"])
-def test_the_root_simulates(name, monkeypatch):
-    model = Model()
-    fail_on(monkeypatch, 0, evaluation, name)
-    with pytest.raises(Unusual, match=f"^{name}$"):
-        model.evaluate()
+def test_what_is_told_of_an_iteration():
+    def report(row):
+        if row.iteration == 1:
+            raise Unusual("told")
+
+    with pytest.raises(Unusual, match=r"^told$"):
+        do.optimize(load_scene(paper_scene(), COARSE), world=COMM, report=report)
     COMM.Barrier()
 
 
@@ -239,173 +345,6 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
     )
     assert [str(one) for one in found] == ["stuck", "stuck"]
     assert all(isinstance(one, ConvergenceError) for one in found)
-    COMM.Barrier()
-
-
-def test_a_batch_under_other_scenes(monkeypatch):
-    model = Model('objective.kind="static"')
-    fail_on(monkeypatch, LONE, arm.Arm, "under")
-    with pytest.raises(Unusual):
-        evaluation.evaluate_batch([model.scene], model.partition, model.arms, model.x, do.Profile())
-    COMM.Barrier()
-
-
-GRADIENTS = {
-    "frozen loads": (motion, "esl_gradient", ()),
-    "moments": (motion, "_load_case_moments", ()),
-    "exact": (motion, "exact_gradient", ('objective.gradient="exact"',)),
-    "adjoint": (motion, "_cotangents", ('objective.gradient="exact"',)),
-    "statics": (static, "static_gradient", ('objective.kind="static"',)),
-    "period": (frequency, "period_gradient", ('objective.kind="eigenfrequency"',)),
-    "carried": (frequency, "rigid_gradient", ('objective.kind="eigenfrequency"',)),
-    "deflection": (tip_deflection, "deflection_gradient", ("constraints.tip_deflection=1.0",)),
-    "frequency": (frequency, "period_gradient", ("constraints.first_frequency=1.0",)),
-}
-
-
-@pytest.mark.parametrize("place", GRADIENTS)
-def test_gradient(place, monkeypatch):
-    owner, name, overrides = GRADIENTS[place]
-    model = Model(*overrides)
-    _, trajectory = model.evaluate()
-    fail_on(monkeypatch, 0 if name.startswith("_") else LONE, owner, name)
-    with pytest.raises(Unusual, match=f"^{name}$"):
-        model.gradient(trajectory)
-        evaluation.constraint_gradients(*model.place)
-    COMM.Barrier()
-
-
-@pytest.mark.parametrize(
-    ("owner", "name"),
-    [
-        (mesh, "mesh_geo"),
-        (mesh, "_arm_mesh"),
-        (IncompatibleElement, "operators"),
-        (arm, "Substructure"),
-    ],
-)
-def test_arms_are_built(owner, name, monkeypatch):
-    fail_on(monkeypatch, LONE, owner, name)
-    with pytest.raises(Unusual, match=f"^{name}$"):
-        Model()
-    COMM.Barrier()
-
-
-@pytest.mark.parametrize(
-    ("owner", "name"),
-    [
-        (arm.Arm, "set_design"),
-        (coordinates, "shape_integrals"),
-        (coordinates, "_leading"),
-        (coordinates, "_largest"),
-    ],
-)
-def test_coordinates_are_chosen(owner, name, monkeypatch):
-    model = Model('reduction.coordinates="auto"', "reduction.tolerance=0.1")
-    fail_on(monkeypatch, 0 if name == "_largest" else LONE, owner, name)
-    with pytest.raises(Unusual, match=f"^{name}$"):
-        do.choose_coordinates(*model.place, model.x, model.profile)
-    COMM.Barrier()
-
-
-OPTIMISATIONS = {
-    "densities": (LONE, arm.Arm, "physical_designs", 0),
-    "gradient by x": (LONE, arm.Arm, "backward", 1),
-    "threshold": (LONE, arm.Arm, "preserving_threshold", 0),
-    "history": (0, run, "HistoryWriter", 0),
-    "history row": (0, history.HistoryWriter, "append", 1),
-    "checkpoint begun": (0, checkpoint, "write_arrays", 0),
-    "checkpoint": (0, checkpoint, "write_arrays", 1),
-    "checkpoint modes": (LONE, iterate_arrays, "_rows", 0),
-}
-
-
-@pytest.mark.parametrize("place", OPTIMISATIONS)
-def test_optimisation(place, monkeypatch, shared_tmp_path):
-    rank, owner, name, after = OPTIMISATIONS[place]
-    scene = load_scene(paper_scene(), (*COARSE, 'design.projection="heaviside"'))
-    fail_on(monkeypatch, rank, owner, name, after)
-    with pytest.raises(Unusual, match=f"^{name}$"):
-        do.optimize(scene, shared_tmp_path, world=COMM)
-    COMM.Barrier()
-
-
-def test_what_is_told_of_an_iteration():
-    def report(row):
-        if row.iteration == 1:
-            raise Unusual("told")
-
-    with pytest.raises(Unusual, match=r"^told$"):
-        do.optimize(load_scene(paper_scene(), COARSE), world=COMM, report=report)
-    COMM.Barrier()
-
-
-def test_resuming(monkeypatch, shared_tmp_path):
-    scene = load_scene(paper_scene(), COARSE)
-    do.optimize(scene, shared_tmp_path, world=COMM)
-    fail_on(monkeypatch, LONE, iterate_arrays, "_match")
-    with pytest.raises(Unusual, match=r"^_match$"):
-        do.optimize(scene, shared_tmp_path, resume=True, world=COMM)
-    COMM.Barrier()
-
-
-WRITING = {
-    "views": (LONE, arm.Arm, "volume_fraction"),
-    "bars": (0, views, "_views"),
-    "design": (0, results, "write_design"),
-    "trajectory": (0, results, "write_trajectory"),
-    "summary": (0, summary, "versions"),
-    "summary file": (0, results, "write_summary"),
-}
-
-
-@pytest.mark.parametrize("place", WRITING)
-def test_results_are_written(place, monkeypatch, shared_tmp_path):
-    rank, owner, name = WRITING[place]
-    model = Model()
-    evaluated, trajectory = model.evaluate()
-    fail_on(monkeypatch, rank, owner, name)
-    simulated = Simulated(*model.place, model.x, evaluated, trajectory, model.profile)
-    with pytest.raises(Unusual, match=f"^{name}$"):
-        write_simulation(shared_tmp_path, simulated, 1.0)
-    COMM.Barrier()
-
-
-def test_optimised_designs_are_written(monkeypatch, shared_tmp_path):
-    scene = load_scene(paper_scene(), COARSE)
-    result = do.optimize(scene, world=COMM)
-    fail_on(monkeypatch, 0, results, "write_fields")
-    with pytest.raises(Unusual):
-        write_result(scene, shared_tmp_path, result, 1.0)
-    COMM.Barrier()
-
-
-def test_gradients_are_written(monkeypatch, shared_tmp_path):
-    model = Model()
-    fail_on(monkeypatch, 0, design, "write_arrays")
-    with pytest.raises(Unusual):
-        design.write_gradient(shared_tmp_path / "gradient.npz", *model.place, model.x, 1.0)
-    COMM.Barrier()
-
-
-def test_designs_are_read(monkeypatch, shared_tmp_path):
-    model = Model()
-    found = do.gather_views(*model.place, model.x)
-    if COMM.rank == 0:
-        design.write_design(shared_tmp_path, found)
-    COMM.Barrier()
-    fail_on(monkeypatch, LONE, design, "_fit")
-    with pytest.raises(Unusual):
-        design.read_design(shared_tmp_path / "design.npz", model.partition, model.arms)
-    COMM.Barrier()
-
-
-@pytest.mark.parametrize("name", ["physical", "backward"])
-def test_taylor_test(name, monkeypatch):
-    model = Model()
-    fail_on(monkeypatch, LONE, arm.Arm, name)
-    with pytest.raises(Unusual):
-        taylor_test(*model.place, model.x, model.profile)
     COMM.Barrier()
 
 
@@ -483,6 +422,7 @@ def test_tables(monkeypatch, shared_tmp_path):
 
 # -- as a command ----------------------------------------------------------------------------
 
+
 # What fails, on which rank, in which command; the other places above end in the same two handlers.
 COMMANDS = {
     "mesh": ("dolfinopt.mesh.arm_mesh", "mesh_geo", 1, "simulate"),
@@ -519,25 +459,12 @@ main()
 def test_commands(place, kind, tmp_path):
     """All ranks end by themselves, with one message: nobody has to be aborted."""
     module, name, rank, command = COMMANDS[place]
-    arguments = [
-        "dolfinopt",
-        command,
-        str(paper_scene()),
-        "--no-plots",
-        "--out",
-        str(tmp_path / "o"),
-    ]
-    for text in COARSE:
-        arguments += ["--set", text]
+    arguments = ["dolfinopt", command, str(paper_scene()), "--no-plots", "--out"]
+    arguments += [str(tmp_path / "o"), *overrides(*COARSE)]
     error = f"__import__('dolfinopt').{kind}('lost')" if "Conv" in kind else f"{kind}('lost')"
     script = SCRIPT.format(arguments=arguments, module=module, name=name, rank=rank, error=error)
-    run = subprocess.run(
-        ["mpirun", "-n", "2", sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=dict(os.environ),
-    )
+    line = ["mpirun", "-n", "2", sys.executable, "-c", script]
+    run = subprocess.run(line, capture_output=True, text=True, timeout=120, env=environment())
     assert run.returncode == 1, run.stderr
     assert "MPI_ABORT" not in run.stderr, run.stderr
     line = "dolfinopt: lost" if "Conv" in kind else "ZeroDivisionError: lost"

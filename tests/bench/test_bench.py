@@ -2,16 +2,17 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from runs import run
+from runs import refusal, run
 
 from dolfinopt.bench import goals, iterations, measure, motion, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, curves, fastest, fitted_power
 from dolfinopt.bench.goals import Goal, goal_table
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.paper.reproduction import load_paper
 
@@ -147,20 +148,12 @@ def test_ended_bench_keeps_what_is_finished(measured, monkeypatch, tmp_path):
     assert cells == ["error [-]", "at most 0.1", "0.01 (why)", "yes"]
 
 
-def test_names():
+def test_names_and_ranks():
     chosen = [one.name for one in benches.named([])]
     assert chosen == ["time", "peers", "whole", "mesh", "reduction", "tolerance", "solvers"]
     assert [one.name for one in benches.named(["solid", "time"])] == ["solid", "time"]
-    with pytest.raises(InputError, match=r"'plane'.*solid"):
-        benches.named(["plane"])
-
-
-def test_bench_refuses_ranks():
-    class Two:
-        size, rank = 2, 0
-
-    with pytest.raises(InputError, match="without mpirun"):
-        run("bench", world=Two())
+    refusal(lambda: benches.named(["plane"]), "'plane'", "solid")
+    refusal(lambda: run("bench", world=SimpleNamespace(size=2, rank=0)), "without mpirun")
 
 
 def test_processes_that_fail_are_an_error(monkeypatch):
@@ -234,54 +227,36 @@ def test_goals_are_met_or_not_or_not_measured():
 
 def test_goals_of_simulations():
     """The slower design; SciPy's seconds at our error, or a bound where no method got there."""
-
     usual = motion.USUAL["method"], motion.USUAL["setting"]
 
-    def row(method, setting, seconds, error, design="a"):
-        return design, 4, method, setting, seconds, error, error
-
-    ours = row(*usual, 0.1, 1e-5)
-    slow = [row("SciPy BDF", "", 1.0, 1e-3), row("SciPy BDF", "", 100.0, 1e-7)]
-    diagram = benches.DIAGRAMS[0]
-
     def found(*rows):
-        seconds, _, ratio, _ = measures("time", time=diagram.frame(rows)).values()
+        frame = benches.DIAGRAMS[0].frame([(d, 4, *of, s, e, e) for d, of, s, e in rows])
+        seconds, _, ratio, _ = measures("time", time=frame).values()
         return seconds, ratio
 
+    ours = ("a", usual, 0.1, 1e-5)
+    bdf, lsoda = ("SciPy BDF", ""), ("SciPy LSODA", "")
+    slow = [("a", bdf, 1.0, 1e-3), ("a", bdf, 100.0, 1e-7)]
     assert found(ours, *slow) == (0.1, pytest.approx(100.0))
     # One that stopped at 3 s, short of the error, takes more: a bound, of no use below 50.
-    assert math.isnan(found(ours, *slow, row("SciPy LSODA", "", 3.0, 1e-4))[1])
-    late = row("SciPy LSODA", "", 20.0, 1e-4)
-    assert found(ours, *slow, late)[1] == pytest.approx(100.0)
-    assert found(ours, *slow, row(*usual, 0.2, 1e-5, "b"))[0] == 0.2
+    assert math.isnan(found(ours, *slow, ("a", lsoda, 3.0, 1e-4))[1])
+    assert found(ours, *slow, ("a", lsoda, 20.0, 1e-4))[1] == pytest.approx(100.0)
+    assert found(ours, *slow, ("b", usual, 0.2, 1e-5))[0] == 0.2
 
 
 def test_goals_of_iterations():
     """Ratios at 400 x 24 cells in one run: CPU seconds on one rank, the wall clock on two."""
-    rows = [
-        (iterations.ITERATION, name, "400 x 24", 9600, cpu, wall, math.nan)
-        for name, cpu, wall in (
-            (iterations.PLAIN, 0.05, 0.06),
-            (iterations.DYNAMIC, 0.10, 0.11),
-            (iterations.TWO_RANKS, 0.20, 0.12),
-        )
-    ]
+    times = {iterations.PLAIN: (0.05, 0.06), iterations.DYNAMIC: (0.10, 0.11)}
+    times |= {iterations.TWO_RANKS: (0.20, 0.12)}
+    rows = [(iterations.ITERATION, name, "400 x 24", 9600, *one, math.nan)
+            for name, one in times.items()]  # fmt: skip
     found = measures("peers", peers=iterations.PEERS.frame(rows)).values()
     assert [*found] == [pytest.approx(2.0), pytest.approx(2.0)]
     found = measures("peers", peers=iterations.PEERS.frame(rows[1:])).values()
     assert all(map(math.isnan, found))
-
-
-def test_goals_of_whole_iterations():
-    rows = [
-        (ranks, n, count, seconds, *(0.1,) * 6, elapsed, 300.0)
-        for ranks, n, count, seconds, elapsed in (
-            (1, 2400, 10, 2400**1.2, 1.0),
-            (1, 38400, 10, 38400**1.2, 1.0),
-            (1, 153600, 10, 1e9, 1.0),  # beyond what the exponent is fitted to
-            (2, 2400, 400, 1.0, 18.0),
-        )
-    ]
+    # The exponent is not fitted to the last cells of one rank.
+    cells = (1, 2400, 10, 2400**1.2, 1.0), (1, 38400, 10, 38400**1.2, 1.0), (1, 153600, 10, 1e9, 1)
+    rows = [(*one[:4], *(0.1,) * 6, one[4], 300.0) for one in (*cells, (2, 2400, 400, 1.0, 18.0))]
     found = measures("whole", whole=iterations.WHOLE.frame(rows)).values()
     assert [*found] == [pytest.approx(1.2), 18.0]
 

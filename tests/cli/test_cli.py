@@ -1,19 +1,17 @@
 """The command line: files, exit status, and one line for whatever the user got wrong."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, overrides, run, shell
+from runs import ROOT, TWO_ARM, environment, overrides, refusal, run, shell
 
 import dolfinopt as do
 from dolfinopt.cli import shared
@@ -27,32 +25,19 @@ WORLD = MPI.COMM_WORLD
 
 
 @pytest.fixture(scope="module")
-def optimised(tmp_path_factory):
+def optimised(folder):
     """A short optimisation's folder, with pictures."""
-    path = tmp_path_factory.mktemp("run") if WORLD.rank == 0 else None
-    folder = WORLD.bcast(path, root=0) / "out"
-    run("optimize", TWO_ARM, *SMALL, "--set", "optimizer.max_iterations=3", "--out", folder)
+    out = folder / "out"
+    run("optimize", TWO_ARM, *SMALL, "--set", "optimizer.max_iterations=3", "--out", out)
     WORLD.barrier()
-    return folder
+    return out
 
 
 def test_optimize_writes_every_file(optimised):
-    expected = {
-        "checkpoint.npz",
-        "design.npz",
-        "design.png",
-        "design.vtu",
-        "design.xdmf",
-        "deviation.png",
-        "history.csv",
-        "history.png",
-        "machine.png",
-        "stress.png",
-        "summary.json",
-        "trajectory.csv",
-        "trajectory.npz",
-    }
-    assert {path.name for path in optimised.iterdir()} == expected
+    """And --overwrite knows them all."""
+    expected = """checkpoint.npz design.npz design.png design.vtu design.xdmf deviation.png
+        history.csv history.png machine.png stress.png summary.json trajectory.csv trajectory.npz"""
+    assert {path.name for path in optimised.iterdir()} == set(expected.split()) <= set(RUN_FILES)
 
 
 @pytest.mark.serial  # ranks have no part in it
@@ -143,39 +128,17 @@ def test_history_ends_in_the_summary(optimised):
 
 
 def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
-    run(
-        "simulate",
-        TWO_ARM,
-        *SMALL,
-        "--design",
-        optimised / "design.npz",
-        "--out",
-        shared_tmp_path,
-        "--no-plots",
-    )
+    design = optimised / "design.npz"
+    run("simulate", TWO_ARM, *SMALL, "--design", design, "--out", shared_tmp_path, "--no-plots")
     WORLD.barrier()
     ours, theirs = (
         json.loads((folder / "summary.json").read_text()) for folder in (shared_tmp_path, optimised)
     )
+    assert list(theirs["first_frequency"]) == ["arm1", "arm2"]
     # Both simulations are right to simulation.tolerance = 1e-4, on grids of their own.
-    assert ours["compliance"] == pytest.approx(theirs["compliance"], rel=2e-4)
-    assert ours["max_deviation"] == pytest.approx(theirs["max_deviation"], rel=2e-4)
-    assert ours["first_frequency"] == pytest.approx(theirs["first_frequency"], rel=1e-9)
+    for key, error in (("compliance", 2e-4), ("max_deviation", 2e-4), ("first_frequency", 1e-9)):
+        assert ours[key] == pytest.approx(theirs[key], rel=error)
     assert not list(shared_tmp_path.glob("*.png"))
-
-
-def test_gradient_file(optimised, shared_tmp_path):
-    out = shared_tmp_path / "deep" / "g.npz"
-    run("gradient", TWO_ARM, *SMALL, "--kind", "esl", "--out", out)
-    WORLD.barrier()
-    with np.load(out) as data:
-        assert set(data.files) == {
-            "objective",
-            "units",
-            *(f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "gradient")),
-        }
-        assert data["objective"] > 0.0
-        assert (data["arm1/gradient"] < 0.0).all()  # more material is always stiffer
 
 
 def test_plot_draws_anew(optimised):
@@ -221,7 +184,6 @@ def test_a_project_can_be_moved(tmp_path):
         run(*resume)
 
 
-@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("words", "kind"),
     [
@@ -232,15 +194,19 @@ def test_a_project_can_be_moved(tmp_path):
 )
 def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
     def written(name, *more):
-        run("gradient", TWO_ARM, *TINY, *more, "--out", shared_tmp_path / name)
+        out = shared_tmp_path / "deep" / name
+        run("gradient", TWO_ARM, *TINY, *more, "--out", out)
         WORLD.barrier()
-        with np.load(shared_tmp_path / name) as data:
+        with np.load(out) as data:
+            arrays = {f"arm{k}/{v}" for k in (1, 2) for v in ("centroid", "gradient")}
+            assert set(data.files) == {"objective", "units", *arrays} and data["objective"] > 0.0
             return data["arm1/gradient"]
 
     expected = {one: written(f"{one}.npz", "--kind", one) for one in ("esl", "exact")}
     capsys.readouterr()
     np.testing.assert_array_equal(written("g.npz", *words), expected[kind])
     assert not np.allclose(expected["esl"], expected["exact"], rtol=0.1)
+    assert (expected["esl"] < 0.0).all()  # under frozen loads more material is always stiffer
     if WORLD.rank == 0:
         assert f"{kind} gradient in" in capsys.readouterr().out
 
@@ -274,13 +240,10 @@ def test_results_are_replaced_only_when_asked(shared_tmp_path, name):
     line = [*USED[name], *TINY, "--out", folder / "g.npz" if name == "gradient" else folder]
     run(*line)
     WORLD.barrier()
-    written = {path.name for path in folder.iterdir()}
     contents = {path.name: path.read_bytes() for path in folder.iterdir()}
     WORLD.barrier()
-    with pytest.raises(InputError, match=r"holds results already.*--overwrite") as caught:
-        run(*line)
-    assert "\n" not in str(caught.value)
-    assert ("--resume" in str(caught.value)) == (name == "optimize")
+    message = refusal(lambda: run(*line), "holds results already", "--overwrite")
+    assert ("--resume" in message) == (name == "optimize")
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == contents
     WORLD.barrier()
     if WORLD.rank == 0:
@@ -292,7 +255,7 @@ def test_results_are_replaced_only_when_asked(shared_tmp_path, name):
     own = {"notes.txt", "mine.png"}
     if name in ("export", "gradient"):  # they write no pictures that could be stale
         own |= {"design.png", "motion.gif"}
-    assert {path.name for path in folder.iterdir()} == written | own
+    assert {path.name for path in folder.iterdir()} == set(contents) | own
 
 
 @pytest.mark.serial
@@ -303,8 +266,8 @@ def test_a_run_that_cannot_begin_leaves_the_old_results(shared_tmp_path):
     run(*line, *TINY, "--out", folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     mesh.write_text("x = = 1;\n")
-    with pytest.raises(InputError, match="syntax error"):
-        run(*line, "--set", f"arms.mesh={mesh}", "--out", folder, "--overwrite")
+    more = ["--set", f"arms.mesh={mesh}", "--out", folder, "--overwrite"]
+    refusal(lambda: run(*line, *more), "bad.geo")
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
@@ -326,17 +289,11 @@ def test_one_run_at_a_time_in_a_folder(optimised, tmp_path, command):
     before = {path.name for path in folder.iterdir()}
     line = [command, TWO_ARM, *SMALL, "--out", folder, "--no-plots"]
     line += ["--set", "optimizer.max_iterations=3"]
-    other = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, folder],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert other.stdout is not None and other.stdin is not None
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    other = subprocess.Popen([sys.executable, "-c", HOLDER, folder], **pipes)
     assert other.stdout.readline() == "held\n"
     for how in ("--overwrite", *(["--resume"] if command == "optimize" else [])):
-        with pytest.raises(InputError, match=r"another run works in this folder; wait"):
-            run(*line, how)
+        refusal(lambda: run(*line, how), "another run", "wait")  # noqa: B023
     assert {path.name for path in folder.iterdir()} == before | {RUN}
     other.kill()  # whoever is killed holds nothing any more
     other.communicate()
@@ -350,12 +307,10 @@ def test_python_does_not_replace_results_either(tmp_path):
     model.optimize(tmp_path)
     before = (tmp_path / "history.csv").read_bytes()
     for again in (model.optimize, partial(do.optimize, model.scene)):
-        with pytest.raises(InputError, match="holds results already"):
-            again(tmp_path)
+        refusal(lambda: again(tmp_path), "holds results already")  # noqa: B023
     assert (tmp_path / "history.csv").read_bytes() == before
     assert model.optimize(tmp_path, overwrite=True).iterations == 1
-    with pytest.raises(InputError, match="expected only one of them"):
-        model.optimize(tmp_path, overwrite=True, resume=True)
+    refusal(lambda: model.optimize(tmp_path, overwrite=True, resume=True), "only one")
 
 
 @pytest.mark.serial
@@ -364,15 +319,9 @@ def test_files_that_the_scene_reads_stay(tmp_path, command):
     table = tmp_path / "trajectory.csv"
     table.write_text("t, x, y\n0, -0.9, 0\n1, 0, 0.5\n1.9, 0.9, 0\n")
     before = table.read_bytes()
-    words = overrides("motion.path=points", f"motion.file={table}")
-    with pytest.raises(InputError, match=r"trajectory\.csv: the scene reads this file \(motion"):
-        run(command, TWO_ARM, *TINY, *words, "--out", tmp_path, "--overwrite")
+    line = [command, TWO_ARM, *TINY, *overrides("motion.path=points", f"motion.file={table}")]
+    refusal(lambda: run(*line, "--out", tmp_path, "--overwrite"), "trajectory.csv", "motion.file")
     assert table.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
-
-
-def test_every_file_of_a_run_is_known(optimised):
-    """What a run writes is what --overwrite removes."""
-    assert {path.name for path in optimised.iterdir()} <= set(RUN_FILES)
 
 
 @pytest.mark.parametrize("how", ["--overwrite", "--resume"])
@@ -396,53 +345,46 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
         run(*line, "optimizer.max_iterations=3", how)
     WORLD.barrier()
     assert {path.name for path in folder.iterdir()} == {"checkpoint.npz", "history.csv"}
-    with pytest.raises(InputError, match=r"summary\.json"):
-        run("plot", folder)
+    refusal(lambda: run("plot", folder), "summary.json")
 
 
 # -- bad input -------------------------------------------------------------------------------
 
 
-def bad(tmp: Path) -> list[tuple[str, list[object], list[str]]]:
-    """Return (name, arguments, words of the message) of commands that must be refused."""
-    opt = ["optimize", TWO_ARM, *SMALL, "--set", "optimizer.max_iterations=1", "--out", tmp / "o"]
-    sim = ["simulate", TWO_ARM, *SMALL, "--out", tmp / "o"]
-    return [
-        ("unknown key", [*opt, "--set", "payload.mas=1"], ["payload.mas", "payload.mass"]),
-        ("negative", [*opt, "--set", "arms.length=-1"], ["arms.0.length", "-1", ">= 0"]),
-        ("nan", [*opt, "--set", "payload.mass=nan"], ["payload.mass", "nan"]),
-        ("type", [*opt, "--set", 'payload.mass="six"'], ["payload.mass", "six", "number"]),
-        ("volume", [*opt, "--set", "design.volume_fraction=1.5"], ["volume_fraction", "1.5"]),
-        ("modes", [*opt, "--set", "reduction.coordinates=100000"], ["coordinates", "100000"]),
-        ("reach", [*opt, "--set", "motion.radius=5"], ["at t =", "m from the shoulder", "5"]),
-        ("no scene", ["optimize", tmp / "no.toml"], ["no.toml"]),
-        ("a folder", ["optimize", tmp], [str(tmp)]),
-        ("unwritable", [*opt[:-1], "/proc/nowhere/o"], ["/proc/nowhere/o", "--out"]),
-        ("no checkpoint", [*opt, "--resume"], ["checkpoint.npz", "--resume"]),
-        ("no design", [*sim, "--design", tmp / "no.npz"], ["no.npz"]),
-        ("no design file", [*sim, "--design", TWO_ARM], [str(TWO_ARM), ".npz"]),
-        ("no run", ["plot", tmp], ["summary.json"]),
-        ("gradient to folder", ["gradient", TWO_ARM, "--out", tmp], [str(tmp), "--out"]),
-        ("no such option", [*opt, "--nonsense"], ["--nonsense"]),
-        ("no such command", ["optimise", TWO_ARM], ["optimise"]),
-    ]
+# Words of the command line (OUT: its folder), and words of the message.
+BAD = [
+    ("optimize SCENE --set payload.mas=1", "payload.mas payload.mass"),
+    ("optimize SCENE --set arms.length=-1", "arms.0.length -1 >= 0"),
+    ("optimize SCENE --set payload.mass=nan", "payload.mass nan"),
+    ('optimize SCENE --set payload.mass="six"', "payload.mass six number"),
+    ("optimize SCENE --set design.volume_fraction=1.5", "volume_fraction 1.5"),
+    ("optimize SCENE --set reduction.coordinates=100000", "coordinates 100000"),
+    ("optimize SCENE --set motion.radius=5", "at t = shoulder 5"),
+    ("optimize OUT/no.toml", "no.toml"),
+    ("optimize OUT", "OUT"),
+    ("optimize SCENE --out /proc/nowhere/o", "/proc/nowhere/o --out"),
+    ("optimize SCENE --resume", "checkpoint.npz --resume"),
+    ("simulate SCENE --design OUT/no.npz", "no.npz"),
+    ("simulate SCENE --design SCENE", "SCENE .npz"),
+    ("plot OUT", "summary.json"),
+    ("gradient SCENE --out OUT", "OUT --out"),
+    ("optimize SCENE --nonsense", "--nonsense"),
+    ("optimise SCENE", "optimise"),
+]
 
 
-NAMES = [name for name, _, _ in bad(Path("x"))]
+@pytest.mark.parametrize(("line", "words"), BAD)
+def test_bad_input_is_one_line(line, words, shared_tmp_path):
+    def filled(text):
+        places = {"SCENE": str(TWO_ARM), "OUT": str(shared_tmp_path)}
+        return [re.sub("SCENE|OUT", lambda m: places[m[0]], word) for word in text.split()]
 
-
-@pytest.mark.parametrize("name", NAMES)
-def test_bad_input_is_one_line(name, shared_tmp_path):
-    import click
-
-    [(arguments, words)] = [(a, w) for n, a, w in bad(shared_tmp_path) if n == name]
-    with pytest.raises((InputError, click.UsageError)) as caught:
-        run(*arguments)
-    error = caught.value
-    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
-    assert "\n" not in message
-    for word in words:
-        assert word in message
+    arguments = filled(line)
+    if len(arguments) > 2 or arguments[0] == "optimize":
+        arguments += SMALL
+        if "--out" not in arguments:
+            arguments += ["--out", shared_tmp_path / "o"]
+    refusal(lambda: run(*arguments), *filled(words))
     WORLD.barrier()
     assert not list(shared_tmp_path.iterdir())  # nothing written
 
@@ -462,42 +404,30 @@ def test_design_that_does_not_fit(optimised, shared_tmp_path, change, words):
     with np.load(optimised / "design.npz") as data:
         arrays = {key: data[key] for key in data.files}
     change(arrays)
-    path = shared_tmp_path / "bad.npz"
+    path, out = shared_tmp_path / "bad.npz", shared_tmp_path / "o"
     if WORLD.rank == 0:
         np.savez(path, **arrays)
     WORLD.barrier()
-    with pytest.raises(InputError) as caught:
-        run("simulate", TWO_ARM, *SMALL, "--design", path, "--out", shared_tmp_path / "o")
-    for word in [str(path), *words]:
-        assert word in str(caught.value)
-    assert not (shared_tmp_path / "o").exists()
+    line = ["simulate", TWO_ARM, *SMALL, "--design", path, "--out", out]
+    refusal(lambda: run(*line), str(path), *words)
+    assert not out.exists()
 
 
 def test_resume_of_another_scene(optimised):
-    with pytest.raises(InputError, match=r"payload\.mass = 6\.0 there, 7\.0 here"):
-        run(
-            "optimize",
-            TWO_ARM,
-            *SMALL,
-            "--set",
-            "payload.mass=7",
-            "--out",
-            optimised,
-            "--resume",
-        )
+    line = ["optimize", TWO_ARM, *SMALL, "--set", "payload.mass=7", "--out", optimised, "--resume"]
+    refusal(lambda: run(*line), "payload.mass = 6.0", "7.0")
 
 
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_exit_status_and_streams(shared_tmp_path, ranks):
     """Status 2 and one line on standard error, from the process itself and through mpirun."""
-    done = shell(
-        "optimize", TWO_ARM, "--set", "payload.mas=1", "--out", shared_tmp_path, ranks=ranks
-    )
-    assert done.returncode == 2
+    words = "optimize", TWO_ARM, "--set", "payload.mas=1", "--out", shared_tmp_path
+    done = shell(*words, ranks=ranks)
+    assert done.returncode == 2 and done.stdout == ""
     ours = [line for line in done.stderr.splitlines() if "payload.mas" in line]
     assert len(ours) == 1 and ours[0].startswith("dolfinopt: ")
-    assert "Traceback" not in done.stderr and done.stdout == ""
+    assert "Traceback" not in done.stderr
     if not ranks:
         assert len(done.stderr.splitlines()) == 1
 
@@ -505,12 +435,17 @@ def test_exit_status_and_streams(shared_tmp_path, ranks):
 @pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [0, 2])
-@pytest.mark.parametrize("words", [[], ["--help"], ["optimize", "--help"]])
+@pytest.mark.parametrize("words", [[], ["--help"], ["optimize", "--help"], ["--version"]])
 def test_help_is_printed_once(words, ranks):
     """On standard output, with status 0, before MPI could tell the ranks apart."""
     done = shell(*words, ranks=ranks)
     assert done.returncode == 0 and done.stderr == ""
+    if words == ["--version"]:
+        assert done.stdout.count("dolfinopt") == 1
+        return
     assert done.stdout.count("Usage: dolfinopt") == 1
+    if "optimize" not in words:
+        assert all(name in done.stdout for name in ("optimize", "simulate", "gradient", "plot"))
 
 
 @pytest.mark.slow
@@ -540,20 +475,11 @@ def test_without_petsc_one_line_says_how_to_get_it(tmp_path):
         from dolfinopt.cli import main
         main()"""
     line = [sys.executable, "-c", code, "simulate", str(TWO_ARM), "--out", str(tmp_path / "o")]
-    done = subprocess.run(line, capture_output=True, text=True, env=dict(os.environ), timeout=60)
+    done = subprocess.run(line, capture_output=True, text=True, env=environment(), timeout=60)
     assert done.returncode == 1 and done.stdout == ""
     [line] = done.stderr.splitlines()
-    assert "petsc4py not installed" in line and "conda install" in line
+    assert "petsc4py" in line and "conda install" in line
     assert not (tmp_path / "o").exists()
-
-
-@pytest.mark.serial
-def test_help_and_version():
-    done = shell("--help")
-    assert done.returncode == 0
-    for command in ("optimize", "simulate", "gradient", "plot"):
-        assert command in done.stdout
-    assert shell("--version").stdout.startswith("dolfinopt")
 
 
 @pytest.mark.serial
@@ -562,12 +488,8 @@ def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening)
     """A scene that asks for it hears that the file has none; a file that has it is no news."""
     small = overrides("arms.cells=[20,3]", f"simulation.stiffening={stiffening}")
     run("export", TWO_ARM, *small, "--out", tmp_path / "bodies")
-    text = (
-        Path(TWO_ARM)
-        .read_text()
-        .replace('name = "arm2"', f'name = "arm2"\nsid = "{tmp_path}/bodies/arm2.sid"')
-    )
-    (tmp_path / "scene.toml").write_text(text)
+    arm2 = f'name = "arm2"\nsid = "{tmp_path}/bodies/arm2.sid"'
+    (tmp_path / "scene.toml").write_text(TWO_ARM.read_text().replace('name = "arm2"', arm2))
     asked = overrides("arms.arm1.cells=[20,3]", "simulation.stiffening=true")
     capsys.readouterr()
     run("export", tmp_path / "scene.toml", *asked, "--out", tmp_path / "out")

@@ -1,7 +1,5 @@
 """What is shown while an optimisation runs, and the time it says to have taken."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

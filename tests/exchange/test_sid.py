@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from runs import refusal
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import (
@@ -256,23 +257,23 @@ def test_every_number_survives(tmp_path_factory, values, structure):
     assert again.structure == structure or structure in (0, 4)
 
 
-def test_files_of_order_zero_may_have_no_coordinates(tmp_path):
-    """Some programs write nq = 0 where nothing depends on q."""
+def test_what_other_programs_write(tmp_path):
+    """nq = 0 where nothing depends on q, and numbers in many ways."""
     lines = bar().splitlines()
     lines[lines.index("nq = 2", lines.index("Ge"))] = "nq = 0"
     data = read(tmp_path, "\n".join(lines))
     assert data.Ge.M1.shape == (2, 0, 6)
     write_sid(tmp_path / "b.sid", data)
     assert bits(read_sid(tmp_path / "b.sid")) == bits(data)
-
-
-@pytest.mark.parametrize(
-    ("written", "value"),
-    [("1.5", 1.5), ("-.5d0", -0.5), ("+2E1", 20.0), ("4", 4.0), ("1.0-100", 1e-100)],
-)
-def test_numbers_of_other_programs(tmp_path, written, value):
-    data = read(tmp_path, bar().replace("m0( 3, 6) = 0.125", f"m0( 3, 6) = {written}"))
-    assert data.Gr.M0[2, 5] == value
+    for text, value in {
+        "1.5": 1.5,
+        "-.5d0": -0.5,
+        "+2E1": 20.0,
+        "4": 4.0,
+        "1.0-100": 1e-100,
+    }.items():
+        data = read(tmp_path, bar().replace("m0( 3, 6) = 0.125", f"m0( 3, 6) = {text}"))
+        assert data.Gr.M0[2, 5] == value
 
 
 def test_what_the_writer_prints():
@@ -348,38 +349,29 @@ DAMAGED = {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damaged_file(tmp_path, name):
     text, words = DAMAGED[name]
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    message = str(caught.value)
-    assert "\n" not in message and message.startswith(f"{tmp_path / 'bar.SID_FEM'}, line ")
-    for word in words:
-        assert word in message, message
+    refusal(lambda: read(tmp_path, text), f"{tmp_path / 'bar.SID_FEM'}, line ", *words)
 
 
 def test_no_damage_goes_unsaid(tmp_path):
     """A file that ends anywhere is refused; so is one with a line of nonsense anywhere."""
     lines = bar().splitlines()
+    nonsense = ("m0( 1, 1", "= 3", "end", "\x00\ufffd")
     for cut in range(len(lines)):
-        with pytest.raises(InputError, match=f"line {cut}: the file ends, expected"):
+        with pytest.raises(InputError, match=f"line {cut}: .*the file ends"):
             read(tmp_path, "\n".join(lines[:cut]))
-    for place in range(1, len(lines)):
-        for nonsense in ("m0( 1, 1", "= 3", "end", "\x00\ufffd"):
-            text = "\n".join([*lines[:place], nonsense, *lines[place:]])
-            if place == 1:  # still the comment
-                assert read(tmp_path, text).mass == 3.0
-                continue
-            with pytest.raises(InputError, match=f"line {place + 1}: found"):
-                read(tmp_path, text)
+        if cut < 2:  # still the comment
+            continue
+        with pytest.raises(InputError, match=f"line {cut + 1}: "):
+            read(tmp_path, "\n".join([*lines[:cut], nonsense[cut % 4], *lines[cut:]]))
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(InputError, match=r"none\.sid: cannot be read .*SID"):
-        read_sid(tmp_path / "none.sid")
-    with pytest.raises(InputError, match=r"none\.npz: cannot be read"):
-        read_sid_npz(tmp_path / "none.npz")
+    refusal(lambda: read_sid(tmp_path / "none.sid"), "none.sid", "cannot be read", "SID")
     (tmp_path / "text.npz").write_text("no archive")
-    with pytest.raises(InputError, match=r"text\.npz: cannot be read"):
-        read_sid_npz(tmp_path / "text.npz")
     np.savez(tmp_path / "other.npz", mass=1.0)
-    with pytest.raises(InputError, match=r"other\.npz: the array '\w+' is missing"):
-        read_sid_npz(tmp_path / "other.npz")
+    for name, word in (
+        ("none", "cannot be read"),
+        ("text", "cannot be read"),
+        ("other", "missing"),
+    ):
+        refusal(lambda: read_sid_npz(tmp_path / f"{name}.npz"), f"{name}.npz", word)  # noqa: B023

@@ -194,29 +194,22 @@ def test_a_solid_lies_along_its_link():
     assert sides.max() < 2.0 * sides.min() and 4000 < np.prod(cells) < 9000
 
 
-def test_a_solid_without_geometry_is_a_guess(tmp_path):
-    file = write_uneven(tmp_path)
-    bodies = scene_bodies(read_robot(file), ("lower",), "grip")
-    (lower,) = (body for body in bodies if body.is_solid)
+def test_solids_of_the_uneven_robot(tmp_path):
+    """Without geometry a guess; what a solid carries without a joint stays."""
+    robot = read_robot(write_uneven(tmp_path))
+    (lower,) = (body for body in scene_bodies(robot, ("lower",), "grip") if body.is_solid)
     assert not lower.measured and lower.size == pytest.approx([lower.length / 10.0] * 2)
     assert lower.length == pytest.approx(np.linalg.norm([0.4, 0.05, 0.1]))
     # Its x axis points to the next joint, its z axis has no component of the joint's across both.
     direction = lower.frame[:3, 0] * lower.length
     assert direction == pytest.approx([0.4, 0.05, 0.1])
     assert abs(lower.frame[:3, 1] @ lower.joint.axis) < 1e-12
-
-
-def test_what_a_solid_carries_without_a_joint_stays(tmp_path):
-    """With mass as a body on a fixed joint; a frame without mass is only a place."""
-    file = write_uneven(tmp_path)
-    bodies = {body.link: body for body in scene_bodies(read_robot(file), ("upper",), "grip")}
+    # With mass as a body on a fixed joint; a frame without mass is only a place.
+    bodies = {body.link: body for body in scene_bodies(robot, ("upper",), "grip")}
     assert bodies["bracket"].joint.kind == "fixed" and bodies["bracket"].parent == "upper"
     assert "mark" not in bodies and bodies["slide"].parent == "upper"
-    assert bodies["base/turn"].links == ("base/turn", "cover")
-    assert list(bodies)[-1] == "grip"
-    assert [one.links for one in bodies.values() if one.parent == "ground"] == [
-        ("base/turn", "cover")
-    ]
+    on_ground = [one.links for one in bodies.values() if one.parent == "ground"]
+    assert on_ground == [("base/turn", "cover")] and list(bodies)[-1] == "grip"
 
 
 def test_the_end_effector_is_the_last_arm(tmp_path):
@@ -294,7 +287,7 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
 
 
-@pytest.mark.parametrize("radius", [0.0331, 0.0452, 0.0575, 0.0618, 0.0704])
+@pytest.mark.parametrize("radius", [0.0331, 0.0575, 0.0704])
 def test_the_filter_is_wide_enough_for_the_cells(tmp_path, radius):
     """What the command writes, the run does not warn of."""
     text = DEMO.read_text().replace('cylinder radius="0.055"', f'cylinder radius="{radius}"')
@@ -388,17 +381,19 @@ def test_geometry_is_mended(shapes, volume, done):
     assert found.offset(0.4) < 0.25
 
 
+FLAT = [[0, 0, 0], [0.4, 0, 0], [0.4, 0.1, 0]]
+
+
 @pytest.mark.parametrize(
-    ("shapes", "message"),
+    ("shapes", "words"),
     [
-        (lambda: [], "it has no geometry"),
-        (lambda: [trimesh.Trimesh([[0, 0, 0], [0.4, 0, 0], [0.4, 0.1, 0]], [[0, 1, 2]])],
-         "encloses nothing"),
-        (lambda: [bar(at=(0.2, 0.0, 2.0))], "its geometry is 1.9"),
+        (lambda: [], "no geometry"),
+        (lambda: [trimesh.Trimesh(FLAT, [[0, 1, 2]])], "encloses nothing"),
+        (lambda: [bar(at=(0.2, 0.0, 2.0))], "1.9"),
     ],
-)  # fmt: skip
-def test_geometry_that_is_no_solid(shapes, message):
-    with pytest.raises(NoSolid, match=message):
+)
+def test_geometry_that_is_no_solid(shapes, words):
+    with pytest.raises(NoSolid, match=words):
         cells_between_joints(shapes(), SPAN)
 
 

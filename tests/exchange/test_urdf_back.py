@@ -10,13 +10,12 @@ import pytest
 from mpi4py import MPI
 from pages import Reader
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
-from runs import ROOT, run
+from runs import ROOT, refusal, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.cli.robots import _check_robot, link_inertia
 from dolfinopt.cli.shared import _minimised
-from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.read import implausible_inertias, read_robot
 from dolfinopt.exchange.urdf.robot import Inertia, Robot, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import read_origin
@@ -91,8 +90,7 @@ def test_new_meshes_take_the_place_of_all_shapes(tmp_path):
     inside = back.read_text().split('<link name="upper">')[1].split("</link>")[0]
     assert inside.count("<visual>") == inside.count("<collision>") == 1
     assert '<material name="grey"/>' in inside and "box" not in inside
-    with pytest.raises(InputError, match="no link 'arm'; is it the robot of the scene"):
-        robot_text(file, [NewLink("arm", body)], folder)
+    refusal(lambda: robot_text(file, [NewLink("arm", body)], folder), "no link 'arm'")
 
 
 def test_a_links_inertia_is_its_bodys_and_its_motors():
@@ -112,18 +110,17 @@ def test_a_links_inertia_is_its_bodys_and_its_motors():
 
 
 def test_export_says_what_it_cannot_write(tmp_path):
-    with pytest.raises(InputError, match="add --urdf for a robot's run"):
-        run("export", tmp_path)
-    with pytest.raises(InputError, match="expected no --design and no --set"):
-        run("export", tmp_path, "--urdf", "--set", "payload.mass=1")
-    with pytest.raises(InputError, match=r"summary.json: cannot be read .* finished"):
-        run("export", tmp_path, "--urdf")
+    for words, expected in (
+        ([], "--urdf"),
+        (["--urdf", "--set", "payload.mass=1"], "no --design and no --set"),
+        (["--urdf"], "summary.json"),
+    ):
+        refusal(lambda: run("export", tmp_path, *words), expected)  # noqa: B023
     record = tmp_path / "robot.json"
     for text in (None, "{", '{"urdf": "a", "solids": {"b": {"link": "c", "frame": [1]}}}'):
         if text is not None:
             record.write_text(text)
-        with pytest.raises(InputError, match=r"robot\.json: cannot be read .* `dolfinopt import`"):
-            read_origin(record)
+        refusal(lambda: read_origin(record), "robot.json", "cannot be read", "`dolfinopt import`")
 
 
 @pytest.fixture
@@ -164,11 +161,9 @@ def check_limits(summary, file):
     effort = found["elbow"]["effort"]
     assert (effort["limit"], effort["met"]) == (20.0, False)
     (said,) = summary["warnings"]
-    assert said == (
-        f"limits exceeded: elbow {beyond['value']:.4g} of {beyond['limit']:.4g} rad at "
-        f"{beyond['instant']:.3g} s, elbow {effort['value']:.4g} of 20 N m at "
-        f"{effort['instant']:.3g} s"
-    )
+    for one, unit in ((beyond, "rad"), (effort, "N m")):
+        assert f"elbow {one['value']:.4g} of {one['limit']:.4g} {unit}" in said
+        assert f"{one['instant']:.3g} s" in said
     assert summary["designed_mass"] == pytest.approx(summary["mass"]["forearm"], rel=1e-15)
     told = _minimised(summary | {"scene": {"objective": {"kind": "mass", "scenarios": None}}})
     assert told.endswith(f" kg ({summary['designed_mass']:.4g} kg of it designed)")
@@ -227,8 +222,8 @@ def test_a_robot_is_never_replaced_by_the_new_one(tmp_path):
               "--no-plots")  # fmt: skip
     run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
     for words in ((), ("--overwrite",)):
-        with pytest.raises(InputError, match=r"the robot is read from this file.*name another"):
-            run("export", tmp_path / "run", "--urdf", "--out", source, *words)
+        line = ["export", tmp_path / "run", "--urdf", "--out", source, *words]
+        refusal(lambda: run(*line), "robot.urdf", "name another")  # noqa: B023
     assert [path.name for path in source.iterdir()] == ["robot.urdf"]
     mesh = source / "forearm.stl"
     trimesh.creation.box(extents=(0.1, 0.1, 0.8)).export(mesh)
@@ -236,8 +231,8 @@ def test_a_robot_is_never_replaced_by_the_new_one(tmp_path):
     (tmp_path / "robot.urdf").write_text(
         DEMO.read_text().replace(shape, '<geometry><mesh filename="robot/forearm.stl"/></geometry>')
     )
-    with pytest.raises(InputError, match=r"forearm\.stl: the robot is read"):
-        _check_robot(tmp_path / "robot.urdf", source, ["forearm.stl"])
+    robot = tmp_path / "robot.urdf"
+    refusal(lambda: _check_robot(robot, source, ["forearm.stl"]), "forearm.stl")
 
 
 def test_before_and_after():
@@ -256,8 +251,8 @@ def test_before_and_after():
     assert frame.loc["peak of drive rail", "unit"] == "N"
     assert frame.loc["peak of drive yaw", "unit"] == "N m"
     assert frame.loc["deflection after the motion", ["before", "after"]].isna().all()
-    with pytest.raises(InputError, match="other arms: foot, link before, link after"):
-        before_after(one, one | {"mass": {"link": 1.0}})
+    words = "other arms", "foot, link before", "link after"
+    refusal(lambda: before_after(one, one | {"mass": {"link": 1.0}}), *words)
 
 
 # -- the demo --------------------------------------------------------------------------------

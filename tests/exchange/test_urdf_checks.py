@@ -1,7 +1,5 @@
 """The import of robots: what it says, refuses and finds doubtful."""
 
-from __future__ import annotations
-
 import re
 import signal
 import sys
@@ -9,9 +7,8 @@ import sys
 import numpy as np
 import pytest
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
-from runs import ROOT, run
+from runs import ROOT, refusal, run
 
-from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.read import implausible_inertias, read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.scene.load import load_scene
@@ -37,8 +34,7 @@ def test_import_says_what_it_made(tmp_path, capsys):
     )
     assert "7.879 kg" in (tmp_path / "a" / "robot.toml").read_text()
     before = (tmp_path / "a" / "robot.toml").read_bytes()
-    with pytest.raises(InputError, match="exists already"):
-        run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")  # fmt: skip
+    refusal(lambda: run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a"), "exists already")
     assert (tmp_path / "a" / "robot.toml").read_bytes() == before
 
 
@@ -56,21 +52,20 @@ def test_a_joint_that_follows_and_those_not_named_have_columns(tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
-    ("table", "message"),
+    ("table", "words"),
     [
-        ("shoulder_pan,elbow\n0,0\n1,1\n", "no column t"),
-        ("t,shoulder\n0,0\n1,1\n", "column 'shoulder': the robot has no such joint; expected t"),
-        ("t,flange\n0,0\n1,1\n", "this joint is fixed"),
-        ("t,elbow\n0,0\n1,1\n1,2\n", "line 4, column t = 1: expected more than 1"),
-        ("t,elbow\n0,0\n1,45\n", r"line 3, joint elbow = 45: expected -3.1416 .*degrees\?"),
-        ("t,elbow\n0,0\n1,3.2\n", r"line 3, joint elbow = 3.2: .* \[rad\], its limits$"),
+        ("shoulder_pan,elbow\n0,0\n1,1\n", ["column t"]),
+        ("t,shoulder\n0,0\n1,1\n", ["column 'shoulder'", "t"]),
+        ("t,flange\n0,0\n1,1\n", ["this joint is fixed"]),
+        ("t,elbow\n0,0\n1,1\n1,2\n", ["line 4, column t = 1", "more than 1"]),
+        ("t,elbow\n0,0\n1,45\n", ["line 3, joint elbow = 45", "-3.1416", "degrees?"]),
+        ("t,elbow\n0,0\n1,3.2\n", ["line 3, joint elbow = 3.2", "[rad]", "limits"]),
     ],
 )
-def test_trajectories_that_cannot_be_followed(tmp_path, table, message):
+def test_trajectories_that_cannot_be_followed(tmp_path, table, words):
     motion = tmp_path / "motion.csv"
     motion.write_text(table)
-    with pytest.raises(InputError, match=message):
-        run_import(DEMO, "forearm", motion, tmp_path / "a")
+    refusal(lambda: run_import(DEMO, "forearm", motion, tmp_path / "a"), *words)
     assert not (tmp_path / "a").exists()
 
 
@@ -79,9 +74,23 @@ def test_a_motion_that_is_too_fast_is_told(tmp_path, capsys):
     motion = tmp_path / "motion.csv"
     motion.write_text("t,elbow\n0,0\n1,1.5\n")
     run_import(DEMO, "forearm", motion, tmp_path / "a")
-    assert "joint elbow moves at up to 2.812 rad/s, beyond its limit of 2.618" in (
-        capsys.readouterr().err
-    )
+    said = capsys.readouterr().err
+    assert "elbow" in said and "2.812 rad/s" in said and "2.618" in said
+
+
+@pytest.mark.parametrize(
+    ("links", "words"),
+    [
+        ("fore_arm", ["'fore_arm'", "forearm?"]),
+        ("base", ["'base'", "ground"]),
+        ("tool", ["'tool'", "nothing hangs on it"]),
+        ("forearm,forearm", ["twice"]),
+        (",", ["names of links"]),
+    ],
+)
+def test_links_that_cannot_be_solids(tmp_path, links, words):
+    refusal(lambda: run_import(DEMO, links, DEMO_MOTION, tmp_path / "a"), *words)
+    assert not (tmp_path / "a").exists()
 
 
 def test_ctrl_c_ends_the_import_before_it_writes(tmp_path, monkeypatch):
@@ -99,77 +108,39 @@ def test_ctrl_c_ends_the_import_before_it_writes(tmp_path, monkeypatch):
         signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize(
-    ("links", "message"),
-    [
-        ("fore_arm", "no link 'fore_arm'; did you mean forearm?"),
-        ("base", "'base' stands on the ground"),
-        ("tool", "'tool': nothing hangs on it"),
-        ("forearm,forearm", "a link is named twice"),
-        (",", "expected names of links"),
-    ],
-)
-def test_links_that_cannot_be_solids(tmp_path, links, message):
-    with pytest.raises(InputError, match=message):
-        run_import(DEMO, links, DEMO_MOTION, tmp_path / "a")
-    assert not (tmp_path / "a").exists()
+A, AB = '<link name="a"/>', '<link name="a"/><link name="b"/>'
 
 
-LINK = '<link name="{}"/>'
-JOINT = (
-    '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>'
-    '<limit lower="0" upper="1" effort="1" velocity="1"/>{}</joint>'
-)
+def joint(kind, parent, child, inside="", name="j"):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<limit lower="0" upper="1" effort="1" velocity="1"/>{inside}</joint>'
+    )
 
 
 @pytest.mark.parametrize(
-    ("inside", "message"),
+    ("inside", "words"),
     [
-        ([], "no links"),
-        ([LINK.format("a"), LINK.format("a")], "link 'a' stands there 2 times"),
-        ([LINK.format("a"), LINK.format("b")], "2 links that no joint holds"),
-        ([LINK.format("a"), JOINT.format("j", "revolute", "a", "b", "")], "no link 'b', its child"),
-        (
-            [LINK.format("a"), LINK.format("b"), JOINT.format("j", "floating", "a", "b", "")],
-            "joint 'j': type 'floating'; a scene has joints of type revolute, continuous",
-        ),
-        (
-            [LINK.format("a"), LINK.format("b"), JOINT.format("j", "planar", "a", "b", "")],
-            "type 'planar'",
-        ),
-        (
-            [LINK.format("a"), LINK.format("b"),
-             JOINT.format("j", "revolute", "a", "b", '<axis xyz="0 0 0"/>')],
-            "expected three numbers, not all zero",
-        ),
-        (
-            [LINK.format("a"), LINK.format("b"),
-             JOINT.format("j", "revolute", "a", "b", '<mimic joint="k"/>')],
-            "follows 'k'; expected a joint that moves",
-        ),
-        (
-            [*map(LINK.format, "abc"), JOINT.format("j", "fixed", "b", "c", ""),
-             JOINT.format("k", "fixed", "c", "b", "")],
-            "part of a loop",
-        ),
-        (["<link/>"], "not a robot that yourdfpy can read"),
-        (
-            [LINK.format("a"), LINK.format("b"),
-             JOINT.format("j", "revolute", "a", "b", '<origin xyz="nan 0 0"/>')],
-            "joint 'j': origin: expected finite numbers, found nan",
-        ),
-        (
-            ['<link name="a"><visual><geometry><box size="-1 1 1"/></geometry></visual></link>'],
-            "link 'a': size of a box: expected positive numbers, found -1, 1, 1",
-        ),
+        ("", ["no links"]),
+        (A + A, ["link 'a'", "2 times"]),
+        (AB, ["2 links that no joint holds"]),
+        (A + joint("revolute", "a", "b"), ["no link 'b'"]),
+        (AB + joint("floating", "a", "b"), ["'j'", "'floating'", "revolute, continuous"]),
+        (AB + joint("planar", "a", "b"), ["'planar'"]),
+        (AB + joint("revolute", "a", "b", '<axis xyz="0 0 0"/>'), ["not all zero"]),
+        (AB + joint("revolute", "a", "b", '<mimic joint="k"/>'), ["'k'", "a joint that moves"]),
+        (AB + '<link name="c"/>' + joint("fixed", "b", "c") + joint("fixed", "c", "b", name="k"),
+         ["loop"]),
+        ("<link/>", ["yourdfpy"]),
+        (AB + joint("revolute", "a", "b", '<origin xyz="nan 0 0"/>'), ["'j'", "origin", "nan"]),
+        ('<link name="a"><visual><geometry><box size="-1 1 1"/></geometry></visual></link>',
+         ["'a'", "size of a box", "positive", "-1, 1, 1"]),
     ],
 )  # fmt: skip
-def test_robots_that_a_scene_cannot_hold(tmp_path, inside, message):
+def test_robots_that_a_scene_cannot_hold(tmp_path, inside, words):
     file = tmp_path / "r.urdf"
-    file.write_text(f'<robot name="r">{"".join(inside)}</robot>')
-    with pytest.raises(InputError, match=message) as caught:
-        read_robot(file)
-    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(file))
+    file.write_text(f'<robot name="r">{inside}</robot>')
+    refusal(lambda: read_robot(file), str(file), *words)
 
 
 def test_meshes_that_are_none(tmp_path):
@@ -193,50 +164,35 @@ ENTITIES = """<!DOCTYPE robot [<!ENTITY other SYSTEM "file:///etc/hostname">]>
 <robot name="a"><link name="b">&other;</link></robot>"""
 
 
-def test_files_that_are_no_robots(tmp_path):
-    file = tmp_path / "r.urdf"
-    with pytest.raises(InputError, match=r"r\.urdf: cannot be read"):
-        read_robot(file)
-    for text, message in (
-        ("<robot", "not XML"),
-        (
-            '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="b">\n'
-            '<xacro:include filename="c"/></link></robot>',
-            r"line 2: an element of xacro, include; .* xacro r.urdf > r-plain.urdf$",
-        ),
-        ("<sdf/>", "expected an element <robot name"),
-        (ENTITIES, "declares XML entities"),
-    ):
-        file.write_text(text)
-        with pytest.raises(InputError, match=message):
-            read_robot(file)
+XACRO = (
+    '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="b">\n'
+    '<xacro:include filename="c"/></link></robot>'
+)
 
 
 @pytest.mark.parametrize(
-    ("name", "new"),
+    ("name", "text", "words"),
     [
-        ("panda.urdf", "panda-plain.urdf"),
-        ("panda.urdf.xacro", "panda.urdf"),
-        ("panda.xacro", "panda.urdf"),
+        ("r.urdf", None, ["r.urdf", "cannot be read"]),
+        ("r.urdf", "<robot", ["XML"]),
+        ("r.urdf", "<sdf/>", ["<robot name"]),
+        ("r.urdf", ENTITIES, ["XML entities"]),
+        ("r.urdf", XACRO, ["line 2", "xacro, include", "xacro r.urdf > r-plain.urdf"]),
+        # `xacro panda.urdf > panda.urdf` would leave an empty file.
+        ("panda.urdf.xacro", XACRO, ["xacro panda.urdf.xacro > panda.urdf"]),
+        ("panda.xacro", XACRO, ["xacro panda.xacro > panda.urdf"]),
     ],
 )
-def test_a_remedy_does_not_overwrite_the_file(tmp_path, name, new):
-    """`xacro panda.urdf > panda.urdf` would leave an empty file."""
+def test_files_that_are_no_robots(tmp_path, name, text, words):
     file = tmp_path / name
-    file.write_text(
-        '<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
-        '<xacro:property name="length" value="0.4"/><link name="b"/></robot>'
-    )
-    with pytest.raises(InputError, match=rf"xacro {name} > {new}$"):
-        read_robot(file)
+    if text is not None:
+        file.write_text(text)
+    refusal(lambda: read_robot(file), *words)
 
 
-def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    with pytest.raises(InputError) as caught:
-        read_robot(DEMO)
-    line = f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
-    assert str(caught.value) == line  # an interpreter that is there, a package that pip finds
+    refusal(lambda: read_robot(DEMO), "yourdfpy", f"{sys.executable} -m pip install yourdfpy")
 
 
 def test_the_launcher_installs_what_import_needs():
@@ -291,9 +247,8 @@ def test_meshes_are_found_in_their_package(tmp_path, monkeypatch, how):
 
 
 def test_a_package_path_that_is_none(tmp_path):
-    with pytest.raises(InputError, match=r"--package-path .*: expected a folder with ROS packages"):
-        run("import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION, "--package-path",
-            tmp_path / "none")  # fmt: skip
+    line = ["import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION]
+    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
 
 
 def test_limits_come_into_the_scene(tmp_path):
@@ -320,41 +275,32 @@ def test_limits_come_into_the_scene(tmp_path):
 # -- inertias --------------------------------------------------------------------------------
 
 
-def test_this_robots_inertias_may_be():
-    assert implausible_inertias(read_robot(DEMO)) == []
+TENSOR = 'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"'
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "words"),
     [
-        ('iyy="0.7576"', 'iyy="-0.7576"', "not positive definite"),
-        ('iyy="0.7576"', 'iyy="1.7576"', "largest exceeds the sum of the others"),
-        ('<mass value="7.879"/>', '<mass value="0"/>', "no mass, though"),
-        ('<mass value="7.879"/>', '<mass value="7879"/>', "kg/m3; expected 100 to 20000"),
-        ('xyz="-0.4053 0 0.0604"', 'xyz="-405.3 0 60.4"', "m outside its geometry"),
-        (
-            'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"',
-            'ixx="26.1" ixy="-0.1" ixz="-29" iyy="757.6" iyz="0" izz="753.3"',
-            "inertia is too large",
-        ),
-        (
-            'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"',
-            'ixx="1e-6" ixy="0" ixz="0" iyy="1e-6" iyz="0" izz="1e-6"',
-            "inertia is too small",
-        ),
+        ('iyy="0.7576"', 'iyy="-0.7576"', "positive definite"),
+        ('iyy="0.7576"', 'iyy="1.7576"', "exceeds the sum of the others"),
+        ('<mass value="7.879"/>', '<mass value="0"/>', "no mass"),
+        ('<mass value="7.879"/>', '<mass value="7879"/>', "100 to 20000"),
+        ('xyz="-0.4053 0 0.0604"', 'xyz="-405.3 0 60.4"', "outside its geometry"),
+        (TENSOR, 'ixx="26.1" ixy="-0.1" ixz="-29" iyy="757.6" iyz="0" izz="753.3"', "too large"),
+        (TENSOR, 'ixx="1e-6" ixy="0" ixz="0" iyy="1e-6" iyz="0" izz="1e-6"', "too small"),
         ('<geometry><cylinder radius="0.055" length="0.84"/></geometry>',
          '<geometry><mesh filename="package://robot/forearm.stl"/></geometry>',
-         "mesh package://robot/forearm.stl cannot be read"),
+         "package://robot/forearm.stl"),
     ],
 )  # fmt: skip
-def test_inertias_that_cannot_be_are_told(tmp_path, old, new, message):
+def test_inertias_that_cannot_be_are_told(tmp_path, old, new, words):
     text = DEMO.read_text()
-    assert old in text
+    assert old in text and implausible_inertias(read_robot(DEMO)) == []
     file = tmp_path / "wrong.urdf"
     file.write_text(text.replace(old, new, 1))
     found = implausible_inertias(read_robot(file))
-    assert any(message in one for one in found), found
-    assert all("link 'forearm': " in one and "\n" not in one for one in found)
+    assert any(words in one for one in found), found
+    assert all("'forearm'" in one and "\n" not in one for one in found)
 
 
 def test_an_inertia_that_no_body_has_is_to_be_corrected(tmp_path, capsys):
@@ -363,7 +309,5 @@ def test_an_inertia_that_no_body_has_is_to_be_corrected(tmp_path, capsys):
     file.write_text(DEMO.read_text().replace('izz="0.0012"', 'izz="0.012"'))
     run_import(file, "forearm", DEMO_MOTION, tmp_path / "a")
     said = capsys.readouterr().err
-    assert "link 'wrist_3': its inertia cannot be" in said
-    assert "correct the scene before you simulate it: " in said
-    with pytest.raises(InputError, match=r"inertia \(wrist_3\)"):
-        load_scene(tmp_path / "a" / "robot.toml")
+    assert "'wrist_3'" in said and "correct the scene" in said
+    refusal(lambda: load_scene(tmp_path / "a" / "robot.toml"), "inertia (wrist_3)")

@@ -1,15 +1,13 @@
 """The elements: patch test, bending, rates of convergence; and one of a test's own beside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import solids
 from mpi4py import MPI
-from runs import ROOT
+from runs import ROOT, refusal
 
-from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import (
     ELEMENTS,
@@ -19,7 +17,6 @@ from dolfinopt.fem.elements import (
     gauss_points,
     jacobian,
     plane_stress,
-    strains,
 )
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import arm_mesh, structured_arm
@@ -102,36 +99,83 @@ OF_QUADRILATERALS = [*ELEMENTS.values(), AssumedStress()]
 EVERY = pytest.mark.parametrize("element", OF_QUADRILATERALS, ids=repr)
 
 
-@EVERY
-def test_patch(element):
-    """Constant strain on distorted cells: the exact strain everywhere, no force inside."""
-    nu = 0.33
-    arm = solid_arm(element, meshed((8, 3)), nu, distort=True)
-    edge = (np.abs(arm.points[:, 1]) > 0.499 * HEIGHT)[arm.interior_nodes]
-    for gradient in ([[1.0, 0.0], [0.0, -nu]], [[0.3, -0.2], [0.7, 0.4]], [[0.0, 1.0], [1.0, 0.0]]):
-        gradient = 1e-3 * np.array(gradient)
-        field = (arm.points @ gradient.T)[:, :, None]
+# Elements by shape of their cells, in the plane and in space.
+SHAPES = [*(("quadrilateral", element) for element in OF_QUADRILATERALS)]
+SHAPES += [("triangle", ELEMENTS[name]) for name in ("linear", "quadratic")]
+SHAPES += [("tetrahedron", ELEMENTS[name]) for name in ("linear", "quadratic")]
+SHAPES += [("hexahedron", ELEMENTS[name]) for name in ELEMENTS]
+NU = solids.POISSON
+
+
+def distorted(shape, element):
+    """Return an arm of distorted cells, its size and its thickness in the plane."""
+    if shape in ("quadrilateral", "triangle"):
+        mesh = meshed((8, 3) if shape == "quadrilateral" else (4, 4), shape == "triangle")
+        arm = solid_arm(element, mesh, NU, distort=shape == "quadrilateral")
+        return arm, np.array([LENGTH, HEIGHT]), THICKNESS
+    mesh = solids.link_mesh(shape, (3, 3, 3))
+    size = np.array([solids.LENGTH, solids.HEIGHT, solids.THICKNESS])
+    points = mesh.mesh.geometry.x
+    inside = (np.abs(points - [0.5 * size[0], 0, 0]) < 0.49 * size).all(axis=1)
+    shift = 0.25 * np.sin(1e3 * points + 3e3 * np.roll(points, 1, axis=1) + [0.0, 1.0, 2.0])
+    points[inside] += (shift * size / 3.0)[inside]
+    [name] = (name for name, one in ELEMENTS.items() if one is element)
+    return solids.elastic_link(name, mesh), size, 1.0
+
+
+@pytest.mark.parametrize(("shape", "element"), SHAPES, ids=repr)
+def test_patch(shape, element):
+    """Constant strain: exact energy and stress, and nodes inside in balance."""
+    arm, size, thickness = distorted(shape, element)
+    d, mesh = len(size), arm.mesh
+    strain = 1e-3 * np.array([[1.0, 0.3, -0.5], [0.3, -0.7, 0.2], [-0.5, 0.2, 0.4]])[:d, :d]
+    turn = 1e-3 * np.array([[0.0, 0.6, -0.1], [-0.6, 0.0, 0.8], [0.1, -0.8, 0.0]])[:d, :d]
+    pairs = [(0, 0), (1, 1), (0, 1)] if d == 2 else [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0)]
+    vector = np.array([strain[i, j] * (1 if i == j else 2) for i, j in pairs])
+    # Hooke's law by Lame's constants, in the plane of plane stress.
+    lame = NU / (1.0 - NU) if d == 2 else NU / (1.0 - 2.0 * NU)
+    sigma = (strain + lame * np.trace(strain) * np.eye(d)) / (1.0 + NU)
+    stress = np.array([sigma[pair] for pair in pairs])
+    field = (arm.points @ (strain + turn).T)[:, :, None]
+    volume = COMM.allreduce(thickness * mesh.area.sum())
+    energy = YOUNG * volume * np.vdot(sigma, strain)
+    # Gmsh places points to 2e-12 of the length. A translation 300 times the displacement costs the
+    # square of that if it is not removed cell by cell: 1e-9 then, measured.
+    assert arm.energy_matrix(field)[0, 0] == pytest.approx(energy, rel=ROUNDING)
+    far = field + np.array([0.3, -0.2, 0.1])[:d, None]
+    assert arm.energy_matrix(far)[0, 0] == pytest.approx(energy, rel=ROUNDING)
+    u = field[arm.operators.cells].reshape(mesh.num_cells, -1)
+    if shape == "quadrilateral":
+        found = np.einsum("epij,ej->epi", element.strain_operator(mesh, arm.operators, GAUSS), u)
+        assert np.abs(found - vector).max(initial=0.0) < 1e-12 * 1e-3
+    if not isinstance(element, AssumedStress):
+        found = arm.substructure.quadrature.stress @ u[:, :, None]
+        total = COMM.allreduce(found.reshape(-1, len(vector)).sum(axis=0))
+        assert np.allclose(total, volume * stress, rtol=ROUNDING)
+    assert np.isclose(COMM.allreduce(arm.rigid_inertia[:, 0, 0].sum()), DENSITY * volume, rtol=1e-9)
+    if shape != "triangle":  # of an arm with bores
         forces, _ = arm.restrict(arm.stiffness_times(field))
-        inside = forces.reshape(-1, 2)[~edge]
-        assert np.abs(inside).max(initial=0.0) < 1e-12 * YOUNG * 1e-3 * HEIGHT * THICKNESS
-        B = element.strain_operator(arm.mesh, arm.operators, GAUSS)
-        u = field[arm.operators.cells].reshape(arm.mesh.num_cells, -1)
-        strain = np.array([gradient[0, 0], gradient[1, 1], gradient[0, 1] + gradient[1, 0]])
-        found = np.einsum("epij,ej->epi", B, u)
-        assert np.abs(found - strain).max(initial=0.0) < 1e-12 * 1e-3
+        centre = np.array([0.5, 0.0, 0.0])[:d] * size
+        inner = (np.abs(arm.points - centre) < 0.499 * size).all(axis=1)[arm.interior_nodes]
+        assert COMM.allreduce(int(inner.sum())) >= 8
+        force = YOUNG * 1e-3 * thickness * size.prod() / size.min()
+        assert np.abs(forces.reshape(-1, d)[inner]).max(initial=0.0) < 1e-12 * force
 
 
 @pytest.mark.serial  # ranks: test_ranks, test_patch
-@EVERY
-def test_tension(element):
+@pytest.mark.parametrize(
+    ("shape", "element"), [one for one in SHAPES if one[0] != "triangle"], ids=repr
+)
+def test_tension(shape, element):
     """Uniaxial stress on distorted cells: the ends carry all of it."""
-    nu, stretch = 0.33, 1e-3
-    arm = solid_arm(element, meshed((8, 3)), nu, distort=True)
-    field = (arm.points * [stretch, -nu * stretch])[:, :, None]
+    stretch = 1e-3
+    arm, size, thickness = distorted(shape, element)
+    field = (arm.points * (stretch * np.array([1.0, -NU, -NU])[: len(size)]))[:, :, None]
     forces, outboard = arm.restrict(arm.stiffness_times(field))
-    pull = YOUNG * stretch * HEIGHT * THICKNESS
+    pull = YOUNG * stretch * size[1:].prod() * thickness
     assert np.abs(forces).max(initial=0.0) < ROUNDING * pull
-    assert outboard[:, 0] == pytest.approx([pull, 0.0, 0.0], abs=ROUNDING * pull)
+    assert outboard[0, 0] == pytest.approx(pull, rel=ROUNDING)
+    assert np.abs(outboard[1:]).max() < ROUNDING * pull
 
 
 @pytest.mark.serial  # ranks: test_ranks, test_patch
@@ -235,25 +279,6 @@ def test_rates_of_convergence(name, order, distort):
     assert error[-1] < 0.1
 
 
-@pytest.mark.serial  # ranks: test_ranks, test_patch
-@pytest.mark.parametrize("name", [*ELEMENTS])
-def test_cantilever(name):
-    """Tip compliance of 50 x 3 slender cells: L^3 / (3 E I) + L / (5/6 G A), no lateral strain."""
-    height = 0.06
-    mesh = structured_arm(COMM, "arm", LENGTH, height, (50, 3))
-    arm = solid_arm(ELEMENTS[name], mesh, 0.0)
-    found = np.linalg.inv(arm.constraint_modes().stiffness)[1, 1]
-    area = THICKNESS * height
-    beam = LENGTH**3 / (3.0 * YOUNG * area * height**2 / 12.0) + LENGTH / (
-        5.0 / 6.0 * 0.5 * YOUNG * area
-    )
-    error = found / beam - 1.0
-    if name == "linear":
-        assert -0.06 < error < -0.03  # locks
-    else:
-        assert abs(error) < 1e-3
-
-
 # -- on several ranks --------------------------------------------------------------------------
 
 
@@ -285,32 +310,5 @@ def test_element_of_a_mesh():
         assert element_of(quadrilaterals, name) is element
     assert element_of(triangles, "linear") == LagrangeElement(1)
     assert element_of(triangles, "quadratic") == LagrangeElement(2)
-    with pytest.raises(
-        InputError, match=r'arms.arm.element = "incompatible": expected "linear" or'
-    ):
-        element_of(triangles, "incompatible")
-
-
-@pytest.mark.serial  # ranks: test_ranks, test_patch
-@pytest.mark.parametrize("name", ["linear", "quadratic"])
-def test_triangles(name):
-    """Constant strain on triangles with bores; the quadrature knows its volume."""
-    nu = 0.33
-    arm = solid_arm(ELEMENTS[name], meshed((4, 4), triangles=True), nu)
-    gradient = 1e-3 * np.array([[0.3, -0.2], [0.7, 0.4]])
-    field = (arm.points @ gradient.T)[:, :, None]
-    strain = np.array([gradient[0, 0], gradient[1, 1], gradient[0, 1] + gradient[1, 0]])
-    u = field[arm.operators.cells].reshape(arm.mesh.num_cells, -1)
-    stress = arm.substructure.quadrature.stress @ u[:, :, None]
-    found = stress.reshape(arm.mesh.num_cells, -1, 3).sum(axis=1)
-    expected = THICKNESS * arm.mesh.area[:, None] * (plane_stress(nu) @ strain)
-    assert np.abs(found - expected).max(initial=0.0) < 1e-12 * np.abs(expected).max(initial=0.0)
-    energy = arm.energy_matrix(field)[0, 0]
-    volume = COMM.allreduce(THICKNESS * arm.mesh.area.sum())
-    assert energy == pytest.approx(YOUNG * volume * strain @ plane_stress(nu) @ strain, rel=1e-10)
-
-
-def test_strains_of_gradients():
-    """Of u = (2 x + 3 y, 5 x + 7 y)."""
-    B = strains(np.eye(2))  # two functions whose gradients are the axes
-    assert (B @ [2.0, 5.0, 3.0, 7.0]).tolist() == [2.0, 7.0, 8.0]
+    words = 'arms.arm.element = "incompatible"', '"linear" or'
+    refusal(lambda: element_of(triangles, "incompatible"), *words)

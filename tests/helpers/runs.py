@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import click
+import pytest
 from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.cli.main import commands
+from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -27,6 +31,21 @@ def scene(*changes: str) -> Scene:
 def overrides(*changes: str) -> list[str]:
     """Return the options of a command that change the scene."""
     return [word for change in changes for word in ("--set", change)]
+
+
+def refusal(make: Callable[[], object], *words: str) -> str:
+    """Check that a call is refused in one line that has all the words; return the line."""
+    with pytest.raises((InputError, click.UsageError)) as caught:
+        make()
+    error = caught.value
+    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
+    assert len(message.splitlines()) == 1 and message.isprintable()
+    # No other exception would be printed above it; those of click have their own.
+    if isinstance(error, InputError):
+        assert error.__context__ is None or error.__suppress_context__
+    for word in words:
+        assert word in message
+    return message
 
 
 def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from runs import ROOT
 
 from dolfinopt.arms.arm import Arm
+from dolfinopt.fem.elasticity import ElasticArm, Substructure
+from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
+from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, load_scene
 
@@ -43,3 +50,25 @@ def solid_scene(
 def solid_arm(comm: MPI.Comm = MPI.COMM_WORLD, **told: Any) -> Arm:
     """Return this arm, see `solid_scene`."""
     return Arm(solid_scene(**told), 0, comm, Profile())
+
+
+def link_mesh(shape: str, cells: tuple[int, int, int]) -> ArmMesh:
+    """Return the link of hexahedra, or of hexahedra each cut into six tetrahedra."""
+    comm, size = MPI.COMM_WORLD, (LENGTH, HEIGHT, THICKNESS)
+    if shape == "hexahedron":
+        return box_arm(comm, "a", size, cells)
+    low = np.array([0.0, -0.5 * HEIGHT, -0.5 * THICKNESS])
+    mesh = create_box(comm, [low, low + size], list(cells), CellType.tetrahedron)
+    owned, _ = compat.local_cell_counts(mesh)
+    corners, none = compat.cell_coordinates(mesh, owned), np.zeros(owned, dtype=bool)
+    ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, LENGTH)]
+    point = np.array([LENGTH, 0.0, 0.0])
+    volume, centroid = cell_volumes(corners), corners.mean(axis=1)
+    return ArmMesh("a", comm, mesh, centroid, volume, none, none, *ends, point)
+
+
+def elastic_link(name: str, mesh: ArmMesh) -> ElasticArm:
+    """Return the solid link made of an element."""
+    substructure = Substructure(mesh, ELEMENTS[name].operators(mesh, 1.0, POISSON), Profile())
+    ones = np.ones(mesh.num_cells)
+    return substructure.at(YOUNG * ones, DENSITY * ones)

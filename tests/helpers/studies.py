@@ -11,6 +11,9 @@ from mpi4py import MPI
 
 from dolfinopt.study.tables import Table
 
+# Of studies, coarse in space and time.
+COARSE = ("arms.cells=[12,3]", "simulation.sample=0.01", "motion.horizon=2.2")
+
 
 def rows_of(path: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV file by column."""

@@ -1,7 +1,5 @@
 """Solid arms: boxes of hexahedra, volumes and facets of cells in space."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI

@@ -1,7 +1,5 @@
 """Names in STEP files: a text written out by hand, a square with a hole, in millimetres."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -54,20 +52,13 @@ def test_edges_are_found_by_their_ends(points, names):
     assert edges.names_at(points, EVERYWHERE) == names
 
 
-def test_faces_are_found_by_all_their_vertices():
-    _, faces = read_shapes(SQUARE)
+def test_faces_are_found_by_all_their_vertices_in_any_unit():
+    edges, faces = read_shapes(SQUARE)
     assert faces.names == ["passive"]
     assert faces.names_at(np.tile(EVERYWHERE, (2, 1)), EVERYWHERE) == {"passive"}
     assert faces.names_at(CORNERS, EVERYWHERE) == set()
-
-
-def test_unit_does_not_matter():
-    edges, _ = read_shapes(SQUARE)
     for factor in (1e3, 1.0 / 0.0254):
         assert edges.names_at(CORNERS[[0, 3]] * factor, EVERYWHERE * factor) == {"inboard"}
-
-
-def test_file_without_names():
     edges, faces = read_shapes("ISO-10303-21;\nDATA;\nENDSEC;\n")
     assert edges.names == faces.names == []
     assert edges.names_at(CORNERS, EVERYWHERE) == set()

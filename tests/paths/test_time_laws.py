@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from bodies import assert_close
 from mpi4py import MPI
-from runs import TWO_ARM
+from runs import TWO_ARM, refusal
 from scipy.integrate import quad
 
 import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import breakpoints, desired_path, rigid_motion
 from dolfinopt.paths.time_laws import Law, Limits, law_for
 from dolfinopt.profiling import Profile
@@ -138,31 +137,22 @@ def test_limits_are_met_exactly(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "expected"),
+    ("name", "limits", "expected"),
     [
-        ({"speed": 1.0, "acceleration": 2.0}, 2.0 + 0.5),  # D/v + v/a
-        ({"speed": 9.0, "acceleration": 2.0}, 2.0),  # 2 sqrt(D/a)
-        ({"acceleration": 2.0}, 2.0),
-        ({"speed": 1.0}, 2.0 / 0.75),  # D/(v (1 - share))
+        ("trapezoidal", {"speed": 1.0, "acceleration": 2.0}, 2.0 + 0.5),  # D/v + v/a
+        ("trapezoidal", {"speed": 9.0, "acceleration": 2.0}, 2.0),  # 2 sqrt(D/a)
+        ("trapezoidal", {"acceleration": 2.0}, 2.0),
+        ("trapezoidal", {"speed": 1.0}, 2.0 / 0.75),  # D/(v (1 - share))
+        # D/v + v/a + a/j, D/v + 2 sqrt(v/j), cbrt(32 D/j): Biagiotti & Melchiorri 2008, 3.4.
+        ("s-curve", {"speed": 1.0, "acceleration": 2.0, "jerk": 8.0}, 2.0 + 0.5 + 0.25),
+        ("s-curve", {"speed": 1.0, "acceleration": 99.0, "jerk": 4.0}, 2.0 + 1.0),
+        ("s-curve", {"jerk": 32.0}, (32.0 * 2.0 / 32.0) ** (1 / 3)),
+        ("s-curve", {"acceleration": 4.0, "jerk": 16.0}, 0.25 + np.sqrt(0.25**2 + 2.0)),
     ],
 )
-def test_fastest_trapezoid(limits: dict[str, float], expected: float) -> None:
+def test_fastest(name: str, limits: dict[str, float], expected: float) -> None:
     """Two metres, in closed form."""
-    assert_close(law_of("trapezoidal", 0.25, 2.0, **limits).least, expected, 1e-14)
-
-
-@pytest.mark.parametrize(
-    ("limits", "expected"),
-    [
-        ({"speed": 1.0, "acceleration": 2.0, "jerk": 8.0}, 2.0 + 0.5 + 0.25),  # D/v + v/a + a/j
-        ({"speed": 1.0, "acceleration": 99.0, "jerk": 4.0}, 2.0 + 1.0),  # D/v + 2 sqrt(v/j)
-        ({"jerk": 32.0}, (32.0 * 2.0 / 32.0) ** (1 / 3)),  # cbrt(32 D/j)
-        ({"acceleration": 4.0, "jerk": 16.0}, 0.25 + np.sqrt(0.25**2 + 4 * 2.0 / 4.0)),
-    ],
-)
-def test_fastest_s_curve(limits: dict[str, float], expected: float) -> None:
-    """Two metres, in closed form (Biagiotti & Melchiorri 2008, 3.4)."""
-    assert_close(law_of("s-curve", 0.25, 2.0, **limits).least, expected, 1e-14)
+    assert_close(law_of(name, 0.25, 2.0, **limits).least, expected, 1e-14)
 
 
 # -- in scenes --------------------------------------------------------------------------------
@@ -206,34 +196,27 @@ def test_duration_follows_from_the_limits() -> None:
     slow = posed(**limits, duration=2.5)
     speed = np.linalg.norm(desired_path(np.linspace(0.0, 2.5, 5001), slow.motion).pd, axis=1)
     assert_close(speed.max(), 2.0 * of.motion.duration / 2.5, 1e-12)
-    with pytest.raises(
-        InputError, match=r"^test\.toml: motion\.duration = 1\.9: expected at least"
-    ):
-        posed(**limits, duration=1.9)
+
     # A long one takes the horizon with it.
     assert posed(law="septic", max_speed=0.5).motion.horizon > 13.0
 
 
 @pytest.mark.parametrize(
-    ("motion", "reason"),
+    ("motion", "words"),
     [
-        (
-            {"law": "trapezoidal", "max_jerk": 9.0},
-            'max_jerk = 9.0: expected none with motion.law = "trapezoidal"',
-        ),
-        (
-            {"law": "s-curve", "max_jerk": 9.0, "acceleration_share": 0.3},
-            "acceleration_share = 0.3: expected 0.25, the default, with motion.max_jerk",
-        ),
-        ({"horizon": 1.0}, "horizon = 1.0: expected at least motion.duration = 1.9"),
-        ({"duration": 2.5, "horizon": 2.0}, "horizon = 2.0: expected at least motion.duration"),
+        ({"law": "trapezoidal", "max_jerk": 9.0},
+         ["motion.max_jerk = 9.0", 'none with motion.law = "trapezoidal"']),
+        ({"law": "s-curve", "max_jerk": 9.0, "acceleration_share": 0.3},
+         ["motion.acceleration_share = 0.3", "0.25, the default", "motion.max_jerk"]),
+        ({"duration": 2.5, "horizon": 2.0}, ["motion.horizon = 2.0", "motion.duration"]),
+        ({"law": "trapezoidal", "max_speed": 2.0, "max_acceleration": 5.0, "duration": 1.9},
+         ["motion.duration = 1.9", "at least"]),
+        ({"path": "joints", "file": str(TWO_ARM), "max_speed": 1.0},
+         ["max_speed", 'none with motion.path = "joints"']),
     ],
-)
-def test_values_that_do_not_go_together(motion: dict[str, Any], reason: str) -> None:
-    """One line that names the key, the value and the other key."""
-    with pytest.raises(InputError) as caught:
-        posed(**motion)
-    assert f"test.toml: motion.{reason}" in str(caught.value)
+)  # fmt: skip
+def test_values_that_do_not_go_together(motion: dict[str, Any], words: list[str]) -> None:
+    refusal(lambda: posed(**motion), "test.toml", *words)
 
 
 DWELL = "t,x,y\n0,-0.4,0.1\n0.18,0.3,0.2\n0.22,0.3,0.2\n0.4,0.5,0.6\n"
@@ -291,11 +274,11 @@ def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
     """Each move has the time that the table gives it: too little is named by file and line."""
     file = tmp_path / "pick.csv"
     file.write_text(DWELL)
-    with pytest.raises(InputError, match=r"pick\.csv: line 3, column t = 0\.18: 0\.18 s for this"):
-        check_motion(posed(path="points", file=str(file), law="s-curve", max_speed=4.0))
-    check_motion(posed(path="points", file=str(file), law="s-curve", max_speed=6.0))
-    with pytest.raises(InputError, match=r"expected none with motion\.path = \"joints\""):
-        posed(path="joints", file=str(file), max_speed=1.0)
+    fast, slow = (
+        posed(path="points", file=str(file), law="s-curve", max_speed=v) for v in (6.0, 4.0)
+    )
+    check_motion(fast)
+    refusal(lambda: check_motion(slow), "pick.csv: line 3, column t = 0.18")
 
 
 def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:

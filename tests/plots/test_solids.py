@@ -1,7 +1,5 @@
 """Pictures of solid links and machines in space: what is drawn is what is there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

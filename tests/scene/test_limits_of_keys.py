@@ -1,17 +1,17 @@
 """Every number of a scene at the limits of its range: it runs, or one line says why not."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
 import pytest
+from machines import GAINS, loop_tree
 from mpi4py import MPI
 from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene.load import describe_keys, load_scene
+from dolfinopt.multibody.motion import check_motion
+from dolfinopt.scene.load import describe_keys, load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # a hundred small runs
 
@@ -56,23 +56,48 @@ NO_LIMITS = {
 }
 
 
-def limits():
-    """Return key and TOML value at every limit of every number."""
-    found = []
+MACHINE_KEYS = ("control.", "closure.", "arms.joint", "arms.rotor", "arms.gear", "motion.speed")
+MACHINE_KEYS += ("motion.start_angle", "motion.cart_mass")
+
+
+def limits(keys=()):
+    """Return key, value and allowed words at every limit of every number."""
     for info in describe_keys():
-        if info.key in NO_LIMITS:
-            continue
-        for sign, bound in re.findall(r"([<>]=?) (\S+)", info.allowed):
-            value = float(bound)
-            if "=" not in sign:  # just inside
-                value = float(np.nextafter(value, np.inf if sign == ">" else -np.inf))
-            text = f"{value:.0f}" if "integer" in info.allowed else repr(value)
-            if "two" in info.allowed:
-                text = f"[{text}, {text}]"
-            elif info.allowed.startswith("an array"):
-                text = f"[{text}]"
-            found.append((info.key, text))
-    return found
+        if info.key.startswith(keys) if keys else info.key not in NO_LIMITS:
+            for sign, bound in re.findall(r"([<>]=?) (\S+)", info.allowed):
+                value = float(bound)
+                if "=" not in sign:  # just inside
+                    value = float(np.nextafter(value, np.inf if sign == ">" else -np.inf))
+                yield info.key, value, info.allowed
+
+
+def toml(value, allowed):
+    text = f"{value:.0f}" if "integer" in allowed else repr(value)
+    if "two" in allowed:
+        return f"[{text}, {text}]"
+    return f"[{text}]" if allowed.startswith("an array") else text
+
+
+def tree_at(key, value):
+    """Return a machine that uses the key, with it."""
+    table, _, name = key.partition(".")
+    quick = {"motion": {"speed": 20.0}, "simulation": {"sample": 5e-3, "tolerance": 1e-2}}
+    data = loop_tree(**quick, reduction={"coordinates": 3})
+    if table == "arms":
+        data["arms"][0][name] = value
+        data["arms"][1] |= {"joint_stiffness": 0.0, "joint_damping": 0.0}
+        if name == "joint_damping" and value > 0.0:
+            data["arms"][0]["joint_stiffness"] = 1e3
+    elif table == "control":
+        data["control"] = {"stiffness": [2e3], "damping": [20.0], name: [value]}
+    elif name in ("point", "direction"):
+        data["closure"][name] = [value, value]
+    elif name == "cart_mass":
+        base = load_scene(TWO_ARM, ["arms.cells=[8,2]", "simulation.tolerance=0.01"]).to_tree()
+        data = base | {"control": GAINS, "motion": base["motion"] | {name: value}}
+    else:
+        data[table][name] = value
+    return data
 
 
 def run(overrides):
@@ -84,20 +109,32 @@ def run(overrides):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "value"), limits(), ids=lambda part: str(part))
-def test_a_number_at_its_limit_runs_or_is_refused_in_one_line(key, value):
+@pytest.mark.parametrize(("key", "value", "allowed"), list(limits()), ids=str)
+def test_a_number_at_its_limit_runs_or_is_refused_in_one_line(key, value, allowed):
     try:
-        run([*USED.get(key, []), f"{key}={value}"])
+        run([*USED.get(key, []), f"{key}={toml(value, allowed)}"])
     except (InputError, ConvergenceError) as error:
         assert len(str(error).splitlines()) == 1
 
 
-@pytest.mark.parametrize("load", ["[1e9, 0.0, 0.0]", "[0.0, 1e-9, 0.0]", "[0.0, 0.0, -1e9]"])
-def test_loads_at_their_limits(load):
-    run(["objective.kind=static", f"objective.loads=[{load}]"])
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "value", "_"), list(limits(MACHINE_KEYS)), ids=str)
+def test_a_number_of_a_machine_at_its_limit_runs_or_is_refused_in_one_line(key, value, _):
+    try:
+        scene = scene_from_dict(tree_at(key, value))
+        check_motion(scene)
+        partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), do.Profile()
+        arms = do.build_arms(scene, partition, profile)
+        x = {k: arm.uniform(0.5) for k, arm in arms.items()}
+        evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
+        assert np.isfinite(evaluation.objective)
+        assert np.isfinite(trajectory.joint_forces).all()
+    except (InputError, ConvergenceError) as error:
+        assert len(str(error).splitlines()) == 1
 
 
-@pytest.mark.parametrize("weight", [1e-9, 1e9])
-def test_weights_at_their_limits(weight):
-    scenario = f'[{{changes = ["payload.mass=4"], weight = {weight}}}]'
-    run([f"scenarios={scenario}"])
+def test_loads_and_weights_at_their_limits():
+    for load in ("[1e9, 0.0, 0.0]", "[0.0, 1e-9, 0.0]", "[0.0, 0.0, -1e9]"):
+        run(["objective.kind=static", f"objective.loads=[{load}]"])
+    for weight in (1e-9, 1e9):
+        run([f'scenarios=[{{changes = ["payload.mass=4"], weight = {weight}}}]'])

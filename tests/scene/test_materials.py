@@ -3,11 +3,9 @@
 import json
 import sys
 
-import numpy as np
 import pytest
-from runs import TWO_ARM, run
+from runs import TWO_ARM, refusal, run
 
-from dolfinopt.errors import InputError
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.messages import implausible
@@ -63,16 +61,9 @@ def test_numbers_take_the_place_of_the_catalogue():
     assert (own.density, own.young_modulus, own.yield_strength) == (2790.0, 71.7e9, 460e6)
     scene = scene_from_dict(tree(name), overrides=["material.young_modulus=70e9"])
     assert (scene.material.young_modulus, scene.material.density) == (70e9, 2810.0)
-
-
-@pytest.mark.parametrize("key", ["material", "material.name"])
-def test_an_override_names_another_material(key):
-    """Numbers of the file do not outlive it."""
-    scene = load_scene(TWO_ARM, [f"{key}=steel S355"])
-    assert scene.material.model_dump() == {"name": "steel S355", **CATALOGUE["steel S355"].values}
-
-
-def test_yield_strength_is_no_must():
+    for key in ("material", "material.name"):  # numbers of the file do not outlive another name
+        known = {"name": "steel S355", **CATALOGUE["steel S355"].values}
+        assert load_scene(TWO_ARM, [f"{key}=steel S355"]).material.model_dump() == known
     assert load_scene(TWO_ARM).material.yield_strength is None
     assert load_scene(TWO_ARM, ["material.yield_strength=95e6"]).material.yield_strength == 95e6
 
@@ -101,12 +92,10 @@ def test_an_arm_has_its_own_material():
     ],
 )
 def test_a_misspelt_material_is_suggested(name, near):
-    with pytest.raises(InputError, match=f"did you mean .*{near}") as caught:
-        scene_from_dict(tree(name))
-    assert str(caught.value).startswith("<scene>: material = ")
-    assert "more)" not in str(caught.value)
-    with pytest.raises(InputError, match=rf"arms\.1\.material \(arm2\) = .*did you mean .*{near}"):
-        scene_from_dict(tree("POM", material=name))
+    message = refusal(lambda: scene_from_dict(tree(name)), "material = ", "did you mean", near)
+    assert "more)" not in message
+    words = "arms.1.material (arm2) = ", "did you mean", near
+    refusal(lambda: scene_from_dict(tree("POM", material=name)), *words)
 
 
 def test_scenarios_change_values_not_the_material():
@@ -114,21 +103,17 @@ def test_scenarios_change_values_not_the_material():
     assert pose_scenarios(scene_from_dict(data))[0].material.density == 7800
     for change in ("material=steel S355", "material.name=steel S355"):
         data["scenarios"] = [{"changes": [change]}]
-        with pytest.raises(InputError, match=r"not another material: .* Poisson's ratio"):
-            scene_from_dict(data)
+        refusal(lambda: scene_from_dict(data), "not another material")
 
 
 def test_keys_lists_the_catalogue(capsys):
     run("keys", "material")
     said = capsys.readouterr().out
-    for name, one in CATALOGUE.items():
-        assert name in said and one.source in said
+    assert all(name in said and one.source in said for name, one in CATALOGUE.items())
     run("keys", "Steel S")
     head, *rows = capsys.readouterr().out.splitlines()
-    assert head.startswith("material") and [row[:10] for row in rows] == [
-        "steel S235",
-        "steel S355",
-    ]
+    assert head.startswith("material")
+    assert [row[:10] for row in rows] == ["steel S235", "steel S355"]
 
 
 def test_editors_know_the_names():
@@ -140,13 +125,3 @@ def test_editors_know_the_names():
     assert not validate.is_valid(tomllib.loads(good.replace("PEEK", "PEAK")))
     assert not validate.is_valid(tomllib.loads(good.replace("POM", "POOM")))
     assert not validate.is_valid(tomllib.loads(good.replace('= "PEEK"', "= {density = 1.0}")))
-
-
-def test_values_are_those_of_the_scene_written_in_numbers():
-    """A name is another way to write numbers, to the bit."""
-    named = load_scene(TWO_ARM, ["material=aluminium 2024-T3"])
-    numbers = [f"material.{key}={v!r}" for key, v in CATALOGUE["aluminium 2024-T3"].values.items()]
-    plain = load_scene(TWO_ARM, numbers)
-    for i in range(2):
-        ours, theirs = (one.material_of(i).model_dump() for one in (named, plain))
-        assert np.array_equal(list(ours.values())[1:], list(theirs.values())[1:])

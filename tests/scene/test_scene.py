@@ -1,7 +1,5 @@
 """The scene: defaults, inheritance, overrides, and one helpful line for every kind of bad input."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -16,7 +14,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from runs import STATED, TWO_ARM
+from runs import STATED, TWO_ARM, refusal
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -62,27 +60,17 @@ def put(data, path, value):
         node[last] = value
 
 
-def changed(path, value):
-    """Return the minimal data with `value` at the dotted `path`."""
-    data = minimal()
-    put(data, path, value)
+def changed(*pairs, n_arms=2):
+    """Return the minimal data with values at dotted paths: path, value, path, value ..."""
+    data = minimal(n_arms)
+    for path, value in zip(pairs[::2], pairs[1::2]):
+        put(data, path, value)
     return data
 
 
-def message_of(data, *overrides, source=FILE):
-    """Return the message with which `data` is refused; it must be a single line."""
-    with pytest.raises(InputError) as caught:
-        scene_from_dict(data, source, overrides)
-    return checked_line(caught, source)
-
-
-def checked_line(caught, source):
-    message = str(caught.value)
-    assert message.startswith(str(source))
-    assert len(message.splitlines()) == 1 and message.isprintable()
-    error = caught.value  # no other exception would be printed above it
-    assert error.__context__ is None or error.__suppress_context__
-    return message
+def refused(data, *words, overrides=(), source=FILE):
+    """Check that `data` is refused with `words`; return the message."""
+    return refusal(lambda: scene_from_dict(data, source, overrides), str(source), *words)
 
 
 # --- valid scenes ----------------------------------------------------------------------------
@@ -92,90 +80,18 @@ def test_demo_holds_the_defaults():
     demo = load_scene(TWO_ARM)
     ends = ["arms.passive=0.0", "simulation.stiffening=false"]  # as in the paper
     assert scene_from_dict(minimal(name="two-arm manipulator"), overrides=ends) == demo
-
-
-def test_demo_values():
-    scene = load_scene(TWO_ARM)
-    assert scene.name == "two-arm manipulator"
-    assert scene.source == str(TWO_ARM)
-    assert (scene.material.young_modulus, scene.material.density) == (70e9, 2700.0)
-    assert [arm.name for arm in scene.arms] == ["arm1", "arm2"]
-    assert scene.arms[1].cells == (200, 12)
-    assert scene.motion.elbow == -1 and scene.motion.gravity == (0.0, 0.0)
-    assert scene.motion.duration == 1.9 and scene.motion.horizon == 3.0
-    assert (scene.payload.mass, scene.damping.stiffness_proportional) == (6.0, 2e-4)
-    assert (scene.reduction.method, scene.reduction.coordinates) == ("craig-bampton", 4)
-    assert (scene.objective.kind, scene.objective.load_cases) == ("esl", 30)
-    assert scene.design.filter_radius == 0.0075 and scene.design.projection is False
-    assert scene.optimizer.max_iterations == 400
-
-
-def test_defaults_of_keys_the_demo_leaves_out():
-    simulation = load_scene(TWO_ARM).simulation
+    assert demo.source == str(TWO_ARM)
+    # Of each table one, as the contract has them.
+    assert (demo.material.young_modulus, demo.material.density) == (70e9, 2700.0)
+    assert demo.arms[1].cells == (200, 12) and demo.motion.elbow == -1
+    assert (demo.motion.duration, demo.motion.horizon) == (1.9, 3.0)
+    assert (demo.payload.mass, demo.damping.stiffness_proportional) == (6.0, 2e-4)
+    assert (demo.reduction.method, demo.reduction.coordinates) == ("craig-bampton", 4)
+    assert (demo.objective.kind, demo.objective.load_cases) == ("esl", 30)
+    assert (demo.design.filter_radius, demo.optimizer.max_iterations) == (0.0075, 400)
+    simulation = demo.simulation  # the demo leaves these out
     assert simulation.integrator == "radau"
     assert (simulation.rho_inf, simulation.stages, simulation.sample) == (0.8, 4, 1e-3)
-
-
-def test_demo_states_every_other_key():
-    text = TWO_ARM.read_text(encoding="utf-8")
-    stated = {line.split(" =")[0].strip() for line in text.splitlines() if " = " in line}
-    known = {info.key.rpartition(".")[2] for info in describe_keys()}
-    assert known - stated == {
-        "integrator",
-        "rho_inf",
-        "stages",
-        "sample",
-        "shared_volume",
-        *("minimum_member", "minimum_gap"),
-        # in space
-        *("type", "parent", "child", "axis", "origin", "rpy", "centre", "offset"),
-        *("parent_interface", "point", "arm", "interface", "initial_joints"),
-        *("position_limits", "velocity_limit", "effort_limit", "interface_offset"),
-        *("pattern", "box", "circle", "depth", "material", "yield_strength"),
-        "kkt_tolerance",
-        "exact_iterations",
-        "exponent",
-        "acceleration_share",
-        "max_speed",
-        "max_acceleration",
-        "max_jerk",
-        "start",
-        "end",
-        "file",
-        "base",
-        "base_position",
-        "shifts",
-        "band",
-        "worst",
-        "loads",
-        "attached",
-        "elbow_angle",
-        "modes",
-        "follow",
-        "effort_weights",
-        *(set(Constraints.model_fields) - {"mass"}),  # the payload has a mass
-        *("stress_exponent", "stress_margin"),
-        "sharpness",
-        "continuation",
-        "erosion",
-        "mesh",
-        "mesh_size",
-        "cell_shape",
-        "element",
-        *("symmetric", "symmetric_z", "extruded", "depth"),
-        *("speed", "start_angle", "cart_mass"),
-        *("joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio"),
-        *("joint_stiffness", "joint_damping"),
-        *("feed_forward", "stiffness", "damping", "limits", "forces"),
-        *("stiffness_factor", "damping_factor"),
-        *("point", "direction", "side", "force"),
-        "design",
-        "rigid",
-        "sid",
-        "scenarios",
-        "changes",
-        "weight",
-    }
 
 
 def test_arm_takes_missing_keys_from_the_arm_before():
@@ -195,36 +111,27 @@ def test_input_data_are_left_unchanged():
     assert data == before
 
 
-def test_name_defaults_to_the_file(tmp_path):
+def test_name_defaults_to_the_file_and_windows_files_are_read(tmp_path):
     path = tmp_path / "crane.v2.toml"
     path.write_text(TWO_ARM.read_text().partition("\n")[2])
     assert load_scene(path).name == "crane.v2"
     assert scene_from_dict(minimal()).name == "scene"
-
-
-def test_byte_order_mark_and_windows_line_ends(tmp_path):
-    path = tmp_path / "two_arm.toml"
     path.write_bytes(b"\xef\xbb\xbf" + TWO_ARM.read_bytes().replace(b"\n", b"\r\n"))
     assert load_scene(path) == load_scene(TWO_ARM)
 
 
 def test_scene_is_frozen_hashable_and_picklable():
     scene = load_scene(TWO_ARM)
-    with pytest.raises(ValidationError, match="frozen"):
-        scene.payload.mass = 3.0
-    with pytest.raises(ValidationError, match="frozen"):
-        scene.name = "other"
+    for table, key in ((scene.payload, "mass"), (scene, "name")):
+        with pytest.raises(ValidationError, match="frozen"):
+            setattr(table, key, 3.0)
     other = load_scene(TWO_ARM, ["payload.mass=3"])
     assert len({scene, load_scene(TWO_ARM), other}) == 2
     restored = pickle.loads(pickle.dumps(scene))
     assert restored == scene and restored.source == scene.source
-
-
-def test_equality_ignores_the_source_only():
-    scene = scene_from_dict(minimal(name="a"), "a.toml")
-    assert scene == scene_from_dict(minimal(name="a"), "b.toml")
-    assert scene != scene_from_dict(minimal(name="b"), "a.toml")
-    assert scene != "a.toml"
+    one, two = (scene_from_dict(minimal(name="x"), source) for source in ("a.toml", "b.toml"))
+    assert one == two  # whatever their source
+    assert scene != str(TWO_ARM)
 
 
 def test_round_trip_through_json():
@@ -243,42 +150,34 @@ def test_integer_stands_for_a_number():
 
 
 @pytest.mark.parametrize(
-    ("path", "value"),
+    ("paths", "value"),
     [
+        ("motion.flattening payload.mass damping.stiffness_proportional", 0),
+        ("design.filter_radius optimizer.max_iterations optimizer.tolerance", 0),
+        ("simulation.rho_inf design.volume_fraction design.initial optimizer.move", 1.0),
+        ("interpolation.penalty motion.elbow", 1),
+        ("design.filter_radius", 1.0),  # the longest arm
         ("material.poisson_ratio", -0.99),
-        ("interpolation.penalty", 1),
         ("arms.0.cells", [MAX_CELLS, 1]),
         ("arms.0.name", "left arm_2-b"),
         ("arms.0.name", "2nd"),
-        ("motion.flattening", 0),
         ("motion.horizon", 1.9),  # no rest behind the motion
-        ("motion.elbow", 1),
         ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
         ("motion", {"path": "arc", "base": "fixed", "base_position": -1.0}),
-        ("payload.mass", 0),
-        ("damping.stiffness_proportional", 0.0),
-        ("simulation.tolerance", 0.1),
-        ("simulation.rho_inf", 1.0),
+        ("simulation.tolerance simulation.sample", 0.1),
         ("simulation.stages", 5),
-        ("simulation.sample", 0.1),
         ("objective.load_cases", 3000),  # 3 s hold 3000 samples, whatever 3.0/1e-3 rounds to
-        ("design.volume_fraction", 1.0),
-        ("design.initial", 1.0),
-        ("design.filter_radius", 0.0),
-        ("optimizer.max_iterations", 0),
-        ("optimizer.move", 1.0),
-        ("optimizer.tolerance", 0.0),
         ("name", 200 * "x"),
         ("reduction.coordinates", 3),
         ("reduction.coordinates", 5177),  # 2 * 199 * 13 + 3
         ("reduction", {"method": "modal", "coordinates": 1}),
         ("reduction", {"coordinates": "auto", "tolerance": 1e-6}),
         ("design", {"minimum": 0.3, "volume_fraction": 0.3}),
-        ("design.filter_radius", 1.0),  # the longest arm
     ],
 )
-def test_borders_of_the_ranges_are_allowed(path, value):
-    scene_from_dict(changed(path, value), overrides=["arms.passive=0"])
+def test_borders_of_the_ranges_are_allowed(paths, value):
+    for path in paths.split():
+        scene_from_dict(changed(path, value), overrides=["arms.passive=0"])
 
 
 # --- what an arm derives from its keys -------------------------------------------------------
@@ -304,30 +203,21 @@ def test_passive_share_counts_centroids(n_along, length):
         n_solid = sum(10 * i + 5 < tenths for i in range(n_along))  # free of rounding
         assert arm.passive_columns == n_solid
         assert arm.passive_share == pytest.approx(2 * n_solid / n_along, abs=1e-15)
-
-
-def test_centroid_on_the_border_is_not_solid():
+    # A centroid on the border, a number without rounding, is not solid.
     assert Arm(**ARM, cells=(2, 1), passive=0.25).passive_columns == 0
-    assert Arm(**ARM, cells=(2, 1), passive=0.26).passive_columns == 1
 
 
-@pytest.mark.parametrize(
-    ("keys", "length"),
-    [
+def test_ends_are_solid_unless_the_scene_says_otherwise():
+    for keys, length in (
         ({}, 0.015),  # a quarter of the height
         ({"height": 0.8}, 0.1),  # a tenth of the length
         ({"passive": 0.0}, 0.0),
         ({"passive": 0.02}, 0.02),
         ({"mesh": "a.msh"}, 0.0),  # has groups of its own
         ({"mesh": "a.msh", "passive": 0.02}, 0.02),
-    ],
-)
-def test_ends_are_solid_unless_the_scene_says_otherwise(keys, length):
-    assert Arm(**ARM | keys).solid_ends == pytest.approx(length, rel=1e-15)
-
-
-def test_default_ends_follow_the_height():
-    data = scene_from_dict(minimal()).to_dict()
+    ):
+        assert Arm(**ARM | keys).solid_ends == pytest.approx(length, rel=1e-15)
+    data = scene_from_dict(minimal()).to_dict()  # the default is not frozen by writing it
     ends = [arm.solid_ends for arm in scene_from_dict(data, overrides=["arms.height=0.1"]).arms]
     assert ends == [0.025, 0.025]
 
@@ -369,6 +259,8 @@ def test_later_override_wins():
     scene = load_scene(TWO_ARM, ["arms.length=0.5", "arms.arm1.length=0.7", "payload.mass=1"])
     assert [arm.length for arm in scene.arms] == [0.7, 0.5]
     assert scene.payload.mass == 1.0
+    scene = load_scene(TWO_ARM, ["arms.1.name=fore arm", "arms.fore arm.length=0.6"])
+    assert scene.arms[1].length == 0.6  # found by its new name
 
 
 def test_override_supplies_missing_keys():
@@ -380,47 +272,55 @@ def test_override_supplies_missing_keys():
     assert scene.material.density == 2700.0
 
 
-def test_override_finds_an_arm_by_its_new_name():
-    scene = load_scene(TWO_ARM, ["arms.1.name=fore arm", "arms.fore arm.length=0.6"])
-    assert scene.arms[1].length == 0.6
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (
+            ["=-1", "=heavy", "=", "=1\nname='x'", "=" + 600 * "["],
+            ["payload.mass = ", "number >= 0"],
+        ),
+        ([".x=1"], ["payload.mass.x", "set payload.mass as a whole"]),
+        ([""], ["key.path=value"]),
+    ],
+    ids=range(3),
+)
+def test_bad_override_of_a_number(overrides, words):
+    for override in overrides:
+        bad_override(f"payload.mass{override}", *words)
 
 
 @pytest.mark.parametrize(
-    ("override", "parts"),
+    ("override", "words"),
     [
-        ("payload.mass=-1", ["payload.mass = -1", "a number >= 0", "[kg]"]),
-        ("payload.mass=heavy", ['payload.mass = "heavy"', "a number >= 0"]),
-        ("payload.mass=", ['payload.mass = ""', "a number >= 0"]),
-        ("payload.mass=1\nname='x'", ["payload.mass = ", "a number >= 0"]),
-        ("payload.mass=" + 600 * "[", ["payload.mass = ", "a number >= 0"]),
-        ("payload.mas=1", ["unknown key payload.mas", "did you mean payload.mass?", "inertia"]),
-        ("payload.mass.x=1", ["unknown key payload.mass.x", "set payload.mass as a whole"]),
+        ("payload.mas=1", ["unknown key payload.mas", "payload.mass?", "inertia"]),
         ("motion.gravity.1=1", ["unknown key motion.gravity.1", "an array of two numbers"]),
-        ("payloads.mass=1", ["unknown key payloads", "did you mean payload?", "optimizer"]),
-        ("density=1", ["unknown key density", "did you mean material.density or arms.density?"]),
-        ("source=x", ["unknown key source", "allowed: name, material"]),
-        ("arms.lenght=1", ["unknown key arms.lenght", "did you mean arms.length?", "arm2"]),
-        ("arms.arm3.length=1", ["unknown key arms.arm3", "allowed: 0, 1, arm1, arm2"]),
-        ("arms.2.length=1", ["unknown key arms.2", "allowed: 0, 1, arm1, arm2"]),
+        ("payloads.mass=1", ["unknown key payloads", "payload?", "optimizer"]),
+        ("density=1", ["unknown key density", "material.density or arms.density?"]),
+        ("source=x", ["unknown key source", "name, material"]),
+        ("arms.lenght=1", ["unknown key arms.lenght", "arms.length?", "arm2"]),
+        ("arms.arm3.length=1", ["unknown key arms.arm3", "0, 1, arm1, arm2"]),
+        ("arms.2.length=1", ["unknown key arms.2", "0, 1, arm1, arm2"]),
         ("arms.-1.length=1", ["unknown key arms.-1"]),
         ("arms." + 5000 * "1" + ".length=1", ['unknown key arms."111']),
-        ("arms.1.grid=a.geo", ["unknown key arms.1.grid (arm2)", "allowed: name, length"]),
-        ("arms.1.length=0", ["arms.1.length (arm2) = 0", "a number >= 1e-06", "[m]"]),
+        ("arms.1.grid=a.geo", ["unknown key arms.1.grid (arm2)", "name, length"]),
+        ("arms.1.length=0", ["arms.1.length (arm2) = 0", ">= 1e-06", "[m]"]),
         ("arms.arm2.length=0", ["arms.1.length (arm2) = 0"]),
-        ("arms=3", ["arms = 3", "an array of tables [[arms]]"]),
-        ("material=3", ["material = 3", "the name of a material, or a table with"]),
-        ("payload.mass", ["expected key.path=value"]),
-        ("=1", ["expected key.path=value"]),
-        ("payload..mass=1", ["expected key.path=value"]),
-        ("", ["expected key.path=value"]),
+        ("arms=3", ["arms = 3", "[[arms]]"]),
+        ("material=3", ["material = 3", "name of a material", "a table"]),
+        ("=1", ["key.path=value"]),
+        ("payload..mass=1", ["key.path=value"]),
+        ("", ["key.path=value"]),
     ],
     ids=lambda value: value[:30] if isinstance(value, str) else "",
 )
-def test_bad_override_is_named(override, parts):
-    message = message_of(minimal(), "payload.inertia=0.1", override)
+def test_bad_override_is_named(override, words):
+    bad_override(override, *words)
+
+
+def bad_override(override, *words):
     shown = override.replace("\n", "\\n") if len(override) <= 80 else f"{override[:77]}..."
-    for part in [f"{FILE} with --set {shown}: ", *parts]:
-        assert part in message
+    before = "payload.inertia=0.1"  # not to blame
+    refused(minimal(), f"{FILE} with --set {shown}: ", *words, overrides=[before, override])
 
 
 def test_one_output_instant_is_enough():
@@ -428,285 +328,222 @@ def test_one_output_instant_is_enough():
     assert scene.simulation.sample == scene.motion.horizon
 
 
-def test_override_of_all_arms_is_one_problem():
-    data = minimal(3)
-    data["arms"][1]["length"] = 2.0
-    assert "more)" not in message_of(data, "arms.length=-1")
-    assert message_of(data, "arms.0.length=-1", "arms.1.length=-1").endswith("(and 1 more)")
-
-
-def test_override_of_a_taken_over_key_is_a_problem_of_its_own():
-    data = changed("arms.0.length", -1)
-    assert message_of(data, "arms.1.length=-1").endswith("(and 1 more)")
-
-
-def test_problem_of_the_file_is_not_blamed_on_an_override():
-    message = message_of(changed("payload.mass", -1), "payload.inertia=1", "motion.radius=1")
-    assert message.startswith(f"{FILE}: payload.mass = -1")
-
-
-def test_last_override_of_a_key_is_blamed():
-    message = message_of(minimal(), "payload.mass=1", "payload.mass=-2")
-    assert message.startswith(f"{FILE} with --set payload.mass=-2: payload.mass = -2: ")
+LENGTH = "arms.1.length"
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "override", "named"),
+    ("pairs", "overrides", "more"),
     [
-        ("arms", 5, "arms.length=1", "arms = 5: "),
-        ("arms", [5], "arms.0.length=1", "arms.0 = 5: "),
-        ("arms", [5], "arms.length=1", "arms.0 = 5: "),
-        ("material", [1], "material.density=1", "material = [1]: "),
-        ("material", 5, "material.density=1", "material = 5: "),
+        ((LENGTH, 2.0), ["arms.length=-1"], None),  # of all arms: one problem
+        ((LENGTH, 2.0), ["arms.0.length=-1", f"{LENGTH}=-1"], 1),
+        (("arms.0.length", -1), [f"{LENGTH}=-1"], 1),  # of a taken-over key: one of its own
+        (("payload.mass", -1, "design", {"initial": 2, "filter_radius": "x"}), [], 2),
+        # Of the first arm cells and length, of the last its own length.
+        (("arms.0.length", -1, "arms.0.cells", [0, 0], "arms.2.length", -2), [], 2),
+        (("arms.1.height", -1), [], None),
+        (("material", {"youngs_modulus": 7e10, "poisson_ratio": 0.3, "density": 1}), [], 1),
     ],
 )
-def test_override_does_not_hide_a_broken_table(path, value, override, named):
-    assert message_of(changed(path, value), override).startswith(f"{FILE}: {named}")
+def test_several_problems_are_counted(pairs, overrides, more):
+    message = refused(changed(*pairs, n_arms=3), overrides=overrides)
+    assert message.endswith(f"(and {more} more)") if more else "more)" not in message
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "overrides", "start"),
+    [
+        ("payload.mass", -1, ["payload.inertia=1", "motion.radius=1"], ": payload.mass = -1: "),
+        ("payload.inertia", 1, ["payload.mass=1", "payload.mass=-2"],
+         " with --set payload.mass=-2: payload.mass = -2: "),
+        ("arms", 5, ["arms.length=1"], ": arms = 5: "),
+        ("arms", [5], ["arms.0.length=1"], ": arms.0 = 5: "),
+        ("arms", [5], ["arms.length=1"], ": arms.0 = 5: "),
+        ("material", [1], ["material.density=1"], ": material = [1]: "),
+        ("material", 5, ["material.density=1"], ": material = 5: "),
+    ],
+)  # fmt: skip
+def test_the_file_or_the_last_override_is_blamed(path, value, overrides, start):
+    assert refused(changed(path, value), overrides=overrides).startswith(FILE + start)
 
 
 # --- bad values ------------------------------------------------------------------------------
 
+LENGTHS, MODULI = "a number >= 1e-06 and <= 10000", "a number >= 1 and <= 1e+15"
+FLAGS, STRING = "true or false", "a string"
+# Keys, values, what is allowed instead.
 BAD_VALUES = [
-    # key, value, the value as shown, what is allowed
-    ("name", "", '""', "printable characters"),
-    ("name", "two\nlines", r'"two\nlines"', "on one line"),
-    ("name", "  ", '"  "', "printable characters"),
-    ("name", 201 * "x", 60 * "x", "1 to 200"),
-    ("name", 5, "5", "a string"),
-    ("material.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
-    ("material.young_modulus", "70e9", '"70e9"', "a number >= 1 and <= 1e+15"),
-    ("material.young_modulus", True, "true", "a number >= 1 and <= 1e+15"),
-    ("material.young_modulus", 10**400, "2**1328...", "a number >= 1 and <= 1e+15"),
-    ("material.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
-    ("material.poisson_ratio", -1.0, "-1.0", "a number >= -0.99 and < 0.5"),
-    ("material.density", -2700.0, "-2700.0", "a number >= 1e-12 and <= 1000000"),
-    ("interpolation.law", "SIMP", '"SIMP"', '"two-material" | "simp" | "pedersen"'),
-    ("interpolation.penalty", 0.9, "0.9", "a number >= 1"),
-    ("interpolation.floor", 0.0, "0.0", "a number >= 1e-12 and < 1"),
-    ("interpolation.floor", 1, "1", "a number >= 1e-12 and < 1"),
-    ("arms.0.name", "a/b", '"a/b"', "letters, digits"),
-    ("arms.0.name", "", '""', "letters, digits"),
-    ("arms.0.name", "-x", '"-x"', "letters, digits"),
-    ("arms.0.name", " x", '" x"', "letters, digits"),
-    ("arms.0.name", "x ", '"x "', "letters, digits"),
-    ("arms.0.name", "x\n", r'"x\n"', "letters, digits"),
-    ("arms.0.name", "..", '".."', "letters, digits"),
-    ("arms.0.name", "ärm", '"ärm"', "letters, digits"),
-    ("arms.0.name", "12", '"12"', "not a digit"),
-    ("arms.0.name", 65 * "a", 65 * "a", "1 to 64"),
-    ("arms.0.name", "ARM2", '"arm2"', "no other arm has"),
-    ("arms.0.name", "arm2_face", '"arm2"', "files of both parts would have one name"),
-    ("arms.1.name", "Arm1_R12", '"Arm1_R12"', "files of both parts would have one name"),
-    ("arms.0.length", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
-    ("arms.0.design", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
-    ("arms.1.design", "arm2", '"arm2"', 'earlier arm with a design of its own: "arm1"'),
-    ("arms.0.design", 1, "1", "a string"),
-    ("arms.0.rigid", 1, "1", "true or false"),
-    ("arms.0.centre", [0, 0, 0], "[0, 0, 0]", "only with rigid = true"),
-    ("arms.0.sid", 1, "1", "a string"),
-    ("arms.0.young_modulus", 0, "0", "a number >= 1 and <= 1e+15"),
-    ("arms.0.poisson_ratio", 0.5, "0.5", "a number >= -0.99 and < 0.5"),
-    ("arms.0.density", "steel", '"steel"', "a number >= 1e-12 and <= 1000000"),
-    ("arms.0.height", -0.06, "-0.06", "a number >= 1e-06 and <= 10000"),
-    ("arms.0.thickness", math.inf, "inf", "a finite number >= 1e-06 and <= 10000"),
-    ("arms.0.cells", [0, 12], "[0, 12]", "two integers >= 1"),
-    ("arms.0.cells", [0, 0], "[0, 0]", "two integers >= 1"),
-    ("arms.0.cells", [MAX_CELLS + 1, 1], "[100001, 1]", "<= 100000"),
-    ("arms.0.cells", [200], "[200]", "an array of two integers"),
-    ("arms.0.cells", [200, 12, 1], "[200, 12, 1]", "needs [[joints]]"),
-    ("arms.0.cells", [200, 12, 1, 1], "[200, 12, 1, 1]", "an array of three integers"),
-    ("arms.0.cells", [200.0, 12], "[200.0, 12]", "two integers"),
-    ("arms.0.cells", "200x12", '"200x12"', "two integers"),
-    ("arms.0.mesh", 1, "1", "a string"),
-    ("arms.0.mesh_size", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
-    ("arms.0.mesh_size", 0.01, "0.01", "only with mesh"),
-    ("arms.0.interface_offset", 0.01, "0.01", "only with mesh"),
-    ("arms.0.cell_shape", "hexagon", '"hexagon"', '"quadrilateral" | "triangle"'),
-    ("arms.0.cell_shape", "triangle", '"triangle"', "only with mesh"),
-    ("arms.0.element", "cubic", '"cubic"', '"incompatible" | "linear" | "quadratic"'),
-    ("arms.0.symmetric", 1, "1", "true or false"),
-    ("arms.0.symmetric_z", True, "true", "only with a solid arm"),
-    ("arms.0.extruded", True, "true", "only with a solid arm"),
-    ("arms.0.passive", -0.01, "-0.01", "a number >= 0"),
-    ("arms.0.passive", 0.5, "0.5", "less than half of length = 1.0 [m]"),
-    ("arms.0.passive", 0.26, "0.26", "volume_fraction = 0.5 can be met"),
-    ("motion.gravity", [0, 0, -9.81], "[0, 0, -9.81]", "two numbers without [[joints]]"),
-    ("payload.offset", [0, 1], "[0, 1]", "an array of three numbers"),
-    ("payload.arm", "arm1", '"arm1"', "none without [[joints]]"),
-    ("payload.interface", "side", '"side"', "none without [[joints]]"),
-    ("motion.rpy", [0, 0, 0], "[0, 0, 0]", 'with motion.path = "arc"'),
-    ("motion.initial_joints", [0.1], "[0.1]", 'with motion.path = "arc"'),
-    ("payload.inertia", [1, 1], "[1, 1]", "an array of six numbers"),
-    ("motion.path", "circle", '"circle"', '"arc" | "line" | "points" | "joints"'),
-    ("motion.path", "joints", "None (default)", 'a table (CSV) with motion.path = "joints"'),
-    ("motion.radius", 0.0, "0.0", "a number >= 1e-06 and <= 10000"),
-    ("motion.flattening", -0.1, "-0.1", "a number >= 0 and <= 1"),
-    ("motion.flattening", 1.1, "1.1", "a number >= 0 and <= 1"),
-    ("motion.start", [0.0], "[0.0]", "an array of two numbers"),
-    ("motion.start", [0.0, 1.0], "[0.0, 1.0]", 'the default, with motion.path = "arc"'),
-    ("motion.end", [0.0, math.inf], "[0.0, inf]", "an array of two finite numbers"),
-    ("motion.file", 5, "5", "a string"),
-    ("motion.file", "absent.csv", '"absent.csv"', "found neither /"),
-    ("motion.law", "cubic", '"cubic"', '"quintic" | "septic" | "trapezoidal" | "s-curve"'),
-    ("motion.horizon", 1.0, "1.0", "at least motion.duration = 1.9 [s], the end of the path"),
-    ("motion.acceleration_share", 0.3, "0.3", '0.25, the default, with motion.law = "quintic"'),
-    ("motion.max_speed", 0.0, "0.0", "a number >= 1e-06 and <= 1e+12"),
-    ("motion.max_acceleration", -1.0, "-1.0", "a number >= 1e-06 and <= 1e+12"),
-    ("motion.max_jerk", "fast", '"fast"', "a number >= 1e-06 and <= 1e+12"),
-    ("motion.base", "rail", '"rail"', '"cart" | "fixed"'),
-    ("motion.base_position", 1, "1", '0.0, the default, with motion.base = "cart"'),
-    ("motion.duration", 0.0, "0.0", "a number >= 0.0001 and <= 100000"),
-    ("motion.horizon", 0, "0", "a number >= 0.0001 and <= 100000"),
-    ("motion.cart_follow", math.nan, "nan", "a finite number"),
-    ("motion.joint_height", "low", '"low"', "a number"),
-    ("motion.elbow", 0, "0", "-1 | 1"),
-    ("motion.elbow", 1.0, "1.0", "-1 | 1"),
-    ("motion.elbow", True, "true", "-1 | 1"),
-    ("motion.gravity", -9.81, "-9.81", "an array of two numbers"),
-    ("motion.gravity", [0.0, 0.0, -9.81], "[0.0, 0.0, -9.81]", "an array of two numbers"),
-    ("motion.gravity", [0.0, -math.inf], "[0.0, -inf]", "an array of two finite numbers"),
-    ("motion.gravity", [False, 0.0], "[false, 0.0]", "an array of two numbers"),
-    ("payload.mass", -6.0, "-6.0", "a number >= 0"),
-    ("payload.mass", math.nan, "nan", "a finite number >= 0"),
-    ("payload.mass", None, "None", "a number >= 0"),
-    ("payload.mass", [[[[1.0]]]], "[[[...]]]", "a number >= 0"),
-    ("payload.inertia", -1, "-1", "a number >= 0"),
-    ("damping.stiffness_proportional", -2e-4, "-0.0002", "a number >= 0"),
-    ("reduction.method", "guyan", '"guyan"', '"craig-bampton" | "modal" | "krylov" | "balanced"'),
-    ("reduction.coordinates", 0, "0", 'an integer >= 1 | "auto"'),
-    ("reduction.coordinates", "all", '"all"', 'an integer >= 1 | "auto"'),
-    ("reduction.tolerance", 0.0, "0.0", "a number >= 1e-06 and <= 0.5"),
-    ("reduction.tolerance", 1e-2, "0.01", "0.001, the default, with reduction.coordinates = 4"),
-    ("reduction.coordinates", 2, "2", 'an integer >= 3 with reduction.method = "craig-bampton"'),
-    ("reduction.coordinates", 4.0, "4.0", "an integer >= 1"),
-    ("reduction.coordinates", True, "true", "an integer >= 1"),
-    ("reduction.coordinates", 5178, "5178", "at most 5177"),  # 2*199*13 + 3
-    ("reduction.shifts", 5.0, "5.0", "an array of numbers >= 0"),
-    ("reduction.shifts", [0.0, -1.0], "[0.0, -1.0]", "an array of numbers >= 0"),
-    ("reduction.shifts", [], "[]", "at least one number >= 0, none of them twice"),
-    ("reduction.shifts", [5.0, 5.0], "[5.0, 5.0]", "none of them twice"),
-    ("reduction.shifts", [5.0], "[5.0]", '[0.0], the default, with reduction.method = "craig'),
-    ("reduction.band", [0.0], "[0.0]", "an array of two numbers >= 0"),
-    ("reduction.band", [9.0, 9.0], "[9.0, 9.0]", "the lower of the two frequencies first"),
-    ("reduction.band", [0.0, 9.0], "[0.0, 9.0]", "[0.0, 50.0], the default, with reduction.method"),
-    ("simulation.tolerance", 0.0, "0.0", "a number >= 1e-12 and <= 0.1"),
-    ("simulation.tolerance", 0.11, "0.11", "a number >= 1e-12 and <= 0.1"),
-    ("simulation.integrator", "euler", '"euler"', '"radau" | "generalized-alpha"'),
-    ("simulation.rho_inf", 1.01, "1.01", "a number >= 0 and <= 1"),
-    ("simulation.stages", 1, "1", "an integer >= 2 and <= 5"),
-    ("simulation.stages", 6, "6", "an integer >= 2 and <= 5"),
-    ("simulation.sample", 0.0, "0.0", "a number >= 1e-09 and <= 100000"),
-    ("simulation.sample", 3.1, "3.1", "motion.horizon = 3.0 [s]"),
-    ("simulation.sample", 1e-9, "1e-09", "between 3e-07 and"),
-    ("simulation.sample", 5e-324, "5e-324", "a number >= 1e-09"),
-    ("simulation.stiffening", "on", '"on"', 'true or false | "auto"'),
-    ("motion.speed", 1.0, "1.0", "10.0, the default"),
-    ("motion.start_angle", 1.0, "1.0", "0.0, the default"),
-    ("motion.cart_mass", -1.0, "-1.0", "a number >= 0"),
-    ("arms.0.mass", 1.0, "1.0", "only with rigid = true"),
-    ("arms.0.inertia", 1.0, "1.0", "only with rigid = true"),
-    ("arms.0.joint_mass", -1.0, "-1.0", "a number >= 0"),
-    ("arms.0.joint_inertia", -1.0, "-1.0", "a number >= 0"),
-    ("arms.0.rotor_inertia", -1.0, "-1.0", "a number >= 0"),
-    ("arms.0.gear_ratio", 0.0, "0.0", "a number >= 0.001"),
-    ("arms.0.joint_stiffness", -1.0, "-1.0", "a number >= 0"),
-    ("arms.0.joint_damping", -1.0, "-1.0", "a number >= 0"),
-    ("objective.kind", "strain", '"strain"', '"esl" | "compliance"'),
-    ("objective.load_cases", 0, "0", "an integer >= 1"),
-    ("objective.load_cases", 3001, "3001", "at most 3000"),
-    ("objective.load_cases", 16**5000, "2**20000...", "at most 3000"),
-    ("objective.gradient", "adjoint", '"adjoint"', '"esl" | "exact"'),
-    ("objective.worst", "stress", '"stress"', '"compliance" | "deviation"'),
-    ("objective.loads", [], "[]", "at least one load [F_x, F_y, moment]"),
-    ("objective.loads", [[0, 0, 0]], "[[0, 0, 0]]", "none of them all zero"),
-    ("objective.loads", [[0, 1e-300, 0]], "[[0, 1e-300, 0]]", "between 1e-09 and 1e+09 [N, N m]"),
-    ("objective.loads", [[0, 1e10, 0]], "[[0, 10000000000.0, 0]]", "between 1e-09 and 1e+09"),
-    ("objective.loads", [[0, 1]], "[[0, 1]]", "an array of arrays of three numbers"),
-    ("objective.loads", [0, 1, 0], "[0, 1, 0]", "an array of arrays of three numbers"),
-    ("objective.attached", "springs", '"springs"', '"rigid-body" | "point-mass" | "none"'),
-    ("objective.elbow_angle", "bent", '"bent"', "a number"),
-    ("objective.modes", 0, "0", "an integer >= 1 and <= 50"),
-    ("objective.follow", 1, "1", "true or false"),
-    ("objective.scenarios", "mean", '"mean"', '"sum" | "worst"'),
-    ("constraints.first_frequency", 0.0, "0.0", "a number >= 1e-06 and <= 1000000000"),
-    ("constraints.tip_deflection", -1e-3, "-0.001", "a number >= 1e-15 and <= 10000"),
-    *((f"constraints.{key}", -1.0, "-1.0", " >= ") for key in Constraints.model_fields),
-    ("objective.effort_weights", [1.0, 2.0], "[1.0, 2.0]", "3 numbers, for cart, arm1, arm2"),
-    ("constraints.peak_force", [1.0, 2.0], "[1.0, 2.0]", "3 numbers, for cart, arm1, arm2"),
-    ("objective.direction", "up", '"up"', '"minimize" | "maximize"'),
-    ("objective.exponent", 1.0, "1.0", "a number >= 2"),
-    ("objective.stress_exponent", 1.0, "1.0", "a number >= 2"),
-    ("objective.stress_margin", -0.1, "-0.1", "a number >= 0"),
-    ("design.volume_fraction", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
-    ("design.volume_fraction", 1.5, "1.5", "a number >= 1e-06 and <= 1"),
-    ("design.volume_fraction", 5e-4, "0.001 (default)", "at most volume_fraction = 0.0005"),
-    ("design.initial", 1.01, "1.01", "a number >= 1e-06 and <= 1"),
-    ("design.initial", 1e-3, "0.001 (default)", "less than initial = 0.001"),
-    ("design.minimum", 0.0, "0.0", "a number >= 1e-09 and < 1"),
-    ("design.filter_radius", 1.001, "1.001", "at most the length of the longest arm, 1.0 [m]"),
-    ("design.filter_radius", -1e-9, "-1e-09", "a number >= 0"),
-    ("design.projection", True, "true", "false"),
-    ("design.projection", 0, "0", "false"),
-    ("design.projection", "tanh", '"tanh"', 'false | "heaviside" | "robust"'),
-    ("design.sharpness", 0.5, "0.5", "a number >= 1"),
-    ("design.continuation", 0, "0", "an integer >= 1"),
-    ("design.minimum_member", -1e-9, "-1e-09", "a number >= 0 and <= 10000"),
-    ("optimizer.kkt_tolerance", -1e-9, "-1e-09", "a number >= 0 and <= 1000000"),
-    ("design.erosion", 0.5, "0.5", "a number >= 0.001 and <= 0.499"),
-    ("design.shared_volume", 1, "1", "true or false"),
-    ("optimizer.max_iterations", -1, "-1", "an integer >= 0"),
-    ("optimizer.max_iterations", 16**5000, "2**20000...", "an integer >= 0 and <= 1000000"),
-    ("optimizer.max_iterations", 400.0, "400.0", "an integer >= 0"),
-    ("optimizer.exact_iterations", -1, "-1", "an integer >= 0"),
-    ("optimizer.move", 0.0, "0.0", "a number >= 1e-06 and <= 1"),
-    ("optimizer.move", 1.1, "1.1", "a number >= 1e-06 and <= 1"),
-    ("optimizer.tolerance", -1.0, "-1.0", "a number >= 0"),
-    ("material.name", "stone", '"stone"', "a material of the catalogue; dolfinopt keys material"),
-    ("material.yield_strength", 0.0, "0.0", "a number >= 0.001 and <= 1e+15"),
-    ("arms.0.material", "steel", '"steel"', 'did you mean "steel S235" or "steel S355"'),
-    ("arms.0.yield_strength", 0.0, "0.0", "a number >= 0.001 and <= 1e+15"),
-    ("arms.0.pattern", "arm2", '"arm2"', "the name of an earlier arm with a design of its own"),
-    ("design.minimum_gap", -1e-9, "-1e-09", "a number >= 0 and <= 10000"),
-    ("material", 5, "5", "a table with the keys name, young_modulus, poisson_ratio"),
-    ("motion", [1, 2], "[1, 2]", "a table with the keys path, radius"),
-    ("arms", {"name": "arm1"}, '{name = "arm1"}', "an array of tables [[arms]], at least one"),
-    ("arms", [], "[]", "an array of tables [[arms]], at least one"),
-    ("arms.1", "arm2", '"arm2"', "a table with the keys name, length"),
+    ("name", ["", "  ", 201 * "x"], "1 to 200 printable characters"),
+    ("name", ["two\nlines"], "on one line"),
+    ("name motion.file arms.0.mesh arms.0.sid arms.0.design", [5], STRING),
+    ("material.young_modulus arms.0.young_modulus", [0, "70e9", True], MODULI),
+    ("material.poisson_ratio arms.0.poisson_ratio", [0.5, -1.0], ">= -0.99 and < 0.5"),
+    ("material.density arms.0.density", [-2.0, "steel"], ">= 1e-12 and <= 1000000"),
+    ("material.yield_strength arms.0.yield_strength", [0.0], ">= 0.001 and <= 1e+15"),
+    ("arms.0.material", ["steel"], 'did you mean "steel S235" or "steel S355"'),
+    ("interpolation.law", ["SIMP"], '"two-material" | "simp" | "pedersen"'),
+    ("interpolation.floor", [0.0, 1], "a number >= 1e-12 and < 1"),
+    ("arms.0.name", ["a/b", "", "-x", " x", "x ", "x\n", "..", "ärm"], "letters, digits"),
+    ("arms.0.name", ["12"], "not a digit"),
+    ("arms.0.name", [65 * "a"], "1 to 64"),
+    ("arms.1.name", ["Arm1_R12"], "files of both parts would have one name"),
+    ("arms.0.length", [0.0], "a number >= 1e-06 and <= 10000"),
+    ("arms.0.height arms.0.thickness arms.0.mesh_size", [0.0, -0.06], LENGTHS),
+    ("arms.0.thickness", [math.inf], "a finite number >= 1e-06 and <= 10000"),
+    ("arms.0.design arms.1.design", ["arm2"], "an earlier arm with a design of its own"),
+    ("arms.0.pattern", ["arm2"], "an earlier arm with a design of its own"),
+    ("arms.0.rigid arms.0.symmetric objective.follow design.shared_volume", [1], FLAGS),
+    ("arms.0.centre", [[0, 0, 0]], "only with rigid = true"),
+    ("arms.0.mass arms.0.inertia", [1.0], "only with rigid = true"),
+    ("arms.0.cells", [[0, 12], [0, 0]], "two integers >= 1"),
+    ("arms.0.cells", [[MAX_CELLS + 1, 1]], "<= 100000"),
+    ("arms.0.cells", [[200], [200.0, 12], "200x12"], "two integers"),
+    ("arms.0.cells", [[200, 12, 1]], "needs [[joints]]"),
+    ("arms.0.cells", [[200, 12, 1, 1]], "an array of three integers"),
+    ("arms.0.mesh_size arms.0.interface_offset", [0.01], "only with mesh"),
+    ("arms.0.cell_shape", ["hexagon"], '"quadrilateral" | "triangle"'),
+    ("arms.0.cell_shape", ["triangle"], "only with mesh"),
+    ("arms.0.element", ["cubic"], '"incompatible" | "linear" | "quadratic"'),
+    ("arms.0.symmetric_z arms.0.extruded", [True], "only with a solid arm"),
+    ("arms.0.passive", [0.5], "less than half of length = 1.0 [m]"),
+    ("arms.0.passive", [0.26], "volume_fraction = 0.5 can be met"),
+    ("arms.0.joint_stiffness arms.0.joint_damping arms.0.joint_mass arms.0.joint_inertia "
+     "arms.0.rotor_inertia arms.0.passive damping.stiffness_proportional objective.stress_margin "
+     "design.filter_radius optimizer.tolerance", [-1e-9], "a number >= 0"),
+    ("arms.0.gear_ratio", [0.0], "a number >= 0.001"),
+    ("motion.path", ["circle"], '"arc" | "line" | "points" | "joints"'),
+    ("motion.radius", [0.0], LENGTHS),
+    ("motion.flattening simulation.rho_inf", [-0.1, 1.01], "a number >= 0 and <= 1"),
+    ("motion.rpy", [[0, 0, 0]], 'with motion.path = "arc"'),
+    ("motion.initial_joints", [[0.1]], 'with motion.path = "arc"'),
+    ("motion.start", [[0.0]], "an array of two numbers"),
+    ("motion.start", [[0.0, 1.0]], 'the default, with motion.path = "arc"'),
+    ("motion.end", [[0.0, math.inf]], "an array of two finite numbers"),
+    ("motion.file", ["absent.csv"], "found neither /"),
+    ("motion.law", ["cubic"], '"quintic" | "septic" | "trapezoidal" | "s-curve"'),
+    ("motion.duration motion.horizon", [0, 0.0], "a number >= 0.0001 and <= 100000"),
+    ("motion.horizon", [1.0], "at least motion.duration = 1.9 [s]"),
+    ("motion.acceleration_share", [0.3], '0.25, the default, with motion.law = "quintic"'),
+    ("motion.max_speed motion.max_acceleration motion.max_jerk", [0.0, -1.0, "fast"],
+     "a number >= 1e-06 and <= 1e+12"),
+    ("motion.base", ["rail"], '"cart" | "fixed"'),
+    ("motion.base_position", [1], '0.0, the default, with motion.base = "cart"'),
+    ("motion.speed", [1.0], "10.0, the default"),
+    ("motion.start_angle", [1.0], "0.0, the default"),
+    ("motion.cart_follow", [math.nan], "a finite number"),
+    ("motion.joint_height objective.elbow_angle", ["low"], "a number"),
+    ("motion.elbow", [0, 1.0, True], "-1 | 1"),
+    ("motion.gravity", [-9.81, [0.0, 0.0, -9.81], [False, 0.0]], "two numbers"),
+    ("motion.gravity", [[0, 0, -9.81]], "two numbers without [[joints]]"),
+    ("motion.gravity", [[0.0, -math.inf]], "an array of two finite numbers"),
+    ("payload.mass payload.inertia motion.cart_mass", [-6.0, None], "a number >= 0"),
+    ("payload.mass", [math.nan], "a finite number >= 0"),
+    ("payload.inertia", [[1, 1]], "an array of six numbers"),
+    ("payload.offset", [[0, 1]], "an array of three numbers"),
+    ("payload.arm payload.interface", ["arm1"], "none without [[joints]]"),
+    ("reduction.method", ["guyan"], '"craig-bampton" | "modal" | "krylov" | "balanced"'),
+    ("reduction.coordinates", [0, "all"], 'an integer >= 1 | "auto"'),
+    ("reduction.coordinates", [2], 'an integer >= 3 with reduction.method = "craig-bampton"'),
+    ("reduction.coordinates", [4.0, True], "an integer >= 1"),
+    ("reduction.coordinates", [5178], "at most 5177"),  # 2*199*13 + 3
+    ("reduction.tolerance", [0.0], "a number >= 1e-06 and <= 0.5"),
+    ("reduction.tolerance", [1e-2], "0.001, the default, with reduction.coordinates = 4"),
+    ("reduction.shifts", [5.0, [0.0, -1.0]], "an array of numbers >= 0"),
+    ("reduction.shifts", [[]], "at least one number >= 0, none of them twice"),
+    ("reduction.shifts", [[5.0, 5.0]], "none of them twice"),
+    ("reduction.shifts", [[5.0]], '[0.0], the default, with reduction.method = "craig'),
+    ("reduction.band", [[0.0]], "an array of two numbers >= 0"),
+    ("reduction.band", [[9.0, 9.0]], "the lower of the two frequencies first"),
+    ("reduction.band", [[0.0, 9.0]], "[0.0, 50.0], the default, with reduction.method"),
+    ("simulation.tolerance", [0.0, 0.11], "a number >= 1e-12 and <= 0.1"),
+    ("simulation.integrator", ["euler"], '"radau" | "generalized-alpha"'),
+    ("simulation.stages", [1, 6], "an integer >= 2 and <= 5"),
+    ("simulation.sample", [0.0, 5e-324], "a number >= 1e-09 and <= 100000"),
+    ("simulation.sample", [3.1], "motion.horizon = 3.0 [s]"),
+    ("simulation.sample", [1e-9], "between 3e-07 and"),
+    ("simulation.stiffening", ["on"], 'true or false | "auto"'),
+    ("objective.kind", ["strain"], '"esl" | "compliance"'),
+    ("objective.load_cases design.continuation", [0], "an integer >= 1"),
+    ("objective.load_cases", [3001], "at most 3000"),
+    ("objective.gradient", ["adjoint"], '"esl" | "exact"'),
+    ("objective.worst", ["stress"], '"compliance" | "deviation"'),
+    ("objective.loads", [[]], "at least one load [F_x, F_y, moment]"),
+    ("objective.loads", [[[0, 0, 0]]], "none of them all zero"),
+    ("objective.loads", [[[0, 1e-300, 0]], [[0, 1e10, 0]]], "between 1e-09 and 1e+09 [N, N m]"),
+    ("objective.loads", [[[0, 1]], [0, 1, 0]], "an array of arrays of three numbers"),
+    ("objective.attached", ["springs"], '"rigid-body" | "point-mass" | "none"'),
+    ("objective.modes", [0], "an integer >= 1 and <= 50"),
+    ("objective.scenarios", ["mean"], '"sum" | "worst"'),
+    ("objective.direction", ["up"], '"minimize" | "maximize"'),
+    ("objective.exponent objective.stress_exponent", [1.0], "a number >= 2"),
+    ("objective.effort_weights constraints.peak_force", [[1.0, 2.0]],
+     "3 numbers, for cart, arm1, arm2"),
+    ("constraints.first_frequency", [0.0], "a number >= 1e-06 and <= 1000000000"),
+    ("constraints.tip_deflection", [-1e-3], "a number >= 1e-15 and <= 10000"),
+    (" ".join(f"constraints.{key}" for key in Constraints.model_fields), [-1.0], " >= "),
+    ("design.volume_fraction design.initial optimizer.move", [0.0, 1.01],
+     "a number >= 1e-06 and <= 1"),
+    ("design.minimum", [0.0], "a number >= 1e-09 and < 1"),
+    ("design.filter_radius", [1.001], "at most the length of the longest arm, 1.0 [m]"),
+    ("design.projection", [True, 0, "tanh"], 'false | "heaviside" | "robust"'),
+    ("design.sharpness interpolation.penalty", [0.9], "a number >= 1"),
+    ("design.minimum_member design.minimum_gap", [-1e-9], "a number >= 0 and <= 10000"),
+    ("design.erosion", [0.5], "a number >= 0.001 and <= 0.499"),
+    ("optimizer.max_iterations optimizer.exact_iterations", [-1, 400.0], "an integer >= 0"),
+    ("optimizer.kkt_tolerance", [-1e-9], "a number >= 0 and <= 1000000"),
+    ("material", [5], "a table with the keys name, young_modulus, poisson_ratio"),
+    ("motion", [[1, 2]], "a table with the keys path, radius"),
+    ("arms", [[]], "[[arms]], at least one"),
+    ("arms.1", ["arm2"], "a table with the keys name, length"),
+]  # fmt: skip
+# Values that are shown otherwise than they are, and contradictions shown at another key.
+SHOWN = [
+    ("material.young_modulus", 10**400, "material.young_modulus = 2**1328...", MODULI),
+    ("objective.load_cases", 16**5000, "objective.load_cases = 2**20000...", "at most 3000"),
+    ("optimizer.max_iterations", 16**5000, "= 2**20000...", "an integer >= 0 and <= 1000000"),
+    ("payload.mass", [[[[1.0]]]], "payload.mass = [[[...]]]", "a number >= 0"),
+    ("arms", {"name": "arm1"}, 'arms = {name = "arm1"}', "[[arms]], at least one"),
+    ("arms.0.name", "ARM2", 'arms.1.name = "arm2"', "no other arm has"),
+    ("arms.0.name", "arm2_face", 'arms.1.name = "arm2"', "both parts would have one name"),
+    ("motion.path", "joints", "motion.file = None (default)", "a table (CSV)"),
+    ("material.name", "stone", 'material = "stone"', "dolfinopt keys material"),
+    ("design.volume_fraction", 5e-4, "design.minimum = 0.001 (default)", "at most volume_fraction"),
+    ("design.initial", 1e-3, "design.minimum = 0.001 (default)", "less than initial = 0.001"),
 ]
 
 
-# Where two keys contradict each other the message may show the other one.
-def test_more_arms_than_any_machine_has():
-    """They were read for half a minute without a word."""
-    with pytest.raises(InputError, match="arms: 1001 of them, expected at most 1000"):
-        scene_from_dict(minimal(1001))
-
-
-SHOWN_KEY = {
-    ("design.volume_fraction", 5e-4): "design.minimum",
-    ("design.initial", 1e-3): "design.minimum",
-    ("arms.0.name", "ARM2"): "arms.1.name",
-    ("arms.0.name", "arm2_face"): "arms.1.name",
-    ("motion.path", "joints"): "motion.file",
-    ("material.name", "stone"): "material",
-}
+def written(value):
+    """Return a value as messages show it."""
+    text = json.dumps(value, ensure_ascii=False)
+    for ours, theirs in (("Infinity", "inf"), ("NaN", "nan"), ("null", "None")):
+        text = text.replace(ours, theirs)
+    return text
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "shown", "allowed"),
-    BAD_VALUES,
-    ids=[f"{path}={shown}" for path, _, shown, _ in BAD_VALUES],
+    ("path", "values", "allowed"),
+    [(path, values, allowed) for paths, values, allowed in BAD_VALUES for path in paths.split()],
 )
-def test_bad_value(path, value, shown, allowed):
-    message = message_of(changed(path, value))
-    place, _, reason = message.removeprefix(f"{FILE}: ").partition(": expected ")
-    key, _, found = place.partition(" = ")
-    named = key.partition(" (")[0]
-    hashable = value if isinstance(value, (str, int, float)) else None
-    assert named == SHOWN_KEY.get((path, hashable), path)
-    assert found == shown if len(shown) < 60 else shown in found
-    assert allowed in reason
+def test_bad_value(path, values, allowed):
+    for value in values:
+        message = refused(changed(path, value))
+        place, _, reason = message.removeprefix(f"{FILE}: ").partition(": expected ")
+        key, _, found = place.partition(" = ")
+        assert key.partition(" (")[0] == path
+        assert found == written(value) if len(found) < 60 else found[:50] in written(value)
+        assert allowed in reason and "more)" not in message
+
+
+@pytest.mark.parametrize(("path", "value", "shown", "allowed"), SHOWN, ids=range(len(SHOWN)))
+def test_value_that_is_shown_otherwise(path, value, shown, allowed):
+    message = refused(changed(path, value))
+    place, _, reason = message.partition(": expected ")
+    assert shown in place.replace(" (arm2)", "").replace(" (ARM2)", "") and allowed in reason
     assert "more)" not in message
+
+
+def test_more_arms_than_any_machine_has():
+    """They were read for half a minute without a word."""
+    refused(minimal(1001), "arms: 1001", "at most 1000")
 
 
 def test_a_mesh_excludes_cells():
@@ -720,7 +557,7 @@ def test_a_mesh_excludes_cells():
     assert second == first.model_copy(update={"name": "arm2"})
     assert third == Arm(**ARM | {"name": "arm3"}, cells=(20, 2))
     data["arms"][2] |= {"mesh": bores}
-    assert "not both" in message_of(data)
+    refused(data, "not both")
     scene = scene_from_dict(minimal(), overrides=[f"arms.mesh={bores}", "arms.1.mesh_size=0.01"])
     assert [arm.mesh_size for arm in scene.arms] == [None, 0.01]
     assert scene.cell_counts == {0: 0, 1: 600}
@@ -747,82 +584,115 @@ def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, tex
     path = tmp_path / file
     path.write_text(text)
     data = minimal()
-    before = {"mesh": "meshes/arm_bores.geo", "mesh_size": 0.004, "cell_shape": "triangle"}
-    data["arms"][0] |= before
+    data["arms"][0] |= {
+        "mesh": "meshes/arm_bores.geo",
+        "mesh_size": 0.004,
+        "cell_shape": "triangle",
+    }
     data["arms"][1] |= {"mesh": str(path)}
     arm = scene_from_dict(data).arms[1]
     assert (arm.mesh_size, arm.cell_shape, arm.cells) == (size, shape, None)
     stated = scene_from_dict(data, overrides=["arms.arm1.mesh_size=0.003"]).arms
     assert [one.mesh_size for one in stated] == [0.003, size]
-    own = data["arms"][1] | {"cells": [20, 2]}  # in place of the mesh
-    data["arms"][1] = {key: value for key, value in own.items() if key != "mesh"}
-    assert scene_from_dict(data).arms[1] == Arm(**ARM | {"name": "arm2"}, cells=(20, 2))
 
 
 @pytest.mark.parametrize(
-    ("suffix", "keys", "reason"),
+    ("suffix", "keys", "words"),
     [
-        (".toml", {}, "ends in .geo, .msh, .step, .stp"),
-        (".msh", {"mesh_size": 0.01}, "a .msh file has its cells"),
-        (".msh", {"cell_shape": "triangle"}, "a .msh file has its cells"),
-        (".geo", {"mesh_size": 0.07}, "at most height = 0.06 [m]: a cell must fit into the arm"),
-        (
-            ".geo",
-            {"cell_shape": "triangle", "element": "incompatible"},
-            '= "incompatible": expected "linear" or "quadratic" with triangles',
-        ),
+        (".toml", {}, [".geo, .msh, .step, .stp"]),
+        (".msh", {"mesh_size": 0.01}, [".msh", "its cells"]),
+        (".msh", {"cell_shape": "triangle"}, [".msh", "its cells"]),
+        (".geo", {"mesh_size": 0.07}, ["at most height = 0.06 [m]"]),
+        (".geo", {"cell_shape": "triangle", "element": "incompatible"},
+         ['= "incompatible"', '"linear" or "quadratic"', "triangles"]),
     ],
-)
-def test_kinds_of_mesh_files(tmp_path, suffix, keys, reason):
+)  # fmt: skip
+def test_kinds_of_mesh_files(tmp_path, suffix, keys, words):
     path = tmp_path / f"arm{suffix}"
     path.write_text("")
     data = minimal(1)
     data["arms"][0] |= {"mesh": str(path)} | keys
-    assert reason in message_of(data)
+    refused(data, *words)
 
 
 def test_every_key_refuses_something():
-    refused = {path.replace("arms.0.", "arms.") for path, *_ in BAD_VALUES}
-    refused |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    refused |= {
-        f"arms.regions.{key}" for key in ("kind", "box", "circle", "depth")
-    }  # see test_regions
-    known = {info.key for info in describe_keys()}
-    tables = ("control", "closure", "joints", "arms.interfaces")  # see test_joints
-    optional = {key for key in known if key.startswith(tables)}
-    assert known - optional <= refused
+    paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
+    tried = {path.replace("arms.0.", "arms.") for path in paths}
+    tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
+    # In files of their own: test_regions, test_joints, test_machine_scenes.
+    elsewhere = ("arms.regions", "control", "closure", "joints", "arms.interfaces")
+    assert {info.key for info in describe_keys() if not info.key.startswith(elsewhere)} <= tried
 
 
-@pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
-@pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov", "balanced"])
-@pytest.mark.parametrize("kind", ["esl", "compliance"])
-def test_all_choices_are_accepted(integrator, method, kind):
-    objective = {"kind": kind, "gradient": "esl"}  # not all have an adjoint
-    tables = {"simulation": {"integrator": integrator}, "objective": objective}
-    scene = scene_from_dict(minimal(reduction={"method": method}, **tables))
-    assert (scene.simulation.integrator, scene.reduction.method) == (integrator, method)
-    assert scene.objective.kind == kind
+def test_all_choices_are_accepted():
+    for integrator in ("radau", "generalized-alpha"):
+        for method in ("modal", "craig-bampton", "krylov", "balanced"):
+            for kind in ("esl", "compliance"):
+                data = minimal(
+                    reduction={"method": method},
+                    simulation={"integrator": integrator},
+                    objective={"kind": kind, "gradient": "esl"},  # not all have an adjoint
+                )
+                scene = scene_from_dict(data)
+                assert (scene.simulation.integrator, scene.reduction.method) == (integrator, method)
+                assert scene.objective.kind == kind
 
 
-@pytest.mark.parametrize(
-    ("n_arms", "motion", "shown", "reason"),
-    [
-        (2, {"path": "line", "radius": 2.0}, "radius = 2.0", "1.0, the default, with motion.path"),
-        (2, {"path": "line", "flattening": 0}, "flattening = 0", "1.0, the default"),
-        (2, {"path": "line", "end": [-1, 0]}, "end = [-1, 0]", "another point than motion.start"),
-        (2, {"base": "fixed", "cart_follow": 0.2}, "cart_follow = 0.2", "0.5, the default"),
-        (2, {"file": str(TWO_ARM)}, "file = ", 'none with motion.path = "arc"'),
-        (2, {"path": "points"}, "file = None (default)", "the path of a table (CSV)"),
-        (2, {"path": "joints", "file": str(TWO_ARM), "elbow": 1}, "elbow = 1", "-1, the default"),
-        (1, {"cart_follow": 0.0}, "cart_follow = 0.0", "0.5, the default, with one arm"),
-        (1, {"base": "fixed"}, 'base = "fixed"', '"cart" with one arm and motion.path = "arc"'),
-    ],
-    ids=str,
-)
-def test_motion_keys_that_do_nothing(n_arms, motion, shown, reason):
-    message = message_of(minimal(n_arms, motion=motion))
-    assert message.startswith(f"{FILE}: motion.{shown}")
-    assert f": expected {reason}" in message and "more)" not in message
+KRYLOV, BALANCED = {"reduction.method": "krylov"}, {"reduction.method": "balanced"}
+LINE, JOINTS = {"motion.path": "line"}, {"motion.path": "joints", "motion.file": str(TWO_ARM)}
+SHARED = {"arms.1.design": "arm1"}
+EXACT = {"objective.gradient": "exact", "simulation.integrator": "generalized-alpha"}
+CONTRADICTIONS = [
+    # changes, the key that is shown, what is allowed
+    (2, LINE | {"motion.radius": 2.0}, "motion.radius = 2.0", "1.0, the default, with motion.path"),
+    (2, LINE | {"motion.flattening": 0}, "motion.flattening = 0", "1.0, the default"),
+    (2, LINE | {"motion.end": [-1, 0]}, "motion.end = [-1, 0]", "another point than motion.start"),
+    (2, {"motion.base": "fixed", "motion.cart_follow": 0.2}, "motion.cart_follow = 0.2", "0.5"),
+    (2, {"motion.file": str(TWO_ARM)}, "motion.file = ", 'none with motion.path = "arc"'),
+    (2, {"motion.path": "points"}, "motion.file = None (default)", "the path of a table (CSV)"),
+    (2, JOINTS | {"motion.elbow": 1}, "motion.elbow = 1", "-1, the default"),
+    (1, {"motion.cart_follow": 0.0}, "motion.cart_follow = 0.0", "0.5, the default, with one arm"),
+    (1, {"motion.base": "fixed"}, 'motion.base = "fixed"', '"cart" with one arm'),
+    (2, EXACT, 'simulation.integrator = "generalized-alpha"', '"radau"'),
+    # Exact by default: the way out is told.
+    (2, EXACT | {"objective": {"kind": "compliance"}}, "simulation.integrator",
+     'state objective.gradient = "esl"'),
+    (2, KRYLOV | {"reduction.shifts": [0.0, 9.0], "reduction.coordinates": 5},
+     "reduction.coordinates = 5", "an integer >= 6"),
+    (2, KRYLOV | {"reduction.coordinates": 2}, "reduction.coordinates = 2", "an integer >= 3"),
+    (2, BALANCED | {"damping.stiffness_proportional": 0.0},
+     "damping.stiffness_proportional = 0.0", 'a number > 0 with reduction.method = "balanced"'),
+    (2, BALANCED | {"objective.gradient": "exact"}, 'reduction.method = "balanced"',
+     '"craig-bampton", "modal" or "krylov" with objective.gradient = "exact"'),
+    (2, {"arms.1.cells": [2, 1], "reduction.coordinates": 8}, "reduction.coordinates",
+     'at most 7, the degrees of freedom of arm "arm2" with cells = [2, 1]'),
+    (2, {"arms.1.height": -1}, "arms.1.height (arm2) = -1", "(height in the plane of motion"),
+    # An arm that shares a design.
+    (2, SHARED | {"arms.1.length": 0.9}, "arms.1.length (arm2) = 0.9", "1.0 as arm1"),
+    (2, SHARED | {"arms.1.density": 1.0}, "arms.1.density (arm2) = 1.0", "no value"),
+    (2, SHARED | {"arms.1.rigid": True}, "arms.1", "only one of design, pattern"),
+    (2, {"arms.1.design": "arm3"}, "arms.1.design", 'design of its own: "arm1"'),
+    (2, {"arms.0.rigid": True, "arms.1.rigid": True}, "arms", "at least one arm with a design"),
+    # Limits and what they need.
+    (2, {"objective.kind": "mass", "constraints.mass": 1.0}, "objective", "under [constraints]"),
+    (2, {"constraints.tip_deflection": [1e-3, 1e-3, 1e-3]}, "constraints.tip_deflection = [",
+     "2 numbers, for arm1, arm2"),
+    (2, {"constraints.tip_deflection": [1e-3, 0.0]}, "constraints.tip_deflection = [0.001, 0.0]",
+     "a number >= 1e-15 and <= 10000 | an array of numbers"),
+    (2, {"constraints.first_frequency": [10.0, 20.0], "arms.1.rigid": True},
+     "constraints.first_frequency = [10.0, 20.0]", "1 number, for arm1"),
+    (2, BALANCED | {"objective": {"kind": "static", "gradient": "exact"},
+                    "constraints.deviation": 0.01}, "reduction.method", "has no adjoint"),
+    *((2, {"scenarios": [{"changes": ["payload.mass=4"]}], "objective.kind": kind},
+       f'objective.kind = "{kind}"', '"deviation"') for kind in ("static", "eigenfrequency")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("n_arms", "changes", "shown", "allowed"), CONTRADICTIONS)
+def test_contradictions(n_arms, changes, shown, allowed):
+    pairs = [part for pair in changes.items() for part in pair]
+    message = refused(changed(*pairs, n_arms=n_arms), allowed)
+    assert message.startswith(f"{FILE}: {shown}") and "more)" not in message
 
 
 def test_one_arm_without_choices_is_accepted():
@@ -863,48 +733,12 @@ def test_file_of_the_package_is_found_last(tmp_path, monkeypatch):
 
 def test_missing_file_is_named_with_all_places(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    message = message_of(minimal(motion=TABLE))
-    assert message.startswith(f'{FILE}: motion.file = "table.csv": expected the path of a file')
-    places = [tmp_path / "some" / "table.csv", tmp_path / "table.csv"]
-    assert message.endswith(f"found neither {places[0]} nor {places[1]}")
-    message = message_of(minimal(), "motion.path=points", "motion.file=table.csv")
-    assert message.startswith(f'{FILE} with --set motion.file=table.csv: motion.file = "table.csv"')
-
-
-@pytest.mark.parametrize("value", ["", ".", "a\0b", 5000 * "x", "\ud800", "/"], ids=range(6))
-def test_what_is_no_file_name_is_refused(value):
-    assert "motion.file = " in message_of(changed("motion.file", value))
-
-
-@pytest.mark.parametrize(
-    ("tables", "shown", "reason"),
-    [
-        (
-            {"reduction": {"method": "krylov", "shifts": [0.0, 9.0], "coordinates": 5}},
-            "reduction.coordinates = 5",
-            "an integer >= 6",
-        ),
-        (
-            {"reduction": {"method": "krylov", "coordinates": 2}},
-            "reduction.coordinates = 2",
-            "an integer >= 3",
-        ),
-        (
-            {"reduction": {"method": "balanced"}, "damping": {"stiffness_proportional": 0.0}},
-            "damping.stiffness_proportional = 0.0",
-            'a number > 0 with reduction.method = "balanced"',
-        ),
-        (
-            {"reduction": {"method": "balanced"}, "objective": {"gradient": "exact"}},
-            'reduction.method = "balanced"',
-            '"craig-bampton", "modal" or "krylov" with objective.gradient = "exact"',
-        ),
-    ],
-    ids=["shifts", "loads", "undamped", "adjoint"],
-)
-def test_reductions_that_cannot_be(tables, shown, reason):
-    message = message_of(minimal(**tables))
-    assert message.startswith(f"{FILE}: {shown}: expected {reason}") and "more)" not in message
+    places = str(tmp_path / "some" / "table.csv"), str(tmp_path / "table.csv")
+    refused(minimal(motion=TABLE), f'{FILE}: motion.file = "table.csv"', *places)
+    overrides = ["motion.path=points", "motion.file=table.csv"]
+    refused(minimal(), f'{FILE} with --set {overrides[1]}: motion.file = "', overrides=overrides)
+    for value in ("", ".", "a\0b", 5000 * "x", "\ud800", "/"):
+        refused(changed("motion.file", value), "motion.file = ")
 
 
 def test_several_shifts_and_a_band_are_accepted():
@@ -916,52 +750,15 @@ def test_several_shifts_and_a_band_are_accepted():
     assert scene_from_dict(minimal(reduction=balanced)).reduction.band == (5.0, 80.0)
 
 
-def test_arm_is_named_in_the_path():
-    message = message_of(changed("arms.1.height", -1))
-    assert message.startswith(f"{FILE}: arms.1.height (arm2) = -1: expected a number >= 1e-06 and")
-    assert " (height in the plane of motion" in message
-    assert message.endswith("[m])")
-
-
-def test_too_many_coordinates_for_one_of_the_arms():
-    data = changed("arms.1.cells", [2, 1])
-    message = message_of(data | {"reduction": {"coordinates": 8}})
-    assert 'at most 7, the degrees of freedom of arm "arm2" with cells = [2, 1]' in message
-
-
-def test_several_problems_are_counted():
-    data = changed("payload.mass", -1)
-    data["design"] = {"initial": 2, "filter_radius": "x"}
-    assert message_of(data).endswith("(and 2 more)")
-
-
-def test_taken_over_problem_counts_once():
-    data = minimal(3)
-    data["arms"][0] |= {"length": -1, "cells": [0, 0], "passive": 3}
-    data["arms"][2]["length"] = -2  # its own
-    message = message_of(data)
-    assert message.startswith(f"{FILE}: arms.0.length (arm1) = -1")
-    assert message.endswith("(and 2 more)")  # cells of the first arm, length of the last
-
-
-def test_long_value_is_cut():
-    message = message_of(changed("objective.kind", 10_000 * "x"))
-    assert "..." in message and len(message) < 500
-
-
-def test_line_ends_and_control_characters_are_escaped():
+def test_whatever_is_shown_is_short_and_printable():
+    assert len(refused(changed("objective.kind", 10_000 * "x"), "...")) < 500
     with pytest.raises(InputError) as caught:
         scene_from_dict(changed("objective.kind", "\x1b[31m\u2028\n"), "a\nb\udc80.toml")
     message = str(caught.value)
     assert message.startswith(r"a\nb\udc80.toml: objective.kind = ") and message.isprintable()
     assert r"\u001b[31m\u2028\n" in message
-
-
-@pytest.mark.parametrize(
-    ("data", "found"), [(5, "5"), ([1], "[1]"), (None, "None"), ("name", '"name"')]
-)
-def test_scene_that_is_no_table(data, found):
-    assert f"expected a table of scene keys, found {found}" in message_of(data)
+    for data in (5, [1], None, "name"):
+        refused(data, "a table of scene keys", written(data))
 
 
 # --- unknown and missing keys ----------------------------------------------------------------
@@ -975,12 +772,8 @@ def test_scene_that_is_no_table(data, found):
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
         ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
         ("radius", "radius", "arms.interfaces.radius or motion.radius", "name, material"),
-        (
-            "tolerance",
-            "tolerance",
-            "reduction.tolerance or simulation.tolerance or optimizer.tolerance",
-            "name, mat",
-        ),
+        ("tolerance", "tolerance",
+         "reduction.tolerance or simulation.tolerance or optimizer.tolerance", "name, mat"),
         ("volum_fraction", "volum_fraction", "design.volume_fraction", "name, material"),
         ("arms.0.blocks", "arms.0.blocks (arm1)", None, "name, length, height, thickness, cells"),
         ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
@@ -988,34 +781,20 @@ def test_scene_that_is_no_table(data, found):
         ("payload.", 'payload.""', None, "mass, inertia"),
         ("source", "source", "closure", "name, material"),
         ("_source", "_source", None, "name, material"),
+        ("payload.1", "payload.1", None, "mass"),
     ],
-)
+)  # fmt: skip
 def test_unknown_key(path, unknown, closest, allowed):
-    message = message_of(changed(path, 1))
-    advice = f"; did you mean {closest}? allowed: " if closest else "; allowed: "
-    assert message.startswith(f"{FILE}: unknown key {unknown}{advice}{allowed}")
-
-
-def test_exact_gradient_needs_radau():
-    data = minimal()
-    data["objective"] = {"gradient": "exact"}
-    data["simulation"] = {"integrator": "generalized-alpha"}
-    assert 'simulation.integrator = "generalized-alpha": expected "radau"' in message_of(data)
-    data["objective"] = {"kind": "compliance"}  # exact by default: the way out is told
-    assert message_of(data).endswith('; or state objective.gradient = "esl"')
+    message = refused(changed(path, 1), f"{FILE}: unknown key {unknown}; ", allowed)
+    assert (f"did you mean {closest}?" in message) if closest else "did you mean" not in message
 
 
 def test_misspelt_key_comes_before_the_missing_one():
     data = minimal()
     data["material"]["youngs_modulus"] = data["material"].pop("young_modulus")
-    message = message_of(data)
-    assert "unknown key material.youngs_modulus; did you mean material.young_modulus?" in message
-    assert message.endswith("(and 1 more)")
-
-
-def test_key_that_is_no_string():
-    assert "unknown key payload.1; allowed: mass" in message_of(minimal(payload={1: 2}))
-    assert "unknown key 1; allowed: name" in message_of(minimal() | {1: 2})
+    words = "unknown key material.youngs_modulus", "material.young_modulus?"
+    assert refused(data, *words).endswith("(and 1 more)")
+    refused(minimal(payload={1: 2}), "unknown key payload.1", "mass")  # a key that is no string
 
 
 @pytest.mark.parametrize(
@@ -1037,30 +816,29 @@ def test_missing_key(table, key, described):
     data = minimal()
     node = data["arms"][int(table[-1])] if table.startswith("arms") else data[table]
     del node[key]
-    message = message_of(data)
     named = f"{table}.{key}" + (" (arm1)" if table == "arms.0" and key != "name" else "")
-    assert message.startswith(f"{FILE}: missing key {named} (")
-    assert described in message and message.endswith(")")
+    message = refused(data, f"{FILE}: missing key {named} (", described)
     assert "more)" not in message  # the arms that would take it over do not count
+
+
+def test_missing_tables():
+    for table, key in (("material", "material.young_modulus"), ("arms", "arms")):
+        data = minimal()
+        del data[table]
+        refused(data, f"missing key {key} (")
 
 
 @pytest.mark.parametrize(
     ("table", "remedy"),
-    [
-        ("motion", 'write [motion] with path = "arc", radius, duration and horizon'),
-        ("payload", "write [payload] with mass = 2.0 [kg], or mass = 0.0 without a load"),
-    ],
+    [("motion", "[motion] with path"), ("payload", "[payload] with mass")],
 )
 def test_motion_and_payload_are_stated(table, remedy):
     """Not even a scene without dynamic responses has them by default: every run simulates."""
     data = minimal(objective={"kind": "static"})
-    stated = data.pop(table)
-    message = message_of(data)
-    assert message.startswith(f"{FILE}: missing table [{table}] (") and message.endswith(remedy)
-    [[key, value]] = stated.items()
-    assert scene_from_dict(data, overrides=[f"{table}.{key}={value}"]) == scene_from_dict(
-        minimal(objective={"kind": "static"})
-    )
+    [[key, value]] = data.pop(table).items()
+    refused(data, f"{FILE}: missing table [{table}] (", remedy)
+    whole = scene_from_dict(minimal(objective={"kind": "static"}))
+    assert scene_from_dict(data, overrides=[f"{table}.{key}={value}"]) == whole
 
 
 @pytest.mark.parametrize(
@@ -1092,27 +870,11 @@ def test_gradient_is_exact_but_of_the_esl_objective_alone(tables, gradient):
         assert scene_from_dict(scene.to_tree(), overrides=[change]).objective.gradient == later
 
 
-def test_scenarios_have_the_gradient_of_their_scene():
-    scene = scene_from_dict(minimal(scenarios=[{"changes": ["payload.mass=4"]}]))
-    assert [one.objective.gradient for one in pose_scenarios(scene)] == ["esl"]
-
-
-def test_missing_tables():
-    data = minimal()
-    del data["material"]
-    assert "missing key material.young_modulus (" in message_of(data)
-    del data["arms"]
-    data["material"] = dict(MATERIAL)
-    assert "missing key arms (arms from the cart outwards)" in message_of(data)
-
-
 # --- files -----------------------------------------------------------------------------------
 
 
-def load_error(path):
-    with pytest.raises(InputError) as caught:
-        load_scene(path)
-    return checked_line(caught, path)
+def load_error(path, *words):
+    return refusal(lambda: load_scene(path), str(path), *words)
 
 
 # The required tables, to follow the lines in question.
@@ -1136,29 +898,28 @@ mass = 6.0
 
 
 @pytest.mark.parametrize(
-    ("text", "parts"),
+    ("text", "words"),
     [
         ("", ["missing key material.young_modulus"]),
-        ("name = 'a'\n[material\ndensity = 1", ["line 2, column 10: not valid TOML: Expected"]),
-        ("name = ", ["line 1, column 8: not valid TOML: Invalid value"]),
-        ("name = 'a'\nx = [1,\n", ["line 3, column 1: not valid TOML: "]),
-        ("name = 1\nname = 2", ["line 2, column 9: not valid TOML: Cannot overwrite"]),
-        ("name = " + 5000 * "1", ["not valid TOML: Exceeds the limit"]),
-        ("name = " + 2000 * "[", ["nested too deeply"]),
+        ("name = 'a'\n[material\ndensity = 1", ["line 2, column 10", "TOML"]),
+        ("name = ", ["line 1, column 8", "TOML"]),
+        ("name = 'a'\nx = [1,\n", ["line 3, column 1", "TOML"]),
+        ("name = 1\nname = 2", ["line 2, column 9", "TOML"]),
+        ("name = " + 5000 * "1", ["TOML"]),
+        ("name = " + 2000 * "[", ["nested"]),
         ("name = 0x" + 5000 * "f" + REQUIRED, ["name = 2**19999...", "a string"]),
         ("payload.mass = 1e400" + REQUIRED, ["payload.mass = inf", "a finite number >= 0"]),
         ("payload.mass = nan" + REQUIRED, ["payload.mass = nan", "a finite number >= 0"]),
         ("payload.mass = 1979-05-27" + REQUIRED, ["payload.mass = 1979-05-27", "number >= 0"]),
         ("[[material]]\ndensity = 1", ["material = [{density = 1}]", "a table with the keys"]),
+        ("name = 'a'\n# L\udce4nge\n", ["line 2", "UTF-8"]),  # a byte of Latin-1
     ],
-    ids=range(12),
+    ids=range(13),
 )
-def test_bad_file_content(tmp_path, text, parts):
+def test_bad_file_content(tmp_path, text, words):
     path = tmp_path / "bad.toml"
-    path.write_text(text)
-    message = load_error(path)
-    for part in parts:
-        assert part in message
+    path.write_text(text, errors="surrogateescape")
+    load_error(path, *words)
 
 
 def test_required_tables_are_enough(tmp_path):
@@ -1167,33 +928,25 @@ def test_required_tables_are_enough(tmp_path):
     assert load_scene(path) == scene_from_dict(minimal(1, name="one"))
 
 
-def test_file_that_is_not_utf8(tmp_path):
-    path = tmp_path / "latin.toml"
-    path.write_bytes("name = 'a'\n# Länge\n".encode("latin-1"))
-    assert "line 2: not UTF-8" in load_error(path)
-
-
-def test_file_that_is_missing(tmp_path):
-    assert "no such file" in load_error(tmp_path / "absent.toml")
-    assert "is a directory" in load_error(tmp_path)
+def test_files_that_cannot_be_read(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    assert "cannot be read (Not a directory)" in load_error(tmp_path / "file" / "scene.toml")
-    assert "cannot be read (File name too long)" in load_error("a" * 5000)
-    assert "is a directory" in load_error(".")
-
-
-def test_file_name_with_a_zero_byte():
-    with pytest.raises(InputError, match=r"^a\\x00b: not a file name; give the path"):
+    for path, reason in (
+        (tmp_path / "absent.toml", "no such file"),
+        (tmp_path, "is a directory"),
+        (".", "is a directory"),
+        (tmp_path / "file" / "scene.toml", "Not a directory"),
+        ("a" * 5000, "File name too long"),
+    ):
+        load_error(path, reason)
+    with pytest.raises(InputError, match=r"a\\x00b: not a file name"):
         load_scene("a\0b")
 
-
-def test_file_that_may_not_be_read(monkeypatch):
     # The superuser may read every file, so that file modes cannot make this happen.
-    def refuse(self):
+    def deny(self):
         raise PermissionError(13, "Permission denied", str(self))
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
-    assert "permission denied; make the file readable" in load_error(TWO_ARM)
+    monkeypatch.setattr(Path, "read_bytes", deny)
+    load_error(TWO_ARM, "permission denied", "make the file readable")
 
 
 # --- whatever else comes ---------------------------------------------------------------------
@@ -1303,58 +1056,45 @@ def test_described_defaults():
 
 
 def test_import_needs_no_mpi_nor_numpy():
-    code = (
-        "import sys, dolfinopt.scene.load; print('numpy' in sys.modules, 'mpi4py' in sys.modules)"
-    )
+    code = "import sys, dolfinopt.scene.load; print({'numpy', 'mpi4py'} & set(sys.modules))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.split() == ["False", "False"]
+    assert run.stdout.strip() == "set()"
 
 
 # --- scenarios -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("scenario", "message"),
+    ("scenario", "words"),
     [
-        ({"changes": 5}, "scenarios.0.changes = 5: expected an array of strings"),
-        ({"changes": [], "weight": 0}, "scenarios.0.weight = 0: expected a number >= 1e-09"),
-        ({"weight": 1.0}, "missing key scenarios.0.changes"),
-        ({"changes": [], "wait": 1.0}, "unknown key scenarios.0.wait; did you mean scenarios.0.w"),
+        ({"changes": 5}, ["scenarios.0.changes = 5", "an array of strings"]),
+        ({"changes": [], "weight": 0}, ["scenarios.0.weight = 0", "a number >= 1e-09"]),
+        ({"weight": 1.0}, ["missing key scenarios.0.changes"]),
+        ({"changes": [], "wait": 1.0}, ["unknown key scenarios.0.wait", "scenarios.0.weight?"]),
         (
             {"changes": ["arms.length=2"]},
-            "expected keys of motion, control, closure, payload, damping or material",
+            ["motion, control, closure, payload, damping or material"],
         ),
-        ({"changes": ["material.poisson_ratio=0.2"]}, "expected no material.poisson_ratio"),
-        ({"changes": ["payload.mas=2"]}, "with --set payload.mas=2: unknown key payload.mas"),
-        ({"changes": ["payload.mass=-2"]}, "payload.mass = -2: expected a number >= 0"),
-        (5, "expected a table with the keys changes, weight"),
+        ({"changes": ["material.poisson_ratio=0.2"]}, ["no material.poisson_ratio"]),
+        ({"changes": ["payload.mas=2"]}, ["with --set payload.mas=2", "unknown key payload.mas"]),
+        ({"changes": ["payload.mass=-2"]}, ["payload.mass = -2", "a number >= 0"]),
+        (5, ["a table with the keys changes, weight"]),
     ],
 )
-def test_bad_scenario(scenario, message):
-    assert message in message_of(minimal(scenarios=[scenario]))
+def test_bad_scenario(scenario, words):
+    refused(minimal(scenarios=[scenario]), *words)
 
 
 def test_scenarios_change_what_they_name():
-    scene = scene_from_dict(
-        minimal(
-            scenarios=[
-                {"changes": ["payload.mass=4", "motion.flattening=0.5"]},
-                {"changes": ["material.density=2800"], "weight": 0.5},
-            ]
-        )
-    )
+    first = {"changes": ["payload.mass=4", "motion.flattening=0.5"]}
+    data = minimal(scenarios=[first, {"changes": ["material.density=2800"], "weight": 0.5}])
+    scene = scene_from_dict(data)
     first, second = pose_scenarios(scene)
     assert (first.payload.mass, first.motion.flattening) == (4.0, 0.5)
     assert (second.payload.mass, second.material.density) == (6.0, 2800.0)
     assert first.scenarios == second.scenarios == ()
+    assert first.objective.gradient == second.objective.gradient == scene.objective.gradient
     assert scene_from_dict(scene.to_dict()) == scene
-
-
-def test_scenarios_need_a_motion():
-    scenarios = [{"changes": ["payload.mass=4"]}]
-    for kind in ("static", "eigenfrequency"):
-        message = message_of(minimal(scenarios=scenarios, objective={"kind": kind}))
-        assert '"esl", "compliance", "deviation"' in message and "with [[scenarios]]" in message
 
 
 # --- arms that share a design, are rigid, or come from a file --------------------------------
@@ -1370,34 +1110,6 @@ def test_who_owns_which_design():
     assert [arm.rigid for arm in scene.arms] == [False, True, False, False]  # not inherited
 
 
-@pytest.mark.parametrize(
-    ("arm", "reason"),
-    [
-        ({"design": "arm1", "length": 0.9}, "arms.1.length (arm2) = 0.9: expected 1.0 as arm1 has"),
-        (
-            {"design": "arm1", "density": 1.0},
-            "arms.1.density (arm2) = 1.0: expected no value, as in arm1",
-        ),
-        (
-            {"design": "arm1", "rigid": True},
-            "only one of design, pattern, rigid and sid, found design and",
-        ),
-        ({"design": "arm3"}, 'an earlier arm with a design of its own: "arm1"'),
-    ],
-)
-def test_contradictions_of_an_arm(arm, reason):
-    data = minimal()
-    data["arms"][1] |= arm
-    assert reason in message_of(data)
-
-
-def test_something_must_be_designed():
-    data = minimal()
-    for arm in data["arms"]:
-        arm["rigid"] = True
-    assert "at least one arm with a design" in message_of(data)
-
-
 def test_own_material():
     data = minimal()
     data["arms"][0] |= {"young_modulus": 210e9}
@@ -1409,18 +1121,15 @@ def test_own_material():
     assert scene.material.young_modulus == 70e9
 
 
-@pytest.mark.parametrize(
-    "tables",
-    [
+def test_nothing_attached_needs_solid_ends():
+    for tables in (
         {"objective": {"kind": "eigenfrequency", "attached": "none"}},
         {"objective": {"attached": "none"}, "constraints": {"first_frequency": 10.0}},
-    ],
-)
-def test_nothing_attached_needs_solid_ends(tables):
-    data = minimal(**tables)
-    scene_from_dict(data)  # they have them by default
-    data["arms"][0]["passive"] = 0.0
-    assert "arms.0.passive (arm1) = 0.0: expected more than 0" in message_of(data)
+    ):
+        data = minimal(**tables)
+        scene_from_dict(data)  # they have them by default
+        data["arms"][0]["passive"] = 0.0
+        refused(data, "arms.0.passive (arm1) = 0.0", "more than 0")
 
 
 @pytest.mark.parametrize(
@@ -1446,41 +1155,18 @@ def test_volume_is_limited_unless_mass_is(tables, limit):
     assert stated.design.volume_fraction == tables.get("design", {}).get("volume_fraction")
 
 
-def test_lightest_design_needs_a_limit():
-    data = minimal(objective={"kind": "mass"}, constraints={"mass": 1.0})
-    assert "expected a limit under [constraints] with it" in message_of(data)
-    scene_from_dict(minimal(objective={"kind": "mass", "direction": "maximize"}))
-
-
 def test_limits_of_every_arm():
     """One for all or one for each: of the flexible arms, and of those with a design."""
-    data = minimal(constraints={"first_frequency": [10.0, 20.0]})
-    assert scene_from_dict(data).constraints.first_frequency == (10.0, 20.0)
-    assert scene_from_dict(scene_from_dict(data).to_dict()).constraints == (
-        scene_from_dict(data).constraints
-    )
-    data["arms"][1]["rigid"] = True
-    assert "first_frequency = [10.0, 20.0]: expected 1 number, for arm1" in message_of(data)
-    data = minimal(constraints={"tip_deflection": [1e-3, 1e-3, 1e-3]})
-    assert "expected 2 numbers, for arm1, arm2" in message_of(data)
-    assert "a number >= 1e-15 and <= 10000 | an array of numbers" in message_of(
-        minimal(constraints={"tip_deflection": [1e-3, 0.0]})
-    )
+    scene = scene_from_dict(minimal(constraints={"first_frequency": [10.0, 20.0]}))
+    assert scene.constraints.first_frequency == (10.0, 20.0)
+    assert scene_from_dict(scene.to_dict()).constraints == scene.constraints
+    scene_from_dict(minimal(objective={"kind": "mass", "direction": "maximize"}))  # no limit
 
 
-def test_limits_of_the_motion_need_what_its_gradient_needs():
-    """An objective without a motion does not let them pass; scenarios may be theirs alone."""
-    data = minimal(
-        objective={"kind": "static", "gradient": "exact"},
-        constraints={"deviation": 0.01},
-        reduction={"method": "balanced"},
-    )
-    assert "the Gramian's basis has no adjoint" in message_of(data)
-    del data["reduction"]
-    data["scenarios"] = [{"changes": ["payload.mass=4"]}]
-    scene_from_dict(data)
-    del data["constraints"]
-    assert "the others do not simulate the motion" in message_of(data)
+def test_scenarios_may_be_of_a_limit_alone():
+    data = minimal(objective={"kind": "static", "gradient": "exact"})
+    data |= {"constraints": {"deviation": 0.01}, "scenarios": [{"changes": ["payload.mass=4"]}]}
+    assert len(scene_from_dict(data).scenarios) == 1
 
 
 def test_length_of_a_body_from_a_file(tmp_path):
@@ -1532,11 +1218,8 @@ def test_options_that_nothing_uses_are_refused(key):
     value, used = UNUSED[key]
     setting = f"{key}={value}"
     assert load_scene(TWO_ARM, [*used, setting])
-    with pytest.raises(InputError) as caught:
-        load_scene(TWO_ARM, [*OTHERS.get(key, []), setting])
-    text = str(caught.value)
+    text = refusal(lambda: load_scene(TWO_ARM, [*OTHERS.get(key, []), setting]))
     assert (f"{key} = " in text and "default" in text) or "expected none" in text
-    assert "\n" not in text
 
 
 def test_every_option_of_a_response_is_used_by_one():
@@ -1551,8 +1234,7 @@ def test_every_option_of_a_response_is_used_by_one():
 def test_no_volume_is_shared_where_none_is_limited():
     lightest, shared = TWO_ARM.with_name("lightest_two_arm.toml"), "design.shared_volume=true"
     assert load_scene(lightest, ["design.volume_fraction=0.4", shared]).design.shared_volume
-    with pytest.raises(InputError, match=r"design\.shared_volume = true: expected false"):
-        load_scene(lightest, [shared])
+    refusal(lambda: load_scene(lightest, [shared]), "design.shared_volume = true", "false")
 
 
 def test_scenarios_are_posed_without_what_combines_them():

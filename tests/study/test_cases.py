@@ -1,12 +1,14 @@
 """Cases: known by what they compute, done once, resumed, and the same on any number of ranks."""
 
+import io
 import shutil
 import sys
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM
+from runs import TWO_ARM, refusal
+from studies import COARSE
 
 import dolfinopt as do
 from dolfinopt import locks
@@ -21,8 +23,7 @@ from dolfinopt.study.store import run_cases
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 TOLERANCE = 1e-3  # of the coordinates
-SMALL = ("arms.cells=[12,3]", "optimizer.max_iterations=3", "simulation.sample=0.01",
-         f"simulation.tolerance={TOLERANCE}", "motion.horizon=2.2")  # fmt: skip
+SMALL = [*COARSE, "optimizer.max_iterations=3", f"simulation.tolerance={TOLERANCE}"]
 alone = pytest.mark.serial  # ranks have no part in it
 
 
@@ -155,10 +156,8 @@ def plan():
 
 
 @pytest.fixture(scope="module")
-def done(plan, tmp_path_factory):
+def done(plan, folder):
     """The plan done on all ranks together, and its folder."""
-    path = tmp_path_factory.mktemp("cases") if WORLD.rank == 0 else None
-    folder = WORLD.bcast(path, root=0)
     return folder, run_cases(plan, folder, WORLD, shown=False)
 
 
@@ -423,28 +422,17 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
 @alone
 def test_another_run_is_refused(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(locks, "try_lock", lambda *arguments: False)
-    with pytest.raises(do.InputError, match="another run works in this folder"):
-        run_cases(plan, tmp_path, SELF, shown=False)
+    refusal(lambda: run_cases(plan, tmp_path, SELF, shown=False), str(tmp_path), "another run")
 
 
 # -- progress --------------------------------------------------------------------------------
 
 
-class Terminal:
+class Terminal(io.StringIO):
     """Standard error that is a terminal, and keeps what is written."""
-
-    def __init__(self):
-        self.text = ""
 
     def isatty(self):
         return True
-
-    def write(self, text):
-        self.text += text
-        return len(text)
-
-    def flush(self):
-        pass
 
 
 def test_plain_lines_tell_of_every_case(plan, shared_tmp_path, capsys):
@@ -465,7 +453,8 @@ def test_terminal(plan, done, tmp_path, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stderr", terminal)
     run_cases(plan[3:5], tmp_path, SELF)
-    assert "2/2 cases" in terminal.text and terminal.text.count("compliance") == 2
+    text = terminal.getvalue()
+    assert "2/2 cases" in text and text.count("compliance") == 2
     made, place = plan[0].design, store._Place(done[0] / "cases", tmp_path)
     assert list(store._running([made], place)) == []
     place.taken(made).touch()
