@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from mpi4py import MPI
-from remainders import build, rates, tip, uneven, wave
+from remainders import build, rates, uneven, wave
 from runs import TWO_ARM
 from scipy.optimize import brentq
 
@@ -447,44 +447,6 @@ def test_a_motor_at_the_elbow_lowers_the_frequency(key: str, mass: float, inerti
 
 
 # -- gradients -------------------------------------------------------------------------------
-
-RIGID = "arms.arm{}.rigid=true"
-
-
-@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["objective.attached=rigid-body"],
-        ["objective.attached=rigid-body", "objective.elbow_angle=2.1", "payload.inertia=0.4"],
-        ["objective.attached=rigid-body", "objective.follow=true"],
-        ["objective.attached=point-mass"],
-        ["objective.attached=none", "arms.passive=0.1"],
-        ["arms.arm2.design=arm1", "objective.exponent=3.0"],
-        ["arms.arm2.design=arm1", "objective.attached=point-mass"],
-        ["arms.joint_mass=2.0", "arms.joint_inertia=0.1"],
-        [RIGID.format(1)],
-        [RIGID.format(2)],
-        ["arms.arm2.density=8000.0", "arms.arm2.young_modulus=2e11", "interpolation.law=simp"],
-    ],
-    ids=" ".join,
-)
-def test_gradients_are_ones(overrides: list[str]) -> None:
-    """All arms' squared periods by all densities: an arm feels the mass of those outboard of it."""
-    built = build("objective.kind=eigenfrequency", "payload.mass=1.0", *overrides)
-    x = built.fields(wave)
-    for direction in (uneven, tip):
-        d = built.fields(direction)
-        built.evaluate(x)
-        slope = built.dot(built.gradient(), d)
-        if slope == 0.0:  # the tip is solid, or no design
-            assert direction is tip
-            continue
-
-        def value(h: float, d=d) -> float:
-            return built.evaluate({k: x[k] + h * d[k] for k in x})[0].objective
-
-        assert rates(value, slope, (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1), direction
 
 
 def test_the_outboard_arm_weighs_on_the_inboard_one() -> None:

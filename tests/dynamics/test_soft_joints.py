@@ -74,27 +74,6 @@ def test_tangent() -> None:
             assert (np.abs(found - matrix[:, :, order, i]) < 1e-5 * size_of).all()
 
 
-def test_exact_gradient() -> None:
-    """Taylor: what is left of the deviation falls with the square of the step."""
-    soft = ("arms.joint_stiffness=3e4", "arms.joint_damping=30.0")
-    objective = (
-        "objective.kind=deviation",
-        "objective.gradient=exact",
-        "simulation.tolerance=1e-6",
-    )
-    model = Model(scene(*SMALL, CONTROL, *ROTORS, GRAVITY, *soft, *objective))
-    x = {k: 0.5 + 0.3 * np.sin(1.7 * np.arange(len(v))) for k, v in model.uniform(0.5).items()}
-    direction = {k: 0.1 * np.cos(2.3 * np.arange(len(v))) for k, v in x.items()}
-    gradient = model.gradient(x)
-    slope = sum(gradient[k] @ direction[k] for k in x)
-    at = [
-        model.simulate({k: x[k] + h * direction[k] for k in x}).evaluation.objective
-        for h in (0.0, 0.1, 0.01)
-    ]
-    left = [abs(f - at[0] - h * slope) for f, h in zip(at[1:], (0.1, 0.01), strict=True)]
-    assert np.log10(left[0] / left[1]) == pytest.approx(2.0, abs=0.05)
-
-
 def test_motors_on_the_desired_motion_move_their_rotors() -> None:
     """Without control the drives give what the springs take, and what the rotors' inertia does."""
     soft = ("arms.joint_stiffness=1e5", "arms.joint_damping=100.0", "arms.gear_ratio=100.0")

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomllib
+from bodies import random_cloud, stiffened
 from mbdyn_reader import mbdyn_forces, mbdyn_stiffening, read_as_mbdyn_does
 from mpi4py import MPI
 from runs import TWO_ARM
-from spatial_bodies import spatial_cloud, stiffened
 from standard_input import random_state
 
 from dolfinopt import Model
@@ -76,7 +76,7 @@ def stiff_element(stiff_parts):
 @pytest.fixture(scope="module")
 def cloud():
     """Point masses in space without any symmetry."""
-    return spatial_cloud(np.random.default_rng(1), 4)
+    return random_cloud(np.random.default_rng(1), 4, 3)
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def test_invariants_are_sums_over_points(cloud):
 def test_several_interfaces(stiff):
     """A node each, behind the inboard joint; loads on all of them stiffen."""
     rng = np.random.default_rng(9)
-    body = spatial_cloud(rng, 4, interfaces=2).body()
+    body = random_cloud(rng, 4, 3, 2).body()
     body = stiffened(rng, body) if stiff else body
     element = modal_element(body)
     assert element.labels == ("1", "2", "3")

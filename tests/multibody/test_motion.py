@@ -31,7 +31,6 @@ from dolfinopt.multibody.motion import (
     line,
     rigid_motion,
 )
-from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import on_root
 from dolfinopt.paths.time_laws import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -640,30 +639,3 @@ def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
         assert_close(trajectory.joint_forces[at], expected, 0.12)
 
     on_root(WORLD, check)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arms", "path", "law", "base"),
-    [
-        (1, "joints in time", "quintic", "fixed"),
-        (1, "line", "trapezoidal", "cart"),
-        (3, "points", "quintic", "cart"),
-        (3, "line", "s-curve", "fixed"),
-    ],
-)
-@pytest.mark.usefixtures("three_steps")
-def test_exact_gradient_of_one_and_three_arms(
-    tmp_path: Path, arms: int, path: str, law: str, base: str
-) -> None:
-    """Taylor remainders of the complete chain fall with the square of the step."""
-    motion = dict(of_kind(tmp_path, arms, path, law, base).to_dict()["motion"], horizon=2.2)
-    lengths = {1: (1.0,), 3: (0.7, 0.7, 0.7)}[arms]
-    tables = {"payload": {"mass": 1.0}, "objective": {"load_cases": 5}}
-    of = scene(lengths, tables, **motion)
-    profile = do.Profile()
-    partition = do.partition_arms(WORLD, of.cell_counts)
-    built = do.build_arms(of, partition, profile)
-    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in built.items()}
-    test = taylor_test(of, partition, built, x, profile)
-    assert test.passed, {row.direction: round(row.rate, 3) for row in test.rows}

@@ -698,30 +698,6 @@ def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
         assert np.abs(ours[k] - slope).max() < 4e-3 * np.abs(slope).max()
 
 
-@pytest.mark.slow
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("q", "shifts"), [(3, [0.0]), (4, [0.0]), (8, [0.0]), (13, [0.0]), (8, [0.0, 30.0])], ids=str
-)
-def test_exact_gradient_of_krylov(q, shifts):
-    """Central differences of the complete chain, loads and basis included."""
-    overrides = ["objective.kind=compliance", "objective.gradient=exact", "payload.mass=1"]
-    overrides += [f"reduction.coordinates={q}", "reduction.method=krylov"]
-    overrides += [f"reduction.shifts={shifts}", "motion.horizon=0.9", "simulation.tolerance=1e-6"]
-    scene, partition, arms, x, _, slopes = simulated(*overrides)
-    direction = {k: np.cos(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
-
-    def along(h):
-        moved = {k: x[k] + h * direction[k] for k in x}
-        return do.evaluate(scene, partition, arms, moved, do.Profile())[0].objective
-
-    expected = sum(slopes[k] @ direction[k] for k in slopes)
-    expected = COMM.allreduce(expected)
-    fine, coarse = ((along(h) - along(-h)) / (2.0 * h) for h in (1e-3, 2e-3))
-    # Of fourth order; simulations to 1e-6 on the same steps leave about 1e-8 / h.
-    assert (4.0 * fine - coarse) / 3.0 == pytest.approx(expected, rel=1e-6)
-
-
 # -- ranks ----------------------------------------------------------------------------------------
 
 
