@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -457,20 +457,6 @@ def change_of(rng: np.random.Generator, body: ShapeIntegrals, name: str) -> np.n
         return change + np.array([1.0, -1.0])[:, None, None] * change.swapaxes(1, 2)
     blocks = change.reshape(3, 3, *change.shape[1:])  # W_ba = W_ab'
     return (blocks + blocks.transpose(1, 0, 3, 2)).reshape(change.shape)
-
-
-def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
-    """Yield changes that span all an integral of a plane body can do."""
-    shape = np.shape(getattr(body, name))
-    for index in np.ndindex(shape):
-        change = np.zeros(shape)
-        change[index] = 1.0
-        if name in ("K", "D", *STIFFENING):
-            change = change + change.swapaxes(-1, -2)
-        elif name == "W":
-            change[0] += change[0].T
-            change[1] -= change[1].T
-        yield change
 
 
 def changed(model: Any, arm: int, name: str, change: np.ndarray) -> Any:

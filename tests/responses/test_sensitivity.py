@@ -113,8 +113,8 @@ def test_gradient_of_a_trajectory(name: str) -> None:
         changes = []
         for body in bodies:
             one = np.asarray(getattr(body, constant))
-            # Every entry moves by the constant's size; of the stiffness by its softest mode's.
-            soft = constant == "K" and one.size
+            # Every entry moves by the constant's size; of K and D by the softest mode's.
+            soft = constant in ("K", "D") and one.size
             size = np.linalg.norm(one, -2) if soft else np.abs(one).max(initial=0.0)
             changes.append(max(float(size), 1e-3) * change_of(rng, body, constant))
 
