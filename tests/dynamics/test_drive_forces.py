@@ -111,7 +111,7 @@ def test_by_coordinates_and_rates(kind: str, count: int, folder: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_tangent(kind: str, folder: Path) -> None:
-    """The derivative of the residual, along a random direction of coordinates and of their rates."""
+    """The derivative of the residual, along random directions of coordinates and of rates."""
     system = moved(kind, folder).problem
     t, rates, sizes = state(moved(kind, folder), 3)
     instants, rng = system.at(t), np.random.default_rng(4)
