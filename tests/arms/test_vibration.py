@@ -22,6 +22,7 @@ from dolfinopt.arms.vibration import (
     loaded_modes,
     rigid_integrals,
 )
+from dolfinopt.fem.interface import floats
 from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.multibody.spatial.frozen import CarriedInertia
 from dolfinopt.responses.frequency import squared_period
@@ -200,6 +201,20 @@ def test_an_arm_cut_in_two() -> None:
         arm.set_design(design_of(arm))
         found.append(loaded_modes(arm.elastic, carried, 3, None).values)
     np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+
+
+def test_ranks_agree_on_floating_solids() -> None:
+    """The refinement of what floats, summed over the ranks, is that of one rank."""
+    found = []
+    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        arm = arm_of((60, 6), "interpolation.floor=1e-9", comm=comm)
+        arm.set_design(
+            design_of(arm, lambda k, x, y: np.floor(12.0 * x) % 2.0 == 0.0).astype(float)
+        )
+        found.append(np.linalg.inv(arm.elastic.constraint_modes().stiffness))
+    assert floats(arm.elastic)
+    scale = np.sqrt(np.outer(np.diag(found[0]), np.diag(found[0])))
+    np.testing.assert_allclose(found[1] / scale, found[0] / scale, atol=1e-4)
 
 
 def euler_values(carried: RigidIntegrals, height: float, count: int) -> np.ndarray:

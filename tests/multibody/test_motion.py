@@ -302,6 +302,10 @@ FAR = {"path": "line", "start": [0, 0], "end": [1e4, 1e4], "cart_follow": 1e3}
 UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, keys that help
     ((1.0, 1.0), {"radius": 4.0}, 0.95, 4.5, "out of reach", "motion.joint_height"),
     ((1.0, 1.0), {"joint_height": -1.0}, 0.95, 2.0, "stretched", "motion.radius"),
+    # Within a millionth of stretched or folded.
+    ((1.0, 1.0), {"joint_height": -0.9999999}, 0.95, 2.0, "stretched", "motion.radius"),
+    ((1.0, 1.0), {"radius": 1e-6, "joint_height": 0.0, "cart_follow": 0.0}, None, 1e-6, "folded",
+     "motion.radius"),
     ((1.4, 0.6), {}, 0.0, np.sqrt(0.5), "too near", "motion.cart_follow"),
     ((1.0, 1.0), {"flattening": 0.0, "joint_height": 0.0, "cart_follow": 0.0}, 0.95, 0.0, "folded",
      "motion.flattening"),

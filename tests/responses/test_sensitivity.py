@@ -1,4 +1,4 @@
-"""Exact gradients: trajectories by differences, drawn scenes, what a wrong one does, the cost."""
+"""Exact gradients: trajectories by differences, what a wrong one does, the cost."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bodies import CONSTANTS, Chain, assert_close, beam, change_of, changed, derivative
 from mpi4py import MPI
-from remainders import build, taylor, uneven, wave
+from remainders import build, taylor, wave
 from runs import ROOT, TWO_ARM, environment, overrides, run, scene
 from scipy.optimize import brentq
 from spatial_beams import DURATION, quintic_motion, reference_chain
@@ -25,7 +25,7 @@ from dolfinopt.dynamics.collocation import even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import drive_force_gradient
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import RigidMotion, check_motion
+from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import scaled
 from dolfinopt.multibody.spatial.equations import SPACE
 from dolfinopt.optimization.gradient_check import TaylorTest
@@ -177,49 +177,6 @@ def test_frozen_deviation_stands_beside_the_exact_one() -> None:
     slopes = {row.direction: (row.slope, row.slope_frozen) for row in test.rows}
     exact, frozen = slopes["tip of the last arm"]
     assert exact > 0.0 > frozen
-
-
-def random_scene(seed: int) -> do.Scene:
-    """Return a scene whose every part that the gradient passes through is drawn anew."""
-    rng = np.random.default_rng(seed)
-    while True:
-        method = str(rng.choice(["craig-bampton", "modal"]))
-        values = {
-            "objective.kind": str(rng.choice(["esl", "compliance", "deviation"])),
-            "objective.gradient": "exact",
-            "reduction.method": method,
-            "reduction.coordinates": rng.integers(3 if method == "craig-bampton" else 1, 7),
-            "payload.mass": 10.0 ** rng.uniform(-1.0, 1.0),
-            "payload.inertia": rng.choice([0.0, 0.02]),
-            "motion.radius": rng.uniform(0.6, 1.1),
-            "motion.flattening": rng.uniform(0.0, 1.0),
-            "motion.duration": rng.uniform(1.2, 2.5),
-            "motion.horizon": rng.uniform(1.8, 2.4),
-            "motion.gravity": [0.0, float(rng.choice([0.0, -9.81]))],
-            "arms.cells": [int(rng.integers(16, 31)), int(rng.integers(2, 5))],
-            "arms.0.height": rng.uniform(0.04, 0.12),
-            "arms.1.height": rng.uniform(0.04, 0.12),
-            "arms.passive": rng.choice([0.0, 0.06]),
-            "design.filter_radius": rng.choice([0.0, 0.01, 0.05]),
-            "damping.stiffness_proportional": rng.choice([0.0, 2e-4, 1e-3]),
-            "interpolation.floor": 10.0 ** rng.uniform(-6.0, -2.0),
-        }
-        try:
-            drawn = scene(*QUICK[2:], *(f"{key}={value}" for key, value in values.items()))
-            check_motion(drawn)
-        except InputError:  # out of the arms' reach: draw again
-            continue
-        return drawn
-
-
-@pytest.mark.serial
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(20))
-def test_gradient_is_one_in_random_scenes(seed: int) -> None:
-    """Along all directions; one whose remainders are all rounding shows nothing."""
-    test = taylor(random_scene(seed), lambda *at: 0.5 + 0.4 * uneven(*at), FINER)
-    assert test.passed, rates(test)
-    assert sum(np.isfinite(row.rate) for row in test.rows) >= 3, rates(test)
 
 
 # -- what a wrong gradient does --------------------------------------------------------------
