@@ -154,20 +154,6 @@ def test_scales_are_those_of_scaled_bodies():
         np.testing.assert_allclose(felt[n], moved, rtol=1e-10, atol=1e-10)
 
 
-def test_wanted_rows_and_repeated_instants():
-    """One instant's tangent for several changes, of some rows: the same numbers."""
-    problem = two_arms()
-    rng = np.random.default_rng(5)
-    q, qd, qdd = 0.01 * rng.normal(size=(3, 4, 6))
-    keep, wanted = np.array([0, 2, 4]), np.array([1, 2, 5])
-    slopes = linearise(problem.mechanism, problem.motion(np.linspace(0, 0.6, 4)), q, qd, qdd, keep)
-    change = rng.normal(size=(3, 8, 3))
-    both = slopes.times(*change, wanted)
-    for k in range(2):
-        each = slopes.times(*change[:, k::2], np.arange(6))
-        np.testing.assert_allclose(both[k::2], each[:, wanted], rtol=1e-12, atol=1e-12)
-
-
 def test_related_bodies():
     """Scaled bodies are found, with their factors; others are not."""
     problems = [

@@ -22,7 +22,6 @@ from dolfinopt.dynamics.collocation import (
     at_stages,
     counted,
     even_steps,
-    lagrange_integrals,
     residual_at,
     stages_of,
     step_ends,
@@ -341,32 +340,6 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
 
 
 # -- energy ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_work_of_the_joints_becomes_energy(damping: float) -> None:
-    """Work of cart and joints = change of kinetic + potential energy + what damping took."""
-    problem, chain = two_arms(damping=damping, gravity=(0.0, -9.81))
-    solution = radau.integrate(problem, 1e-7, 3, Profile())
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    h = np.diff(solution.time_grid)
-    t = (solution.time_grid[:-1, None] + h[:, None] * 0.5 * (nodes + 1.0)).ravel()
-    motion = problem.motion(t)
-    q, qd, qdd = (solution.sample(t, k) for k in range(3))
-    drives = inverse_dynamics(problem.mechanism, motion, q, qd, qdd)[1]
-    D = np.kron(np.eye(2), chain.clouds[0].D)
-    power = (drives * motion.qd).sum(axis=1) - np.einsum("nk,kl,nl->n", qd, D, qd)
-    work = np.cumsum((0.5 * h) * (power.reshape(len(h), -1) @ weights))
-
-    ends = solution.time_grid
-    rigid = problem.motion(ends)
-    y = np.concatenate([rigid.q, solution.sample(ends)], axis=1)
-    yd = np.concatenate([rigid.qd, solution.sample(ends, 1)], axis=1)
-    kinetic = np.array([chain.kinetic(*pair) for pair in zip(y, yd, strict=True)])
-    energy = kinetic + [chain.potential(row) for row in y]
-    # Speeds are less exact than the coordinates: by the ratio of the fastest to the slowest
-    # vibration, about fifty.
-    assert_close(work, energy[1:] - energy[0], 50 * 1e-7, kinetic.max())
 
 
 # -- error control ---------------------------------------------------------------------------
@@ -1082,14 +1055,3 @@ def test_sample_of_known_polynomials() -> None:
     t = np.array([0.0, 0.1, 0.3, 0.31, 0.9, 1.0])
     for order in range(3):
         assert_close(solution.sample(t, order), values(t, order), 1e-14)
-
-
-def test_lagrange_integrals() -> None:
-    """Polynomials of the nodes' degree: their value, integral and integral of that."""
-    nodes = np.array([0.1, 0.5, 1.0])
-    tau = np.linspace(0.0, 1.0, 7)
-    value, first, second = lagrange_integrals(nodes, tau)
-    for k in range(3):
-        assert_close(value @ nodes**k, tau**k, 1e-13)
-        assert_close(first @ nodes**k, tau ** (k + 1) / (k + 1), 1e-13)
-        assert_close(second @ nodes**k, tau ** (k + 2) / ((k + 1) * (k + 2)), 1e-13)

@@ -683,7 +683,7 @@ def drawn(rng: np.random.Generator, folder: Path) -> dict:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(24))  # 24 takes 90 s
 def test_any_scene(seed: int, tmp_path: Path) -> None:
     """Finite, and of second-order remainders along all directions; or a named error of one line.
 

@@ -142,15 +142,6 @@ def test_first_frequency():
     assert first_frequency(body) == pytest.approx(lowest, rel=1e-12)
 
 
-def test_first_frequency_of_a_spring_and_a_mass():
-    none, one = np.zeros(1), np.ones((1, 1))
-    body = plane_body(
-        1.0, np.zeros(2), 1.0, np.zeros((2, 1)), none, none,
-        4.0 * one, 0.0 * one, 400.0 * one, one, np.zeros((3, 1)), np.zeros(2),
-    )  # fmt: skip
-    assert first_frequency(body) == pytest.approx(10.0 / (2.0 * np.pi), rel=1e-15)
-
-
 def test_modes_give_the_first_frequency_of_the_body(uneven_arm):
     body = shape_integrals(uneven_arm, modal(uneven_arm, Options(2)), DAMPING)
     values = np.sqrt(np.diag(body.K)) / (2.0 * np.pi)

@@ -358,20 +358,6 @@ def test_moments_of_an_arm_agree_with_its_planar_integrals(tmp_path, arm, known)
     assert lifted.W[8, 0, 0] == pytest.approx(depth, rel=1e-14)
 
 
-def test_moments_of_a_plate_in_closed_form():
-    """A uniform 1.2 m x 0.3 m plate of 2 cm under rigid motions: cuboid's moments of inertia."""
-    mesh = structured_arm(MPI.COMM_SELF, "arm", 1.2, 0.3, (6, 2))
-    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Profile())
-    elastic = substructure.at(np.full(mesh.num_cells, 70e9), np.full(mesh.num_cells, 2700.0))
-    basis = craig_bampton(elastic, Options(3))
-    W = plate_moments(elastic, basis, THICKNESS)
-    data = to_sid(in_space(shape_integrals(elastic, basis, 0.0), W))
-    mass, (a, b, c) = 2700.0 * 1.2 * 0.3 * THICKNESS, (1.2, 0.3, THICKNESS)
-    expected = mass / 12.0 * np.diag([b * b + c * c, 4 * a * a + c * c, 4 * a * a + b * b])
-    # Gmsh places points to 2e-12 of the length.
-    assert np.abs(data.inertia(np.zeros(3)) - expected).max() < 1e-10 * expected.max()
-
-
 # -- data of other programs ------------------------------------------------------------------
 
 

@@ -73,27 +73,6 @@ def test_rigid_limit_is_newtons_law(
     assert result.objective == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_work_of_the_drives_is_what_damping_takes() -> None:
-    """From rest to rest the forces that the effort is made of do no other work."""
-    changes = ["motion.horizon=4.0", "damping.stiffness_proportional=2e-2"]
-    result = Model(scene(*SMALL, *changes)).simulate()
-    if WORLD.rank == 0:
-        trajectory = result.trajectory
-        assert trajectory is not None
-        power = trajectory.joint_forces * trajectory.motion.qd
-        rates = trajectory.unknowns[1]
-        lost = np.zeros(len(rates))
-        for part, body in zip(
-            trajectory.mechanism.slices, trajectory.mechanism.bodies, strict=True
-        ):
-            lost += np.einsum("ni,ij,nj->n", rates[:, part], body.D, rates[:, part])
-        step = trajectory.t[1]
-        work, heat = (float(x.sum()) * step for x in (power, lost))  # zero at both ends
-        assert work == pytest.approx(heat, rel=1e-2)
-        assert heat > 1e-3 * float(np.abs(power).sum()) * step
-
-
 def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
     """Weighted; of a fixed base the joints' alone."""
     for changes in ((), ("motion.base=fixed", "motion.radius=0.6")):
