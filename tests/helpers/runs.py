@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from mpi4py import MPI
 
 import dolfinopt as do
 from dolfinopt.cli.main import commands
+from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -32,6 +36,16 @@ def overrides(*changes: str) -> list[str]:
 def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:
     """Run a command in this process, on all ranks of `world`; errors of dolfinopt are raised."""
     commands.main([str(word) for word in words], standalone_mode=False, obj=world)
+
+
+@contextmanager
+def refused(*words: str, error: type[Exception] = InputError) -> Iterator[None]:
+    """Assert that what is run is refused in one line with all these words: key, value, remedy."""
+    with pytest.raises(error) as caught:
+        yield
+    said = str(caught.value)
+    assert "\n" not in said
+    assert [word for word in words if word not in said] == [], said
 
 
 def environment() -> dict[str, str]:

@@ -11,12 +11,11 @@ import tomllib
 from bodies import random_cloud, stiffened
 from mbdyn_reader import mbdyn_forces, mbdyn_stiffening, read_as_mbdyn_does
 from mpi4py import MPI
-from runs import TWO_ARM
+from runs import TWO_ARM, refused
 from standard_input import random_state
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
-from dolfinopt.errors import InputError
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement, fem_text, read_fem, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
 from dolfinopt.fem.elasticity import Substructure
@@ -59,18 +58,8 @@ def parts():
 
 
 @pytest.fixture(scope="module")
-def element(parts):
-    return modal_element(*parts[1:])
-
-
-@pytest.fixture(scope="module")
 def stiff_parts():
     return reduced((8, 3), uneven=True, stiffened=True)
-
-
-@pytest.fixture(scope="module")
-def stiff_element(stiff_parts):
-    return modal_element(*stiff_parts[1:])
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +75,22 @@ def stiff_cloud(cloud):
     return replace(body, along_modes=np.zeros((0, 4, 4)))
 
 
+@pytest.fixture(scope="module")
+def elements(parts, stiff_parts, cloud, stiff_cloud):
+    return {
+        "plane": modal_element(*parts[1:]),
+        "stiff plane": modal_element(*stiff_parts[1:]),
+        "linear space": modal_element(cloud.body()),
+        "space": modal_element(stiff_cloud),
+    }
+
+
 @pytest.mark.parametrize(
     ("kind", "loads"),
     [("plane", []), ("stiff plane", [3, 9, 10, 11, 13, 14, 18]), ("space", range(1, 19))],
 )
-def test_round_trip_is_exact(tmp_path, element, stiff_element, stiff_cloud, kind, loads):
-    space = modal_element(stiff_cloud)
-    written = {"plane": element, "stiff plane": stiff_element, "space": space}[kind]
+def test_round_trip_is_exact(tmp_path, elements, kind, loads):
+    written = elements[kind]
     write_fem(tmp_path / "a.fem", written)
     again = read_fem(tmp_path / "a.fem")
     assert list(again.loads) == list(loads)
@@ -106,7 +104,7 @@ def test_round_trip_is_exact(tmp_path, element, stiff_element, stiff_cloud, kind
         assert np.shape(ours) == np.shape(theirs) and np.array_equal(ours, theirs), name
 
 
-def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
+def test_mbdyn_stiffens_it_alike(stiff_parts, elements):
     """Any motion in the plane, force and moment outboard: rows lose sum_p p K0_p q."""
     body = stiff_parts[0]
     rng = np.random.default_rng(0)
@@ -115,7 +113,7 @@ def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
     w[2], wd[2], moment[2] = rng.normal(size=3)
     p = np.array([a[0], a[1], wd[2], -(w[2] ** 2), force[0], force[1], moment[2]])
     K0 = np.concatenate([body.K0, body.K0_outboard])
-    groups = read_as_mbdyn_does(fem_text(stiff_element))
+    groups = read_as_mbdyn_does(fem_text(elements["stiff plane"]))
     found = mbdyn_stiffening(groups, a, w, wd, force, moment)
     np.testing.assert_allclose(found, -np.tensordot(p, K0, 1), atol=1e-12 * np.abs(found).max())
     # Rotation stiffens a slender beam, and so does a pull at its end: the joint gives -pull.
@@ -125,7 +123,8 @@ def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
         assert mbdyn_stiffening(groups, **all_loads)[1, 1] > 0.0
 
 
-def test_mbdyn_reads_it(element):
+def test_mbdyn_reads_it(elements):
+    element = elements["plane"]
     groups = read_as_mbdyn_does(fem_text(element))
     assert sorted(groups) == [1, 2, 5, 6, 7, 8, 9, 10, 11, 12, 13]
     assert groups[1] == (9 * 4 + 2, 4)
@@ -142,8 +141,8 @@ def test_mbdyn_reads_it(element):
     assert np.array_equal(groups[9], groups[9].T) and np.array_equal(groups[10], groups[10].T)
 
 
-def test_interfaces_are_the_first_nodes(parts, element):
-    body = parts[0]
+def test_interfaces_are_the_first_nodes(parts, elements):
+    body, element = parts[0], elements["plane"]
     assert np.array_equal(element.points[:2], [[0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0]])
     assert not element.modes[0].any() and not element.lumped[:2].any()
     assert np.array_equal(element.modes[1, [0, 1, 5]], body.outboard)
@@ -305,55 +304,33 @@ def test_nodes_of_an_arm_on_several_ranks(parts):
 # -- damaged files ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("** RECORD GROUP 9,", "** RECORD 9,", ["record group 9, MODAL MASS MATRIX, is missing"]),
-        ("** RECORD GROUP 10", "** RECORD GROUP 9", ["record group 9 appears twice"]),
-        ("REV0        38", "REV0        39", ["record group 2 has 38 labels, expected 39"]),
-        ("REV0        38", "REV0     three", ["record group 1", "five integers"]),
-        ("  4         0", "  5         0", ["record group 8 has 912 numbers, expected 1140"]),
-        ("INERTIA\n ", "INERTIA\n 1.0 ", ["record group 12 has 14 numbers, expected 13"]),
-        ("INERTIA\n ", "INERTIA\n x", ["record group 12", "could not convert"]),
-    ],
-)
-def test_damaged_file(tmp_path, element, old, new, words):
-    text = fem_text(element)
+DAMAGED = [
+    ("plane", "** RECORD GROUP 9,", "** RECORD 9,", ("record group 9", "missing")),
+    ("plane", "** RECORD GROUP 10", "** RECORD GROUP 9", ("record group 9", "twice")),
+    ("plane", "REV0        38", "REV0        39", ("record group 2", "38 labels", "39")),
+    ("plane", "REV0        38", "REV0     three", ("record group 1", "five integers")),
+    ("plane", "  4         0", "  5         0", ("record group 8", "912 numbers", "1140")),
+    ("plane", "INERTIA\n ", "INERTIA\n 1.0 ", ("record group 12", "14 numbers", "13")),
+    ("plane", "INERTIA\n ", "INERTIA\n x", ("record group 12", "could not convert")),
+    ("stiff plane", "MATRIX\n7\n", "MATRIX\n6\n", ("record group 19", "120 numbers", "103")),
+    ("stiff plane", "MATRIX\n7\n3\n", "MATRIX\n7\n3.5\n", ("record group 19", "integer >= 1")),
+    ("stiff plane", "MATRIX\n7\n", "MATRIX\nx\n", ("record group 19", "120 numbers", "1")),
+    ("linear space", "GROUP 16,", "16,", ("record group 16", "INVARIANT 8", "missing")),
+    ("linear space", "GROUP 18,", "GROUP 11,", ("11 and 14 to 18", "remove one of them")),
+]
+
+
+@pytest.mark.parametrize(("kind", "old", "new", "words"), DAMAGED)
+def test_damaged_file(tmp_path, elements, kind, old, new, words):
+    text, path = fem_text(elements[kind]), tmp_path / "a.fem"
     assert text.count(old) == 1
-    path = tmp_path / "a.fem"
     path.write_text(text.replace(old, new))
-    with pytest.raises(InputError) as caught:
+    with refused(f"{path}: ", *words):
         read_fem(path)
-    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
-    for word in words:
-        assert word in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("MATRIX\n7\n", "MATRIX\n6\n", ["record group 19 has 120 numbers, expected 103"]),
-        ("MATRIX\n7\n3\n", "MATRIX\n7\n3.5\n", ["record group 19", "an integer >= 1"]),
-        ("MATRIX\n7\n", "MATRIX\nx\n", ["record group 19 has 120 numbers, expected 1"]),
-    ],
-)
-def test_damaged_stiffening(tmp_path, stiff_element, old, new, words):
-    test_damaged_file(tmp_path, stiff_element, old, new, words)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("GROUP 16,", "16,", ["record group 16, INVARIANT 8, is missing"]),
-        ("GROUP 18,", "GROUP 11,", ["11 and 14 to 18 exclude each other", "remove one of them"]),
-    ],
-)
-def test_damaged_invariants(tmp_path, cloud, old, new, words):
-    test_damaged_file(tmp_path, modal_element(cloud.body()), old, new, words)
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(InputError, match=r"none\.fem: cannot be read"):
+    with refused("none.fem", "cannot be read"):
         read_fem(tmp_path / "none.fem")
 
 

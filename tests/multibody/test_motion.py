@@ -15,6 +15,7 @@ import pytest
 from bodies import Chain, assert_close, bar, derivative
 from mpi4py import MPI
 from remainders import built_of
+from runs import refused
 from scipy.optimize import brentq
 
 from dolfinopt.dynamics.simulation import Trajectory
@@ -411,11 +412,8 @@ def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words) -> None
     file.write_text(text)
     of = scene(path="joints", file=str(file), **keys)
     for call in (check_motion, breakpoints):
-        with pytest.raises(InputError) as caught:
+        with refused(f"{file}: ", *words):
             call(of)
-        said = str(caught.value)
-        assert said.startswith(f"{file}: ") and "\n" not in said
-        assert all(word in said for word in words), said
 
 
 @pytest.mark.parametrize("name", ["t", "cart"])

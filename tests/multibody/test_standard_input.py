@@ -10,11 +10,11 @@ import pytest
 from bodies import Cloud, beam, random_cloud, random_tree
 from bodies import stiffened as bent
 from mpi4py import MPI
+from runs import refused
 from standard_input import State, forces_of_sid, random_state
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import (
     StandardInputData,
     Taylor,
@@ -189,7 +189,7 @@ def test_several_interfaces(tmp_path, stiff):
     again = load_body(tmp_path / "a.sid", 3, further={"3": (0.4, 0.3, 0.2)})
     for name in ("outboard", "points", "K0_outboard"):
         assert np.array_equal(getattr(again, name), getattr(body, name)), name
-    with pytest.raises(InputError, match="no node 'tool'; it has 1, 3, 2"):
+    with refused("'tool'", "1, 3, 2"):
         from_sid(data, 3, further=["tool"])
 
 
@@ -421,10 +421,8 @@ def test_a_plane_file_may_leave_out_what_the_plane_does_not_feel():
 )
 def test_nodes_that_are_not_there(arguments, words):
     _, data = foreign(np.random.default_rng(5))
-    with pytest.raises(InputError) as caught:
+    with refused(*words):
         from_sid(data, 2, *arguments)
-    for word in words:
-        assert word in str(caught.value)
 
 
 # -- what is no body ---------------------------------------------------------------------------
@@ -518,22 +516,18 @@ REFUSED = {
 def test_what_is_no_body_is_refused(name, dimension):
     data = sid_of(body_of(dimension, 3, 2))
     from_sid(data, dimension)
-    with pytest.raises(InputError) as caught:
+    with refused("tip.sid: ", *REFUSED[name].words):
         from_sid(REFUSED[name].change(data), dimension, source="tip.sid")
-    message = str(caught.value)
-    assert message.startswith("tip.sid: ") and "\n" not in message
-    for word in REFUSED[name].words:
-        assert word in message, message
 
 
 @pytest.mark.parametrize(
     ("dimension", "place", "wanted"),
-    [(2, r"\(1, 0\.2\)", r"\(length, 0\)"), (3, r"\(1, 0\.2, -0\.1\)", r"\(length, 0, 0\)")],
+    [(2, "(1, 0.2) m", "(length, 0)"), (3, "(1, 0.2, -0.1) m", "(length, 0, 0)")],
 )
 def test_length_must_agree(tmp_path, dimension, place, wanted):
     body = body_of(dimension, 1, 4)
     write_sid(tmp_path / "a.sid", sid_of(body))
-    with pytest.raises(InputError, match=rf"a\.sid: .*{place} m, .* length is 1 m; .*{wanted}"):
+    with refused("a.sid: ", place, "1 m", wanted):
         load_body(tmp_path / "a.sid", dimension, length=1.0)
     point = np.zeros(dimension)
     point[0] = 0.5
@@ -546,5 +540,5 @@ def test_interfaces_must_agree(tmp_path):
     straight = replace(cloud, ends=np.array([[1.0, 0.0, 0.0], [0.4, 0.3, 0.2]])).body()
     write_sid(tmp_path / "b.sid", to_sid(straight))
     assert len(load_body(tmp_path / "b.sid", 3, 1.0, {"3": (0.4, 0.3, 0.2)}).points) == 2
-    with pytest.raises(InputError, match=r"node 3 is at \(0.4, 0.3, 0.2\) m, but the arm's inter"):
+    with refused("node 3", "(0.4, 0.3, 0.2) m"):
         load_body(tmp_path / "b.sid", 3, 1.0, {"3": (0.4, 0.3, 0.0)})
