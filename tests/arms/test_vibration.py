@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from mpi4py import MPI
-from remainders import build, rates, uneven, wave
+from remainders import Field, arm_of, build, dense_matrices, rates, uneven, wave
 from runs import TWO_ARM
 from scipy.optimize import brentq
 
@@ -28,16 +28,7 @@ from dolfinopt.multibody.spatial.frozen import CarriedInertia
 from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient
 
-Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 NOTHING = RigidIntegrals(0.0, 0j, 0.0)
-
-
-def arm_of(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
-    """Return the first arm, solid, on its own ranks."""
-    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    arm = Arm(scene, 0, comm, do.Profile())
-    arm.set_design(np.ones(arm.mesh.num_cells))
-    return arm
 
 
 def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
@@ -146,32 +137,6 @@ def test_rigid_integrals_of_a_bar() -> None:
 # -- frequencies -----------------------------------------------------------------------------
 
 
-def dense_values(arm: Arm, carried: np.ndarray, count: int) -> np.ndarray:
-    """Return the lowest eigenvalues of T'KT, T'MT + carried, densely from the elements."""
-    elastic, operators = arm.elastic, arm.elastic.operators
-    points, size = operators.points, len(operators.points)
-    K, M = np.zeros((2, 2 * size, 2 * size))
-    stiffness = arm.solid.young_modulus * arm.material.stiffness
-    density = arm.solid.density * arm.material.mass
-    for e, cell in enumerate(operators.cells):
-        dofs = (2 * cell[:, None] + [0, 1]).ravel()
-        K[np.ix_(dofs, dofs)] += stiffness[e] * operators.stiffness[e]
-        for c in (0, 1):
-            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * operators.mass[e]
-    length = elastic.mesh.outboard_point[0]
-    clamped, end = np.isclose(points[:, 0], 0.0), np.isclose(points[:, 0], length)
-    inner = np.flatnonzero(~(clamped | end))
-    T = np.zeros((2 * size, 2 * len(inner) + 3))
-    for column, dof in enumerate((2 * inner[:, None] + [0, 1]).ravel()):
-        T[dof, column] = 1.0
-    for node in np.flatnonzero(end):
-        T[2 * node, -3], T[2 * node, -1] = 1.0, -points[node, 1]
-        T[2 * node + 1, -2] = 1.0
-    mass = T.T @ M @ T
-    mass[-3:, -3:] += carried
-    return scipy.linalg.eigh(T.T @ K @ T, mass, eigvals_only=True)[:count]
-
-
 @pytest.mark.parametrize(
     "carried",
     [NOTHING, RigidIntegrals(6.0, 0j, 0.0), RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)],
@@ -182,7 +147,10 @@ def test_dense_eigenproblem(carried: RigidIntegrals) -> None:
     arm = arm_of((9, 3), "arms.height=0.2")
     arm.set_design(design_of(arm))
     modes = loaded_modes(arm.elastic, carried, 5, None)
-    expected = dense_values(arm, carried.matrix(), 5)
+    young, density = arm.solid.young_modulus, arm.solid.density
+    K, M = dense_matrices(arm.elastic, young * arm.material.stiffness, density * arm.material.mass)
+    M[-3:, -3:] += carried.matrix()
+    expected = scipy.linalg.eigh(K, M, eigvals_only=True)[:5]
     # LAPACK is right to 1e-16 of the largest eigenvalue, some 1e6 times the lowest.
     np.testing.assert_allclose(modes.values, expected, rtol=1e-8)
     assert modes.frequency == pytest.approx(np.sqrt(expected[0]) / (2.0 * np.pi), rel=1e-8)

@@ -13,7 +13,7 @@ import scipy.linalg
 import scipy.sparse
 from mpi4py import MPI
 from petsc4py import PETSc
-from remainders import Built, Field, build, built_of, taylor, uneven, wave
+from remainders import Built, Field, arm_of, build, built_of, taylor, uneven, wave
 from runs import TWO_ARM, run
 from runs import overrides as options
 
@@ -48,8 +48,7 @@ def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
 
 def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3)) -> Arm:
     """Build the first arm of that scene."""
-    told = f"arms.cells=[{cells[0]},{cells[1]}]", "simulation.stiffening=false", *overrides
-    return Arm(do.load_scene(TWO_ARM, told), 0, MPI.COMM_SELF, do.Profile())
+    return arm_of(cells, "simulation.stiffening=false", *overrides)
 
 
 # -- designs ---------------------------------------------------------------------------------

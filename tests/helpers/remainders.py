@@ -76,6 +76,40 @@ def built_of(scene: Scene, world: MPI.Comm = MPI.COMM_WORLD) -> Built:
     return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
 
 
+def arm_of(
+    cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF, index: int = 0
+) -> Arm:
+    """Return one arm of the two-arm scene, solid, on its own ranks."""
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    arm = Arm(scene, index, comm, do.Profile())
+    arm.set_design(np.ones(arm.mesh.num_cells))
+    return arm
+
+
+def dense_matrices(elastic, young, density) -> tuple[np.ndarray, np.ndarray]:
+    """Return T'KT and T'MT (n, n) of a plane arm, put together from the elements' matrices.
+
+    T clamps the inboard edge and holds the outboard one rigid, its three coordinates last.
+    """
+    operators = elastic.operators
+    points, size = operators.points, len(operators.points)
+    K, M = np.zeros((2, 2 * size, 2 * size))
+    for e, cell in enumerate(operators.cells):
+        dofs = (2 * cell[:, None] + [0, 1]).ravel()
+        K[np.ix_(dofs, dofs)] += young[e] * operators.stiffness[e]
+        for c in (0, 1):
+            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * operators.mass[e]
+    length = elastic.mesh.outboard_point[0]
+    clamped, end = np.isclose(points[:, 0], 0.0), np.isclose(points[:, 0], length)
+    inner = np.flatnonzero(~(clamped | end))
+    T = np.zeros((2 * size, 2 * len(inner) + 3))
+    T[(2 * inner[:, None] + [0, 1]).ravel(), np.arange(2 * len(inner))] = 1.0
+    for node in np.flatnonzero(end):
+        T[2 * node, -3], T[2 * node, -1] = 1.0, -points[node, 1]
+        T[2 * node + 1, -2] = 1.0
+    return T.T @ K @ T, T.T @ M @ T
+
+
 def wave(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return densities within [0.1, 0.9] that vary along and across the arm."""
     return 0.5 + 0.3 * np.sin(7.0 * x + k) + 2.0 * y

@@ -8,11 +8,11 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import beside_volume, build, built_of, rates, tip, uneven, wave
+from remainders import arm_of, beside_volume, build, built_of, rates, tip, uneven, wave
 from runs import TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm, chain_of
+from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.collocation import Solution, radau_iia, response_instants
 from dolfinopt.multibody.end_effector import deviation
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
@@ -138,8 +138,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
     """Mass, centre and inertia of the meshed solid bar, with the arm's own density."""
     built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
     body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0)})[0]
-    scene = do.load_scene(TWO_ARM, ("arms.cells=[24,3]", "arms.length=0.8", "material.density=5e3"))
-    meshed = Arm(scene, 0, MPI.COMM_SELF, do.Profile())
+    meshed = arm_of((24, 3), "arms.length=0.8", "material.density=5e3")
     twin = meshed.reduce(np.ones(meshed.mesh.num_cells))
     # Gmsh places nodes to 1e-12 of the length.
     assert body.mass == pytest.approx(twin.mass, rel=1e-11)
@@ -153,12 +152,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
 
 def body_of(*overrides: str, index: int = 1) -> ShapeIntegrals:
     """Return one arm's body, on its own ranks."""
-    arm = Arm(
-        do.load_scene(TWO_ARM, ("arms.cells=[24,3]", *overrides)),
-        index,
-        MPI.COMM_SELF,
-        do.Profile(),
-    )
+    arm = arm_of((24, 3), *overrides, index=index)
     return arm.reduce(wave(index, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0])))
 
 
