@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import tomllib
 from bodies import random_cloud, stiffened
-from mbdyn_reader import mbdyn_forces, mbdyn_stiffening, read_as_mbdyn_does
 from mpi4py import MPI
+from readers import mbdyn_forces, mbdyn_stiffening, random_state, read_as_mbdyn_does
 from runs import TWO_ARM, refused
-from standard_input import random_state
 
 from dolfinopt import Model
 from dolfinopt.cli import commands

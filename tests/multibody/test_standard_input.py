@@ -10,8 +10,8 @@ import pytest
 from bodies import Cloud, beam, random_cloud, random_tree
 from bodies import stiffened as bent
 from mpi4py import MPI
+from readers import State, forces_of_sid, random_state
 from runs import refused
-from standard_input import State, forces_of_sid, random_state
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
