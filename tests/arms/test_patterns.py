@@ -10,7 +10,6 @@ from runs import STATED, TWO_ARM, overrides, refused, run
 import dolfinopt as do
 from dolfinopt.arms.arm import Patterns, uniform_design
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output.design import read_design
 from dolfinopt.parallel import Partition
 
@@ -72,26 +71,6 @@ def test_the_same_arm_again_is_the_shared_design():
         histories.append(WORLD.bcast(rows, root=0))
     assert len(histories[0]) == 5
     np.testing.assert_allclose(histories[1], histories[0], rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["static", *(pytest.param(k, marks=pytest.mark.serial)  # one shows how ranks add up
-                 for k in ("esl", "eigenfrequency", "deviation"))],
-)  # fmt: skip
-@pytest.mark.usefixtures("three_steps")
-def test_gradients_add_up(kind):
-    """The Taylor test moves one design, and both arms with it."""
-    quick = ("motion.horizon=2.0", "simulation.tolerance=1e-6", "arms.symmetric=true")
-    scene, partition, arms = built(*SCALED, *quick, REGIONS, f"objective.kind={kind}")
-    x = {k: waves(arm) for k, arm in arms.items() if k == 0}
-    test = taylor_test(scene, partition, arms, x, do.Profile())
-    assert [row.direction for row in test.rows][2:] == [
-        "root of the first arm",
-        "tip of the last arm",
-    ]
-    for row in test.rows:
-        assert row.slope != 0.0 and row.rate > 1.9
 
 
 def test_constraints_of_both_arms_bind_one_design():

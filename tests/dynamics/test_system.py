@@ -126,6 +126,14 @@ def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
     return MachineSystem(mechanism, desired, (0.0, 0.3, 0.5), drives)
 
 
+def test_drives_follow_their_law() -> None:
+    """u = Kp (q_d - q) + Kd (qd_d - qd), of cart and joint."""
+    e, ed = np.random.default_rng(1).normal(size=(2, 5, 3))
+    found = controlled(1.0).at(np.linspace(0.0, 0.5, 5)).drive_forces(e, ed)
+    expected = -np.array([4e3, 100.0]) * e[:, :2] - np.array([40.0, 0.5]) * ed[:, :2]
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+
+
 def by_scipy(system: MachineSystem, t: np.ndarray) -> np.ndarray:
     """Return y (n, S) by SciPy's explicit method, accelerations from the mass matrix."""
     size = system.num_coordinates

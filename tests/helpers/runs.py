@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from mpi4py import MPI
@@ -46,6 +48,16 @@ def refused(*words: str, error: type[Exception] = InputError) -> Iterator[None]:
     said = str(caught.value)
     assert "\n" not in said
     assert [word for word in words if word not in said] == [], said
+
+
+def demo(name: str) -> ModuleType:
+    """Import a demo by its path."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "demos" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 def environment() -> dict[str, str]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import ROOT, refused, scene
+from runs import demo, refused, scene
 
 import dolfinopt as do
 from dolfinopt import Model
@@ -190,12 +189,7 @@ def test_least_effort_at_the_accuracy_of_least_compliance() -> None:
 @pytest.mark.serial  # ranks have no part in it
 def test_effort_demo(shared_tmp_path: Path) -> None:
     """Runs, tables and draws on few cells."""
-    path = ROOT / "demos" / "demo_effort.py"
-    spec = importlib.util.spec_from_file_location("demo_effort", path)
-    assert spec is not None and spec.loader is not None
-    demo = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(demo)
-    rows = demo.main(shared_tmp_path, (20, 2), 3)
+    rows = demo("demo_effort").main(shared_tmp_path, (20, 2), 3)
     if WORLD.rank == 0:
         assert [row["design"] for row in rows] == ["least compliance", "least effort"]
         lines = (shared_tmp_path / "effort.csv").read_text(encoding="utf-8").splitlines()

@@ -123,6 +123,12 @@ TWO = (
     f'scenarios=[{{changes=[{MATERIAL}, "damping.stiffness_proportional=1e-3"]}}, '
     '{changes=["motion.flattening=0.5", "motion.horizon=2.5", "payload.mass=8"], weight=0.3}]'
 )
+REPEATED = (
+    "arms.cells=[40,4]", "arms.passive=0.05", "arms.arm2.pattern=arm1", "arms.arm2.length=0.8",
+    "arms.arm2.height=0.045", "arms.arm2.thickness=0.012", "arms.symmetric=true",
+    'arms.arm1.regions=[{kind="void", circle=[0.5, 0.0, 0.016]}, '
+    '{kind="solid", box=[0.2, -0.03, 0.3, -0.01]}]',
+)  # fmt: skip
 CASES = [
     # Prescribed motions in the plane.
     case("two_arm", "reduction.coordinates=3"),
@@ -180,6 +186,9 @@ CASES = [
       for combined in ("sum", "worst")
       for more in ((), (DEVIATION, "reduction.coordinates=3"),
                    ("arms.arm2.design=arm1", MODAL), ("arms.arm1.rigid=true",))),
+    # Two arms of one design, by the densities of one; of the same size, or scaled.
+    *(case("two_arm", *REPEATED, kind, ranks=kind == STATIC)
+      for kind in ("objective.kind=esl", STATIC, FREQUENCY, DEVIATION)),
     # Other numbers of arms.
     case("one_arm", COMPLIANCE, "motion.law=trapezoidal"),
     case("three_arm", "motion.law=s-curve", "objective.load_cases=5", slow=True),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,7 +12,7 @@ import pytest
 from bodies import CONSTANTS, Chain, assert_close, beam, change_of, changed, derivative
 from mpi4py import MPI
 from remainders import build, taylor, wave
-from runs import ROOT, TWO_ARM, environment, overrides, refused, run, scene
+from runs import TWO_ARM, demo, environment, overrides, refused, run, scene
 from scipy.optimize import brentq
 from spatial_beams import DURATION, quintic_motion, reference_chain
 
@@ -311,11 +310,7 @@ def test_same_gradient_on_any_number_of_ranks(tmp_path, method: str, ranks: int)
 @pytest.mark.serial
 def test_payload_demo(shared_tmp_path, capsys) -> None:
     """Runs, tables and draws on few cells; a light payload gains by the exact gradient."""
-    spec = importlib.util.spec_from_file_location("demo_payload", ROOT / "demos/demo_payload.py")
-    assert spec is not None and spec.loader is not None
-    demo = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(demo)
-    rows = demo.main(shared_tmp_path, (20, 2), (0.2,), 15)
+    rows = demo("demo_payload").main(shared_tmp_path, (20, 2), (0.2,), 15)
     if WORLD.rank == 0:
         frozen, exact = rows
         assert (frozen["gradient"], exact["gradient"]) == ("esl", "exact")
