@@ -1,4 +1,4 @@
-"""Taylor remainders of functions of all arms' physical densities, for the tests of gradients."""
+"""Arms of small scenes, dense and built, and Taylor remainders of functions of their densities."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
+from dolfinopt.fem.elasticity import Substructure
+from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.optimization import gradient_check
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
 from dolfinopt.parallel import Partition, sum_over_arms
@@ -84,6 +87,19 @@ def arm_of(
     arm = Arm(scene, index, comm, do.Profile())
     arm.set_design(np.ones(arm.mesh.num_cells))
     return arm
+
+
+def substructure(
+    size: tuple[float, float, float],
+    cells: tuple[int, int],
+    comm: MPI.Comm = MPI.COMM_SELF,
+    element: str = "linear",
+    poisson_ratio: float = 0.33,
+) -> Substructure:
+    """Return a rectangle of length, height and thickness, m."""
+    mesh = structured_arm(comm, "arm", *size[:2], cells)
+    operators = ELEMENTS[element].operators(mesh, size[2], poisson_ratio)
+    return Substructure(mesh, operators, do.Profile())
 
 
 def dense_matrices(elastic, young, density) -> tuple[np.ndarray, np.ndarray]:

@@ -11,22 +11,20 @@ import tomllib
 from bodies import random_cloud, stiffened
 from mpi4py import MPI
 from readers import mbdyn_forces, mbdyn_stiffening, random_state, read_as_mbdyn_does
+from remainders import substructure
 from runs import TWO_ARM, refused
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement, fem_text, read_fem, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
-from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
 from dolfinopt.multibody.shape_integrals import in_space, plate_moments, shape_integrals
 from dolfinopt.multibody.spatial.kinematics import BodyMotion
 from dolfinopt.multibody.spatial.mechanism import constants_of
 from dolfinopt.multibody.standard_input import load_body
-from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
@@ -37,14 +35,12 @@ PLACING = 1e-10
 
 def reduced(cells, comm=MPI.COMM_SELF, uneven=False, stiffened=False, element="linear"):
     """Return the body, the same in space, and its nodes, which are None but on the first rank."""
-    mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
-    operators = ELEMENTS[element].operators(mesh, THICKNESS, 0.33)
-    substructure = Substructure(mesh, operators, Profile())
-    x = np.ones(mesh.num_cells)
+    arm = substructure((LENGTH, HEIGHT, THICKNESS), cells, comm, element)
+    mesh, x = arm.mesh, np.ones(arm.mesh.num_cells)
     if uneven:
         place = np.round(mesh.centroid, 9)
         x = 0.5 + 0.4 * np.sin(30.0 * place[:, 0] + 170.0 * place[:, 1])
-    elastic = substructure.at(70e9 * x**3, 2700.0 * x)
+    elastic = arm.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(4))
     body = shape_integrals(elastic, basis, 2e-4, unit_loads(elastic) if stiffened else None)
     lifted = in_space(body, plate_moments(elastic, basis, THICKNESS))

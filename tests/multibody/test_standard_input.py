@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from bodies import Cloud, beam, random_cloud, random_tree
 from bodies import stiffened as bent
-from mpi4py import MPI
 from readers import State, forces_of_sid, random_state
+from remainders import substructure
 from runs import refused
 
 from dolfinopt.dynamics import radau
@@ -23,10 +23,7 @@ from dolfinopt.exchange.sid import (
     write_sid,
     write_sid_npz,
 )
-from dolfinopt.fem.elasticity import Substructure
-from dolfinopt.fem.elements import LagrangeElement
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody import inverse_dynamics as plane
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
@@ -302,10 +299,9 @@ def test_outboard_node(dimension, stiff):
 
 def test_stiffened_body_of_a_file_moves_the_same(tmp_path):
     """A beam that is spun up, from its file: the motion of the body that was written."""
-    mesh = structured_arm(MPI.COMM_SELF, "beam", 1.0, 0.01, (40, 2))
-    operators = LagrangeElement().operators(mesh, 0.01, 0.0)
-    one = np.ones(mesh.num_cells)
-    elastic = Substructure(mesh, operators, Profile()).at(70e9 * one, 2700.0 * one)
+    arm = substructure((1.0, 0.01, 0.01), (40, 2), poisson_ratio=0.0)
+    one = np.ones(arm.mesh.num_cells)
+    elastic = arm.at(70e9 * one, 2700.0 * one)
     basis = craig_bampton(elastic, Options(4))
     body = shape_integrals(elastic, basis, 1e-3, unit_loads(elastic))
     write_sid(tmp_path / "beam.sid", sid_of(body))
@@ -331,11 +327,10 @@ def test_stiffened_body_of_a_file_moves_the_same(tmp_path):
 
 @pytest.fixture(scope="module")
 def arm():
-    mesh = structured_arm(MPI.COMM_SELF, "arm", 1.2, 0.3, (10, 3))
-    substructure = Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, 0.33), Profile())
-    place = np.round(mesh.centroid, 9)
+    arm = substructure((1.2, 0.3, THICKNESS), (10, 3))
+    place = np.round(arm.mesh.centroid, 9)
     x = 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
-    elastic = substructure.at(70e9 * x**3, 2700.0 * x)
+    elastic = arm.at(70e9 * x**3, 2700.0 * x)
     return elastic, craig_bampton(elastic, Options(5))
 
 

@@ -11,17 +11,15 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from mpi4py import MPI
+from remainders import substructure
 from runs import TWO_ARM
 from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import LagrangeElement
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.shape_integrals import first_frequency, shape_integrals
-from dolfinopt.profiling import Profile
 from dolfinopt.reduction import (
     METHODS,
     Basis,
@@ -56,8 +54,7 @@ DENSE = 1e-7
 
 
 def make_arm(cells=(20, 4), comm=SELF, length=LENGTH):
-    mesh = structured_arm(comm, "arm", length, HEIGHT, cells)
-    return Substructure(mesh, LagrangeElement().operators(mesh, THICKNESS, POISSON), Profile())
+    return substructure((length, HEIGHT, THICKNESS), cells, comm)
 
 
 def with_densities(arm, x):
