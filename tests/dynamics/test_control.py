@@ -153,11 +153,11 @@ def test_stiff_springs_are_rigid_drives() -> None:
 def test_generalised_alpha(joints: Tree) -> None:
     """The conventional method finds the same motion, to the error it says it has."""
     tree = small(joints, motion={"horizon": 1.0, "duration": 1.0}, payload={"mass": 2.0})
-    options = {"integrator": "generalized-alpha", "tolerance": 1e-3}
+    options = {"integrator": "generalized-alpha", "tolerance": 3e-3}
     other, _ = machine(simulated(with_keys(tree, {"simulation": options})))
     trajectory, _ = machine(simulated(tree))
-    assert apart(other.deviation, trajectory.deviation) < 1e-3  # measured 2.8e-4
-    assert apart(other.joint_forces, trajectory.joint_forces) < 2e-3  # 3.3e-4
+    assert apart(other.deviation, trajectory.deviation) < 3e-3  # measured 5e-4
+    assert apart(other.joint_forces, trajectory.joint_forces) < 6e-3  # 8e-4
 
 
 def test_motors_on_the_desired_motion_move_their_rotors() -> None:

@@ -424,8 +424,8 @@ def test_integrators_agree_on_other_chains(arms: int) -> None:
     """One arm and three."""
     size = (0.2, 1.0, -0.8, 0.5)[: 1 + arms]
     problem, _ = two_arms(lambda t: reach(t, size), arms=arms, damping=2e-3)
-    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 1e-3)
-    assert distance(problem, other, one) <= 1e-3 + 1e-5
+    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 3e-3)
+    assert distance(problem, other, one) <= 3e-3 + 1e-5
 
 
 # -- robustness ------------------------------------------------------------------------------

@@ -244,7 +244,7 @@ def test_designs_that_hang_together_cost_nothing_more() -> None:
     arm.elastic.constraint_modes()
     assert arm.profile.counts.solves == 3
     arm.set_design(islands(0, *arm.mesh.centroid.T))
-    with pytest.raises(ConvergenceError, match="connected by void alone"):
+    with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):
         arm.elastic.constraint_modes()
     assert arm.profile.counts.solves > 9
 
