@@ -156,8 +156,8 @@ def test_generalised_alpha(joints: Tree) -> None:
     options = {"integrator": "generalized-alpha", "tolerance": 3e-3}
     other, _ = machine(simulated(with_keys(tree, {"simulation": options})))
     trajectory, _ = machine(simulated(tree))
-    assert apart(other.deviation, trajectory.deviation) < 3e-3  # measured 5e-4
-    assert apart(other.joint_forces, trajectory.joint_forces) < 6e-3  # 8e-4
+    assert apart(other.deviation, trajectory.deviation) < 3e-3  # measured 6.8e-4
+    assert apart(other.joint_forces, trajectory.joint_forces) < 6e-3  # 8.0e-4
 
 
 def test_motors_on_the_desired_motion_move_their_rotors() -> None:
