@@ -87,22 +87,11 @@ def two_arms(
 
 def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> ElasticSystem:
     """Return one coordinate of that frequency (rad/s) and damping ratio that the cart pushes."""
-    body = plane_body(
-        mass=1.0,
-        moment=np.zeros(2),
-        inertia=0.0,
-        C=np.array([[1.0], [0.0]]),
-        j=np.zeros(1),
-        r=np.zeros(1),
-        M=np.eye(1),
-        G=np.zeros((1, 1)),
-        K=frequency**2 * np.eye(1),
-        D=2.0 * damping * frequency * np.eye(1),
-        outboard=np.zeros((3, 1)),
-        outboard_point=np.array([1.0, 0.0]),
-    )
-    mechanism = Mechanism((body,), 0.0, 0.0, (0.0, 0.0), 0.0)
-    return ElasticSystem(mechanism, motion, (0.0, PUSH, end))
+    none, one, tip = np.zeros(1), np.eye(1), np.array([1.0, 0.0])
+    C, D = tip[:, None], 2.0 * damping * frequency * one
+    shape = (none, none, one, 0.0 * one, frequency**2 * one, D, np.zeros((3, 1)), tip)
+    body = plane_body(1.0, np.zeros(2), 0.0, C, *shape)
+    return ElasticSystem(Mechanism((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
 
 
 PUSH = 0.1  # s, when the cart begins to accelerate

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomllib
 from mpi4py import MPI
 from remainders import taylor, wave
 from runs import ROOT
@@ -22,7 +21,7 @@ LOOP = ("motion.speed=60", "motion.duration=0.05", "motion.horizon=0.1", "design
 # Scene, what makes it small, and its kinds of machine.
 BASES = {
     "two_arm": ("two_arm", ("arms.cells=[20,3]", *SHORT)),
-    "one_arm": ("two_arm", ("arms.cells=[20,3]", *SHORT)),
+    "one_arm": ("two_arm", ("arms.cells=[20,3]", "motion.radius=0.4", *SHORT)),
     "three_arm": ("three_arm", ("arms.cells=[20,3]", *SHORT)),
     "controlled": ("controlled_two_arm", ("arms.cells=[20,3]", *SHORT)),
     "slider": (
@@ -91,11 +90,10 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     if base == "fork":
         return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
     path = ROOT / "demos" / f"{name}.toml"
-    data = tomllib.loads(path.read_text())
-    if base == "one_arm":
-        del data["arms"][1:]
-        told.append("motion.radius=0.4")
-    return do.scene_from_dict(data, str(path), told)
+    if base != "one_arm":
+        return do.load_scene(path, told)
+    tree = do.load_scene(path).to_tree()
+    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
 
 
 def case(base: str, *changes: str, slow: bool = False, ranks: bool = False):
