@@ -13,8 +13,8 @@ from dolfinopt.arms.arm import Arm
 pytestmark = pytest.mark.serial  # ranks have no part in it
 
 
-def small_arm(*overrides: str) -> Arm:
-    scene = do.load_scene(TWO_ARM, ("arms.cells=[16,3]", *overrides))
+def small_arm() -> Arm:
+    scene = do.load_scene(TWO_ARM, ["arms.cells=[16,3]"])
     return Arm(scene, 0, MPI.COMM_SELF, do.Profile())
 
 

@@ -5,13 +5,11 @@ import json
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import STATED, TWO_ARM, overrides, run
+from runs import STATED, TWO_ARM, overrides, refused, run
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Patterns, uniform_design
-from dolfinopt.errors import InputError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output.design import read_design
 from dolfinopt.parallel import Partition
 
@@ -73,26 +71,6 @@ def test_the_same_arm_again_is_the_shared_design():
         histories.append(WORLD.bcast(rows, root=0))
     assert len(histories[0]) == 5
     np.testing.assert_allclose(histories[1], histories[0], rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["static", *(pytest.param(k, marks=pytest.mark.serial)  # one shows how ranks add up
-                 for k in ("esl", "eigenfrequency", "deviation"))],
-)  # fmt: skip
-@pytest.mark.usefixtures("three_steps")
-def test_gradients_add_up(kind):
-    """The Taylor test moves one design, and both arms with it."""
-    quick = ("motion.horizon=2.0", "simulation.tolerance=1e-6", "arms.symmetric=true")
-    scene, partition, arms = built(*SCALED, *quick, REGIONS, f"objective.kind={kind}")
-    x = {k: waves(arm) for k, arm in arms.items() if k == 0}
-    test = taylor_test(scene, partition, arms, x, do.Profile())
-    assert [row.direction for row in test.rows][2:] == [
-        "root of the first arm",
-        "tip of the last arm",
-    ]
-    for row in test.rows:
-        assert row.slope != 0.0 and row.rate > 1.9
 
 
 def test_constraints_of_both_arms_bind_one_design():
@@ -220,24 +198,27 @@ def test_a_run_resumes_to_the_same_bits(shared_tmp_path):
         assert evaluation.compliance == pytest.approx(one["compliance"], rel=1e-4)
 
 
+OF_FIRST = "arms.arm2.pattern=arm1"
+
+
 @pytest.mark.serial
 @pytest.mark.parametrize(
-    ("changes", "reason"),
+    ("changes", "words"),
     [
-        (["arms.arm2.pattern=arm3"], 'design of its own: "arm1"'),
-        (["arms.arm1.pattern=arm2"], "no arm before it has one"),
-        (["arms.arm2.pattern=arm1", "arms.arm2.cells=[20,4]"], r"expected \[40, 4\] as arm1 has"),
-        (["arms.arm2.pattern=arm1", "arms.arm2.mesh=meshes/arm.geo"], "arm2 has mesh = "),
-        (["arms.arm1.mesh=meshes/arm.geo", "arms.arm2.pattern=arm1"], "arm1 has mesh = "),
-        (["arms.arm2.pattern=arm1", "arms.arm2.rigid=true"], "found pattern and rigid"),
-        (["arms.arm2.pattern=arm1", "arms.arm2.design=arm1"], "found design and pattern"),
-        (["arms.arm2.pattern=arm1", "arms.arm2.passive=0.1"], "expected none: it is that of arm1"),
-        (["arms.arm2.pattern=arm1", "arms.arm2.symmetric=true"], "expected none: it is that of"),
-        (["arms.arm1.rigid=true", "arms.arm2.pattern=arm1"], "no arm before it has one"),
+        (["arms.arm2.pattern=arm3"], ("arms.arm2.pattern", "arm3", '"arm1"')),
+        (["arms.arm1.pattern=arm2"], ("arms.arm1.pattern", "no arm before it")),
+        (["arms.arm1.rigid=true", OF_FIRST], ("arms.arm2.pattern", "no arm before it")),
+        ([OF_FIRST, "arms.arm2.cells=[20,4]"], ("arms.arm2.cells", "[20, 4]", "[40, 4]", "arm1")),
+        ([OF_FIRST, "arms.arm2.mesh=meshes/arm.geo"], ("pattern", "arm2 has mesh = ")),
+        (["arms.arm1.mesh=meshes/arm.geo", OF_FIRST], ("pattern", "arm1 has mesh = ")),
+        ([OF_FIRST, "arms.arm2.rigid=true"], ("pattern and rigid",)),
+        ([OF_FIRST, "arms.arm2.design=arm1"], ("design and pattern",)),
+        ([OF_FIRST, "arms.arm2.passive=0.1"], ("arms.arm2.passive", "0.1", "none", "arm1")),
+        ([OF_FIRST, "arms.arm2.symmetric=true"], ("arms.arm2.symmetric", "none", "arm1")),
     ],
 )
-def test_what_cannot_be_a_pattern(changes, reason):
-    with pytest.raises(InputError, match=reason):
+def test_what_cannot_be_a_pattern(changes, words):
+    with refused(*words):
         do.load_scene(TWO_ARM, (*SMALL, *changes))
 
 
@@ -246,7 +227,7 @@ def test_a_pattern_of_a_pattern_is_refused():
     three = [{"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}]
     three += [{"name": "arm2", "pattern": "arm1"}, {"name": "arm3", "pattern": "arm2"}]
     data = {"material": "POM", "arms": three}
-    with pytest.raises(InputError, match="arm2 itself has that of arm1"):
+    with refused("arms.2.pattern (arm3)", "arm2", "arm1"):
         do.scene_from_dict(STATED | data)
     # Identical arms may share the mesh of one that repeats another's design.
     three[2] = {"name": "arm3", "design": "arm2"}

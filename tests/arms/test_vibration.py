@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from mpi4py import MPI
-from remainders import build, rates, tip, uneven, wave
+from remainders import Field, arm_of, build, dense_matrices, rates, uneven, wave
 from runs import TWO_ARM
 from scipy.optimize import brentq
 
@@ -22,21 +22,13 @@ from dolfinopt.arms.vibration import (
     loaded_modes,
     rigid_integrals,
 )
+from dolfinopt.fem.interface import floats
 from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.multibody.spatial.frozen import CarriedInertia
 from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient
 
-Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 NOTHING = RigidIntegrals(0.0, 0j, 0.0)
-
-
-def arm_of(cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF) -> Arm:
-    """Return the first arm, solid, on its own ranks."""
-    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
-    arm = Arm(scene, 0, comm, do.Profile())
-    arm.set_design(np.ones(arm.mesh.num_cells))
-    return arm
 
 
 def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
@@ -145,32 +137,6 @@ def test_rigid_integrals_of_a_bar() -> None:
 # -- frequencies -----------------------------------------------------------------------------
 
 
-def dense_values(arm: Arm, carried: np.ndarray, count: int) -> np.ndarray:
-    """Return the lowest eigenvalues of T'KT, T'MT + carried, densely from the elements."""
-    elastic, operators = arm.elastic, arm.elastic.operators
-    points, size = operators.points, len(operators.points)
-    K, M = np.zeros((2, 2 * size, 2 * size))
-    stiffness = arm.solid.young_modulus * arm.material.stiffness
-    density = arm.solid.density * arm.material.mass
-    for e, cell in enumerate(operators.cells):
-        dofs = (2 * cell[:, None] + [0, 1]).ravel()
-        K[np.ix_(dofs, dofs)] += stiffness[e] * operators.stiffness[e]
-        for c in (0, 1):
-            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * operators.mass[e]
-    length = elastic.mesh.outboard_point[0]
-    clamped, end = np.isclose(points[:, 0], 0.0), np.isclose(points[:, 0], length)
-    inner = np.flatnonzero(~(clamped | end))
-    T = np.zeros((2 * size, 2 * len(inner) + 3))
-    for column, dof in enumerate((2 * inner[:, None] + [0, 1]).ravel()):
-        T[dof, column] = 1.0
-    for node in np.flatnonzero(end):
-        T[2 * node, -3], T[2 * node, -1] = 1.0, -points[node, 1]
-        T[2 * node + 1, -2] = 1.0
-    mass = T.T @ M @ T
-    mass[-3:, -3:] += carried
-    return scipy.linalg.eigh(T.T @ K @ T, mass, eigvals_only=True)[:count]
-
-
 @pytest.mark.parametrize(
     "carried",
     [NOTHING, RigidIntegrals(6.0, 0j, 0.0), RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)],
@@ -181,7 +147,10 @@ def test_dense_eigenproblem(carried: RigidIntegrals) -> None:
     arm = arm_of((9, 3), "arms.height=0.2")
     arm.set_design(design_of(arm))
     modes = loaded_modes(arm.elastic, carried, 5, None)
-    expected = dense_values(arm, carried.matrix(), 5)
+    young, density = arm.solid.young_modulus, arm.solid.density
+    K, M = dense_matrices(arm.elastic, young * arm.material.stiffness, density * arm.material.mass)
+    M[-3:, -3:] += carried.matrix()
+    expected = scipy.linalg.eigh(K, M, eigvals_only=True)[:5]
     # LAPACK is right to 1e-16 of the largest eigenvalue, some 1e6 times the lowest.
     np.testing.assert_allclose(modes.values, expected, rtol=1e-8)
     assert modes.frequency == pytest.approx(np.sqrt(expected[0]) / (2.0 * np.pi), rel=1e-8)
@@ -200,6 +169,20 @@ def test_an_arm_cut_in_two() -> None:
         arm.set_design(design_of(arm))
         found.append(loaded_modes(arm.elastic, carried, 3, None).values)
     np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+
+
+def test_ranks_agree_on_floating_solids() -> None:
+    """The refinement of what floats, summed over the ranks, is that of one rank."""
+    found = []
+    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        arm = arm_of((60, 6), "interpolation.floor=1e-9", comm=comm)
+        arm.set_design(
+            design_of(arm, lambda k, x, y: np.floor(12.0 * x) % 2.0 == 0.0).astype(float)
+        )
+        found.append(np.linalg.inv(arm.elastic.constraint_modes().stiffness))
+    assert floats(arm.elastic)
+    scale = np.sqrt(np.outer(np.diag(found[0]), np.diag(found[0])))
+    np.testing.assert_allclose(found[1] / scale, found[0] / scale, atol=1e-4)
 
 
 def euler_values(carried: RigidIntegrals, height: float, count: int) -> np.ndarray:
@@ -447,52 +430,3 @@ def test_a_motor_at_the_elbow_lowers_the_frequency(key: str, mass: float, inerti
 
 
 # -- gradients -------------------------------------------------------------------------------
-
-RIGID = "arms.arm{}.rigid=true"
-
-
-@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["objective.attached=rigid-body"],
-        ["objective.attached=rigid-body", "objective.elbow_angle=2.1", "payload.inertia=0.4"],
-        ["objective.attached=rigid-body", "objective.follow=true"],
-        ["objective.attached=point-mass"],
-        ["objective.attached=none", "arms.passive=0.1"],
-        ["arms.arm2.design=arm1", "objective.exponent=3.0"],
-        ["arms.arm2.design=arm1", "objective.attached=point-mass"],
-        ["arms.joint_mass=2.0", "arms.joint_inertia=0.1"],
-        [RIGID.format(1)],
-        [RIGID.format(2)],
-        ["arms.arm2.density=8000.0", "arms.arm2.young_modulus=2e11", "interpolation.law=simp"],
-    ],
-    ids=" ".join,
-)
-def test_gradients_are_ones(overrides: list[str]) -> None:
-    """All arms' squared periods by all densities: an arm feels the mass of those outboard of it."""
-    built = build("objective.kind=eigenfrequency", "payload.mass=1.0", *overrides)
-    x = built.fields(wave)
-    for direction in (uneven, tip):
-        d = built.fields(direction)
-        built.evaluate(x)
-        slope = built.dot(built.gradient(), d)
-        if slope == 0.0:  # the tip is solid, or no design
-            assert direction is tip
-            continue
-
-        def value(h: float, d=d) -> float:
-            return built.evaluate({k: x[k] + h * d[k] for k in x})[0].objective
-
-        assert rates(value, slope, (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1), direction
-
-
-def test_the_outboard_arm_weighs_on_the_inboard_one() -> None:
-    """Without the coupling the gradient of arm 1's period by arm 2's mass would be missing."""
-    built = build("objective.kind=eigenfrequency", "constraints.first_frequency=1.0")
-    built.evaluate(built.fields(wave))
-    first, second = built.constraint_gradients()
-    ones = built.fields(lambda k, x, y: np.full(len(x), float(k == 1)))
-    others = built.fields(lambda k, x, y: np.full(len(x), float(k == 0)))
-    assert built.dot(first, ones) > 0.0  # heavier outboard: longer period
-    assert built.dot(second, others) == 0.0  # arm 2 does not feel arm 1

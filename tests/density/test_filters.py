@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import dolfinx
 import numpy as np
 import pytest
@@ -56,19 +54,6 @@ def test_constants_bounds_and_volume_are_kept(mesh, radius):
     assert filtered_roughness < roughness or radius == 0.0  # it does smooth
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.0075, 0.12])
-def test_backward_is_the_transpose(mesh, radius):
-    # Cells of different areas, so that the filter is not symmetric by itself.
-    uneven = dataclasses.replace(mesh, area=mesh.area * (0.5 + mesh.centroid[:, 0]))
-    smooth = HelmholtzFilter(uneven, radius)
-    x = rough(mesh.centroid) - 0.4
-    w = np.cos(3e4 * mesh.centroid[:, 0] - 2e4 * mesh.centroid[:, 1])
-    forward, backward = smooth.forward(x), smooth.backward(w)
-    products = np.array([w @ forward, backward @ x, np.abs(w) @ np.abs(forward)])
-    left, right, size = COMM.allreduce(products)
-    assert abs(left - right) < ROUNDING * size
-
-
 @pytest.mark.serial
 def test_backward_is_the_transpose_entry_by_entry():
     mesh = arm(cells=(6, 3))
@@ -91,80 +76,35 @@ def test_radius_zero_is_the_identity(mesh):
         assert y is not x  # who changes the result keeps the design
 
 
-@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
-@pytest.mark.parametrize("radius", [0.03, 0.06])
-def test_response_to_a_point_has_the_second_moment_of_the_cone(radius):
-    """Along a thin arm the kernel is exp(-|s| / r) / (2 r): variance 2 r^2 = radius^2 / 6.
-
-    The five-point scheme has that variance exactly, cell by cell; what the ends cut off is
-    exp(-L / 2 r) = 3e-13 of it and more.
-    """
-    mesh = arm(cells=(201, 1))
-    s = mesh.centroid[:, 0] - 0.5 * LENGTH
-    point = np.where(np.abs(s) < 1e-6, 1.0, 0.0)
-    y = HelmholtzFilter(mesh, radius).forward(point)
-    mass, mean, variance = COMM.allreduce(np.array([y.sum(), y @ s, y @ s**2]))
-    assert mass == pytest.approx(1.0, rel=ROUNDING)
-    # Gmsh places centroids to 2e-12, so distances of cells are right to 4e-10 of their 5 mm.
-    assert mean == pytest.approx(0.0, abs=1e-11)
-    assert variance == pytest.approx(radius**2 / 6.0, rel=1e-8)
+def point(refine):
+    """Return the error of the Green's function beyond its tip, of the peak."""
+    r, along = 0.05, 50 * refine + 1
+    mesh = arm(cells=(along, 1))
+    s = np.abs(mesh.centroid[:, 0] - 0.5 * LENGTH)
+    density = np.where(s < 1e-6, along / LENGTH, 0.0)  # 1/m
+    y = HelmholtzFilter(mesh, radius_of(r)).forward(density)
+    # exp(-s / r) / (2 r) with its images beyond the ends.
+    kernel = np.cosh((0.5 * LENGTH - s) / r) / (2.0 * r * np.sinh(0.5 * LENGTH / r))
+    return np.abs(y - kernel)[s > 0.5 * r].max(initial=0.0) * 2.0 * r
 
 
-def rate(errors, factor=2.0):
-    """Return the exponent of a least-squares power law for errors on ever finer meshes."""
-    steps = np.arange(len(errors)) * np.log(factor)
-    return -np.polyfit(steps, np.log(errors), 1)[0]
-
-
-@pytest.mark.serial
-def test_response_to_a_point_converges_to_the_exponential_kernel():
-    """Error of the Green's function beyond its tip; order 2 in the cell size."""
-    r = 0.05
-    errors = []
-    for along in (51, 101, 201, 401):
-        mesh = arm(cells=(along, 1))
-        s = np.abs(mesh.centroid[:, 0] - 0.5 * LENGTH)
-        density = np.where(s < 1e-6, along / LENGTH, 0.0)  # 1/m
-        y = HelmholtzFilter(mesh, radius_of(r)).forward(density)
-        # exp(-s / r) / (2 r) with its images beyond the ends.
-        kernel = np.cosh((0.5 * LENGTH - s) / r) / (2.0 * r * np.sinh(0.5 * LENGTH / r))
-        away = s > 0.5 * r
-        error = np.abs(y - kernel)[away].max(initial=0.0) * 2.0 * r
-        errors.append(COMM.allreduce(error, MPI.MAX))
-    # Measured: 6.3e-3, 2.2e-3, 5.4e-4, 1.5e-4 of the peak; rate 1.83, coarse meshes included.
-    assert errors[-1] < 2e-4
-    assert 1.75 < rate(errors) < 2.25
+def cosine(refine):
+    """Return the error of an eigenfunction: cos(k s) gives cos(k s) / (1 + r^2 k^2)."""
+    r, waves = 0.02, np.array([5.0 * np.pi / LENGTH, 2.0 * np.pi / HEIGHT])
+    mesh = arm(cells=(25 * refine, 4 * refine))
+    x = np.cos((mesh.centroid + np.array([0.0, 0.5 * HEIGHT])) * waves).prod(axis=1)
+    y = HelmholtzFilter(mesh, radius_of(r)).forward(x)
+    return np.abs(y - x / (1.0 + r**2 * (waves**2).sum())).max(initial=0.0)
 
 
 @pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
-def test_filter_does_not_depend_on_the_mesh():
-    """A cosine is an eigenfunction: x = cos(k s) gives cos(k s) / (1 + r^2 k^2); order 2."""
-    r = 0.02
-    waves = np.array([5.0 * np.pi / LENGTH, 2.0 * np.pi / HEIGHT])
-    errors = []
-    for refine in (1, 2, 4, 8):
-        mesh = arm(cells=(25 * refine, 4 * refine))
-        place = mesh.centroid + np.array([0.0, 0.5 * HEIGHT])
-        x = np.cos(place * waves).prod(axis=1)
-        y = HelmholtzFilter(mesh, radius_of(r)).forward(x)
-        exact = x / (1.0 + r**2 * (waves**2).sum())
-        errors.append(COMM.allreduce(np.abs(y - exact).max(initial=0.0), MPI.MAX))
-    # Measured: 2.2e-2, 7.0e-3, 1.8e-3, 4.7e-4; rate 1.86, coarse meshes included.
-    assert errors[-1] < 6e-4
-    assert 1.75 < rate(errors) < 2.25
-
-
-@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
-def test_ranks_agree_with_one_rank(mesh):
-    def by_place(mesh, comm):
-        smooth = HelmholtzFilter(mesh, 0.03)
-        x = rough(np.round(mesh.centroid, 9))
-        columns = [mesh.centroid, smooth.forward(x)[:, None], smooth.backward(x)[:, None]]
-        rows = np.concatenate(comm.allgather(np.hstack(columns)))
-        return rows[np.lexsort(np.round(rows[:, :2], 6).T)]
-
-    alone = arm(comm=MPI.COMM_SELF)
-    assert np.allclose(by_place(mesh, COMM), by_place(alone, MPI.COMM_SELF), atol=1e-10)
+@pytest.mark.parametrize("field", [point, cosine])
+def test_filter_converges_with_the_mesh(field):
+    """Order 2 in the cell size; measured 1.83 and 1.86, coarse meshes included."""
+    errors = [COMM.allreduce(field(refine), MPI.MAX) for refine in (1, 2, 4, 8)]
+    rate = -np.polyfit(np.arange(4) * np.log(2.0), np.log(errors), 1)[0]
+    assert errors[-1] < 6e-4  # 1.5e-4 and 4.7e-4
+    assert 1.75 < rate < 2.25
 
 
 # -- cells of any shape ----------------------------------------------------------------------

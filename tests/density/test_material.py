@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import ROOT, demo
 
 from dolfinopt.density.interpolation import LAWS, SWITCH, interpolate
 from dolfinopt.output.run import optimize
@@ -17,7 +13,6 @@ from dolfinopt.scene.load import Law, load_scene
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 
-ROOT = Path(__file__).parents[2]
 BOTH_SIDES = SWITCH * (1.0 + np.array([-1e-3, -1e-9, -2e-16, 0.0, 2e-16, 1e-9, 1e-3]))
 X = np.sort(np.concatenate([np.linspace(0.0, 1.0, 101), BOTH_SIDES]))
 FLOOR = 1e-6
@@ -46,15 +41,10 @@ def test_every_law_joins_void_and_solid(law, penalty, floor):
     assert ends.mass == pytest.approx([void, 1.0], rel=ROUNDING)
 
 
-def test_two_material_law_in_the_middle():
-    half = values(0.5, "two-material")
-    assert half.stiffness == pytest.approx([0.125 + 0.875e-6], rel=ROUNDING)
-    assert half.mass == pytest.approx([0.5 + 0.5e-6], rel=ROUNDING)
-
-
 @pytest.mark.parametrize(
     ("law", "x", "stiffness", "mass"),
     [
+        ("two-material", 0.5, 0.125 + 0.875e-6, 0.5 + 0.5e-6),
         ("simp", 0.5, 0.125, 0.5),
         ("simp", 1e-3, 1e-9, 1e-3),
         ("pedersen", 0.5, 0.125, 0.5),
@@ -178,20 +168,9 @@ def test_every_law_optimises(law):
         assert last < 0.6 * first  # the first steps, 0.2 at most each, at least halve it nearly
 
 
-def demo() -> ModuleType:
-    """Import the demo by its path."""
-    path = ROOT / "demos/demo_localised_modes.py"
-    spec = importlib.util.spec_from_file_location("demo_localised_modes", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_local_modes_of_a_frame_with_void(shared_tmp_path: Path) -> None:
+def test_local_modes_of_a_frame_with_void(shared_tmp_path) -> None:
     """Classic SIMP's lowest modes live in the windows; the other laws' are the frame's."""
-    spectra = demo().main(shared_tmp_path, (40, 6), (1e-3, 1e-2, 0.0))
+    spectra = demo("demo_localised_modes").main(shared_tmp_path, (40, 6), (1e-3, 1e-2, 0.0))
     if MPI.COMM_WORLD.rank > 0:
         assert spectra == []
         return
@@ -216,7 +195,9 @@ def test_local_modes_of_a_frame_with_void(shared_tmp_path: Path) -> None:
 
 def test_local_frequencies_scale_with_the_root_of_stiffness_by_mass() -> None:
     """From x = 1e-3 to 2e-3 x^2 grows fourfold, and a window's own frequency twofold."""
-    first, second = (demo().spectrum("simp", void, (40, 6)) for void in (1e-3, 2e-3))
+    first, second = (
+        demo("demo_localised_modes").spectrum("simp", void, (40, 6)) for void in (1e-3, 2e-3)
+    )
     local = first.frequency[first.local][0], second.frequency[second.local][0]
     # floor^2 adds 1e-3 to the stiffness of x^3 = 1e-9, and the frame is not rigid.
     assert local[1] / local[0] == pytest.approx(2.0, rel=2e-3)

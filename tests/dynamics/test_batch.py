@@ -38,33 +38,20 @@ LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
 DAMPING = 1e-3  # s
 
 
-def reach(duration: float, size: float):
-    """Return a quintic motion of cart and two joints."""
-
-    def motion(t: np.ndarray) -> RigidMotion:
-        s, sd, sdd = quintic(t, duration)
-        moved = size * np.array([0.2, 1.0, -0.8])
-        home = np.array([0.0, 0.6, 0.8])
-        return RigidMotion(home + np.outer(s, moved), np.outer(sd, moved), np.outer(sdd, moved))
-
-    return motion
-
-
 def two_arms(
-    payload: float = 1.0,
-    inertia: float = 0.01,
-    duration: float = 0.6,
-    horizon: float = 1.0,
-    size: float = 1.0,
-    gravity: tuple[float, float] = (0.0, 0.0),
-    factors: tuple[float, float, float] = (1.0, 1.0, DAMPING),
-    bending: float = 10.0,
-) -> ElasticSystem:
+    payload=1.0, inertia=0.01, duration=0.6, horizon=1.0, size=1.0, gravity=(0.0, 0.0),
+    factors=(1.0, 1.0, DAMPING), bending=10.0,
+) -> ElasticSystem:  # fmt: skip
     """Return two slender arms of 1 to 50 Hz; factors of mass, stiffness, and the damping, s."""
     body = beam(bending=bending, axial=300.0, damping=DAMPING).body()
     bodies = tuple(of_material(body, *factors) for _ in range(2))
     mechanism = Mechanism(bodies, payload, inertia, gravity, 0.0)
-    return ElasticSystem(mechanism, reach(duration, size), (0.0, duration, horizon))
+
+    def motion(t: np.ndarray) -> RigidMotion:
+        s, sd, sdd = (np.outer(x, size * np.array([0.2, 1.0, -0.8])) for x in quintic(t, duration))
+        return RigidMotion(np.array([0.0, 0.6, 0.8]) + s, sd, sdd)
+
+    return ElasticSystem(mechanism, motion, (0.0, duration, horizon))
 
 
 def various() -> list[ElasticSystem]:
@@ -132,40 +119,17 @@ def test_scales_are_those_of_scaled_bodies():
     change = rng.normal(size=(3, 4, 6))
     felt = slopes.times(*change, np.arange(6))
     for n in range(4):
-        one = Mechanism(
-            tuple(
-                of_material(body, f[0], f[1], f[2] / f[1])
-                for body, f in zip(bodies, factors[n], strict=True)
-            ),
-            payload[n, 0],
-            payload[n, 1],
-            (payload[n, 2], payload[n, 3]),
-            0.0,
-        )
-        at = RigidMotion(motion.q[n : n + 1], motion.qd[n : n + 1], motion.qdd[n : n + 1])
-        here = (q[n : n + 1], qd[n : n + 1], qdd[n : n + 1])
-        alone = inverse_dynamics(one, at, *here)
+        own = (of_material(b, f[0], f[1], f[2] / f[1]) for b, f in zip(bodies, factors[n]))
+        gravity = (payload[n, 2], payload[n, 3])
+        one = Mechanism(tuple(own), payload[n, 0], payload[n, 1], gravity, 0.0)
+        at, (q1, qd1, qdd1) = motion[n : n + 1], (x[n : n + 1] for x in (q, qd, qdd))
         # The same sums in another order: rounding.
-        np.testing.assert_allclose(rows[n], alone[0][0], rtol=1e-11, atol=1e-11)
-        np.testing.assert_allclose(drives[n], alone[1][0], rtol=1e-11, atol=1e-11)
-        matrix = linearise(one, at, *here).dense()[0]
-        np.testing.assert_allclose(slopes.dense()[n], matrix, rtol=1e-11, atol=1e-11)
+        alone = inverse_dynamics(one, at, q1, qd1, qdd1)
+        matrix = linearise(one, at, q1, qd1, qdd1).dense()[0]
         moved = matrix @ np.concatenate([x[n] for x in change])
-        np.testing.assert_allclose(felt[n], moved, rtol=1e-10, atol=1e-10)
-
-
-def test_wanted_rows_and_repeated_instants():
-    """One instant's tangent for several changes, of some rows: the same numbers."""
-    problem = two_arms()
-    rng = np.random.default_rng(5)
-    q, qd, qdd = 0.01 * rng.normal(size=(3, 4, 6))
-    keep, wanted = np.array([0, 2, 4]), np.array([1, 2, 5])
-    slopes = linearise(problem.mechanism, problem.motion(np.linspace(0, 0.6, 4)), q, qd, qdd, keep)
-    change = rng.normal(size=(3, 8, 3))
-    both = slopes.times(*change, wanted)
-    for k in range(2):
-        each = slopes.times(*change[:, k::2], np.arange(6))
-        np.testing.assert_allclose(both[k::2], each[:, wanted], rtol=1e-12, atol=1e-12)
+        pairs = (rows, alone[0][0]), (drives, alone[1][0]), (slopes.dense(), matrix), (felt, moved)
+        for found, expected in pairs:
+            np.testing.assert_allclose(found[n], expected, rtol=1e-10, atol=1e-10)
 
 
 def test_related_bodies():
@@ -192,7 +156,8 @@ def test_related_bodies():
 @pytest.mark.parametrize("stages", [1, 2, 3, 4])
 def test_held_matrix_is_exact_where_the_tangent_rests(stages):
     """At rest and without motion, stage by stage the same tangent: both matrices are one."""
-    resting = replace(two_arms(), motion=lambda t: reach(0.6, 1.0)(np.zeros_like(t)))
+    moving = two_arms()
+    resting = replace(moving, motion=lambda t: moving.motion(np.zeros_like(t)))
     modes, method = modes_of(resting), radau_iia(stages)
     own = stages_of(modes, method, even_steps(resting, 12))
     count = len(own.h)

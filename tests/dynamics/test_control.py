@@ -1,4 +1,4 @@
-"""The two-arm machine under feedback control: against geometrically exact beams, and limits."""
+"""Machines under control: against geometrically exact beams, energy, stiff limits, soft joints."""
 
 from __future__ import annotations
 
@@ -6,42 +6,51 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reference_machines import (
+from machines import (
     GAINS,
     Tree,
     apart,
+    energies,
+    four_bar,
     imbalance,
     machine,
     reference,
     simulated,
+    slider_crank,
     two_arm,
     with_keys,
 )
+from runs import TWO_ARM, overrides, run
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import LINEAR, saturated
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 
+# Ten times the earth's in the loops, whose speed leaves little to it.
+EARTH, STRONG = {"gravity": [0.0, -9.81]}, {"gravity": [0.0, -98.1]}
+SOFT = {"joint_stiffness": 1e5, "joint_damping": 100.0}
+ROTORS = {"rotor_inertia": 2e-5, "gear_ratio": 100.0}
 
-@pytest.fixture(scope="module")
-def controlled() -> Tree:
-    """Return the scene of `reference/control_half_1.9s.csv`."""
+
+def small(joints: Tree | None = None, **changes: Any) -> Tree:
+    """Return the controlled machine on few cells, its arms with keys of their joints."""
+    cells = ("arms.cells=[16,3]", "reduction.coordinates=3", "motion.horizon=1.9")
+    tree = two_arm(*cells, control=GAINS, simulation={"stiffening": True, "tolerance": 1e-5})
+    for arm in tree["arms"]:
+        arm |= joints or {}
+    return with_keys(tree, changes)
+
+
+# -- exact beams -----------------------------------------------------------------------------
+
+
+def test_deviation_and_forces_of_exact_beams() -> None:
+    """Exudyn's beams with the same controller, and a second code: `reference/README.md`."""
     tree = two_arm("arms.cells=[100,6]", "reduction.coordinates=6", control=GAINS)
     simulation = {"stiffening": True, "sample": 1e-2, "tolerance": 1e-5}
-    return with_keys(tree, {"simulation": simulation})
-
-
-@pytest.fixture(scope="module")
-def moved(controlled: Tree) -> SimulationResult:
-    """Return its simulation."""
-    return simulated(controlled)
-
-
-def test_deviation_and_forces_of_exact_beams(moved: SimulationResult) -> None:
-    """Exudyn's beams with the same controller, and a second code: `reference/README.md`."""
+    moved = simulated(with_keys(tree, {"simulation": simulation}))
     expected, (trajectory, _) = reference("control_half_1.9s"), machine(moved)
     assert np.allclose(trajectory.t, expected["t"])
     path = np.stack([expected["dev_x"], expected["dev_y"]], axis=1)
@@ -59,17 +68,61 @@ def test_deviation_and_forces_of_exact_beams(moved: SimulationResult) -> None:
         assert apart(trajectory.joint_forces[:, k], expected[f"u_{name}"]) < 5e-3  # 3.7e-3
 
 
-def small(**changes: Any) -> Tree:
-    """Return the controlled machine on few cells."""
-    overrides = ("arms.cells=[20,3]", "reduction.coordinates=3", "motion.horizon=2.2")
-    tree = two_arm(*overrides, control=GAINS, simulation={"stiffening": True, "tolerance": 1e-5})
-    return with_keys(tree, changes)
+@pytest.mark.parametrize(("stiffening", "least", "most"), [(True, 0.0, 4e-3), (False, 1e-2, 3e-2)])
+def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: float) -> None:
+    """Fast arms with 0.5 kg: linear they are 2.0 % off, stiffened 0.39 %; `reference/README.md`."""
+    expected = reference("two_arm_half_T0.9_0.5kg")
+    motion = {"duration": 0.9, "horizon": float(expected["t"][-1])}
+    simulation = {"stiffening": stiffening, "sample": 5e-3, "tolerance": 1e-5}
+    told = {"motion": motion, "simulation": simulation}
+    moved = simulated(two_arm("reduction.coordinates=6", "payload.mass=0.5", **told)).trajectory
+    assert moved is not None
+    trajectory = moved.sampled
+    assert np.allclose(trajectory.t, expected["t"])
+    path = np.stack([expected["dev_x"], expected["dev_y"]], axis=1)
+    off = np.hypot(*(trajectory.deviation - path).T).max() / np.hypot(*path.T).max()
+    assert least < off < most
 
 
-@pytest.mark.parametrize("stiffening", [False, True])
-def test_work_of_the_drives_is_energy(stiffening: bool) -> None:
-    """What the drives do is kinetic and strain energy and what damping took."""
-    assert imbalance(simulated(small(simulation={"stiffening": stiffening}))) < 1e-6  # 4e-9
+# -- energy ----------------------------------------------------------------------------------
+
+
+def arms(stiffening: bool, **changes: object) -> Tree:
+    """Return the machine with motors at its joints under gravity, without control unless told."""
+    simulation = {"stiffening": stiffening, "tolerance": 1e-6}
+    tree = small({"joint_mass": 0.5, "joint_inertia": 0.01}, motion=EARTH, simulation=simulation)
+    return {**tree, "control": None, **changes}
+
+
+def loop(tree: Tree) -> Tree:
+    """Return a closed loop of soft bars under gravity."""
+    tree["material"]["young_modulus"] *= 0.1
+    keys = {"simulation": {"tolerance": 1e-6}, "reduction": {"coordinates": 3}}
+    return with_keys(tree, {**keys, "motion": {**STRONG, "horizon": 0.1}})
+
+
+SCENES = {
+    "prescribed": lambda: arms(False),
+    "prescribed, stiffened": lambda: arms(True),
+    "controlled": lambda: arms(False, control=GAINS),
+    "controlled, stiffened": lambda: arms(True, control=GAINS),
+    "slider": lambda: loop(slider_crank(0.012, (20, 3))),
+    "pin": lambda: loop(four_bar((20, 3))),
+}
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_work_under_gravity_is_energy(kind: str) -> None:
+    """Drive work = kinetic + strain + potential energy + what damping took."""
+    result = simulated(SCENES[kind]())
+    trajectory = result.trajectory
+    assert trajectory is not None
+    parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
+    assert min(parts) > 1e-4 * max(parts)  # each of them counts
+    assert imbalance(result) < 1e-8  # measured 2e-11 at most
+
+
+# -- limits ----------------------------------------------------------------------------------
 
 
 def test_rigid_limit() -> None:
@@ -83,14 +136,59 @@ def test_rigid_limit() -> None:
     assert result.max_deviation < 1e-4  # m; 3.6e-5
 
 
-def test_generalised_alpha() -> None:
+def test_stiff_springs_are_rigid_drives() -> None:
+    """The motors' inertia acts on the joints then; the rest falls with the spring's softness."""
+    rigid = machine(simulated(small(ROTORS, motion=EARTH)))[0]
+    left = []
+    for stiffness in (2e6, 2e7):
+        spring = {"joint_stiffness": stiffness, "joint_damping": 1e-3 * stiffness}
+        soft = machine(simulated(small(ROTORS | spring, motion=EARTH)))[0]
+        assert soft.problem.num_coordinates == rigid.problem.num_coordinates + 2
+        left.append(apart(soft.deviation, rigid.deviation))
+    assert left[0] / left[1] == pytest.approx(10.0, rel=0.05)
+    assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
+
+
+@pytest.mark.parametrize("joints", [{}, SOFT, SOFT | ROTORS], ids=["rigid", "light", "rotors"])
+def test_generalised_alpha(joints: Tree) -> None:
     """The conventional method finds the same motion, to the error it says it has."""
-    tree = small()
-    options = {"integrator": "generalized-alpha", "tolerance": 1e-3}
+    tree = small(joints, motion={"horizon": 1.0, "duration": 1.0}, payload={"mass": 2.0})
+    options = {"integrator": "generalized-alpha", "tolerance": 3e-3}
     other, _ = machine(simulated(with_keys(tree, {"simulation": options})))
     trajectory, _ = machine(simulated(tree))
-    assert apart(other.deviation, trajectory.deviation) < 1e-3  # measured 1.1e-4
-    assert apart(other.joint_forces, trajectory.joint_forces) < 2e-3  # 3.3e-4
+    assert apart(other.deviation, trajectory.deviation) < 3e-3  # measured 6.8e-4
+    assert apart(other.joint_forces, trajectory.joint_forces) < 6e-3  # 8.0e-4
+
+
+def test_motors_on_the_desired_motion_move_their_rotors() -> None:
+    """Without control the drives give what the springs take, and what the rotors' inertia does."""
+    light, heavy = (
+        simulated(small(SOFT | ROTORS | {"rotor_inertia": one}, control=None)).trajectory
+        for one in (0.0, 2e-5)
+    )
+    np.testing.assert_array_equal(heavy.deviation, light.deviation)  # the arms do not feel it
+    change = heavy.joint_forces - light.joint_forces
+    expected = 2e-5 * 100.0**2 * heavy.desired.qdd
+    expected[:, 0] = 0.0  # the cart is prescribed, and moved by what the arms do
+    size = np.abs(heavy.joint_forces).max()
+    np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
+
+
+def test_angles_of_motors_are_written(tmp_path) -> None:
+    """At rest under gravity the drives give what the springs between motor and arm give."""
+    gains = "control={stiffness=[2e5, 2e4, 2e4], damping=[2e4, 600.0, 600.0]}"
+    joints = (f"arms.{key}={value}" for key, value in (SOFT | ROTORS).items())
+    quick = "arms.cells=[16,3]", "motion.horizon=1.9", "simulation.tolerance=1e-3"
+    changes = (*quick, gains, "motion.gravity=[0.0, -9.81]", *joints)
+    run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "run", *overrides(*changes))
+    found = np.load(tmp_path / "run" / "trajectory.npz")
+    twist = found["q_motors"][0] - found["q_r"][0, 1:]
+    np.testing.assert_allclose(1e5 * twist, found["joint_forces"][0, 1:], rtol=1e-9)
+    header = (tmp_path / "run" / "trajectory.csv").read_text().splitlines()[0]
+    assert "q_motor_arm1,q_motor_arm2" in header
+
+
+# -- saturation ------------------------------------------------------------------------------
 
 
 def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
@@ -115,9 +213,8 @@ def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
 def lifting(mass: float, limits: list[float] | None) -> Tree:
     """Return a robot of two links that lifts its payload, its drives as its data sheet has them."""
     bar = {"height": 0.1, "thickness": 0.02, "cells": [16, 3], "passive": 0.0}
-    robot = two_arm("motion.horizon=1.2", "motion.duration=0.8", control={
-        "stiffness": [2e4, 1e4], "damping": [600.0, 200.0], **({"limits": limits} if limits else {})
-    })  # fmt: skip
+    gains = {"stiffness": [2e4, 1e4], "damping": [600.0, 200.0]}
+    robot = two_arm(control=gains | ({"limits": limits} if limits else {}))
     robot["arms"] = [
         {"name": "upper", "length": 0.612, "joint_mass": 4.0, **bar},
         {"name": "fore", "length": 0.572, "joint_mass": 0.0, **bar},
@@ -138,23 +235,5 @@ def test_robot_within_its_data_sheet() -> None:
     forces = np.abs(machine(simulated(lifting(17.0, weak)))[0].joint_forces[:, 1:])
     assert forces[:, 0].max() == pytest.approx(260.0, rel=1e-12)
     assert (forces <= np.array(weak) * (1.0 + 1e-12)).all()
-    with pytest.raises(ConvergenceError, match=r"too weak or soft for gravity.*control\.limits"):
+    with pytest.raises(ConvergenceError, match=r"control\.limits.*control\.stiffness"):
         simulated(lifting(40.0, limits))
-
-
-@pytest.mark.parametrize(("stiffening", "least", "most"), [(True, 0.0, 4e-3), (False, 1e-2, 3e-2)])
-def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: float) -> None:
-    """Fast arms with 0.5 kg: linear they are 2.0 % off, stiffened 0.39 %; `reference/README.md`."""
-    expected = reference("two_arm_half_T0.9_0.5kg")
-    horizon = float(expected["t"][-1])
-    overrides = ("reduction.coordinates=6", "payload.mass=0.5")
-    motion = {"duration": 0.9, "horizon": horizon}
-    simulation = {"stiffening": stiffening, "sample": 5e-3, "tolerance": 1e-5}
-    tree = two_arm(*overrides, motion=motion, simulation=simulation)
-    moved = simulated(tree).trajectory
-    assert moved is not None
-    trajectory = moved.sampled
-    assert np.allclose(trajectory.t, expected["t"])
-    path = np.stack([expected["dev_x"], expected["dev_y"]], axis=1)
-    off = np.hypot(*(trajectory.deviation - path).T).max() / np.hypot(*path.T).max()
-    assert least < off < most

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bodies import CONSTANTS, changed, derivative, unit_changes
+from bodies import CONSTANTS, change_of, changed, derivative
 from machines import controlled, loop
 
 from dolfinopt import Model
@@ -110,6 +110,28 @@ def test_by_coordinates_and_rates(kind: str, count: int, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_tangent(kind: str, folder: Path) -> None:
+    """The derivative of the residual, along random directions of coordinates and of rates."""
+    system = moved(kind, folder).problem
+    t, rates, sizes = state(moved(kind, folder), 3)
+    instants, rng = system.at(t), np.random.default_rng(4)
+    matrix = instants.linearise(*rates).dense().reshape(3, len(sizes[0]), 3, -1)
+    for order, size in enumerate(sizes):
+        direction = 0.1 * size * rng.uniform(-1.0, 1.0, size=rates[order].shape)
+
+        def along(h: float, order: int = order, direction: np.ndarray = direction) -> np.ndarray:
+            return instants.residual(
+                *(x + h * direction * (k == order) for k, x in enumerate(rates))
+            )
+
+        found = np.einsum("nij,nj->ni", matrix[:, :, order], direction)
+        bound = np.einsum("nij,nj->ni", np.abs(matrix[:, :, order]), np.abs(direction))
+        # Rounding of residuals of a thousand newtons.
+        rounding = 1e-11 * np.abs(instants.residual(*rates)).max()
+        assert (np.abs(derivative(along, 0.05) - found) <= near(kind) * bound + rounding).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_by_bodies(kind: str, folder: Path) -> None:
     """By every constant: inverse dynamics of prescribed drives, feed-forward, the loop's lever."""
     trajectory = moved(kind, folder)
@@ -122,11 +144,8 @@ def test_by_bodies(kind: str, folder: Path) -> None:
     slopes = []
     for arm, body in enumerate(system.mechanism.bodies):
         for name in CONSTANTS:
-            changes = list(unit_changes(body, name))
-            if not changes:
-                continue
-            size = 0.01 * max(float(np.abs(getattr(body, name)).max()), 1e-6)
-            change = size * sum(rng.uniform(-1.0, 1.0) * c for c in changes)
+            largest = float(np.abs(getattr(body, name)).max(initial=0.0))
+            change = 0.01 * max(largest, 1e-6) * change_of(rng, body, name)
 
             def along(h: float, arm: int = arm, name: str = name, c: np.ndarray = change) -> float:
                 mechanism = changed(system.mechanism, arm, name, h * c)

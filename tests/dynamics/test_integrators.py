@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
-from mpi4py import MPI
+from remainders import build
 from scipy.integrate import solve_ivp
 
-import dolfinopt as do
 from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics import newton as factors
 from dolfinopt.dynamics import radau as march
@@ -24,7 +22,6 @@ from dolfinopt.dynamics.collocation import (
     at_stages,
     counted,
     even_steps,
-    lagrange_integrals,
     residual_at,
     stages_of,
     step_ends,
@@ -90,22 +87,11 @@ def two_arms(
 
 def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> ElasticSystem:
     """Return one coordinate of that frequency (rad/s) and damping ratio that the cart pushes."""
-    body = plane_body(
-        mass=1.0,
-        moment=np.zeros(2),
-        inertia=0.0,
-        C=np.array([[1.0], [0.0]]),
-        j=np.zeros(1),
-        r=np.zeros(1),
-        M=np.eye(1),
-        G=np.zeros((1, 1)),
-        K=frequency**2 * np.eye(1),
-        D=2.0 * damping * frequency * np.eye(1),
-        outboard=np.zeros((3, 1)),
-        outboard_point=np.array([1.0, 0.0]),
-    )
-    mechanism = Mechanism((body,), 0.0, 0.0, (0.0, 0.0), 0.0)
-    return ElasticSystem(mechanism, motion, (0.0, PUSH, end))
+    none, one, tip = np.zeros(1), np.eye(1), np.array([1.0, 0.0])
+    C, D = tip[:, None], 2.0 * damping * frequency * one
+    shape = (none, none, one, 0.0 * one, frequency**2 * one, D, np.zeros((3, 1)), tip)
+    body = plane_body(1.0, np.zeros(2), 0.0, C, *shape)
+    return ElasticSystem(Mechanism((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
 
 
 PUSH = 0.1  # s, when the cart begins to accelerate
@@ -218,19 +204,6 @@ def test_step_response_of_an_oscillator(integrator: str, damping: float) -> None
     assert solution.error <= tolerance
 
 
-@pytest.mark.parametrize("rho_inf", [0.0, 0.5, 1.0])
-def test_unresolved_vibration_dies_by_rho_inf(rho_inf: float) -> None:
-    """A push of steps a hundred times too long: what is left of it after ten more steps."""
-    problem = oscillator(1e4, 0.0, pushed, 0.3)  # h = 0.01 s: w h = 100
-    solution = generalized_alpha.on_grid(problem, even_steps(problem, 30), 1e-6, rho_inf)
-    vibration = np.abs(solution.sample(solution.time_grid)[:, 0] + 1e-8)  # about -1 / w^2
-    # A double eigenvalue rho_inf: (1 + n) rho_inf^n up to a factor of the two vectors' angle.
-    bound = 10.0 * 11.0 * rho_inf**10
-    left = vibration[20:].max() / 1e-8
-    assert left <= bound + 1e-3  # w h is not infinite
-    assert rho_inf < 1.0 or left > 0.9
-
-
 @BOTH
 def test_rest_under_gravity_is_static_equilibrium(integrator: str) -> None:
     """Starts where the potential is stationary, and stays there."""
@@ -279,24 +252,10 @@ def fitted_order(
     return float(np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0]))
 
 
-@pytest.mark.parametrize(
-    ("stages", "counts"), [(1, (200, 800)), (2, (40, 160)), (3, (40, 160)), (4, (20, 40))]
-)
-def test_order_of_radau(stages: int, counts: tuple[int, int]) -> None:
-    """Order 2 s - 1 at the steps' ends, against one stage more on the finest steps."""
-    problem, _ = two_arms(swing, (0.0, 0.5), axial=100.0, damping=2e-3)
-    finest = even_steps(problem, max(counts))
-    # Far below the errors that are measured, 1e-9 at the least.
-    reference = radau.on_grid(problem, finest, 1e-12, stages + 1)
-    order = fitted_order(
-        problem, lambda edges: radau.on_grid(problem, edges, 1e-12, stages), counts, reference
-    )
-    # Shaken by the fastest vibration, 43 Hz, of which the longest steps see one period.
-    assert order == pytest.approx(2 * stages - 1, abs=0.2)
-
-
 def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
     """Return a motion over half a second by a drive's profile, and where its phases end."""
+    if name == "smooth":
+        return swing, (0.0, 0.5)
     law, size = law_for(name, 1.0, Limits(), 0.4), np.array([0.1, 0.5, -0.4])
 
     def motion(t: np.ndarray) -> RigidMotion:
@@ -306,16 +265,25 @@ def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
     return motion, (0.0, *(0.5 * law.knots).tolist(), 0.5)
 
 
-@pytest.mark.parametrize("name", ["trapezoidal", "s-curve"])
-@pytest.mark.parametrize(("stages", "counts"), [(2, (40, 160)), (3, (40, 160)), (4, (40, 80))])
-def test_order_of_radau_with_jumps(name: str, stages: int, counts: tuple[int, int]) -> None:
-    """Accelerations and jerks that jump at the steps' ends, and only there, keep the order."""
+@pytest.mark.parametrize(
+    ("name", "stages", "counts"),
+    [
+        *(("smooth", *one) for one in ((1, (200, 800)), (2, (40, 160)), (3, (40, 160)))),
+        ("smooth", 4, (20, 40)),
+        *(("trapezoidal", *one) for one in ((2, (40, 160)), (3, (40, 160)), (4, (40, 80)))),
+        *(("s-curve", *one) for one in ((2, (40, 160)), (3, (40, 160)), (4, (40, 80)))),
+    ],
+)
+def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None:
+    """2 s - 1 at the steps' ends; jumps of acceleration and jerk there, and only there, keep it."""
     problem, _ = two_arms(*profile(name), axial=100.0, damping=2e-3)
+    # One stage more on the finest steps: far below the errors that are measured, 1e-9 at the least.
     reference = radau.on_grid(problem, even_steps(problem, max(counts)), 1e-12, stages + 1)
     order = fitted_order(
         problem, lambda edges: radau.on_grid(problem, edges, 1e-12, stages), counts, reference
     )
-    assert order == pytest.approx(2 * stages - 1, abs=0.4)
+    # Shaken by the fastest vibration, 43 Hz, of which the longest steps see one period.
+    assert order == pytest.approx(2 * stages - 1, abs=0.2 if name == "smooth" else 0.4)
 
 
 @BOTH
@@ -326,6 +294,7 @@ def test_jumps_of_acceleration_meet_the_tolerance(integrator: str) -> None:
     tolerance = 1e-5 if integrator == "radau" else 1e-3
     found = solve(integrator, problem, tolerance)
     assert np.isin(problem.breakpoints, found.time_grid).all()
+    assert (np.diff(found.time_grid) > 0.0).all()
     assert distance(problem, found, exact) <= tolerance
 
 
@@ -347,32 +316,6 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
 
 
 # -- energy ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_work_of_the_joints_becomes_energy(damping: float) -> None:
-    """Work of cart and joints = change of kinetic + potential energy + what damping took."""
-    problem, chain = two_arms(damping=damping, gravity=(0.0, -9.81))
-    solution = radau.integrate(problem, 1e-7, 3, Profile())
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    h = np.diff(solution.time_grid)
-    t = (solution.time_grid[:-1, None] + h[:, None] * 0.5 * (nodes + 1.0)).ravel()
-    motion = problem.motion(t)
-    q, qd, qdd = (solution.sample(t, k) for k in range(3))
-    drives = inverse_dynamics(problem.mechanism, motion, q, qd, qdd)[1]
-    D = np.kron(np.eye(2), chain.clouds[0].D)
-    power = (drives * motion.qd).sum(axis=1) - np.einsum("nk,kl,nl->n", qd, D, qd)
-    work = np.cumsum((0.5 * h) * (power.reshape(len(h), -1) @ weights))
-
-    ends = solution.time_grid
-    rigid = problem.motion(ends)
-    y = np.concatenate([rigid.q, solution.sample(ends)], axis=1)
-    yd = np.concatenate([rigid.qd, solution.sample(ends, 1)], axis=1)
-    kinetic = np.array([chain.kinetic(*pair) for pair in zip(y, yd, strict=True)])
-    energy = kinetic + [chain.potential(row) for row in y]
-    # Speeds are less exact than the coordinates: by the ratio of the fastest to the slowest
-    # vibration, about fifty.
-    assert_close(work, energy[1:] - energy[0], 50 * 1e-7, kinetic.max())
 
 
 # -- error control ---------------------------------------------------------------------------
@@ -428,24 +371,6 @@ def test_relative_error_is_of_the_worst_arm() -> None:
     assert nothing == pytest.approx(0.2 * np.sqrt(K), rel=1e-14)
 
 
-def test_tolerance_beyond_rounding() -> None:
-    """Radau says what it reached; generalised-alpha what it would take."""
-    problem, _ = two_arms(swing, (0.0, 0.5))
-    with pytest.raises(ConvergenceError, match=r"reaches an error of \S+e-1\d .*tolerance"):
-        radau.integrate(problem, 1e-17, 4, Profile())
-    with pytest.raises(ConvergenceError, match=r"needs about \S+ steps"):
-        generalized_alpha.integrate(problem, 1e-11, 0.8, Profile())
-
-
-@BOTH
-def test_steps_end_at_the_breakpoints(integrator: str) -> None:
-    """So that no step spans a jump of the motion's third derivative."""
-    problem, _ = two_arms()
-    solution = solve(integrator, problem, 1e-2)
-    assert np.isin(problem.breakpoints, solution.time_grid).all()
-    assert (np.diff(solution.time_grid) > 0.0).all()
-
-
 # -- agreement -------------------------------------------------------------------------------
 
 
@@ -474,8 +399,8 @@ def scipy_solution(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
 
 def test_agrees_with_scipy() -> None:
     """Three implementations, one motion."""
-    problem, _ = two_arms(gravity=(0.0, -9.81))
-    t = np.linspace(0.0, 1.0, 101)
+    problem, _ = two_arms(breakpoints=(0.0, 0.3), gravity=(0.0, -9.81))
+    t = np.linspace(0.0, 0.3, 31)
     expected = scipy_solution(problem, t)
     for integrator, tolerance in (("radau", 1e-5), ("generalized-alpha", 1e-3)):
         q = solve(integrator, problem, tolerance).sample(t)
@@ -488,11 +413,35 @@ def test_integrators_agree_on_other_chains(arms: int) -> None:
     """One arm and three."""
     size = (0.2, 1.0, -0.8, 0.5)[: 1 + arms]
     problem, _ = two_arms(lambda t: reach(t, size), arms=arms, damping=2e-3)
-    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 1e-3)
-    assert distance(problem, other, one) <= 1e-3 + 1e-5
+    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 3e-3)
+    assert distance(problem, other, one) <= 3e-3 + 1e-5
 
 
 # -- robustness ------------------------------------------------------------------------------
+
+Answer = Callable[[int, Callable[[], Solution], np.ndarray], Solution]
+
+
+@pytest.fixture
+def on_grids(monkeypatch: pytest.MonkeyPatch) -> Callable[[Answer], list[int]]:
+    """Let grids be solved by a function of their number and the true answer; return their steps."""
+
+    def replaced(answer: Answer) -> list[int]:
+        grids: list[int] = []
+        true = radau._on_grid
+
+        def seen(*details: Any) -> Solution:
+            grids.append(len(details[1]) - 1)
+            return answer(len(grids), lambda: true(*details), details[1])
+
+        monkeypatch.setattr(radau, "_on_grid", seen)
+        return grids
+
+    return replaced
+
+
+def stuck(*_: object) -> Any:
+    raise ConvergenceError("no further than t = 0.1 s; stiffen the arms")
 
 
 def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -500,8 +449,7 @@ def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _ = two_arms(payload=2.0, bending=3.0)
     edges = even_steps(problem, 100)
     plain = radau.on_grid(problem, edges, 1e-8, 3)
-    windows = []
-    newton = march.newton
+    windows, newton = [], march.newton
 
     def spy(stages, *arguments, **options):  # type: ignore[no-untyped-def]
         answer = newton(stages, *arguments, **options)
@@ -526,91 +474,87 @@ def test_large_deflections_are_solved_from_rest() -> None:
     assert distance(problem, other, one) <= 1e-2
 
 
-@BOTH
+def soft_arms() -> ElasticSystem:
+    """Return arms spun up to where centrifugal forces beat the stiffness."""
+    spun = lambda t: reach(t, (0.0, 300.0, 0.0))  # noqa: E731
+    return two_arms(spun, (0.0, 0.6), bending=1e-2, axial=1.0)[0]
+
+
+def folded_arms() -> ElasticSystem:
+    """Return arms that the first acceleration alone would fold."""
+    return two_arms(swing, (0.0, 1.0), payload=2.0, bending=1e-4, axial=1e-2)[0]
+
+
 @pytest.mark.filterwarnings("error")
-def test_arms_too_soft_are_a_named_error(integrator: str) -> None:
-    """Spun up to where centrifugal forces beat the stiffness, deflections grow without bound."""
-    problem, _ = two_arms(
-        lambda t: reach(t, (0.0, 300.0, 0.0)), (0.0, 0.6), bending=1e-2, axial=1.0
-    )
-    why = {"radau": r"deflects by \d+ % of its length", "generalized-alpha": "in a time step"}
-    with pytest.raises(ConvergenceError, match=rf"{why[integrator]}.*material\.young_modulus"):
-        solve(integrator, problem, 1e-2)
+@pytest.mark.parametrize(
+    ("integrator", "problem", "tolerance", "stages", "words"),
+    [
+        ("radau", soft_arms, 1e-2, 3, r"deflects by \d+ %.*material\.young_modulus"),
+        ("generalized-alpha", soft_arms, 1e-2, 3, r"time step.*material\.young_modulus"),
+        ("radau", folded_arms, 1e-2, 3, "no static equilibrium"),
+        ("generalized-alpha", folded_arms, 1e-2, 3, "no static equilibrium"),
+        # Beyond rounding Radau says what it reached, generalised-alpha what it would take.
+        ("radau", lambda: two_arms(swing, (0.0, 0.5))[0], 1e-17, 4, r"\S+e-1\d .*tolerance"),
+        ("generalized-alpha", lambda: two_arms(swing, (0.0, 0.5))[0], 1e-11, 3, r"about \S+ steps"),
+    ],
+    ids=lambda one: getattr(one, "__name__", str(one)),
+)
+def test_what_cannot_be_solved_is_a_named_error(integrator, problem, tolerance, stages, words):
+    with pytest.raises(ConvergenceError, match=words):
+        if integrator == "radau":
+            radau.integrate(problem(), tolerance, stages, Profile())
+        else:
+            solve(integrator, problem(), tolerance)
 
 
 @pytest.mark.parametrize("failing", [0, 1, 3])
-def test_failures_on_any_grid_are_a_named_error(
-    monkeypatch: pytest.MonkeyPatch, failing: int
-) -> None:
+def test_failures_on_any_grid_are_a_named_error(monkeypatch, on_grids, failing: int) -> None:
     """A grid fails, then the march along the motion: its error names the remedy."""
     problem, _ = two_arms()
     plain = radau.on_grid(problem, even_steps(problem, 20), 1e-2, 3)
-    grids = []
 
-    def poor(*details: Any) -> Solution:
-        grids.append(len(details[1]) - 1)
-        if len(grids) > failing:
-            raise ConvergenceError("Newton's method fails")
-        return replace(plain, error=0.3**failing)
+    def poor(number: int, *_: object) -> Solution:
+        return stuck() if number > failing else replace(plain, error=0.3**failing)
 
-    def stuck(*_: object) -> None:
-        raise ConvergenceError("no further than t = 0.1 s; stiffen the arms")
-
-    monkeypatch.setattr(radau, "_on_grid", poor)
+    grids = on_grids(poor)
     monkeypatch.setattr(radau, "graded", stuck)
     with pytest.raises(ConvergenceError, match="stiffen the arms"):
         solve("radau", problem, 1e-2)
     assert len(grids) == failing + 1
 
 
-def test_marches_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_marches_once(monkeypatch: pytest.MonkeyPatch, on_grids) -> None:
     """Where its steps fail, too, nothing else is tried."""
-    problem, _ = two_arms()
-    grids, marches, graded, estimated = [], [], radau.graded, radau.estimated_errors
-
-    def poor(*details: Any) -> Solution:
-        grids.append(len(details[1]) - 1)
-        raise ConvergenceError("Newton's method fails; stiffen the arms")
-
-    def march_along(*details: Any) -> march.Graded:
-        marches.append(details)
-        return graded(*details)
-
-    monkeypatch.setattr(radau, "_on_grid", poor)
-    monkeypatch.setattr(radau, "graded", march_along)
-    monkeypatch.setattr(radau, "estimated_errors", lambda *a: estimated(*a) + 1e-1)
+    marches, graded, estimated = [], radau.graded, radau.estimated_errors
+    grids = on_grids(stuck)
+    monkeypatch.setattr(radau, "graded", lambda *told: (marches.append(1), graded(*told))[1])
+    monkeypatch.setattr(radau, "estimated_errors", lambda *told: estimated(*told) + 1e-1)
     with pytest.raises(ConvergenceError, match="stiffen the arms"):
-        solve("radau", problem, 1e-2)
+        solve("radau", two_arms()[0], 1e-2)
     assert (len(grids), len(marches)) == (2, 1)
 
 
 @pytest.mark.parametrize(
-    ("error", "message", "most"),
+    ("error", "words", "most"),
     [
-        (1.0, r"reaches an error of 1 with \d+ steps, not the simulation\.tolerance", 4),
-        (2e-4, r"reaches an error of 0\.0002 with \d+ steps, not the simulation\.tolerance", 6),
-        (np.inf, r"finds no estimate of its error with \d+ time steps.*simulation\.stages", 1),
+        (1.0, r"error of 1 with \d+ steps.*simulation\.tolerance", 4),
+        (2e-4, r"error of 0\.0002 with \d+ steps.*simulation\.tolerance", 6),
+        (np.inf, r"no estimate.*with \d+ time steps.*simulation\.stages", 1),
     ],
 )
-def test_error_that_no_steps_lower(
-    monkeypatch: pytest.MonkeyPatch, error: float, message: str, most: int
-) -> None:
+def test_error_that_no_steps_lower(monkeypatch, on_grids, error, words, most) -> None:
     """Constant and infinite estimates end after a few grids, in one line, not with the memory."""
     problem, _ = two_arms()
     plain = radau.on_grid(problem, even_steps(problem, 20), 1e-4, 3)
-    grids = []
 
-    def constant(preconditioner, time_grid, *others):  # type: ignore[no-untyped-def]
-        grids.append(len(time_grid) - 1)
-        n = len(time_grid) - 1
-        shape = (n, *plain.a.shape[1:])
-        none = np.zeros((n, shape[2]))
-        return replace(plain, time_grid=time_grid, q=none, qd=none, a=np.zeros(shape), error=error)
+    def constant(number: int, true: object, grid: np.ndarray) -> Solution:
+        a = np.zeros((len(grid) - 1, *plain.a.shape[1:]))
+        return replace(plain, time_grid=grid, q=a[:, 0], qd=a[:, 0], a=a, error=error)
 
-    monkeypatch.setattr(radau, "_on_grid", constant)
+    grids = on_grids(constant)
     estimate = radau.estimated_errors
     monkeypatch.setattr(radau, "estimated_errors", lambda *a: 0.0 * estimate(*a) + error)
-    with pytest.raises(ConvergenceError, match=message) as raised:
+    with pytest.raises(ConvergenceError, match=words) as raised:
         solve("radau", problem, 1e-4)
     assert "\n" not in str(raised.value)
     assert len(grids) <= most
@@ -618,17 +562,14 @@ def test_error_that_no_steps_lower(
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_estimate_below_the_tolerance_is_no_refusal(
-    monkeypatch: pytest.MonkeyPatch, share: float
-) -> None:
+def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, on_grids, share: float) -> None:
     """Where finer steps have no room, an error between the aim and the tolerance is accepted."""
     problem, _ = two_arms()
     found = radau.on_grid(problem, even_steps(problem, 40), 1e-4, 3)
-    estimated = replace(found, error=share * 1e-4)
-    monkeypatch.setattr(radau, "_on_grid", lambda *details: estimated)
+    on_grids(lambda *_: replace(found, error=share * 1e-4))
     monkeypatch.setattr(radau, "MAX_STEPS", 40)
     if share < 1.0:
-        assert solve("radau", problem, 1e-4).error == estimated.error
+        assert solve("radau", problem, 1e-4).error == share * 1e-4
     else:
         with pytest.raises(ConvergenceError, match=r"simulation\.tolerance"):
             solve("radau", problem, 1e-4)
@@ -639,86 +580,59 @@ def test_more_steps_than_there_is_room_for_are_refused() -> None:
     problem, _ = two_arms()
     grid = even_steps(problem, 5000)
     found = Solution(grid, np.ones(1), *np.zeros((2, 5000, 6)), np.zeros((5000, 1, 6)), 1.0, 1)
-    with pytest.raises(
-        ConvergenceError, match=r"would need \d+, more than 30000.*simulation\.stages"
-    ):
+    with pytest.raises(ConvergenceError, match=r"more than 30000.*simulation\.stages"):
         radau.next_time_grid(problem, found, 1e-4, 3)
 
 
-def test_patience_that_ends_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patience_that_ends_is_not_tried_again(on_grids) -> None:
     """Work beyond what is counted ends a simulation: no finer grid, no march."""
-    problem, _ = two_arms()
-    on_grid, grids = radau._on_grid, []
-
-    def seen(*details):  # type: ignore[no-untyped-def]
-        grids.append(len(details[1]) - 1)
-        return on_grid(*details)
-
-    monkeypatch.setattr(radau, "_on_grid", seen)
+    grids = on_grids(lambda number, true, grid: true())
     with counted(10.0), pytest.raises(ConvergenceError, match="more than 10 Newton iterations"):
-        solve("radau", problem, 1e-4)
+        solve("radau", two_arms()[0], 1e-4)
     assert len(grids) == 1
+
+
+def test_motion_that_finer_steps_let_grow_is_given_up(monkeypatch, on_grids) -> None:
+    """Light coordinates of a stiffened machine: two grids, then one after the march, a remedy."""
+    marched = radau._marched
+    grids = on_grids(lambda n, true, grid: replace(true(), error=(1e-3, 71.0, 72.0)[n - 1]))
+    monkeypatch.setattr(radau, "_marched", lambda *told: replace(marched(*told), error=1e-3))
+    with pytest.raises(ConvergenceError, match=r"simulation\.stiffening = false"):
+        solve("radau", oscillator(3.0, 0.0, pushed, 1.0), 1e-4)
+    assert len(grids) == 3
+
+
+def arms_of_a_scene(*changes: str, cells: tuple[int, int] = (20, 2)) -> Any:
+    """Return the trajectory of two linear arms of half density, or the error."""
+    built = build("simulation.stiffening=false", "motion.horizon=1.0", *changes, cells=cells)
+    return built.evaluate(built.fields(lambda k, x, y: np.full_like(x, 0.5)), simulated=True)[1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stages", [2, 4])  # 3 takes ten times as long
 def test_motion_that_every_grid_finds_otherwise_is_given_up(
-    monkeypatch: pytest.MonkeyPatch, stages: int
+    monkeypatch: pytest.MonkeyPatch, on_grids, stages: int
 ) -> None:
     """Undamped vibrations that feed on themselves: two grids are enough to tell, and few sweeps."""
-    scene = do.load_scene(
-        Path(__file__).parents[2] / "demos" / "two_arm.toml",
-        (
-            "arms.cells=[40,4]",
-            "arms.element=linear",
-            "payload.mass=11.2",
-            "motion.duration=0.87",
-            "motion.flattening=0.46",
-            "simulation.stiffening=false",
-            "damping.stiffness_proportional=0",
-            "reduction.coordinates=9",
-            "simulation.tolerance=1e-2",
-            f"simulation.stages={stages}",
-        ),
-    )
-    profile = Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, profile)
-    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    grids, work, told = [], [], []
-    on_grid, newton = radau._on_grid, march.newton
-
-    def seen_grid(modes, edges, *others):  # type: ignore[no-untyped-def]
-        grids.append(len(edges) - 1)
-        return on_grid(modes, edges, *others)
+    work, told, newton = [], [], march.newton
+    grids = on_grids(lambda number, true, grid: true())
 
     def seen_newton(stages, *others, **options):  # type: ignore[no-untyped-def]
         found = newton(stages, *others, **options)
         work.append(found.iterations[0] * len(stages.h))
         return found
 
-    monkeypatch.setattr(radau, "_on_grid", seen_grid)
     monkeypatch.setattr(march, "newton", seen_newton)
     monkeypatch.setattr("dolfinopt.progress.SILENT", 0.0)
     monkeypatch.setattr("dolfinopt.progress.log.info", lambda *words: told.append(words))
-    remedy = r"gets no further than.*material\.young_modulus.*motion\.duration"
-    with pytest.raises(ConvergenceError, match=remedy):
-        do.evaluate(scene, partition, arms, x, profile)
+    changes = ["arms.element=linear", "payload.mass=11.2", "motion.duration=0.87"]
+    changes += ["motion.flattening=0.46", "damping.stiffness_proportional=0"]
+    changes += ["reduction.coordinates=9", "simulation.tolerance=1e-2", "motion.horizon=3.0"]
+    with pytest.raises(ConvergenceError, match=r"material\.young_modulus.*motion\.duration"):
+        arms_of_a_scene(*changes, f"simulation.stages={stages}", cells=(40, 4))
     assert len(grids) <= 2
     assert sum(work) <= march.SWEEPS * sum(grids) + march.LONGEST * march.MAX_ITERATIONS
     assert len(told) >= 2
-
-
-FAST = ("arms.cells=[20,2]", "simulation.stiffening=false", "motion.horizon=1.0")
-
-
-def fast_two_arms(*changes: str) -> Any:
-    """Return the trajectory of two soft arms, or the error."""
-    scene = do.load_scene(Path(__file__).parents[2] / "demos" / "two_arm.toml", [*FAST, *changes])
-    partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile()
-    arms = do.build_arms(scene, partition, profile)
-    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    return do.evaluate(scene, partition, arms, x, profile)[1]
 
 
 def test_steps_follow_a_motion_with_a_short_event() -> None:
@@ -726,7 +640,7 @@ def test_steps_follow_a_motion_with_a_short_event() -> None:
 
     Even steps over 3 s, 100 x 6 cells, were 10 969.
     """
-    trajectory = fast_two_arms("motion.duration=0.7")
+    trajectory = arms_of_a_scene("motion.duration=0.7")
     steps = np.diff(trajectory.solution.time_grid)
     assert len(steps) < 600
     assert steps.max() > 20.0 * steps.min()
@@ -737,38 +651,12 @@ def test_steps_follow_a_motion_with_a_short_event() -> None:
 
 def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of an arm's length, by the march, and by what Newton's method finds at once."""
-    remedy = r"deflects by [0-9.]+ % of its length: beyond 50 %.*linear elasticity.*young_modulus"
-    with pytest.raises(ConvergenceError, match="at t = .* an arm " + remedy):
-        fast_two_arms("motion.duration=0.45")
+    remedy = r"deflects by [0-9.]+ % .*50 %.*young_modulus"
+    with pytest.raises(ConvergenceError, match="t = .* an arm " + remedy):
+        arms_of_a_scene("motion.duration=0.45")
     monkeypatch.setattr("dolfinopt.dynamics.simulation.VALID", 0.01)
-    with pytest.raises(ConvergenceError, match="^arm 'arm1' " + remedy):
-        fast_two_arms("motion.duration=1.0", "payload.mass=1")
-
-
-def test_motion_that_finer_steps_let_grow_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Light coordinates of a stiffened machine: two grids, then one after the march, a remedy."""
-    on_grid, grids, marched = radau._on_grid, [], radau._marched
-
-    def grown(*details):  # type: ignore[no-untyped-def]
-        grids.append(len(details[1]) - 1)
-        return replace(on_grid(*details), error=(1e-3, 71.0, 72.0)[len(grids) - 1])
-
-    def along(*details):  # type: ignore[no-untyped-def]
-        return replace(marched(*details), error=1e-3)
-
-    monkeypatch.setattr(radau, "_on_grid", grown)
-    monkeypatch.setattr(radau, "_marched", along)
-    with pytest.raises(ConvergenceError, match=r"stiffen the arms.*simulation\.stiffening = false"):
-        solve("radau", oscillator(3.0, 0.0, pushed, 1.0), 1e-4)
-    assert len(grids) == 3
-
-
-@BOTH
-def test_no_static_equilibrium_is_a_named_error(integrator: str) -> None:
-    """Arms that the first acceleration alone would fold."""
-    problem, _ = two_arms(swing, (0.0, 1.0), payload=2.0, bending=1e-4, axial=1e-2)
-    with pytest.raises(ConvergenceError, match="no static equilibrium"):
-        solve(integrator, problem, 1e-2)
+    with pytest.raises(ConvergenceError, match="arm1.*" + remedy):
+        arms_of_a_scene("motion.duration=1.0", "payload.mass=1")
 
 
 @BOTH
@@ -797,23 +685,15 @@ def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
     length, count = 0.5, 8 * max(bending, axial)
     u = (np.arange(count) + 0.5) / count
     p, r = (np.arange(n) * np.pi + 0.5 * np.pi for n in (bending, axial))
-    modes = np.zeros((count, 2, bending + axial))
+    modes, outboard = np.zeros((count, 2, bending + axial)), np.zeros((3, bending + axial))
     modes[:, 1, :bending] = 1.0 - np.cos(np.outer(u, p))
     modes[:, 0, bending:] = np.sin(np.outer(u, r))
-    outboard = np.zeros((3, bending + axial))
     outboard[0, bending:] = np.sin(r)
     outboard[1, :bending] = 1.0 - np.cos(p)
     outboard[2, :bending] = p * np.sin(p) / length
     K = np.diag(np.concatenate([10.0 / length**3 * p**4, 3e3 / length * r**2]) / 2.0)
-    return Cloud(
-        points=np.column_stack([length * u, np.zeros(count)]),
-        masses=np.full(count, 0.6 / count),
-        modes=modes,
-        K=K,
-        D=damping * K,
-        outboard=outboard,
-        outboard_point=np.array([length, 0.0]),
-    )
+    points, ends = np.column_stack([length * u, np.zeros(count)]), np.array([[length, 0.0]])
+    return Cloud(points, np.full(count, 0.6 / count), modes, K, damping * K, outboard, ends)
 
 
 def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> ElasticSystem:
@@ -1151,14 +1031,3 @@ def test_sample_of_known_polynomials() -> None:
     t = np.array([0.0, 0.1, 0.3, 0.31, 0.9, 1.0])
     for order in range(3):
         assert_close(solution.sample(t, order), values(t, order), 1e-14)
-
-
-def test_lagrange_integrals() -> None:
-    """Polynomials of the nodes' degree: their value, integral and integral of that."""
-    nodes = np.array([0.1, 0.5, 1.0])
-    tau = np.linspace(0.0, 1.0, 7)
-    value, first, second = lagrange_integrals(nodes, tau)
-    for k in range(3):
-        assert_close(value @ nodes**k, tau**k, 1e-13)
-        assert_close(first @ nodes**k, tau ** (k + 1) / (k + 1), 1e-13)
-        assert_close(second @ nodes**k, tau ** (k + 2) / ((k + 1) * (k + 2)), 1e-13)

@@ -1,14 +1,11 @@
-"""Extremes: every outcome is right by an independent path, or one of the two named errors.
-
-Nothing here knows of ranks but the last test.
-"""
+"""Extremes: every outcome is right by an independent path, or one of the two named errors."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +13,12 @@ import scipy.linalg
 import scipy.sparse
 from mpi4py import MPI
 from petsc4py import PETSc
-from remainders import Built, rates, uneven, wave
-from runs import TWO_ARM
+from remainders import Built, Field, arm_of, build, built_of, taylor, uneven, wave
+from runs import TWO_ARM, run
+from runs import overrides as options
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.cli import commands
 from dolfinopt.dynamics import newton, radau
 from dolfinopt.dynamics import radau as march
 from dolfinopt.dynamics.collocation import Solution
@@ -35,11 +32,9 @@ from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.reduction.eigenproblem import interior_pencil, lowest_eigenpairs
-from dolfinopt.responses.constraints import load_cases, objective
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
-Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 NAMED = (InputError, ConvergenceError)
 EXTENDED = pytest.mark.skipif(
     np.finfo(np.longdouble).eps > 1e-18, reason="long double is no longer than double here"
@@ -48,22 +43,12 @@ EXTENDED = pytest.mark.skipif(
 
 def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
     """Build the two-arm scene on few cells."""
-    scene = do.load_scene(
-        TWO_ARM,
-        (f"arms.cells=[{cells[0]},{cells[1]}]", "simulation.stiffening=false", *overrides),
-    )
-    profile = do.Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
+    return build("simulation.stiffening=false", *overrides, cells=cells)
 
 
-def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3), comm: MPI.Comm | None = None) -> Arm:
+def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3)) -> Arm:
     """Build the first arm of that scene."""
-    scene = do.load_scene(
-        TWO_ARM,
-        (f"arms.cells=[{cells[0]},{cells[1]}]", "simulation.stiffening=false", *overrides),
-    )
-    return Arm(scene, 0, comm or MPI.COMM_SELF, do.Profile())
+    return arm_of(cells, "simulation.stiffening=false", *overrides)
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -73,17 +58,9 @@ def solid(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.ones_like(x)
 
 
-def void(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.zeros_like(x)
-
-
 def checkerboard(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return solid and void by lot, in the same places on any partition."""
     return (uneven(k, np.round(x, 6), np.round(y, 6)) > 0.0).astype(float)
-
-
-def tip_cut_off(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.where(x > 0.8, 0.0, 1.0)
 
 
 def gap(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -96,9 +73,9 @@ def islands(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 DESIGNS: dict[str, Field] = {
     "solid": solid,
-    "void": void,
+    "void": lambda k, x, y: np.zeros_like(x),
     "checkerboard": checkerboard,
-    "tip cut off": tip_cut_off,
+    "tip cut off": lambda k, x, y: np.where(x > 0.8, 0.0, 1.0),
     "gap": gap,
     "islands": islands,
 }
@@ -179,7 +156,6 @@ def compliance_error(arm: Arm) -> float:
     return float(np.linalg.norm(inverse @ (found - exact) @ inverse.T, 2))
 
 
-@pytest.mark.serial
 @EXTENDED
 @pytest.mark.parametrize("name", DESIGNS)
 def test_contrast(name: str) -> None:
@@ -208,7 +184,6 @@ def test_contrast(name: str) -> None:
             assert error < 1e-3
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("name", ["checkerboard", "gap", "islands"])
 @pytest.mark.parametrize("cells", [(12, 3), (60, 4)])
 def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
@@ -232,7 +207,7 @@ def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
 
 def test_connectivity() -> None:
     """Cells float exactly where every path to the inboard interface has a far softer cell."""
-    arm = one_arm(cells=(12, 5), comm=MPI.COMM_WORLD)
+    arm = one_arm(cells=(12, 5))
     nx, ny = 12, 5
     length, height = arm.mesh.outboard_point[0], arm.scene.arms[0].height
     x, y = arm.mesh.centroid.T
@@ -262,7 +237,6 @@ def test_connectivity() -> None:
     assert outcomes == {True, False}
 
 
-@pytest.mark.serial
 def test_designs_that_hang_together_cost_nothing_more() -> None:
     """In a void of 1e-12 of solid: three solves, and no step of refinement."""
     arm = one_arm("interpolation.law=simp", "interpolation.floor=1e-6", cells=(40, 6))
@@ -270,12 +244,11 @@ def test_designs_that_hang_together_cost_nothing_more() -> None:
     arm.elastic.constraint_modes()
     assert arm.profile.counts.solves == 3
     arm.set_design(islands(0, *arm.mesh.centroid.T))
-    with pytest.raises(ConvergenceError, match="connected by void alone"):
+    with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):
         arm.elastic.constraint_modes()
     assert arm.profile.counts.solves > 9
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0])
 def test_a_stiffness_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, wrong: float) -> None:
     """Neither NaN nor a negative stiffness ends in an error of linear algebra."""
@@ -288,7 +261,6 @@ def test_a_stiffness_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, wron
                 arm.elastic.constraint_modes()
 
 
-@pytest.mark.serial
 @EXTENDED
 @pytest.mark.parametrize(
     ("height", "cells"),
@@ -330,7 +302,6 @@ def dense_eigenvalues(arm: ElasticArm, count: int) -> np.ndarray:
     return 2.0 / largest[::-1]
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize(
     ("count", "density", "floor"), [(5, 1e-3, 1e-6), (6, 1e-6, 1e-12), (10, 1e-5, 1e-12)]
 )
@@ -350,7 +321,6 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
         np.testing.assert_allclose(gram, np.eye(modes), atol=1e-10)
 
 
-@pytest.mark.serial
 def test_ordinary_modes_cost_what_they_did() -> None:
     """Of a warm start one sweep of count + 4 solves, and three of the constraint modes."""
     arm = one_arm(cells=(60, 6))
@@ -361,7 +331,6 @@ def test_ordinary_modes_cost_what_they_did() -> None:
     assert arm.profile.counts.eigenproblems == 2
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("method", ["craig-bampton", "modal", "krylov"])
 @pytest.mark.parametrize("field", [checkerboard, gap, solid])
 def test_a_hundred_coordinates(method: str, field: Field) -> None:
@@ -398,7 +367,6 @@ def distance(trajectory: Trajectory, other: Solution) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.serial
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -432,7 +400,6 @@ def test_motions(overrides: list[str]) -> None:
     assert distance(trajectory, fine) < 1.1e-4
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -462,7 +429,6 @@ def quasi_static(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
     return -np.linalg.solve(problem.mechanism.stiffness(), rows.T).T
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("young_modulus", [1e14, 1e15])
 def test_stiff_arms_follow_their_loads(young_modulus: float) -> None:
     """q + beta qd is the static deflection, off by (slowest frequency x time of the motion)^-2."""
@@ -475,7 +441,6 @@ def test_stiff_arms_follow_their_loads(young_modulus: float) -> None:
     assert relative_error(trajectory.mechanism, q - static, static) < 2e-4 + 6e11 / young_modulus
 
 
-@pytest.mark.serial
 def test_vibrations_of_megahertz() -> None:
     """Arms of a centimetre with 40 coordinates, undamped: the motion of those with 8."""
     small = ["arms.length=0.01", "arms.height=2e-3", "arms.thickness=1e-3", "payload.mass=1e-3"]
@@ -502,7 +467,6 @@ def mass_matrix(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.
     return rows[1:] - rows[0]
 
 
-@pytest.mark.serial
 def test_undamped_energy_does_not_drift() -> None:
     """28 s after the motion the arms still vibrate with the energy they were left with."""
     trajectory = moved(
@@ -526,7 +490,6 @@ def test_undamped_energy_does_not_drift() -> None:
     assert energies[0] > 1e-6 * largest
 
 
-@pytest.mark.serial
 @pytest.mark.slow
 def test_tolerances() -> None:
     """From 1e-2 to 1e-9, against a solution of 1e-11."""
@@ -539,21 +502,9 @@ def test_tolerances() -> None:
         assert distance(best, solution) < tolerance
 
 
-@pytest.mark.serial
-def test_singular_arms_are_named() -> None:
-    """Within a millionth of stretched or folded the scene is refused, with time and distance."""
-    for overrides, word in (
-        (["motion.joint_height=-0.9999999"], "stretched"),
-        (["motion.radius=1e-6", "motion.joint_height=0.0", "motion.cart_follow=0.0"], "folded"),
-    ):
-        with pytest.raises(InputError, match=word):
-            moved(*overrides)
-
-
 # -- what broke Newton -----------------------------------------------------------------------
 
 
-@pytest.mark.serial
 @pytest.mark.slow
 def test_designs_of_modal_truncation_with_many_coordinates() -> None:
     """Void tips that four modes do not see, undamped: arms that fold over are solved, and right."""
@@ -586,7 +537,6 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
         assert distance(trajectory, rough) < 1e-2
 
 
-@pytest.mark.serial
 def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Deflections of 28 %: with Newton's method refused for more than 20 steps, the same motion."""
     trajectory = moved("material.young_modulus=1.5e9", "motion.horizon=1.9")
@@ -620,7 +570,6 @@ MILLIMETRES = [  # mm, t, s, N
 ]
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize(
     ("overrides", "translated"),
     [
@@ -664,35 +613,24 @@ def test_millimetres_and_tonnes(overrides: list[str], translated: list[str]) -> 
 # -- a warning -------------------------------------------------------------------------------
 
 
-@pytest.mark.serial
-def test_large_deflections_are_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
     """A tenth of an arm's length: in summary.json and on standard error, arm by arm."""
-    scene = ["simulate", str(TWO_ARM), "--set", "arms.cells=[12,2]", "--no-plots", "--out"]
-    heavy = ["--set", "payload.mass=40", "--set", "arms.arm2.young_modulus=1e12"]
-    heavy += ["--set", "simulation.stiffening=false"]
-    for name, more in (("small", []), ("large", heavy)):
-        commands.main(
-            [*scene, str(tmp_path / name), *more], standalone_mode=False, obj=MPI.COMM_WORLD
-        )
+    heavy = ["payload.mass=40", "arms.arm2.young_modulus=1e12"]
+    for name, more in (("small", []), ("large", [*heavy, "simulation.stiffening=false"])):
+        changes = options("arms.cells=[12,2]", *more)
+        run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / name, *changes)
         printed = capsys.readouterr().err
         warnings = json.loads((tmp_path / name / "summary.json").read_text())["warnings"]
         assert [f"dolfinopt: warning: {w}" for w in warnings] == printed.splitlines()
-        if name == "small":
-            assert warnings == []
-    trajectory = moved(
-        "payload.mass=40",
-        "arms.arm2.young_modulus=1e12",
-        field=lambda k, x, y: 0.5 * np.ones_like(x),
-    )
+        assert warnings or name == "small"
+    trajectory = moved(*heavy, field=lambda k, x, y: 0.5 * np.ones_like(x))
     body = trajectory.mechanism.bodies[0]
     tip = trajectory.q_e[:, trajectory.mechanism.slices[0]] @ body.outboard.T
     ratio = np.linalg.norm(tip[:, :2], axis=1).max() / 1.0
     assert ratio > 0.1 > trajectory.deflections[1]
     deflection, stiffening = warnings
     assert f"'arm1' deflects by {100.0 * ratio:.3g} %" in deflection
-    assert "simulation.stiffening = false leaves out" in stiffening
+    assert "simulation.stiffening = false" in stiffening
 
 
 # -- everything at once ----------------------------------------------------------------------
@@ -703,127 +641,70 @@ KINDS = ["esl", "compliance", "deviation", "static", "eigenfrequency"]
 JOINTS = "t,cart,{arms}\n0,0,{a}\n0.6,0.2,{b}\n1,0.1,{c}\n"
 
 
-def drawn(rng: np.random.Generator, folder: Path) -> tuple[dict, list[str]]:
-    """Draw a scene of one to four arms and what it sets."""
+def drawn(rng: np.random.Generator, folder: Path) -> dict:
+    """Draw a scene of one to four arms."""
 
-    def one(choices: list) -> object:
+    def one(*choices: object) -> Any:
         return choices[rng.integers(len(choices))]
 
     count = int(rng.integers(1, 5))
-    cells = [int(rng.integers(4, 16)), int(rng.integers(1, 4))]
-    arm = {"length": 1.6 / count, "height": 0.06, "thickness": 0.01, "cells": cells, "passive": 0.0}
-    arms: list[dict] = [{"name": f"a{k}"} for k in range(count)]
-    arms[0] |= arm
+    cells = [int(rng.integers(8, 24)), int(rng.integers(1, 4))]
+    arms: list[dict] = [{"name": f"a{k}", "height": rng.uniform(0.04, 0.12)} for k in range(count)]
+    arms[0] |= {"length": 1.6 / count, "thickness": 0.01, "cells": cells, "passive": one(0.0, 0.06)}
     if rng.random() < 0.2:
         del arms[0]["cells"]
         arms[0] |= {"mesh": "meshes/arm_bores.geo", "mesh_size": 0.04, "height": 0.12}
-    if count > 1 and rng.random() < 0.3:
-        arms[-1]["rigid"] = True
-    elif count > 1 and rng.random() < 0.3:
-        arms[-1]["design"] = "a0"
-    motion: dict = {"duration": 1.0, "horizon": 1.3, "gravity": one([[0.0, 0.0], [0.5, -9.81]])}
+    if count > 1 and rng.random() < 0.5:
+        arms[-1] |= one({"rigid": True}, {"design": "a0", "height": arms[0]["height"]})
+    motion: dict = {"duration": rng.uniform(1.0, 2.0), "gravity": one([0.0, 0.0], [0.5, -9.81])}
+    motion["horizon"] = motion["duration"] + 0.3
     if rng.random() < 0.4:
         names = ",".join(f"a{k}" for k in range(count))
         rows = {c: ",".join(f"{v:.3f}" for v in rng.uniform(-1.5, 1.5, count)) for c in "abc"}
-        table = folder / f"joints{rng.integers(10**9)}.csv"
-        table.write_text(JOINTS.format(arms=names, **rows))
-        motion |= {"path": "joints", "file": str(table)}
+        (folder / "joints.csv").write_text(JOINTS.format(arms=names, **rows))
+        motion |= {"path": "joints", "file": str(folder / "joints.csv"), "duration": 1.0}
     else:
-        motion |= {"path": "arc", "radius": one([0.5, 0.9]), "joint_height": one([-0.4, -0.1])}
-        motion |= {"flattening": one([0.2, 1.0]), "law": one(["quintic", "septic"])}
-    method, kind = one(METHODS), one(KINDS)
-    objective_keys = {"kind": kind, "load_cases": 5, "gradient": one(["esl", "exact"])}
+        motion |= {"path": "arc", "radius": rng.uniform(0.5, 1.0), "law": one("quintic", "septic")}
+        motion |= {"flattening": rng.uniform(0.0, 1.0), "joint_height": one(-0.4, -0.1)}
     return {
         "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
-        "interpolation": {"law": one(LAWS), "floor": one([1e-3, 1e-6, 1e-12])},
+        "interpolation": {"law": one(*LAWS), "floor": one(1e-3, 1e-6, 1e-12)},
         "arms": arms,
         "motion": motion,
-        "payload": {"mass": one([0.0, 1.0, 6.0]), "inertia": one([0.0, 0.1])},
-        "damping": {"stiffness_proportional": one([2e-4, 1e-2])},
-        "reduction": {"method": method, "coordinates": int(rng.integers(3, 9))},
-        "objective": objective_keys,
-        "simulation": {"tolerance": one([1e-3, 1e-5]), "stages": int(rng.integers(2, 6))},
-        "design": {"filter_radius": one([0.0, 0.03])},
-    }, [str(kind), str(method)]
-
-
-def taylor_rate(built: Built, x: dict, slopes: dict, trajectory: Trajectory | None) -> float | None:
-    """Return the remainders' rate with instants and steps held; None where all is rounding."""
-    d = built.fields(uneven)
-    along = built.dot(slopes, d)
-    scene = built.scene
-    if trajectory is not None:
-        tight = scene.simulation.model_copy(
-            update={"tolerance": min(trajectory.solution.error / radau.AIM, 0.1)}
-        )
-        scene = scene.model_copy(update={"simulation": tight})
-    start = () if trajectory is None else trajectory.solutions
-
-    def value(h: float) -> float:
-        moved_x = {k: x[k] + h * d[k] for k in x}
-        evaluation, there = do.evaluate(
-            scene, built.partition, built.arms, moved_x, built.profile, start, simulated=False
-        )
-        if there is None or trajectory is None:
-            return evaluation.objective
-        return objective(there, scene, load_cases(trajectory, scene))
-
-    here, steps = value(0.0), (4e-4, 1e-4)
-    rest = [abs(value(h) - here - h * along) for h in steps]
-    if rest[1] < 3e-9 * abs(here):  # what Newton's iteration leaves
-        return None
-    return rates(value, along, steps)
-
-
-def outcome(seed: int, folder: Path) -> str:
-    """Run one drawn scene; return its ending: "right" or the name of the error."""
-    rng = np.random.default_rng(seed)
-    data, _ = drawn(rng, folder)
-    try:
-        scene = do.scene_from_dict(data, source=f"scene {seed}")
-        profile = do.Profile()
-        partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-        built = Built(scene, partition, do.build_arms(scene, partition, profile), profile)
-        crisp = rng.random() < 0.25
-        x = {k: 0.55 + 0.35 * field for k, field in built.fields(uneven).items()}
-        if crisp:
-            x = {k: np.where(field > 0.55, 1.0, 0.0) for k, field in x.items()}
-        evaluation, trajectory = built.evaluate(x)
-        slopes = built.gradient(trajectory)
-    except NAMED as error:
-        assert "\n" not in str(error)
-        return type(error).__name__
-    assert np.isfinite(evaluation.objective) and evaluation.objective > 0.0
-    assert all(np.isfinite(values).all() for values in slopes.values())
-    if not crisp and (trajectory is None or scene.objective.gradient == "exact"):
-        try:
-            rate = taylor_rate(built, x, slopes, trajectory)
-        except ConvergenceError:
-            return "ConvergenceError"
-        assert rate is None or rate > 1.8, (seed, data, rate)
-    return "right"
+        "payload": {"mass": one(0.0, 1.0, 6.0), "inertia": one(0.0, 0.1)},
+        "damping": {"stiffness_proportional": one(0.0, 2e-4, 1e-2)},
+        "reduction": {"method": one(*METHODS), "coordinates": int(rng.integers(3, 9))},
+        "objective": {"kind": one(*KINDS), "load_cases": 5, "gradient": one("esl", "exact")},
+        "simulation": {"tolerance": one(1e-3, 1e-5), "stages": int(rng.integers(2, 6))},
+        "design": {"filter_radius": one(0.0, 0.03)},
+    }
 
 
 @pytest.mark.slow
-@pytest.mark.serial
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("seed", range(23, 45))
+@pytest.mark.parametrize("seed", range(24))  # 24 takes 90 s
 def test_any_scene(seed: int, tmp_path: Path) -> None:
-    """Laws, reductions, objectives, one to four arms, tables, bores, drawn by lot: finite and
-    consistent to second order, or a named error of one line."""
-    outcome(seed, tmp_path)
+    """Finite, and of second-order remainders along all directions; or a named error of one line.
 
+    From finer steps than the command's: at random designs of undamped arms the remainder's cubic
+    part outweighs its square at 0.01. A direction whose remainders are all rounding shows nothing.
+    """
+    rng = np.random.default_rng(seed)
+    data = drawn(rng, tmp_path)
+    crisp = rng.random() < 0.25
 
-# -- several ranks ---------------------------------------------------------------------------
+    def design(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        grey = 0.55 + 0.35 * uneven(k, x, y)
+        return np.where(grey > 0.55, 1.0, 0.0) if crisp else grey
 
-
-def test_ranks_agree_on_floating_solids() -> None:
-    """The refinement of what floats, summed over the ranks, is that of one rank."""
-    found = []
-    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
-        arm = one_arm("interpolation.floor=1e-9", cells=(60, 6), comm=comm)
-        arm.set_design(islands(0, *arm.mesh.centroid.T))
-        found.append(np.linalg.inv(arm.elastic.constraint_modes().stiffness))
-    assert floats(arm.elastic)
-    scale = np.sqrt(np.outer(np.diag(found[0]), np.diag(found[0])))
-    np.testing.assert_allclose(found[1] / scale, found[0] / scale, atol=1e-4)
+    try:
+        built = built_of(do.scene_from_dict(data, source=f"scene {seed}"))
+        evaluation, trajectory = built.evaluate(built.fields(design))
+        slopes = built.gradient(trajectory)
+        assert np.isfinite(evaluation.objective) and evaluation.objective > 0.0
+        assert all(np.isfinite(values).all() for values in slopes.values())
+        if not crisp and (trajectory is None or built.scene.objective.gradient == "exact"):
+            test = taylor(built.scene, design, tuple(0.00125 / 4.0**k for k in range(3)))
+            assert test.passed, (data, test)
+    except NAMED as error:
+        assert "\n" not in str(error)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import tomllib
 from bodies import beam
-from mbdyn_reader import read_as_mbdyn_does
 from mpi4py import MPI
+from readers import read_as_mbdyn_does
 from runs import ROOT, overrides, refusal, run
 
 import dolfinopt as do

@@ -1,31 +1,50 @@
-"""Bodies made of point masses, whose shape integrals are sums, and measures for the dynamics."""
+"""Bodies made of point masses, whose shape integrals are sums, in the plane and in space."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import expm
 
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
-from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import (
+    STIFFENING,
+    TABLE,
+    ShapeIntegrals,
+    in_space,
+    plane_body,
+)
+from dolfinopt.multibody.spatial.mechanism import (
+    GROUND,
+    Joint,
+    SpatialMechanism,
+    exponential,
+    rigid_spatial_body,
+    skew,
+)
 
 # By which integrals a function of a body is differentiated.
-CONSTANTS = [one.name for one in TABLE if one.name != "outboard_point"]
+CONSTANTS = [one.name for one in TABLE if not one.name.endswith(("_point", "_points"))]
+STEP = 1e-30  # of a complex step
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Point masses that move by linear modes in a body's frame.
+    """Point masses that move by linear modes in a body's frame, in d = 2 or 3 dimensions.
 
     Attributes:
-        points: (n, 2) reference positions X, m.
+        points: (n, d) reference positions X, m.
         masses: (n,) kg.
-        modes: (n, 2, q) displacement of every point.
+        modes: (n, d, q) displacement of every point.
         K, D: (q, q) stiffness and damping.
-        outboard: (3, q) u_x, u_y, theta of the outboard interface.
-        outboard_point: (2,) its reference position, m.
+        outboard: (3, q) u_x, u_y, theta of the outboard interface; (6 i, q) of all, in space.
+        ends: (i, d) their reference positions, m.
     """
 
     points: np.ndarray
@@ -34,13 +53,18 @@ class Cloud:
     K: np.ndarray
     D: np.ndarray
     outboard: np.ndarray
-    outboard_point: np.ndarray
+    ends: np.ndarray
 
     def body(self) -> ShapeIntegrals:
         """Return the shape integrals as sums over the points."""
-        m, X, Phi = self.masses, self.points, self.modes
-        SX = np.stack([-X[:, 1], X[:, 0]], axis=1)
-        SPhi = np.stack([-Phi[:, 1], Phi[:, 0]], axis=1)
+        m, X, Phi, q = self.masses, self.points, self.modes, len(self.K)
+        if X.shape[1] == 3:
+            N = np.concatenate([X[:, :, None], Phi], axis=2)
+            W = np.einsum("n,nak,nbl->abkl", m, N, N).reshape(9, 1 + q, 1 + q)
+            ends, none = (self.outboard, self.ends[0]), np.zeros((0, q, q))
+            w = np.einsum("n,nak->ak", m, N)
+            return ShapeIntegrals(m.sum(), w, W, self.K, self.D, *ends, none, none, self.ends[1:])
+        SX, SPhi = (np.stack([-x[:, 1], x[:, 0]], axis=1) for x in (X, Phi))
         return plane_body(
             mass=m.sum(),
             moment=m @ X,
@@ -53,23 +77,31 @@ class Cloud:
             K=self.K,
             D=self.D,
             outboard=self.outboard,
-            outboard_point=self.outboard_point,
+            outboard_point=self.ends[0],
         )
 
 
-def random_cloud(rng: np.random.Generator, coordinates: int) -> Cloud:
+def random_cloud(rng: np.random.Generator, q: int, d: int = 2, interfaces: int = 1) -> Cloud:
     """Return a body without any symmetry, of about 1 kg and 1 m."""
-    count = 12
-    root, damping = rng.normal(size=(2, coordinates, coordinates))
+    root, damping = rng.normal(size=(2, q, q))
     return Cloud(
-        points=rng.normal(loc=(0.5, 0.1), scale=0.5, size=(count, 2)),
-        masses=rng.uniform(0.05, 0.15, size=count),
-        modes=rng.normal(scale=0.3, size=(count, 2, coordinates)),
-        K=root @ root.T + np.eye(coordinates),
+        points=rng.normal(loc=(0.5, 0.1, 0.0)[:d], scale=0.4, size=(10, d)),
+        masses=rng.uniform(0.05, 0.15, size=10),
+        modes=rng.normal(scale=0.3, size=(10, d, q)),
+        K=root @ root.T + np.eye(q),
         D=damping @ damping.T,
-        outboard=rng.normal(scale=0.3, size=(3, coordinates)),
-        outboard_point=np.array([1.0, 0.2]),
+        outboard=rng.normal(scale=0.3, size=(3 if d == 2 else 6 * interfaces, q)),
+        ends=np.array([[1.0, 0.2, -0.1], [0.4, 0.3, 0.2]])[:interfaces, :d],
     )
+
+
+def bar(length: float, height: float, mass: float) -> Cloud:
+    """Return a rigid bar as four masses: those of Gauss' rule, exact to degree 3."""
+    g = 0.5 / np.sqrt(3.0)
+    x, y = np.meshgrid(length * np.array([0.5 - g, 0.5 + g]), height * np.array([-g, g]))
+    points, none = np.stack([x.ravel(), y.ravel()], axis=1), np.zeros((0, 0))
+    masses, ends = np.full(4, 0.25 * mass), np.array([[length, 0.0]])
+    return Cloud(points, masses, np.zeros((4, 2, 0)), none, none, np.zeros((3, 0)), ends)
 
 
 def beam(
@@ -92,15 +124,12 @@ def beam(
     K = np.zeros((3, 3))
     K[:2, :2] = bending / length**3 * np.array([[3.0, 1.5 * length], [1.5 * length, length**2]])
     K[2, 2] = axial / length
-    return Cloud(
-        points=np.column_stack([length * u, np.zeros(24)]),
-        masses=np.full(24, mass / 24),
-        modes=modes,
-        K=K,
-        D=damping * K,
-        outboard=np.array([[0.0, 0.0, 1.0], [1.0, length / 2.0, 0.0], [1.5 / length, 1.0, 0.0]]),
-        outboard_point=np.array([length, 0.0]),
-    )
+    points, ends = np.column_stack([length * u, np.zeros(24)]), np.array([[length, 0.0]])
+    outboard = np.array([[0.0, 0.0, 1.0], [1.0, length / 2.0, 0.0], [1.5 / length, 1.0, 0.0]])
+    return Cloud(points, np.full(24, mass / 24), modes, K, damping * K, outboard, ends)
+
+
+# -- chains in the plane ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -108,7 +137,13 @@ class Chain:
     """Clouds on a cart by Lagrange's equations; y = (x_cart, angles, elastic coordinates).
 
     Positions are written out with rotation matrices in real numbers, so that a complex step
-    differentiates them to rounding.
+    differentiates them to rounding. With K0 bodies deform in the second order: first moment s,
+    inertia J, angular momentum h of the relative motion and the outboard interface lose 1/2 q'K0 q
+    by the load that works on them, and so does the displacement q along the modes; the kinetic
+    energy is built of them: what geometric stiffness is in the theory.
+
+    Attributes:
+        K0: of every cloud, (7 + q, q, q): by the seven loads, and L of its modes; or none.
     """
 
     clouds: tuple[Cloud, ...]
@@ -118,6 +153,7 @@ class Chain:
     joint_height: float
     joints: tuple[JointHardware, ...] = ()
     cart_mass: float = 0.0
+    K0: tuple[np.ndarray, ...] = ()
 
     @property
     def rigid(self) -> int:
@@ -127,85 +163,90 @@ class Chain:
     @property
     def size(self) -> int:
         """Number of all coordinates."""
-        return self.rigid + sum(cloud.K.shape[0] for cloud in self.clouds)
+        return self.rigid + sum(len(cloud.K) for cloud in self.clouds)
+
+    @cached_property
+    def bodies(self) -> tuple[ShapeIntegrals, ...]:
+        """The same as shape integrals, with geometric stiffness if there is any."""
+        bodies = tuple(cloud.body() for cloud in self.clouds)
+        return tuple(
+            replace(body, K0=K0[:4], K0_outboard=K0[4:7], along_modes=K0[7:])
+            for body, K0 in zip(bodies, self.K0)
+        ) or bodies  # fmt: skip
 
     def mechanism(self) -> Mechanism:
         """Return the same chain of shape integrals."""
-        return Mechanism(
-            tuple(cloud.body() for cloud in self.clouds),
-            self.payload_mass,
-            self.payload_inertia,
-            self.gravity,
-            self.joint_height,
-            joints=self.joints,
-            cart_mass=self.cart_mass,
-        )
-
-    def interfaces(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places (arms, 2) and angles (arms,) of the outboard interfaces."""
-        origin = np.array([y[0], self.joint_height])
-        angle = np.zeros((), dtype=y.dtype)
-        places, angles = [], []
-        for cloud, joint, e in zip(self.clouds, y[1 : self.rigid], self.parts(y), strict=True):
-            origin = origin + _rotation(angle + joint) @ (
-                cloud.outboard_point + cloud.outboard[:2] @ e
-            )
-            angle = angle + joint + cloud.outboard[2] @ e
-            places.append(origin)
-            angles.append(angle)
-        return np.array(places), np.array(angles)
-
-    def hardware_product(self, y: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
-        """Return what masses at the interfaces, rotors and the cart add to u' M(y) v."""
-        total = self.cart_mass * u[0] * v[0]
-        (p, a), (r, b) = (
-            tuple(x.imag * 1e30 for x in self.interfaces(y + 1e-30j * z)) for z in (u, v)
-        )
-        for k, joint in enumerate(self.joints):
-            total += joint.mass * p[k] @ r[k] + joint.inertia * a[k] * b[k]
-            total += joint.rotor * u[1 + k] * v[1 + k]
-        return total
-
-    def hardware_weight(self, y: np.ndarray) -> np.ndarray:
-        """Return the first moment of the masses at the interfaces (2,), kg m."""
-        places = self.interfaces(y)[0]
-        return sum((j.mass * p for j, p in zip(self.joints, places)), np.zeros(2))
+        load = self.payload_mass, self.payload_inertia
+        own = self.gravity, self.joint_height
+        return Mechanism(self.bodies, *load, *own, joints=self.joints, cart_mass=self.cart_mass)
 
     def parts(self, y: np.ndarray) -> list[np.ndarray]:
         """Return each arm's elastic coordinates."""
-        return np.split(
-            y[self.rigid :], np.cumsum([cloud.K.shape[0] for cloud in self.clouds])[:-1]
+        return np.split(y[self.rigid :], np.cumsum([len(cloud.K) for cloud in self.clouds])[:-1])
+
+    def frames(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the arms' origins and outboard places (1 + arms, 2), angles before and behind."""
+        origins, behind = [np.array([y[0], self.joint_height])], []
+        angles, angle = [], np.zeros((), dtype=y.dtype)
+        for k, (cloud, e) in enumerate(zip(self.clouds, self.parts(y), strict=True)):
+            bent = np.array([e @ A @ e for A in self.K0[k][4:7]]) if self.K0 else np.zeros(3)
+            u = cloud.outboard @ e - 0.5 * bent
+            angles.append(angle + y[1 + k])
+            origins.append(origins[-1] + rotation(angles[-1]) @ (cloud.ends[0] + u[:2]))
+            angle = angles[-1] + u[2]
+            behind.append(angle)
+        return np.array(origins), np.array(angles), np.array(behind)
+
+    def points(self, y: np.ndarray) -> np.ndarray:
+        """Return the places (n, 2) of all point masses."""
+        origins, angles, _ = self.frames(y)
+        parts = zip(self.clouds, self.parts(y), origins, angles)
+        return np.concatenate(
+            [o + (c.points + c.modes @ e) @ rotation(a).T for c, e, o, a in parts]
         )
 
-    def places(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return all points (n, 2), the payload's place (2,) and angle."""
-        origin = np.array([y[0], self.joint_height])
-        angle = np.zeros((), dtype=y.dtype)
-        points = []
-        for cloud, joint, e in zip(self.clouds, y[1 : self.rigid], self.parts(y), strict=True):
-            angle = angle + joint
-            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            points.append(origin + (cloud.points + cloud.modes @ e) @ turn.T)
-            origin = origin + turn @ (cloud.outboard_point + cloud.outboard[:2] @ e)
-            angle = angle + cloud.outboard[2] @ e
-        return np.concatenate(points), origin, angle
-
-    def rates(self, y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the velocities of `places`, by a complex step along yd."""
-        points, tip, angle = self.places(y + 1e-30j * yd)
-        return points.imag * 1e30, tip.imag * 1e30, angle.imag * 1e30
+    @property
+    def carried(self) -> np.ndarray:
+        """Masses and inertias (2, arms) at the outboard interfaces, kg and kg m2."""
+        found = np.zeros((2, len(self.clouds)))
+        for k, joint in enumerate(self.joints):
+            found[:, k] = joint.mass, joint.inertia
+        found[:, -1] += self.payload_mass, self.payload_inertia
+        return found
 
     def momentum_product(self, y: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
-        """Return u' M(y) v from the points' velocities."""
-        masses = np.concatenate([cloud.masses for cloud in self.clouds])
-        points_u, tip_u, angle_u = self.rates(y, u)
-        points_v, tip_v, angle_v = self.rates(y, v)
-        return (
-            np.einsum("n,ni,ni->", masses, points_u, points_v)
-            + self.payload_mass * tip_u @ tip_v
-            + self.payload_inertia * angle_u * angle_v
-            + self.hardware_product(y, u, v)
-        )
+        """Return u' M(y) v from the velocities of points and interfaces, or by the integrals."""
+
+        def along(function: Callable[[np.ndarray], Any], x: np.ndarray) -> Any:
+            found = function(y + 1j * STEP * x)
+            return [np.imag(z) / STEP for z in found] if isinstance(found, tuple) else (
+                np.imag(found) / STEP
+            )  # fmt: skip
+
+        (p, a, b), (r, c, d) = (along(self.frames, x) for x in (u, v))
+        masses, inertias = self.carried
+        total = self.cart_mass * u[0] * v[0]
+        total += masses @ (p[1:] * r[1:]).sum(axis=1) + inertias @ (b * d)
+        total += sum(j.rotor * u[1 + k] * v[1 + k] for k, j in enumerate(self.joints))
+        if not self.K0:
+            m = np.concatenate([cloud.masses for cloud in self.clouds])
+            return total + np.einsum("n,ni,ni->", m, along(self.points, u), along(self.points, v))
+        angles = self.frames(y)[1]
+        for k, (body, K0) in enumerate(zip(self.bodies, self.K0)):
+            e, R = self.parts(y)[k], rotation(angles[k])
+            s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
+            L = e @ K0[7:]
+            z, turn = e - 0.5 * L @ e, np.eye(len(e)) - L
+            J = body.inertia + 2.0 * body.j @ e - e @ K0[3] @ e + z @ body.M @ z
+            by_s, by_h = body.C - e @ K0[:2], body.r + turn.T @ body.G @ z - K0[2] @ e
+            around = np.array([-s[1], s[0]])
+            (v1, w1, s1, h1, e1), (v2, w2, s2, h2, e2) = (
+                (R.T @ place[k], turned[k], by_s @ ed, by_h @ ed, turn @ ed)
+                for place, turned, ed in ((p, a, self.parts(u)[k]), (r, c, self.parts(v)[k]))
+            )
+            total += body.mass * v1 @ v2 + v1 @ (s2 + w2 * around) + v2 @ (s1 + w1 * around)
+            total += J * w1 * w2 + w1 * h2 + w2 * h1 + e1 @ body.M @ e2
+        return total
 
     def kinetic(self, y: np.ndarray, yd: np.ndarray) -> float:
         """Return T, J."""
@@ -213,15 +254,15 @@ class Chain:
 
     def potential(self, y: np.ndarray) -> float:
         """Return the potential of gravity and elasticity, J."""
-        masses = np.concatenate([cloud.masses for cloud in self.clouds])
-        points, tip, _ = self.places(y)
-        weight = masses @ points + self.payload_mass * tip + self.hardware_weight(y)
-        elastic = sum(0.5 * e @ c.K @ e for c, e in zip(self.clouds, self.parts(y), strict=True))
+        origins, angles, _ = self.frames(y)
+        weight, elastic = self.carried[0] @ origins[1:], 0.0
+        for k, (body, e) in enumerate(zip(self.bodies, self.parts(y))):
+            s = body.moment + body.C @ e
+            if self.K0:
+                s = s - 0.5 * np.array([e @ A @ e for A in self.K0[k][:2]])
+            weight = weight + body.mass * origins[k] + rotation(angles[k]) @ s
+            elastic += 0.5 * e @ body.K @ e
         return elastic - weight @ np.array(self.gravity)
-
-    def dissipation(self, yd: np.ndarray) -> float:
-        """Return the power that damping takes, W."""
-        return sum(e @ c.D @ e for c, e in zip(self.clouds, self.parts(yd), strict=True))
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return d/dt dT/dyd - dT/dy + dV/dy + D yd by numerical differentiation."""
@@ -234,106 +275,195 @@ class Chain:
         def lagrangian(t: float) -> np.ndarray:
             return np.array([self.kinetic(y + t * e, yd) - self.potential(y + t * e) for e in unit])
 
-        damping = np.concatenate(
-            [np.zeros(self.rigid)]
-            + [c.D @ e for c, e in zip(self.clouds, self.parts(yd), strict=True)]
-        )
-        return derivative(momentum) - derivative(lagrangian) + damping
+        damping = [c.D @ e for c, e in zip(self.clouds, self.parts(yd), strict=True)]
+        lost = np.concatenate([np.zeros(self.rigid), *damping])
+        return derivative(momentum) - derivative(lagrangian) + lost
+
+
+def rotation(angle: np.ndarray) -> np.ndarray:
+    """Return the matrix that turns by an angle."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+# -- trees in space --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class BentChain(Chain):
-    """A chain whose bodies deform in the second order, by Lagrange's equations.
+class CloudTree:
+    """Clouds joined as a tree, by Newton's law for every point; y = (joints, elastic)."""
 
-    First moment s, inertia J, angular momentum h of the relative motion and the outboard interface
-    lose 1/2 q'K0 q by the load that works on them; so does the displacement q along the modes. The
-    kinetic energy is built of them: what geometric stiffness is in the theory.
+    clouds: tuple[Cloud, ...]
+    joints: tuple[Joint, ...]
+    carried: dict[tuple[int, int], Cloud]  # by arm and interface; rigid
+    gravity: np.ndarray
+    end: int
 
-    Attributes:
-        K0: of every cloud, (7 + q, q, q): by the seven loads, and L of its modes.
+    def mechanism(self) -> SpatialMechanism:
+        """Return the same tree of shape integrals."""
+        carried = {site: one.body() for site, one in self.carried.items()}
+        first = tuple(carried.pop((i, 0), None) for i in range(len(self.clouds)))
+        bodies = tuple(cloud.body() for cloud in self.clouds)
+        tree = bodies, self.joints, first, self.gravity, self.end
+        return SpatialMechanism(*tree, carried_further=carried)
+
+    def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+        """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
+        masses, _, second = self._points(y, yd, ydd)
+        none = np.zeros_like(y)
+        steps = 1j * STEP * np.eye(len(y))
+        J = [self._points(y + step, none, none)[1].imag / STEP for step in steps]
+        out = np.einsum("n,kni,ni->k", masses, J, second - self.gravity)
+        for joint in self.joints:
+            if joint.coordinate is not None:
+                out[joint.coordinate] += joint.rotor * ydd[joint.coordinate]
+        first = sum(joint.coordinate is not None for joint in self.joints)
+        for cloud in self.clouds:
+            part = slice(first, first + len(cloud.K))
+            out[part] += cloud.K @ y[part] + cloud.D @ yd[part]
+            first = part.stop
+        return out
+
+    def _points(
+        self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return masses (n,), places and accelerations (n, 3) of all points.
+
+        Every frame is the product of exponentials of 4 x 4 matrices along y + yd t + ydd t^2 / 2,
+        taken as polynomials of t by blocks: exp of a block Toeplitz matrix holds its series.
+        """
+        series = (y, yd, 0.5 * ydd)
+        ends: dict[tuple[int, int], np.ndarray] = {(GROUND, 0): _polynomial(np.eye(4))}
+        first = sum(joint.coordinate is not None for joint in self.joints)
+        masses, places, second = [], [], []
+        for i, (joint, cloud) in enumerate(zip(self.joints, self.clouds, strict=True)):
+            part = slice(first, first + len(cloud.K))
+            first = part.stop
+            frame = ends[joint.parent, joint.interface]
+            frame = frame @ _polynomial(_place(joint.rotation, joint.origin))
+            if (k := joint.coordinate) is not None:
+                generator = _place(0.0 * np.eye(3), joint.axis)
+                if joint.kind == "revolute":
+                    generator = _place(skew(joint.axis), np.zeros(3))
+                generator[3, 3] = 0.0
+                frame = frame @ expm(_polynomial(*(generator * c[k] for c in series)))
+            moved = [c[part] for c in series]
+            for s, point in enumerate(cloud.ends):
+                B = cloud.outboard[6 * s : 6 * s + 6]
+                u, theta = [B[:3] @ e for e in moved], [skew(B[3:] @ e) for e in moved]
+                u[0] = u[0] + point
+                rates = (_place(0.0 * np.eye(3), x) for x in u[1:])
+                shift = _polynomial(_place(np.eye(3), u[0]), *rates)
+                turn = [np.pad(x, (0, 1)) for x in theta]
+                ends[i, s] = frame @ shift @ expm(_polynomial(*turn))
+            X = [cloud.points + cloud.modes @ moved[0], *(cloud.modes @ e for e in moved[1:])]
+            bodies = [(frame, cloud.masses, X)]
+            for (k, s), load in self.carried.items():
+                if k == i:
+                    still = [load.points, *(0.0 * load.points,) * 2]
+                    bodies.append((ends[i, s], load.masses, still))
+            for place, mass, points in bodies:
+                c0, c1, c2 = (place[:4, 4 * j : 4 * j + 4] for j in range(3))
+                R0, R1, R2 = (c[:3, :3] for c in (c0, c1, c2))
+                masses.append(mass)
+                places.append(points[0] @ R0.T + c0[:3, 3])
+                acceleration = points[0] @ R2.T + points[1] @ R1.T + points[2] @ R0.T + c2[:3, 3]
+                second.append(2.0 * acceleration)
+        return np.concatenate(masses), np.concatenate(places), np.concatenate(second)
+
+
+def _place(R: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    out = np.zeros((4, 4), dtype=np.result_type(R, origin))
+    out[:3, :3], out[:3, 3] = R, origin
+    if R.any():
+        out[3, 3] = 1.0
+    return out
+
+
+def _polynomial(*coefficients: np.ndarray) -> np.ndarray:
+    """Return c_0 + c_1 t + c_2 t^2 as a block Toeplitz matrix (12, 12)."""
+    out = np.zeros((12, 12), dtype=np.result_type(*coefficients))
+    for k, c in enumerate(coefficients):
+        for i in range(3 - k):
+            out[4 * i : 4 * i + 4, 4 * (i + k) : 4 * (i + k) + 4] = c
+    return out
+
+
+def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
+    """Return two branches with every kind of joint, rigid and flexible bodies, and loads.
+
+    With two interfaces the branches leave a flexible body at both of them, and others are held at
+    the second one.
     """
-
-    K0: tuple[np.ndarray, ...] = ()
-
-    def mechanism(self) -> Mechanism:
-        """Return the chain of bodies with geometric stiffness."""
-        linear = super().mechanism()
-        bodies = [
-            replace(body, K0=K0[:4], K0_outboard=K0[4:7], along_modes=K0[7:])
-            for body, K0 in zip(linear.bodies, self.K0, strict=True)
-        ]
-        return replace(linear, bodies=tuple(bodies))
-
-    def frames(self, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return origins (2,) and angles of all frames, the payload's last."""
-        origins, angles = [np.array([y[0], self.joint_height])], []
-        angle = np.zeros((), dtype=y.dtype)
-        for cloud, K0, joint, e in zip(
-            self.clouds, self.K0, y[1 : self.rigid], self.parts(y), strict=True
-        ):
-            angles.append(angle + joint)
-            d = (
-                cloud.outboard_point
-                + cloud.outboard[:2] @ e
-                - 0.5 * np.array([e @ A @ e for A in K0[4:6]])
-            )
-            origins.append(origins[-1] + _rotation(angles[-1]) @ d)
-            angle = angles[-1] + cloud.outboard[2] @ e - 0.5 * e @ K0[6] @ e
-        return origins, [*angles, angle]
-
-    def interfaces(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return places (arms, 2) and angles (arms,) of the outboard interfaces."""
-        origins, angles = self.frames(y)
-        inner = [a - joint for a, joint in zip(angles[1:-1], y[2 : self.rigid], strict=True)]
-        return np.array(origins[1:]), np.array([*inner, angles[-1]])
-
-    def places(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return no points, the payload's place (2,) and angle."""
-        origins, angles = self.frames(y)
-        return np.zeros((0, 2)), origins[-1], angles[-1]
-
-    def momentum_product(self, y: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
-        """Return u' M(y) v from the bodies' integrals."""
-        moved = [self.frames(y + 1e-30j * x) for x in (u, v)]
-        angles = self.frames(y)[1]
-        total = 0.0
-        for k, (cloud, K0) in enumerate(zip(self.clouds, self.K0, strict=True)):
-            body, e = cloud.body(), self.parts(y)[k]
-            s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
-            along = e @ K0[7:]
-            z, turn = e - 0.5 * along @ e, np.eye(len(e)) - along
-            J = body.inertia + 2.0 * body.j @ e - e @ K0[3] @ e + z @ body.M @ z
-            by_s, by_h = body.C - e @ K0[:2], body.r + turn.T @ body.G @ z - K0[2] @ e
-            rates = []
-            for (origins, turned), x in zip(moved, (u, v), strict=True):
-                velocity = _rotation(angles[k]).T @ origins[k].imag * 1e30
-                ed = self.parts(x)[k]
-                rates.append((velocity, turned[k].imag * 1e30, by_s @ ed, by_h @ ed, ed))
-            (v1, w1, s1, h1, e1), (v2, w2, s2, h2, e2) = rates
-            around = np.array([-s[1], s[0]])
-            total += body.mass * v1 @ v2 + v1 @ (s2 + w2 * around) + v2 @ (s1 + w1 * around)
-            total += J * w1 * w2 + w1 * h2 + w2 * h1
-            total += (turn @ e1) @ body.M @ (turn @ e2)
-        (tip1, angle1), (tip2, angle2) = (
-            (origins[-1].imag * 1e30, turned[-1].imag * 1e30) for origins, turned in moved
-        )
-        total += self.payload_mass * tip1 @ tip2 + self.payload_inertia * angle1 * angle2
-        return total + self.hardware_product(y, u, v)
-
-    def potential(self, y: np.ndarray) -> float:
-        """Return the potential of gravity and elasticity, J."""
-        origins, angles = self.frames(y)
-        weight, elastic = self.payload_mass * origins[-1] + self.hardware_weight(y), 0.0
-        for k, (cloud, K0) in enumerate(zip(self.clouds, self.K0, strict=True)):
-            body, e = cloud.body(), self.parts(y)[k]
-            s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
-            weight = weight + body.mass * origins[k] + _rotation(angles[k]) @ s
-            elastic = elastic + 0.5 * e @ body.K @ e
-        return elastic - weight @ np.array(self.gravity)
+    last = interfaces - 1
+    rigid, fork = (random_cloud(rng, q, 3, interfaces) for q in (0, 3))
+    outer = random_cloud(rng, 2, 3), random_cloud(rng, 3, 3, interfaces)
+    kinds = (
+        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3, last), ("prismatic", 1, 1, 0.4),
+        ("fixed", 1, None, 0.0, last), ("revolute", 3, 2, 0.0, last),
+    )  # fmt: skip
+    joints = []
+    for kind, parent, coordinate, rotor, *interface in kinds:
+        axis, origin, turn = rng.normal(size=(3, 3))
+        place = axis / np.linalg.norm(axis), 0.3 * origin, exponential(turn), rotor
+        joints.append(Joint("joint", kind, parent, coordinate, *place, *interface))
+    loads = {site: random_cloud(rng, 0, 3) for site in sorted({(1, 0), (1, last), (3, 0), (4, 0)})}
+    clouds = rigid, fork, *outer, rigid
+    return CloudTree(clouds, tuple(joints), loads, rng.normal(size=3), 4)
 
 
-def _rotation(angle: np.ndarray) -> np.ndarray:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+def posed_machine(plane: Mechanism) -> SpatialMechanism:
+    """Return a plane machine in space: a cart on the x axis, joints about z."""
+    x, _, z = np.eye(3)
+    none, still = np.zeros(3), np.eye(3)
+    joints = [Joint("cart", "prismatic", GROUND, 0, x, rotor=float(plane.rotors[0]))]
+    carried: list[ShapeIntegrals | None] = [None]
+    for k in range(len(plane.bodies)):
+        origin = np.array([0.0, plane.joint_height, 0.0]) if k == 0 else none
+        rotor, load = float(plane.rotors[1 + k]), plane.carried(k)
+        joints.append(Joint(f"joint{k}", "revolute", k, 1 + k, z, origin, still, rotor))
+        inertia = None if load is None else (0.0, 0.0, load[1], 0.0, 0.0, 0.0)
+        carried.append(None if load is None else rigid_spatial_body(load[0], none, inertia))
+    bodies = (rigid_spatial_body(0.0, none, np.zeros(6)), *map(in_space, plane.bodies))
+    gravity = np.array([*plane.gravity, 0.0])
+    return SpatialMechanism(bodies, tuple(joints), tuple(carried), gravity, len(plane.bodies))
+
+
+def posed_motion(motion: RigidMotion) -> RigidMotion:
+    """Return a plane machine's motion as that of the joints in space."""
+    return RigidMotion(motion.q, motion.qd, motion.qdd)
+
+
+# -- changes and derivatives -----------------------------------------------------------------
+
+
+def stiffened(rng: np.random.Generator, body: ShapeIntegrals, along: float = 0.1) -> ShapeIntegrals:
+    """Return a body with some geometric stiffness by all 7 or 18 loads and more."""
+    q, b, frame = body.num_modes, len(body.outboard), len(body.w) + len(body.W)
+    K0 = rng.normal(scale=0.2, size=(frame + b + q, q, q))
+    K0 = K0 + K0.swapaxes(1, 2)
+    # The modes of light clouds move little mass.
+    parts = {"K0": K0[:frame], "K0_outboard": K0[frame : frame + b]}
+    return replace(body, **parts, along_modes=along * K0[frame + b :])
+
+
+def change_of(rng: np.random.Generator, body: ShapeIntegrals, name: str) -> np.ndarray:
+    """Return a change of an integral that keeps its symmetries."""
+    change = np.asarray(rng.normal(size=np.shape(getattr(body, name))))
+    if name in ("K", "D", *STIFFENING):
+        return change + change.swapaxes(-1, -2)
+    if name != "W":
+        return change
+    if len(change) == 2:  # int N'N and int N'SN
+        return change + np.array([1.0, -1.0])[:, None, None] * change.swapaxes(1, 2)
+    blocks = change.reshape(3, 3, *change.shape[1:])  # W_ba = W_ab'
+    return (blocks + blocks.transpose(1, 0, 3, 2)).reshape(change.shape)
+
+
+def changed(model: Any, arm: int, name: str, change: np.ndarray) -> Any:
+    """Return the mechanism with one constant of one body increased."""
+    bodies = list(model.bodies)
+    bodies[arm] = replace(bodies[arm], **{name: getattr(bodies[arm], name) + change})
+    return replace(model, bodies=tuple(bodies))
 
 
 def derivative(function: Callable[[float], ArrayLike], step: float = 5e-3) -> np.ndarray:
@@ -349,6 +479,11 @@ def derivative(function: Callable[[float], ArrayLike], step: float = 5e-3) -> np
     return np.asarray(total)
 
 
+def complex_derivative(function: Callable[[complex], np.ndarray]) -> np.ndarray:
+    """Return the derivative at 0 by a complex step, to rounding."""
+    return np.imag(function(1j * STEP)) / STEP
+
+
 def assert_close(
     found: ArrayLike, expected: ArrayLike, relative: float, size: float | None = None
 ) -> None:
@@ -359,24 +494,3 @@ def assert_close(
     size = float(np.abs(expected).max()) if size is None else size
     here, there = np.asarray(found), np.asarray(expected)
     np.testing.assert_allclose(here, there, rtol=0.0, atol=relative * size)
-
-
-def unit_changes(body: ShapeIntegrals, name: str) -> Iterator[np.ndarray]:
-    """Yield changes that span all an integral can do: int N'N, K, D symmetric, int N'SN skew."""
-    shape = np.shape(getattr(body, name))
-    for index in np.ndindex(shape):
-        change = np.zeros(shape)
-        change[index] = 1.0
-        if name in ("K", "D", *STIFFENING):
-            change = change + change.swapaxes(-1, -2)
-        elif name == "W":
-            change[0] += change[0].T
-            change[1] -= change[1].T
-        yield change
-
-
-def changed(model: Mechanism, arm: int, name: str, change: np.ndarray) -> Mechanism:
-    """Return the mechanism with one constant of one arm increased."""
-    bodies = list(model.bodies)
-    bodies[arm] = replace(bodies[arm], **{name: getattr(bodies[arm], name) + change})
-    return replace(model, bodies=tuple(bodies))

@@ -1,15 +1,27 @@
-"""Small machines: a controlled two-arm machine, a slider-crank and a four-bar."""
+"""Machines: control, slider-crank, four-bar; what `tests/reference` says of them, and balances."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from runs import TWO_ARM
+import numpy as np
+from runs import TWO_ARM, scene
 
 import dolfinopt as do
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.model import SimulationResult
+from dolfinopt.multibody.end_effector import _frames, interface_place, outboard
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.scene.load import Scene, scene_from_dict
 
+Tree = dict[str, Any]
+REFERENCE = Path(__file__).parents[1] / "reference"
 GAINS = {"stiffness": [2e5, 2e4, 2e4], "damping": [2e4, 600.0, 600.0]}
 
 
@@ -24,7 +36,7 @@ CRANK = {"name": "crank", "rigid": True, "length": 0.15, "height": 0.02, "thickn
          "mass": 0.0, "inertia": 0.0}  # fmt: skip
 ROD = {"name": "rod", "length": 0.3, "height": 0.012, "thickness": 0.01, "cells": [16, 2],
        "passive": 0.0}  # fmt: skip
-LOOP: dict[str, Any] = {
+LOOP: Tree = {
     "name": "slider-crank",
     "material": {"young_modulus": 210e9, "poisson_ratio": 0.3, "density": 7850.0},
     "interpolation": {"law": "two-material", "penalty": 3.0, "floor": 1e-3},
@@ -40,7 +52,7 @@ LOOP: dict[str, Any] = {
     "design": {"initial": 0.5, "filter_radius": 0.0},
     "optimizer": {"max_iterations": 2},
 }  # fmt: skip
-FOUR_BAR: dict[str, Any] = LOOP | {
+FOUR_BAR: Tree = LOOP | {
     "name": "four-bar",
     "arms": [CRANK | {"length": 0.1}, ROD | {"name": "coupler", "length": 0.28},
              ROD | {"name": "rocker", "length": 0.25}],
@@ -49,20 +61,174 @@ FOUR_BAR: dict[str, Any] = LOOP | {
 }  # fmt: skip
 
 
-def loop_tree(kind: str = "slider", **tables: Any) -> dict[str, Any]:
-    """Return the slider-crank's ("slider") or the four-bar's ("pin") scene as a dictionary.
+def with_keys(tree: Tree, changes: Mapping[str, Any]) -> Tree:
+    """Return a scene with other keys; those of a table beside what it has."""
+    new = copy.deepcopy(tree)
+    for key, value in changes.items():
+        new[key] = {**(new.get(key) or {}), **value} if isinstance(value, Mapping) else value
+    return new
 
-    Args:
-        kind: of the closure.
-        tables: whole tables, or keys of one that are changed.
-    """
-    data = copy.deepcopy(LOOP if kind == "slider" else FOUR_BAR)
-    for name, value in tables.items():
-        old = data.get(name)
-        data[name] = {**old, **value} if isinstance(old, dict) else copy.deepcopy(value)
-    return data
+
+def loop_tree(kind: str = "slider", **tables: Any) -> Tree:
+    """Return the slider-crank's ("slider") or the four-bar's ("pin") scene, tables changed."""
+    return with_keys(LOOP if kind == "slider" else FOUR_BAR, tables)
 
 
 def loop(kind: str = "slider", **tables: Any) -> Scene:
     """Return the scene of `loop_tree`."""
     return scene_from_dict(loop_tree(kind, **tables))
+
+
+# -- machines of tests/reference -------------------------------------------------------------
+
+
+def reference(name: str) -> dict[str, np.ndarray]:
+    """Return the columns of a table of `tests/reference` by name, without units."""
+    file = REFERENCE / f"{name}.csv"
+    with file.open(encoding="ascii") as lines:
+        names = [column.split("[")[0].strip() for column in next(lines).split(",")]
+    return dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1).T, strict=True))
+
+
+def two_arm(*overrides: str, **changes: Any) -> Tree:
+    """Return the two-arm scene with keys changed, then tables."""
+    return with_keys(scene(*overrides).to_tree(), changes)
+
+
+def slider_crank(height: float, cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
+    """Return the slider-crank of `tests/reference`: steel rod of `height`, m, 2 turns in 0.1 s."""
+    tree = with_keys(LOOP, {
+        "motion": {"speed": 150.0},
+        "closure": {"side": 1},
+        "reduction": {"coordinates": 8},
+        "simulation": {"stiffening": True, "sample": 2e-4, "tolerance": 1e-4},
+        "design": {"volume_fraction": 1.0, "initial": 1.0},
+        "objective": {"kind": "compliance"},
+    })  # fmt: skip
+    tree["arms"][1] |= {"height": height, "cells": list(cells)}
+    return with_keys(tree, changes)
+
+
+def four_bar(cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
+    """Return the four-bar of `tests/reference`, of aluminium."""
+    tree = slider_crank(0.010, cells)
+    crank, bar = tree["arms"]
+    tree["material"] = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
+    tree["arms"] = [
+        dict(crank, length=0.1),
+        dict(bar, name="coupler", length=0.28, joint_mass=0.05),
+        dict(bar, name="rocker", length=0.25, joint_mass=0.0),  # not the arm's before
+    ]
+    tree["motion"] |= {"speed": 100.0, "duration": 0.08, "horizon": 0.2}
+    tree["simulation"] |= {"sample": 4e-4}
+    tree["closure"], tree["payload"] = FOUR_BAR["closure"], {"mass": 0.0}
+    return with_keys(tree, changes)
+
+
+def simulated(tree: Tree) -> SimulationResult:
+    """Return the simulation of a scene's initial design."""
+    return do.Model(scene_from_dict(tree)).simulate()
+
+
+def machine(result: SimulationResult) -> tuple[Trajectory, MachineSystem]:
+    """Return the trajectory of a simulated machine every `simulation.sample`, and its system."""
+    assert result.trajectory is not None
+    assert isinstance(result.trajectory.problem, MachineSystem)
+    return result.trajectory.sampled, result.trajectory.problem
+
+
+def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
+    """Return an arm's deflection halfway (n,), m: left normal of the chord between its joints."""
+    trajectory, _ = machine(result)
+    mechanism = trajectory.mechanism
+    view = result.views[[one.name for one in result.views].index(result.scene.arms[arm].name)]
+    corners, modes = view.corners.reshape(-1, 2), view.modes.reshape(-1, 2, view.modes.shape[-1])
+    middle = 0.5 * mechanism.bodies[arm].outboard_point
+    node = int(np.argmin(np.hypot(*(corners - middle).T)))
+    assert np.allclose(corners[node], middle)
+    q = trajectory.q_e[:, mechanism.slices[arm]]
+    place = complex(*middle) + q @ (modes[node, 0] + 1j * modes[node, 1])
+    chord = outboard(mechanism.modal_constants[arm], q)[0]
+    return (np.conj(chord / np.abs(chord)) * place).imag
+
+
+def apart(found: np.ndarray, expected: np.ndarray) -> float:
+    """Return the largest difference over time, of the largest value expected."""
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
+
+
+def imbalance(result: SimulationResult) -> float:
+    """Return how much of the drives' work is not energy, of the largest energy that is stored.
+
+    Work less what damping took, and less kinetic and strain energy and gravity's potential, at the
+    steps' ends; of a prescribed motion, a machine or a closed loop.
+    """
+    trajectory = result.trajectory
+    assert trajectory is not None
+    grid, mechanism = trajectory.solution.time_grid, trajectory.mechanism
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    h = np.diff(grid)[:, None]
+    t = grid[:-1, None] + 0.5 * h * (nodes + 1.0)
+    motion, _, qd, _, forces = states(trajectory, t.ravel())
+    power = (forces * motion.qd).sum(axis=1)
+    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
+        power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
+    work = np.cumsum((0.5 * h * weights * power.reshape(t.shape)).sum(axis=1))
+    stored = sum(energies(trajectory, grid))
+    return float(np.abs(work - (stored[1:] - stored[0])).max() / np.abs(stored).max())
+
+
+def states(
+    trajectory: Trajectory, t: np.ndarray
+) -> tuple[RigidMotion, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return rigid motion, elastic coordinates with derivatives, and the drives' forces at t."""
+    y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
+    if not isinstance(trajectory.problem, MachineSystem):
+        motion = trajectory.problem.motion(t)
+        forces = inverse_dynamics(trajectory.mechanism, motion, y, yd, ydd)[1]
+        return motion, y, yd, ydd, forces
+    instants = trajectory.problem.at(t)
+    (_, q, _), (_, qd, _), (_, qdd, _) = (instants.split(x) for x in (y, yd, ydd))
+    return instants.motion(y, yd, ydd), q, qd, qdd, instants.forces(y, yd, ydd)
+
+
+def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return kinetic and strain energy and gravity's potential, (n,) each, J.
+
+    The first by the mass matrix; the last by where masses are, arms that shorten as they bend
+    included.
+    """
+    motion, q, qd, qdd, _ = states(trajectory, t)
+    mechanism = trajectory.mechanism
+    rigid = np.arange(1 + len(mechanism.bodies))
+    tangent = linearise(mechanism, motion, q, qd, qdd, None, rigid).dense()
+    size = tangent.shape[1]
+    speeds = np.concatenate([motion.qd, qd], axis=1)
+    kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
+    strain = np.zeros(len(t))
+    origins, rotations, _ = _frames(mechanism, motion, q)
+    moment = mechanism.payload_mass * origins[-1]  # first moment of all masses, complex
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
+        e = q[:, part]
+        strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
+        own = body.moment + e @ body.C.T
+        if body.is_stiffened:
+            own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:2], e)
+        moment = moment + body.mass * origins[k] + rotations[k] * (own[:, 0] + 1j * own[:, 1])
+    for k, joint in enumerate(mechanism.joints):
+        moment = moment + joint.mass * origins[1 + k]
+    potential = -(np.conj(complex(*mechanism.gravity)) * moment).real
+    return kinetic, strain, potential
+
+
+def gaps(result: SimulationResult) -> np.ndarray:
+    """Return the violation of a loop's constraints at all stages (n, m), m."""
+    trajectory, system = machine(result)
+    assert system.closure is not None
+    grid, nodes = trajectory.solution.time_grid, trajectory.solution.nodes
+    t = (grid[:-1, None] + np.diff(grid)[:, None] * nodes).ravel()
+    y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
+    instants = system.at(t)
+    motion = instants.motion(y, yd, ydd)
+    place = interface_place(system.mechanism, motion, instants.split(y)[1]).place
+    return system.closure.gap(place)

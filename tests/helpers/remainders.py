@@ -1,4 +1,4 @@
-"""Taylor remainders of functions of all arms' physical densities, for the tests of gradients."""
+"""Arms of small scenes, dense and built, and Taylor remainders of functions of their densities."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from mpi4py import MPI
 from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
+from dolfinopt.fem.elasticity import Substructure
+from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.optimization import gradient_check
+from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
 from dolfinopt.parallel import Partition, sum_over_arms
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients
 from dolfinopt.scene.load import Scene
 
 Cells = Mapping[int, np.ndarray]
-Named = dict[str, np.ndarray]
+Field = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -47,11 +53,11 @@ class Built:
         """Return the product over all cells of all arms, on all ranks."""
         return float(sum_over_arms(self.partition, {k: np.array(a[k] @ b[k]) for k in self.arms}))
 
-    def fields(self, function: Callable[[int, np.ndarray, np.ndarray], np.ndarray]) -> Cells:
+    def fields(self, function: Field) -> Cells:
         """Return function(arm, x, y) of the cells' centroids over the arm's length."""
         out = {}
         for k, arm in self.arms.items():
-            x, y = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
+            x, y = arm.mesh.centroid.T[:2] / arm.mesh.outboard_point[0]
             out[k] = function(k, x, y)
         return out
 
@@ -63,10 +69,61 @@ def beside_volume(evaluation: Evaluation) -> tuple[float, ...]:
 
 def build(*overrides: str, cells: tuple[int, int] = (24, 3)) -> Built:
     """Build the two-arm scene on few cells (collective)."""
-    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    return built_of(do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides)))
+
+
+def built_of(scene: Scene, world: MPI.Comm = MPI.COMM_WORLD) -> Built:
+    """Build a scene's arms (collective)."""
     profile = do.Profile()
-    partition = do.partition_arms(MPI.COMM_WORLD, scene.cell_counts)
+    partition = do.partition_arms(world, scene.cell_counts)
     return Built(scene, partition, do.build_arms(scene, partition, profile), profile)
+
+
+def arm_of(
+    cells: tuple[int, int], *overrides: str, comm: MPI.Comm = MPI.COMM_SELF, index: int = 0
+) -> Arm:
+    """Return one arm of the two-arm scene, solid, on its own ranks."""
+    scene = do.load_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
+    arm = Arm(scene, index, comm, do.Profile())
+    arm.set_design(np.ones(arm.mesh.num_cells))
+    return arm
+
+
+def substructure(
+    size: tuple[float, float, float],
+    cells: tuple[int, int],
+    comm: MPI.Comm = MPI.COMM_SELF,
+    element: str = "linear",
+    poisson_ratio: float = 0.33,
+) -> Substructure:
+    """Return a rectangle of length, height and thickness, m."""
+    mesh = structured_arm(comm, "arm", *size[:2], cells)
+    operators = ELEMENTS[element].operators(mesh, size[2], poisson_ratio)
+    return Substructure(mesh, operators, do.Profile())
+
+
+def dense_matrices(elastic, young, density) -> tuple[np.ndarray, np.ndarray]:
+    """Return T'KT and T'MT (n, n) of a plane arm, put together from the elements' matrices.
+
+    T clamps the inboard edge and holds the outboard one rigid, its three coordinates last.
+    """
+    operators = elastic.operators
+    points, size = operators.points, len(operators.points)
+    K, M = np.zeros((2, 2 * size, 2 * size))
+    for e, cell in enumerate(operators.cells):
+        dofs = (2 * cell[:, None] + [0, 1]).ravel()
+        K[np.ix_(dofs, dofs)] += young[e] * operators.stiffness[e]
+        for c in (0, 1):
+            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * operators.mass[e]
+    length = elastic.mesh.outboard_point[0]
+    clamped, end = np.isclose(points[:, 0], 0.0), np.isclose(points[:, 0], length)
+    inner = np.flatnonzero(~(clamped | end))
+    T = np.zeros((2 * size, 2 * len(inner) + 3))
+    T[(2 * inner[:, None] + [0, 1]).ravel(), np.arange(2 * len(inner))] = 1.0
+    for node in np.flatnonzero(end):
+        T[2 * node, -3], T[2 * node, -1] = 1.0, -points[node, 1]
+        T[2 * node + 1, -2] = 1.0
+    return T.T @ K @ T, T.T @ M @ T
 
 
 def wave(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -85,24 +142,26 @@ def tip(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return ((x > 0.8) & (k == 1)).astype(float)
 
 
-def by_number(model: do.Model) -> tuple[Named, Named]:
-    """Return a design in [0.2, 0.8] and a random direction in [-1, 1], by arm and cell number."""
-    rng = np.random.default_rng(0)
-    x = {
-        name: 0.5 + 0.3 * np.sin(1.7 * np.arange(len(one)))
-        for name, one in model.uniform(0.5).items()
-    }
-    return x, {name: rng.uniform(-1.0, 1.0, len(one)) for name, one in x.items()}
-
-
-def product(a: Named, b: Named) -> float:
-    """Return the product over all arms of one rank."""
-    return float(sum(a[name] @ b[name] for name in a))
-
-
-def objective_along(model: do.Model, x: Named, direction: Named) -> Callable[[float], float]:
-    """Return h -> the objective at x + h direction."""
-    return lambda h: model.simulate({name: x[name] + h * direction[name] for name in x}).objective
+def taylor(
+    scene: Scene,
+    design: Field,
+    steps: Sequence[float],
+    directions: Sequence[str] = (),
+    world: MPI.Comm = MPI.COMM_WORLD,
+) -> TaylorTest:
+    """Return the Taylor test of a design, with these steps, along some or all directions."""
+    built = built_of(scene, world)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gradient_check, "STEPS", tuple(steps))
+        if directions:
+            every = gradient_check._directions
+            patch.setattr(
+                gradient_check,
+                "_directions",
+                lambda *told: {name: every(*told)[name] for name in directions},
+            )
+        x = built.fields(design)
+        return taylor_test(built.scene, built.partition, built.arms, x, built.profile)
 
 
 def rates(

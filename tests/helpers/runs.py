@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 
 import click
 import pytest
@@ -51,6 +54,26 @@ def refusal(make: Callable[[], object], *words: str) -> str:
 def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:
     """Run a command in this process, on all ranks of `world`; errors of dolfinopt are raised."""
     commands.main([str(word) for word in words], standalone_mode=False, obj=world)
+
+
+@contextmanager
+def refused(*words: str, error: type[Exception] = InputError) -> Iterator[None]:
+    """Assert that what is run is refused in one line with all these words: key, value, remedy."""
+    with pytest.raises(error) as caught:
+        yield
+    said = str(caught.value)
+    assert "\n" not in said
+    assert [word for word in words if word not in said] == [], said
+
+
+def demo(name: str) -> ModuleType:
+    """Import a demo by its path."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "demos" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 def environment() -> dict[str, str]:

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tomllib
+from runs import refused
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.errors import InputError
 from dolfinopt.multibody.motion import breakpoints
 from dolfinopt.multibody.spatial.end_effector import Follower, end_path, relative_vectors
 from dolfinopt.multibody.spatial.mechanism import end_chain, exponential, joint_motion
@@ -92,7 +92,7 @@ def test_line_by_a_law():
     assert np.abs(np.linalg.norm(found - scene.motion.start, axis=1) - along).max() < EXACT
     assert breakpoints(scene)[1:3] == pytest.approx((0.2, scene.motion.duration - 0.2))
     data["motion"]["rpy"] = [0.0, 0.0, 0.0]
-    with pytest.raises(InputError, match=r"cannot be at .* turned as it is to be: .* rad off"):
+    with refused("cannot be at", "rad off"):
         check_motion(scene_from_dict(data, ARM))
 
 
@@ -170,7 +170,7 @@ def test_joints_of_the_table(tmp_path):
         assert getattr(a, key) == pytest.approx(getattr(b, key), abs=EXACT)
     # With another yaw the point leaves the plane of the two.
     write(tmp_path / "a.csv", "t,x,y,z,yaw", [0.0, 0.2, 0.4], points, [0.3, 0.4, 0.3])
-    with pytest.raises(InputError, match=r"\(shoulder, elbow\) leave it [0-9.e-]+ m off at best"):
+    with refused("(shoulder, elbow)", "m off at best"):
         joint_motion(t, scene)
 
 
@@ -191,27 +191,24 @@ def test_a_slide_is_no_angle_where_the_reach_is_one_metre():
     assert follower._slides.tolist() == [False, True]
 
 
+UP = [[0.6, 0, 0.2], [0.5, 0, 0.2]]
 REFUSED = [
-    (ARM, "x,y,z", [[0.6, 0, 0.2], [2.0, 0, 0.2]], "", "cannot be at .* m off at best"),
-    (ARM, "x,y,z", [[2.6, 0, 0.2], [0.6, 0, 0.2]], "", r"at t = 0 s .* or motion.initial_joints"),
-    (ARM, "x,y,z", [[0.5, 0, 0.2], [-0.5, 0, 0.2]], "", "singular position"),
-    (ARM, "x,y", [[0.6, 0], [0.5, 0]], "", "missing column 'z'"),
-    (ROBOT, "x,y,z,roll", [[0.6, 0, 0.2, 0], [0.5, 0, 0.2, 0]], "", "missing column 'pitch'"),
-    (ARM, "x,y,z,wrist", [[0.6, 0, 0.2, 0], [0.5, 0, 0.2, 0]], "", "unknown column 'wrist'"),
-    (ARM, "x,y,z,yaw,shoulder,elbow", [[0.6, 0, 0.2, 0, 0, 0], [0.5, 0, 0.2, 0, 0, 0]], "",
-     "its table prescribes all joints"),
-    (ROBOT, "x,y,z", [[0.6, 0, 0.2], [0.5, 0, 0.2]], "",
-     r"expected at most 3 joints, .* found 6 .*orientation \(roll, pitch, yaw or rx, ry, rz\)"),
-    (ARM, "x,y,z", [[0.6, 0, 0.2], [0.5, 0, 0.2]], "payload.arm=link1",
-     r"joints that do not move the end-effector \(elbow\)"),
-]  # fmt: skip
+    (ARM, "x,y,z", [[0.6, 0, 0.2], [2.0, 0, 0.2]], "", ("at t = ", "off at best")),
+    (ARM, "x,y,z", [[2.6, 0, 0.2], [0.6, 0, 0.2]], "", ("at t = 0 s", "motion.initial_joints")),
+    (ARM, "x,y,z", [[0.5, 0, 0.2], [-0.5, 0, 0.2]], "", ("singular",)),
+    (ARM, "x,y", [[0.6, 0], [0.5, 0]], "", ("path.csv", "missing column 'z'")),
+    (ROBOT, "x,y,z,roll", np.pad(UP, ((0, 0), (0, 1))), "", ("missing column 'pitch'",)),
+    (ARM, "x,y,z,wrist", np.pad(UP, ((0, 0), (0, 1))), "", ("unknown column 'wrist'",)),
+    (ARM, "x,y,z,yaw,shoulder,elbow", np.pad(UP, ((0, 0), (0, 3))), "", ("prescribes all joints",)),
+    (ROBOT, "x,y,z", UP, "", ("at most 3 joints", "found 6", "(roll, pitch, yaw or rx, ry, rz)")),
+    (ARM, "x,y,z", UP, "payload.arm=link1", ("do not move the end-effector", "(elbow)")),
+]
 
 
-@pytest.mark.parametrize(("demo", "names", "rows", "change", "text"), REFUSED)
-def test_refusals(demo, names, rows, change, text, tmp_path):
-    file = write(tmp_path / "path.csv", names, rows)
+@pytest.mark.parametrize(("demo", "names", "rows", "change", "words"), REFUSED)
+def test_refusals(demo, names, rows, change, words, tmp_path):
+    file = write(tmp_path / "path.csv", names, np.asarray(rows, dtype=float))
     end = "motion.duration=0.5", "motion.horizon=0.5"
     changes = [one for one in (f"motion.file={file}", *end, change) if one]
-    with pytest.raises(InputError, match=text) as caught:
+    with refused(*words):
         check_motion(scene_of(demo, *changes))
-    assert len(str(caught.value).splitlines()) == 1

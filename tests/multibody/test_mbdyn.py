@@ -8,26 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomllib
-from mbdyn_reader import mbdyn_forces, mbdyn_stiffening, read_as_mbdyn_does
+from bodies import random_cloud, stiffened
 from mpi4py import MPI
+from readers import mbdyn_forces, mbdyn_stiffening, random_state, read_as_mbdyn_does
+from remainders import substructure
 from runs import TWO_ARM
-from spatial_bodies import spatial_cloud, stiffened
-from standard_input import random_state
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
 from dolfinopt.exchange.mbdyn import Invariants, fem_text, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
-from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
 from dolfinopt.multibody.shape_integrals import in_space, plate_moments, shape_integrals
 from dolfinopt.multibody.spatial.kinematics import BodyMotion
 from dolfinopt.multibody.spatial.mechanism import constants_of
 from dolfinopt.multibody.standard_input import load_body
-from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
@@ -38,14 +35,12 @@ PLACING = 1e-10
 
 def reduced(cells, comm=MPI.COMM_SELF, uneven=False, stiffened=False, element="linear"):
     """Return the body, the same in space, and its nodes, which are None but on the first rank."""
-    mesh = structured_arm(comm, "arm", LENGTH, HEIGHT, cells)
-    operators = ELEMENTS[element].operators(mesh, THICKNESS, 0.33)
-    substructure = Substructure(mesh, operators, Profile())
-    x = np.ones(mesh.num_cells)
+    arm = substructure((LENGTH, HEIGHT, THICKNESS), cells, comm, element)
+    mesh, x = arm.mesh, np.ones(arm.mesh.num_cells)
     if uneven:
         place = np.round(mesh.centroid, 9)
         x = 0.5 + 0.4 * np.sin(30.0 * place[:, 0] + 170.0 * place[:, 1])
-    elastic = substructure.at(70e9 * x**3, 2700.0 * x)
+    elastic = arm.at(70e9 * x**3, 2700.0 * x)
     basis = craig_bampton(elastic, Options(4))
     body = shape_integrals(elastic, basis, 2e-4, unit_loads(elastic) if stiffened else None)
     lifted = in_space(body, plate_moments(elastic, basis, THICKNESS))
@@ -58,24 +53,14 @@ def parts():
 
 
 @pytest.fixture(scope="module")
-def element(parts):
-    return modal_element(*parts[1:])
-
-
-@pytest.fixture(scope="module")
 def stiff_parts():
     return reduced((8, 3), uneven=True, stiffened=True)
 
 
 @pytest.fixture(scope="module")
-def stiff_element(stiff_parts):
-    return modal_element(*stiff_parts[1:])
-
-
-@pytest.fixture(scope="module")
 def cloud():
     """Point masses in space without any symmetry."""
-    return spatial_cloud(np.random.default_rng(1), 4)
+    return random_cloud(np.random.default_rng(1), 4, 3)
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +70,22 @@ def stiff_cloud(cloud):
     return replace(body, along_modes=np.zeros((0, 4, 4)))
 
 
+@pytest.fixture(scope="module")
+def elements(parts, stiff_parts, cloud, stiff_cloud):
+    return {
+        "plane": modal_element(*parts[1:]),
+        "stiff plane": modal_element(*stiff_parts[1:]),
+        "linear space": modal_element(cloud.body()),
+        "space": modal_element(stiff_cloud),
+    }
+
+
 @pytest.mark.parametrize(
     ("kind", "loads"),
     [("plane", []), ("stiff plane", [3, 9, 10, 11, 13, 14, 18]), ("space", range(1, 19))],
 )
-def test_round_trip_is_exact(tmp_path, element, stiff_element, stiff_cloud, kind, loads):
-    space = modal_element(stiff_cloud)
-    written = {"plane": element, "stiff plane": stiff_element, "space": space}[kind]
+def test_round_trip_is_exact(tmp_path, elements, kind, loads):
+    written = elements[kind]
     write_fem(tmp_path / "a.fem", written)
     groups = read_as_mbdyn_does((tmp_path / "a.fem").read_text())
     found = groups.get(19, [])
@@ -107,7 +101,7 @@ def test_round_trip_is_exact(tmp_path, element, stiff_element, stiff_cloud, kind
             assert np.array_equal(groups[group], expected), group
 
 
-def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
+def test_mbdyn_stiffens_it_alike(stiff_parts, elements):
     """Any motion in the plane, force and moment outboard: rows lose sum_p p K0_p q."""
     body = stiff_parts[0]
     rng = np.random.default_rng(0)
@@ -116,7 +110,7 @@ def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
     w[2], wd[2], moment[2] = rng.normal(size=3)
     p = np.array([a[0], a[1], wd[2], -(w[2] ** 2), force[0], force[1], moment[2]])
     K0 = np.concatenate([body.K0, body.K0_outboard])
-    groups = read_as_mbdyn_does(fem_text(stiff_element))
+    groups = read_as_mbdyn_does(fem_text(elements["stiff plane"]))
     found = mbdyn_stiffening(groups, a, w, wd, force, moment)
     np.testing.assert_allclose(found, -np.tensordot(p, K0, 1), atol=1e-12 * np.abs(found).max())
     # Rotation stiffens a slender beam, and so does a pull at its end: the joint gives -pull.
@@ -126,7 +120,8 @@ def test_mbdyn_stiffens_it_alike(stiff_parts, stiff_element):
         assert mbdyn_stiffening(groups, **all_loads)[1, 1] > 0.0
 
 
-def test_mbdyn_reads_it(element):
+def test_mbdyn_reads_it(elements):
+    element = elements["plane"]
     groups = read_as_mbdyn_does(fem_text(element))
     assert sorted(groups) == [1, 2, 5, 6, 7, 8, 9, 10, 11, 12, 13]
     assert groups[1] == (9 * 4 + 2, 4)
@@ -143,8 +138,8 @@ def test_mbdyn_reads_it(element):
     assert np.array_equal(groups[9], groups[9].T) and np.array_equal(groups[10], groups[10].T)
 
 
-def test_interfaces_are_the_first_nodes(parts, element):
-    body = parts[0]
+def test_interfaces_are_the_first_nodes(parts, elements):
+    body, element = parts[0], elements["plane"]
     assert np.array_equal(element.points[:2], [[0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0]])
     assert not element.modes[0].any() and not element.lumped[:2].any()
     assert np.array_equal(element.modes[1, [0, 1, 5]], body.outboard)
@@ -218,7 +213,7 @@ def test_invariants_are_sums_over_points(cloud):
 def test_several_interfaces(stiff):
     """A node each, behind the inboard joint; loads on all of them stiffen."""
     rng = np.random.default_rng(9)
-    body = spatial_cloud(rng, 4, interfaces=2).body()
+    body = random_cloud(rng, 4, 3, 2).body()
     body = stiffened(rng, body) if stiff else body
     element = modal_element(body)
     assert element.labels == ("1", "2", "3")

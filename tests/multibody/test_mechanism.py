@@ -1,27 +1,36 @@
-"""Inverse dynamics against Lagrange's equations of point masses, energy and closed forms."""
+"""Mechanisms of plane and space: point masses, tangents and gradients, closed forms."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
-from bodies import BentChain, Chain, assert_close, derivative, random_cloud
-
-from dolfinopt.multibody.end_effector import (
-    InterfacePlace,
-    deviation,
-    end_effector,
-    end_effector_gradient,
-    interface_place,
-    place_gradient,
+from bodies import (
+    CONSTANTS,
+    Chain,
+    assert_close,
+    change_of,
+    changed,
+    derivative,
+    posed_machine,
+    posed_motion,
+    random_cloud,
+    random_tree,
+    stiffened,
 )
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
+from runs import ROOT
+
+from dolfinopt.multibody import end_effector as plane_end
+from dolfinopt.multibody import inverse_dynamics as plane
+from dolfinopt.multibody.end_effector import interface_place, place_gradient
+from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
-from dolfinopt.multibody.shape_integrals import STIFFENING, ShapeIntegrals, plane_body
-from dolfinopt.multibody.tangent import Tangent, body_gradient, linearise
+from dolfinopt.multibody.shape_integrals import plane_body
+from dolfinopt.multibody.spatial.equations import SPACE
+from dolfinopt.multibody.spatial.mechanism import exponential
 from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -29,211 +38,308 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
 # Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
 HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
-ARMS = pytest.mark.parametrize("arms", [1, 2, 3])
-BENT = pytest.mark.parametrize("bent", [False, True], ids=["linear", "bent"])
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
+ROUNDING = 1e-12
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    """Return the same random numbers on all ranks."""
-    return np.random.default_rng(7)
+@dataclass(frozen=True)
+class Machine:
+    """A mechanism with its equations, what it was made of, and states y, yd, ydd (3, n, S)."""
+
+    equations: Equations
+    model: Any
+    mechanism: Any
+    states: np.ndarray
+
+    @property
+    def rigid(self) -> int:
+        return self.mechanism.num_rigid
+
+    def split(self, states: np.ndarray) -> tuple[RigidMotion, list[np.ndarray]]:
+        """Return rigid motion and elastic coordinates with rates."""
+        return RigidMotion(*states[:, :, : self.rigid]), list(states[:, :, self.rigid :])
+
+    def forces(self, states: np.ndarray, mechanism: Any = None) -> np.ndarray:
+        """Return the forces of rigid and elastic coordinates (n, S)."""
+        motion, rates = self.split(states)
+        rows, drives = self.equations.forces(mechanism or self.mechanism, motion, *rates)
+        return np.hstack([drives, rows])
+
+    def tangent(self, keep: Any = None, rigid: Any = None, part: slice = slice(None)) -> Any:
+        motion, rates = self.split(self.states[:, part])
+        return self.equations.linearise(self.mechanism, motion, *rates, keep, rigid)
 
 
 def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
     """Return a chain of random clouds with payload and gravity in both directions."""
     clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
-    if not bent:
-        return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6)
-    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms]]
+    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms] * bent]
     stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
-    return BentChain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
+    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
 
 
-def states(rng: np.random.Generator, model: Chain, count: int) -> np.ndarray:
-    """Return random y, yd, ydd (3, count, size)."""
-    return rng.normal(scale=0.7, size=(3, count, model.size))
+def machine_of(kind: str, count: int = 4) -> Machine:
+    rng = np.random.default_rng(7)
+    arms, bent = kind.removesuffix(", stiffened"), kind.endswith("stiffened")
+    if arms == "tree":
+        model: Any = random_tree(rng, interfaces=2)
+        mechanism: Any = model.mechanism()
+        if bent:
+            bodies = tuple(stiffened(rng, b) if b.num_modes else b for b in mechanism.bodies)
+            mechanism = replace(mechanism, bodies=bodies)
+    else:
+        model = chain(rng, int(arms[0]), bent)
+        mechanism = model.mechanism()
+    size = mechanism.num_rigid + mechanism.num_coordinates
+    states = rng.normal(scale=0.6, size=(3, count, size))
+    return Machine(SPACE if arms == "tree" else PLANE, model, mechanism, states)
 
 
-def forces(model: Chain, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
-    """Return `inverse_dynamics` in the order of y (n, size)."""
-    r = model.rigid
-    motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
-    rows, drives = inverse_dynamics(model.mechanism(), motion, y[:, r:], yd[:, r:], ydd[:, r:])
-    return np.concatenate([drives, rows], axis=1)
+CHAINS = [f"{arms}{bent}" for arms in ("1 arm", "2 arms", "3 arms") for bent in ("", ", stiffened")]
+KINDS = [*CHAINS, "tree", "tree, stiffened"]
 
 
-@BENT
-@ARMS
-def test_forces_are_those_of_lagranges_equations(
-    rng: np.random.Generator, arms: int, bent: bool
-) -> None:
-    """Cart, joints and elastic rows: gravity, payload and damping included."""
-    model = chain(rng, arms, bent)
-    y, yd, ydd = states(rng, model, 3)
-    found = forces(model, y, yd, ydd)
+@pytest.fixture(scope="module", params=KINDS)
+def machine(request) -> Machine:
+    return machine_of(request.param)
+
+
+@pytest.mark.parametrize("kind", KINDS[:-1])  # a stiffened tree: by what it has of the plane's
+def test_forces_are_those_of_the_points(kind: str) -> None:
+    """Lagrange's equations in the plane, Newton's law for every point in space."""
+    one = machine_of(kind, 3)
+    found = one.forces(one.states)
     for n in range(3):
-        expected = model.forces(y[n], yd[n], ydd[n])
+        expected = one.model.forces(*one.states[:, n])
         assert_close(found[n], expected, DIFFERENCES)
+    motion, rates = one.split(one.states)
+    alone = one.equations.residual(one.mechanism, motion, *rates)
+    assert_close(alone, found[:, one.rigid :], ROUNDING)
 
 
-def test_deformation_of_the_second_order_with_many_modes(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("stiff", [False, True])
+def test_plane_machine_in_space(stiff: bool) -> None:
+    """Forces and end-effector are those of the plane's equations, in a tilted frame, too."""
+    rng = np.random.default_rng(3)
+    chain = Chain(
+        (random_cloud(rng, 3), random_cloud(rng, 2)), 2.0, 0.3, (0.5, -9.81), -0.5,
+        (JointHardware(0.4, 0.1, 0.2), JointHardware(rotor=0.3)), 1.5,
+    ).mechanism()  # fmt: skip
+    if stiff:
+        chain = replace(chain, bodies=tuple(stiffened(rng, b, 1.0) for b in chain.bodies))
+    motion, rates = RigidMotion(*rng.normal(size=(3, 5, 3))), 0.4 * rng.normal(size=(3, 5, 5))
+    expected = plane.inverse_dynamics(chain, motion, *rates)
+    space, joints = posed_machine(chain), posed_motion(motion)
+    tilt = exponential(np.array([0.3, -1.0, 0.5]))  # the whole machine, gravity included
+    first = replace(space.joints[0], rotation=tilt)
+    tilted = replace(space, joints=(first, *space.joints[1:]), gravity=tilt @ space.gravity)
+    for one in (space, tilted):
+        for found, value in zip(SPACE.forces(one, joints, *rates), expected, strict=True):
+            assert_close(found, value, ROUNDING)
+    e = rates[0]
+    assert np.abs(SPACE.end_effector(space, joints, e)[:, 2]).max() == 0.0
+    for function in ("end_effector", "deviation"):
+        found, value = getattr(SPACE, function)(space, joints, e), getattr(plane_end, function)
+        assert_close(found[:, :2], value(chain, motion, e), ROUNDING)
+
+
+def test_deformation_of_the_second_order_with_many_modes(monkeypatch) -> None:
     """By products of modes two by two, or load by load: the same forces."""
-    model = chain(rng, 2, bent=True)
-    y, yd, ydd = states(rng, model, 40)
-    few = forces(model, y, yd, ydd)
+    one = machine_of("2 arms, stiffened", 40)
+    few = one.forces(one.states)
     monkeypatch.setattr("dolfinopt.multibody.inverse_dynamics.FEW_MODES", 0)
-    assert_close(forces(model, y, yd, ydd), few, 1e-13)
+    assert_close(one.forces(one.states), few, 1e-13)
 
 
-def split_tangent(
-    model: Chain, state: np.ndarray, keep: np.ndarray | None, rigid: np.ndarray | None
-) -> Tangent:
-    """Return the tangent at states y, yd, ydd (3, n, size)."""
-    r = model.rigid
-    motion = RigidMotion(*(x[:, :r] for x in state))
-    return linearise(model.mechanism(), motion, *(x[:, r:] for x in state), keep, rigid)
-
-
-def full_tangent(model: Chain, state: np.ndarray) -> np.ndarray:
-    """Return the derivative (n, size, 3, size) of all forces by y, yd, ydd, by differences."""
+def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
+    """Dense, by parts and from both sides, whatever rigid and elastic coordinates are asked for."""
+    states, R = machine.states, machine.rigid
+    _, count, size = states.shape
     columns = []
     for k in range(3):
-        for unit in np.eye(model.size):
-
-            def moved(t: float, k: int = k, unit: np.ndarray = unit) -> np.ndarray:
-                other = state.copy()
-                other[k] += t * unit
-                return forces(model, *other)
-
-            columns.append(derivative(moved))
-    return np.stack(columns, axis=2).reshape(state.shape[1], model.size, 3, model.size)
-
-
-@pytest.mark.parametrize("base", ["cart", "fixed", "prescribed", "one joint"])
-@BENT
-@ARMS
-def test_tangent_is_the_derivative_of_the_forces(
-    rng: np.random.Generator, arms: int, bent: bool, base: str
-) -> None:
-    """By free rigid coordinates on a cart or a fixed base, by one of them, and by elastic ones."""
-    model = chain(rng, arms, bent)
-    r = model.rigid
-    state = states(rng, model, 4)
-    if base == "fixed":
-        state[1:, :, 0] = 0.0
-    free = {"cart": np.arange(r), "fixed": np.arange(1, r), "one joint": np.array([r - 1])}
-    rigid = free.get(base)
-    own = np.concatenate([np.zeros(0, int) if rigid is None else rigid, np.arange(r, model.size)])
-    exact = full_tangent(model, state)[:, own][:, :, :, own]
-    found = split_tangent(model, state, None, rigid).dense()
-    assert_close(found.reshape(exact.shape), exact, DIFFERENCES)
+        for unit in np.eye(size):
+            step = np.zeros((3, 1, size))
+            step[k] = unit
+            columns.append(derivative(lambda t, step=step: machine.forces(states + t * step)))
+    whole = np.stack(columns, axis=2).reshape(count, size, 3, size)
+    scale, rng = float(np.abs(whole).max()), np.random.default_rng(1)
+    some = np.arange(0, size - R, 2)
+    asked = [(None, None), (np.arange(R), None), (np.arange(1, R), None), (np.array([R - 1]), some)]
+    for rigid, keep in [*asked, (None, some)]:
+        tangent = machine.tangent(keep, rigid)
+        free = np.zeros(0, dtype=int) if rigid is None else rigid
+        rows = np.concatenate([free, np.arange(R, size)])
+        own = np.concatenate([free, R + (np.arange(size - R) if keep is None else keep)])
+        exact = whole[:, :, :, own]
+        dense = tangent.dense().reshape(count, len(own), 3, len(own))
+        assert_close(dense, exact[:, own], DIFFERENCES, scale)
+        y = rng.normal(size=(count, len(rows)))
+        found, expected = tangent.transposed(y), np.einsum("ni,nikj->knj", y, exact[:, rows])
+        assert_close(np.stack(found), expected, DIFFERENCES, 10.0 * scale)
+        wanted = np.arange(0, len(rows), 2)
+        change = rng.normal(size=(3, 2 * count, len(own)))  # two of each instant
+        pairs = change.reshape(3, count, 2, -1)
+        expected = np.einsum("nikj,knmj->nmi", exact[:, rows[wanted]], pairs)
+        found = tangent.times(*change, wanted).reshape(expected.shape)
+        assert_close(found, expected, DIFFERENCES, 10.0 * scale)
+        assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
 
 
-@BENT
-@ARMS
-def test_parts_of_the_tangent_are_those_of_the_dense_one(
-    rng: np.random.Generator, arms: int, bent: bool
-) -> None:
-    """Some columns, some rows, and products from both sides, rigid coordinates free."""
-    model = chain(rng, arms, bent)
-    r, size = model.rigid, model.size
-    state = states(rng, model, 4)
-    rigid, every = np.arange(r), np.arange(size)
-    whole = split_tangent(model, state, None, rigid)
-    dense = whole.dense().reshape(4, size, 3, size)
-    rows = rng.normal(size=(4, size))
-    expected = np.einsum("ni,nikj->knj", rows, dense)
-    assert_close(np.stack(whole.transposed(rows)), expected, 1e-13)
-    keep = np.flatnonzero(rng.uniform(size=size - r) < 0.6)
-    columns = np.concatenate([rigid, r + keep])
-    part = split_tangent(model, state, keep, rigid)
-    assert_close(
-        part.dense().reshape(4, len(columns), 3, -1), dense[:, columns][..., columns], 1e-13
-    )
-    change = rng.normal(size=(3, 4, len(columns)))
-    wanted = every[::2]
-    expected = np.einsum("nikj,knj->ni", dense[:, wanted][..., columns], change)
-    assert_close(part.times(*change, wanted), expected, 1e-13)
-    assert_close(part.window(1, 3).dense(), part.dense()[1:3], 0.0, 1.0)
+def test_tangent_of_a_fixed_base() -> None:
+    """The cart at rest: joints alone are free."""
+    one = machine_of("3 arms")
+    one.states[1:, :, 0] = 0.0
+    found = one.tangent(None, np.arange(1, one.rigid)).dense().reshape(4, -1, 3, 9)
+    whole = one.tangent(None, np.arange(one.rigid)).dense().reshape(4, -1, 3, 10)
+    assert_close(found, whole[:, 1:, :, 1:], ROUNDING)
 
 
-@BENT
-@ARMS
-def test_gradient_of_virtual_work_of_all_forces(
-    rng: np.random.Generator, arms: int, bent: bool
-) -> None:
-    """By the integrals of every body, multipliers on cart and joints included."""
-    model = chain(rng, arms, bent)
-    mechanism, r = model.mechanism(), model.rigid
-    state = states(rng, model, 4)
-    motion, rates = RigidMotion(*(x[:, :r] for x in state)), [x[:, r:] for x in state]
-    weights = rng.normal(size=(4, model.size))
-    names = ("mass", "w", "W", "K", "D", "outboard", *STIFFENING)
-
-    def work(t: float, k: int, change: ShapeIntegrals) -> float:
-        bodies = list(mechanism.bodies)
-        bodies[k] = replace(
-            bodies[k], **{n: getattr(bodies[k], n) + t * getattr(change, n) for n in names}
-        )
-        rows, drives = inverse_dynamics(replace(mechanism, bodies=tuple(bodies)), motion, *rates)
-        return float((np.concatenate([drives, rows], axis=1) * weights).sum())
-
-    gradient = body_gradient(mechanism, motion, *rates, weights[:, r:], weights[:, :r])
-    for k in range(arms):
-        change = random_cloud(rng, COORDINATES[k]).body()
-        if bent:
-            K0 = rng.normal(size=(7 + COORDINATES[k], COORDINATES[k], COORDINATES[k]))
-            K0 = K0 + K0.swapaxes(1, 2)
-            change = replace(change, K0=K0[:4], K0_outboard=K0[4:7], along_modes=K0[7:])
-        expected = derivative(lambda t, k=k, change=change: work(t, k, change), 2e-3)
-        found = sum(np.sum(getattr(gradient[k], n) * getattr(change, n)) for n in names)
-        assert_close(found, expected, DIFFERENCES, np.abs(weights).sum())
-
-
-@BENT
-@ARMS
-def test_mass_matrix_is_that_of_the_points(rng: np.random.Generator, arms: int, bent: bool) -> None:
+def test_mass_matrix(machine: Machine) -> None:
     """Symmetric and positive definite over rigid and elastic coordinates together."""
-    model = chain(rng, arms, bent)
-    y, yd, _ = states(rng, model, 1)[:, 0]
-    unit = np.eye(model.size)
-    repeat = np.ones((model.size, 1))
-    mass = forces(model, y * repeat, yd * repeat, unit)
-    mass = mass - forces(model, y[None], yd[None], np.zeros((1, model.size)))
-    expected = [[model.momentum_product(y, a, b) for a in unit] for b in unit]
-    # Rounding of a difference of forces ten times larger than the mass.
-    assert_close(mass, np.array(expected), 1e-13)
-    assert_close(mass, mass.T, 1e-13)
-    assert np.linalg.eigvalsh(mass).min() > 0.0
-    motion = RigidMotion(*(x[None, : model.rigid] for x in (y, yd, yd)))
-    elastic = (x[None, model.rigid :] for x in (y, yd, yd))
-    by_qdd = linearise(model.mechanism(), motion, *elastic).dense()[
-        0, :, -(model.size - model.rigid) :
-    ]
-    part = mass[model.rigid :, model.rigid :]
-    assert_close(by_qdd, part, 1e-13)
+    size = machine.states.shape[2]
+    mass = machine.tangent(None, np.arange(machine.rigid)).dense()[:, :, 2 * size :]
+    assert_close(mass, mass.swapaxes(1, 2), ROUNDING)
+    if isinstance(machine.model, Chain) and not machine.model.K0:  # large ones bend too far
+        assert np.linalg.eigvalsh(mass).min() > 0.0
 
 
-@BENT
-@ARMS
-def test_work_becomes_energy(rng: np.random.Generator, arms: int, bent: bool) -> None:
-    """int (forces . yd - dissipation) dt = change of T + V along a motion nobody solved for."""
-    model = chain(rng, arms, bent)
-    amplitude, phase = rng.normal(scale=0.3, size=(2, model.size))
-    frequency = rng.uniform(1.0, 4.0, size=model.size)  # rad/s
-    nodes, weights = np.polynomial.legendre.leggauss(40)  # exact to rounding over 1 s
-    t = np.concatenate([0.5 * (nodes + 1.0), [0.0, 1.0]])[:, None]
-    angle = frequency * t + phase
-    y = amplitude * np.sin(angle)
-    yd = amplitude * frequency * np.cos(angle)
-    ydd = -amplitude * frequency**2 * np.sin(angle)
-    power = (forces(model, y, yd, ydd) * yd).sum(axis=1) - [model.dissipation(v) for v in yd]
-    work = 0.5 * weights @ power[:-2]
-    energy = [model.kinetic(y[n], yd[n]) + model.potential(y[n]) for n in (-2, -1)]
-    assert_close(work, energy[1] - energy[0], 1e-12, np.abs(power).max())
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
+    """Virtual work of rows and drives by every integral of every body."""
+    states, rng = machine.states, np.random.default_rng(5)
+    weights = rng.normal(size=states.shape[1:])
+    motion, rates = machine.split(states)
+    parts = weights[:, machine.rigid :], weights[:, : machine.rigid]
+    gradient = machine.equations.body_gradient(machine.mechanism, motion, *rates, *parts)
+    for i, body in enumerate(machine.mechanism.bodies):
+        change = change_of(rng, body, name)
+
+        def work(h: float, i: int = i, change: np.ndarray = change) -> float:
+            moved = changed(machine.mechanism, i, name, h * change)
+            return float(np.sum(weights * machine.forces(states, moved)))
+
+        found = np.sum(getattr(gradient[i], name) * change)
+        assert_close(found, derivative(work, 2e-3), DIFFERENCES, 10.0 * np.abs(weights).sum())
+
+
+def test_end_effector(machine: Machine) -> None:
+    """Its place, the deviation from the rigid machine, and derivatives by all they depend on."""
+    eq, mechanism, rng = machine.equations, machine.mechanism, np.random.default_rng(9)
+    motion, (q, _, _) = machine.split(machine.states)
+    place = eq.end_effector(mechanism, motion, q)
+    if isinstance(machine.model, Chain):
+        expected = [machine.model.frames(y)[0][-1] for y in machine.states[0]]
+        assert_close(place, expected, 1e-14)
+    stiff = eq.end_effector(mechanism, motion, 0.0 * q)
+    assert_close(eq.deviation(mechanism, motion, q), place - stiff, 1e-14, np.abs(place).max())
+    assert not eq.deviation(mechanism, motion, 0.0 * q).any()
+    weights = rng.normal(size=place.shape)
+    by_q, by_rigid, by_bodies = eq.end_effector_gradient(mechanism, motion, q, weights, True)
+    step, turn = rng.normal(size=q.shape), rng.normal(size=motion.q.shape)
+
+    def along(h: float) -> float:
+        moved = RigidMotion(motion.q + h * turn, motion.qd, motion.qdd)
+        return float(np.sum(weights * eq.end_effector(mechanism, moved, q + h * step)))
+
+    expected = np.sum(by_q * step) + np.sum(by_rigid * turn)
+    assert_close(expected, derivative(along), DIFFERENCES, 10.0)
+    stiff = any(body.is_stiffened for body in mechanism.bodies)
+    assert set().union(*by_bodies) == {"outboard", *["K0_outboard"] * stiff}
+    for i, body in enumerate(mechanism.bodies):
+        for name, gradient in by_bodies[i].items():
+            change = change_of(rng, body, name)
+
+            def moved(h: float, i: int = i, name: str = name, x: np.ndarray = change) -> float:
+                one = changed(mechanism, i, name, h * x)
+                return float(np.sum(weights * eq.end_effector(one, motion, q)))
+
+            assert_close(np.sum(gradient * change), derivative(moved), DIFFERENCES, 10.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["2 arms, stiffened", "tree"])
+def test_few_instants_are_those_of_many(kind: str, count: int) -> None:
+    """Values at up to three instants, which are computed as four, and sums over them."""
+    one = machine_of(kind, 8)
+    eq, mechanism, R = one.equations, one.mechanism, one.rigid
+    weights, rng = np.zeros_like(one.states[0]), np.random.default_rng(2)
+    weights[:count] = rng.normal(size=weights[:count].shape)  # none at the others
+    pull = rng.normal(size=(8, 2 if eq is PLANE else 3)) * (np.arange(8) < count)[:, None]
+    found = []
+    for part in (slice(None), slice(count)):
+        motion, rates = one.split(one.states[:, part])
+        values = [one.forces(one.states[:, part]), one.tangent(part=part).dense()]
+        values += [eq.residual(mechanism, motion, *rates)]
+        by_q, _, by_end = eq.end_effector_gradient(mechanism, motion, rates[0], pull[part], True)
+        by = weights[part, R:], weights[part, :R]
+        bodies = eq.body_gradient(mechanism, motion, *rates, *by)
+        sums = [x for b in bodies for x in (b.w, b.W, b.K)] + [x["outboard"] for x in by_end]
+        found.append(([x[:count] for x in (*values, by_q)], sums))
+    for whole, few in zip(*(values + sums for values, sums in found), strict=True):
+        assert_close(few, whole, ROUNDING, max(1.0, np.abs(whole).max(initial=0.0)))
+
+
+def test_few_instants_do_not_depend_on_memory() -> None:
+    """The same bits wherever the arrays lie; NumPy 1.24 multiplies short complex arrays two ways.
+
+    Arrays of all small sizes that come and go make the allocator choose other places every time.
+    """
+    scene = load_scene(ROOT / "demos" / "three_arm.toml")
+    for count in (1, 2, 3, 4):
+        one, found = machine_of("3 arms", count), set()
+        weights, t = np.random.default_rng(3).normal(size=(count, 2)), np.linspace(0.2, 0.7, count)
+        for k in range(60):
+            order = np.random.default_rng(k)
+            kept = [np.empty(n, dtype=complex) for n in order.integers(1, 9, 1500)]
+            for place in order.permutation(1500)[:700]:
+                kept[place] = kept[0]
+            motion, (q, qd, qdd) = one.split(one.states.copy())
+            slopes = PLANE.body_gradient(one.mechanism, motion, q, qd, qdd, qd)
+            by_q, _, by_end = PLANE.end_effector_gradient(one.mechanism, motion, q, weights, True)
+            arrays = [
+                one.forces(one.states),
+                PLANE.residual(one.mechanism, motion, q, qd, qdd),
+                one.tangent().dense(),
+                PLANE.end_effector(one.mechanism, motion, q),
+                *(value for by in slopes for value in (by.w, by.W, by.K, by.outboard)),
+                *(by_q, *(by["outboard"] for by in by_end)),
+                *vars(rigid_motion(t, scene)).values(),
+            ]
+            found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
+        assert len(found) == 1
+
+
+# -- of the plane ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", CHAINS)
+def test_interface_and_its_variation(kind: str) -> None:
+    """Jacobian and Hessian by all coordinates; both by outboard modes and their stiffness."""
+    one, rng = machine_of(kind), np.random.default_rng(8)
+    mechanism, y, moved = one.mechanism, *one.states[:2]
+
+    def at(y: np.ndarray, mechanism: Mechanism = mechanism, second: bool = False):
+        motion, (q, _, _) = one.split(np.stack([y, 0.0 * y, 0.0 * y]))
+        return interface_place(mechanism, motion, q, second=second)
+
+    here = at(y, second=True)
+    motion, (q, _, _) = one.split(one.states)
+    assert_close(here.place, PLANE.end_effector(mechanism, motion, q) @ [1.0, 1j], 1e-14)
+    for c, unit in enumerate(np.eye(y.shape[1])):
+        for found, key in ((here.jacobian, "place"), (here.hessian, "jacobian")):
+            by = derivative(lambda t, unit=unit, key=key: getattr(at(y + t * unit), key))
+            assert_close(found[:, c], by, DIFFERENCES, np.abs(found).max())
+    weights, pull = rng.normal(size=(2, 4)) + 1j * rng.normal(size=(2, 4))
+    for k, by in enumerate(place_gradient(mechanism, motion, q, weights, moved, pull)):
+        for name, gradient in by.items():
+            change = change_of(rng, mechanism.bodies[k], name)
+
+            def worth(t: float, k: int = k, name: str = name, x: np.ndarray = change) -> float:
+                there = at(y, changed(mechanism, k, name, t * x))
+                swept = np.einsum("nc,nc->n", there.jacobian, moved)
+                return float((np.conj(weights) * there.place + np.conj(pull) * swept).real.sum())
+
+            assert_close(np.sum(gradient * change), derivative(worth), 1e-10, 10.0)
 
 
 def test_rigid_limit_is_the_two_link_arm() -> None:
@@ -242,240 +348,43 @@ def test_rigid_limit_is_the_two_link_arm() -> None:
     Source: Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), section 7.4, with
     the cart's acceleration added.
     """
-    rng = np.random.default_rng(3)
-    (m1, c1, J1, l1), (m2, c2, J2, l2) = (1.5, 0.4, 0.5, 1.0), (0.9, 0.3, 0.2, 0.8)
+    links = (m1, c1, J1, l1), (m2, c2, J2, l2) = (1.5, 0.4, 0.5, 1.0), (0.9, 0.3, 0.2, 0.8)
     mp, Jp, g = 0.7, 0.05, 9.81
-    mechanism = Mechanism(
-        (rigid_link(m1, c1, J1, l1), rigid_link(m2, c2, J2, l2)), mp, Jp, (0.0, -g), 0.3
-    )
-    q, qd, qdd = rng.normal(size=(3, 6, 3))
+    none, one = np.zeros(1), np.eye(1)  # a coordinate that moves nothing but itself
+    bodies = tuple(
+        plane_body(
+            m, np.array([m * c, 0.0]), J, np.zeros((2, 1)), none, none, one, 0.0 * one, one,
+            0.0 * one, np.zeros((3, 1)), np.array([length, 0.0]),
+        )
+        for m, c, J, length in links
+    )  # fmt: skip
+    q, qd, qdd = np.random.default_rng(3).normal(size=(3, 6, 3))
     zero = np.zeros((6, 2))
-    _, drives = inverse_dynamics(mechanism, RigidMotion(q, qd, qdd), zero, zero, zero)
-
-    alpha, total = q[:, 1], q[:, 1] + q[:, 2]
-    w1, w2 = qd[:, 1], qd[:, 1] + qd[:, 2]
-    wd1, wd2 = qdd[:, 1], qdd[:, 1] + qdd[:, 2]
+    mechanism = Mechanism(bodies, mp, Jp, (0.0, -g), 0.3)
+    _, drives = PLANE.forces(mechanism, RigidMotion(q, qd, qdd), zero, zero, zero)
+    (x, a1, a2), (alpha, total) = qdd.T, (q[:, 1], q[:, 1] + q[:, 2])
+    w1, w2, wd1, wd2 = qd[:, 1], qd[:, 1] + qd[:, 2], a1, a1 + a2
     s1 = m1 * c1 + (m2 + mp) * l1  # first moments that follow each link's direction
     s2 = m2 * c2 + mp * l2
     inner, outer = J1 + (m2 + mp) * l1**2, J2 + mp * l2**2 + Jp
     cos, sin = np.cos(q[:, 2]), np.sin(q[:, 2])
-    x = qdd[:, 0]
-    elbow = (
-        outer * wd2
-        + s2 * l1 * (cos * wd1 + sin * w1**2)
-        + s2 * (g * np.cos(total) - x * np.sin(total))
-    )
-    shoulder = (
-        elbow
-        + inner * wd1
-        + s2 * l1 * (cos * wd2 - sin * w2**2)
-        + s1 * (g * np.cos(alpha) - x * np.sin(alpha))
-    )
-    cart = (
-        (m1 + m2 + mp) * x
-        - s1 * (np.sin(alpha) * wd1 + np.cos(alpha) * w1**2)
-        - s2 * (np.sin(total) * wd2 + np.cos(total) * w2**2)
-    )
-    expected = np.stack([cart, shoulder, elbow], axis=1)
-    assert_close(drives, expected, 1e-13)
+    elbow = outer * wd2 + s2 * l1 * (cos * wd1 + sin * w1**2)
+    elbow += s2 * (g * np.cos(total) - x * np.sin(total))
+    shoulder = elbow + inner * wd1 + s2 * l1 * (cos * wd2 - sin * w2**2)
+    shoulder += s1 * (g * np.cos(alpha) - x * np.sin(alpha))
+    cart = (m1 + m2 + mp) * x - s1 * (np.sin(alpha) * wd1 + np.cos(alpha) * w1**2)
+    cart -= s2 * (np.sin(total) * wd2 + np.cos(total) * w2**2)
+    assert_close(drives, np.stack([cart, shoulder, elbow], axis=1), 1e-13)
 
 
-def rigid_link(mass: float, centre: float, inertia: float, length: float) -> ShapeIntegrals:
-    """Return a link with a single elastic coordinate that moves nothing but itself."""
-    return plane_body(
-        mass=mass,
-        moment=np.array([mass * centre, 0.0]),
-        inertia=inertia,
-        C=np.zeros((2, 1)),
-        j=np.zeros(1),
-        r=np.zeros(1),
-        M=np.eye(1),
-        G=np.zeros((1, 1)),
-        K=np.eye(1),
-        D=np.zeros((1, 1)),
-        outboard=np.zeros((3, 1)),
-        outboard_point=np.array([length, 0.0]),
-    )
-
-
-@BENT
-@ARMS
-def test_instants_do_not_feel_one_another(rng: np.random.Generator, arms: int, bent: bool) -> None:
-    """A batch gives what its instants give one by one."""
-    model = chain(rng, arms, bent)
-    mechanism, r = model.mechanism(), model.rigid
-    y, yd, ydd = states(rng, model, 5)
-    together = forces(model, y, yd, ydd)
-    motion = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
-    slopes = linearise(mechanism, motion, y[:, r:], yd[:, r:], ydd[:, r:]).dense()
-    for n in range(5):
-        part = slice(n, n + 1)
-        one = forces(model, y[part], yd[part], ydd[part])
-        # Matrix products of other shapes sum in another order.
-        assert_close(one[0], together[n], 1e-14, np.abs(together).max())
-        motion = RigidMotion(y[part, :r], yd[part, :r], ydd[part, :r])
-        slope = linearise(mechanism, motion, y[part, r:], yd[part, r:], ydd[part, r:]).dense()
-        assert_close(slope[0], slopes[n], 1e-14, np.abs(slopes).max())
-
-
-@BENT
-@ARMS
-def test_end_effector_is_the_payloads_place(
-    rng: np.random.Generator, arms: int, bent: bool
-) -> None:
-    """Positions, and the deviation from the rigid chain that is zero without deflection."""
-    model = chain(rng, arms, bent)
-    mechanism, r = model.mechanism(), model.rigid
-    y = states(rng, model, 4)[0]
-    motion = RigidMotion(y[:, :r], y[:, :r], y[:, :r])
-    expected = np.array([model.places(row)[1] for row in y])
-    stiff = np.array([model.places(np.append(row[:r], 0.0 * row[r:]))[1] for row in y])
-    size = np.abs(expected).max()
-    assert_close(end_effector(mechanism, motion, y[:, r:]), expected, 1e-14, size)
-    assert_close(deviation(mechanism, motion, y[:, r:]), expected - stiff, 1e-14, size)
-    assert not deviation(mechanism, motion, 0.0 * y[:, r:]).any()
-
-
-def test_compliance_is_twice_the_elastic_energy(rng: np.random.Generator) -> None:
+def test_compliance_is_twice_the_elastic_energy() -> None:
     """Arm by arm, from the block-diagonal stiffness."""
-    model = chain(rng, 3)
-    mechanism = model.mechanism()
-    q = rng.normal(size=(4, mechanism.num_coordinates))
+    mechanism = machine_of("3 arms").mechanism
+    q = np.random.default_rng(4).normal(size=(4, mechanism.num_coordinates))
     found = compliance(mechanism.bodies, mechanism.slices, q)
-    assert found.shape == (4, 3)
-    total = np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q)
-    assert_close(found.sum(axis=1), total, 1e-13)
+    assert_close(found.sum(axis=1), np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q), 1e-13)
     alone = np.zeros_like(q)
     alone[:, mechanism.slices[1]] = q[:, mechanism.slices[1]]
     parts = compliance(mechanism.bodies, mechanism.slices, alone)
     assert not parts[:, [0, 2]].any()
     assert_close(parts[:, 1], found[:, 1], 1e-14)
-
-
-# -- places in memory ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_few_instants_do_not_depend_on_memory(rng: np.random.Generator, count: int) -> None:
-    """The same bits wherever the arrays lie; NumPy 1.24 multiplies short complex arrays two ways.
-
-    Arrays of all small sizes that come and go make the allocator choose other places every time.
-    """
-    model = chain(rng, 3)
-    mechanism, r = model.mechanism(), model.rigid
-    scene = load_scene(Path(__file__).parents[2] / "demos" / "three_arm.toml")
-    y, yd, ydd = states(rng, model, count)
-    weights = rng.normal(size=(count, 2))
-    t = np.linspace(0.2, 0.7, count)
-    found = set()
-    for k in range(60):
-        order = np.random.default_rng(k)
-        kept = [np.empty(n, dtype=complex) for n in order.integers(1, 9, 1500)]
-        for place in order.permutation(1500)[:700]:
-            kept[place] = kept[0]
-        motion = RigidMotion(y[:, :r].copy(), yd[:, :r].copy(), ydd[:, :r].copy())
-        q, qd, qdd = y[:, r:], yd[:, r:], ydd[:, r:]
-        slopes = body_gradient(mechanism, motion, q, qd, qdd, qd)
-        by_q, by_outboard = end_effector_gradient(mechanism, motion, q, weights)
-        arrays = [
-            *inverse_dynamics(mechanism, motion, q, qd, qdd),
-            elastic_residual(mechanism, motion, q, qd, qdd),
-            linearise(mechanism, motion, q, qd, qdd).dense(),
-            end_effector(mechanism, motion, q),
-            *(value for one in slopes for value in (one.w, one.W, one.K, one.outboard)),
-            *(by_q, *(one["outboard"] for one in by_outboard)),
-            *vars(rigid_motion(t, scene)).values(),
-        ]
-        found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
-    assert len(found) == 1
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_instants_are_those_of_many(rng: np.random.Generator, count: int) -> None:
-    """Values and sums at up to three instants, which are computed as four."""
-    model = chain(rng, 2)
-    mechanism, r = model.mechanism(), model.rigid
-    y, yd, ydd = states(rng, model, 8)
-    many = RigidMotion(y[:, :r], yd[:, :r], ydd[:, :r])
-    rates, weights = (y[:, r:], yd[:, r:], ydd[:, r:]), rng.normal(size=(8, 2))
-    first = slice(count)
-    few = tuple(x[first] for x in rates)
-    for function in (inverse_dynamics, elastic_residual, lambda *x: linearise(*x).dense()):
-        whole, part = function(mechanism, many, *rates), function(mechanism, many[first], *few)
-        if not isinstance(whole, tuple):
-            whole, part = (whole,), (part,)
-        for a, b in zip(whole, part, strict=True):
-            assert len(b) == count
-            np.testing.assert_allclose(b, a[first], rtol=1e-12, atol=1e-12)
-    # What is summed over the instants: weights of none at the others.
-    weights[count:] = 0.0
-    multipliers = np.where(np.arange(8)[:, None] < count, rates[1], 0.0)
-    by_q, by_outboard = end_effector_gradient(mechanism, many[first], few[0], weights[first])
-    whole_q, whole_outboard = end_effector_gradient(mechanism, many, rates[0], weights)
-    np.testing.assert_allclose(by_q, whole_q[first], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(
-        by_outboard[0]["outboard"], whole_outboard[0]["outboard"], rtol=1e-12, atol=1e-12
-    )
-    part = body_gradient(mechanism, many[first], *few, multipliers[first])
-    whole = body_gradient(mechanism, many, *rates, multipliers)
-    for a, b in zip(whole, part, strict=True):
-        np.testing.assert_allclose(b.W, a.W, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(b.K, a.K, rtol=1e-12, atol=1e-12)
-
-
-@BENT
-@ARMS
-def test_jacobian_and_hessian_of_the_interface(
-    rng: np.random.Generator, arms: int, bent: bool
-) -> None:
-    """Derivatives of the end-effector's place by rigid and elastic coordinates."""
-    model = chain(rng, arms, bent)
-    mechanism, r = model.mechanism(), model.rigid
-    y = states(rng, model, 4)[0]
-
-    def at(y: np.ndarray, second: bool = False) -> InterfacePlace:
-        motion = RigidMotion(y[:, :r], 0.0 * y[:, :r], 0.0 * y[:, :r])
-        return interface_place(mechanism, motion, y[:, r:], second=second)
-
-    here = at(y, second=True)
-    place = end_effector(mechanism, RigidMotion(y[:, :r], y[:, :r], y[:, :r]), y[:, r:])
-    assert_close(here.place, place @ [1.0, 1j], 1e-14)
-    for c, unit in enumerate(np.eye(model.size)):
-        by_place = derivative(lambda t, unit=unit: at(y + t * unit).place)
-        assert_close(here.jacobian[:, c], by_place, DIFFERENCES, np.abs(here.jacobian).max())
-        by_jacobian = derivative(lambda t, unit=unit: at(y + t * unit).jacobian)
-        assert here.hessian is not None
-        assert_close(here.hessian[:, c], by_jacobian, DIFFERENCES, np.abs(here.hessian).max())
-
-
-@BENT
-@ARMS
-def test_gradient_of_the_interfaces_place_and_its_variation(
-    rng: np.random.Generator, arms: int, bent: bool
-) -> None:
-    """By the outboard modes of every body and their geometric stiffness."""
-    model = chain(rng, arms, bent)
-    mechanism, r = model.mechanism(), model.rigid
-    y, moved = states(rng, model, 4)[:2]
-    weights, pull = rng.normal(size=(2, 4)) + 1j * rng.normal(size=(2, 4))
-    motion, q = RigidMotion(y[:, :r], 0.0 * y[:, :r], 0.0 * y[:, :r]), y[:, r:]
-
-    def worth(one: Mechanism) -> float:
-        here = interface_place(one, motion, q)
-        swept = np.einsum("nc,nc->n", here.jacobian, moved)
-        return float((np.conj(weights) * here.place + np.conj(pull) * swept).real.sum())
-
-    found = place_gradient(mechanism, motion, q, weights, moved, pull)
-    for k, by in enumerate(found):
-        assert set(by) == ({"outboard", "K0_outboard"} if bent else {"outboard"})
-        for name, gradient in by.items():
-            change = rng.normal(size=gradient.shape)
-            change = change + change.swapaxes(1, 2) if name == "K0_outboard" else change
-
-            def other(t: float, k: int = k, name: str = name, change: np.ndarray = change) -> float:
-                bodies = list(mechanism.bodies)
-                value = getattr(bodies[k], name) + t * change
-                bodies[k] = replace(bodies[k], **{name: value})
-                return worth(replace(mechanism, bodies=tuple(bodies)))
-
-            assert_close(np.sum(gradient * change), derivative(other), 1e-10, 10.0)

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Chain, Cloud, assert_close, derivative
+from bodies import Chain, assert_close, bar, derivative
 from mpi4py import MPI
+from remainders import built_of
+from runs import refused
 from scipy.optimize import brentq
 
-import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
@@ -31,8 +32,6 @@ from dolfinopt.multibody.motion import (
     line,
     rigid_motion,
 )
-from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.parallel import on_root
 from dolfinopt.paths.time_laws import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
 
@@ -62,10 +61,13 @@ SCENES = pytest.mark.parametrize(
 
 
 def scene(
-    lengths: tuple[float, ...] = (1.0, 1.0), tables: dict[str, Any] | None = None, **motion: Any
+    lengths: tuple[float, ...] = (1.0, 1.0),
+    tables: dict[str, Any] | None = None,
+    cells: tuple[int, int] = (20, 2),
+    **motion: Any,
 ) -> Scene:
     """Return the paper's example with these arms, this motion and other tables of the scene."""
-    section = {"height": 0.06, "thickness": 0.01, "cells": [20, 2], "passive": 0.0}
+    section = {"height": 0.06, "thickness": 0.01, "cells": list(cells), "passive": 0.0}
     return scene_from_dict(
         {
             "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
@@ -88,24 +90,13 @@ def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
     return np.stack([x, of.motion.joint_height + np.sin(angles) @ lengths], axis=1)
 
 
-def test_quintic_rests_before_and_after() -> None:
-    """Zero speed and acceleration up to the start and from the end on."""
-    s, sd, sdd = quintic(np.array([-1.0, 0.0, DURATION, 5.0]), DURATION)
-    assert s.tolist() == [0.0, 0.0, 1.0, 1.0]
-    assert not sd.any()
-    assert not sdd.any()
-
-
-def test_quintic_derivatives() -> None:
-    """By differences, and the known peaks 15/8 and 10/sqrt(3) of speed and acceleration."""
-    s, sd, sdd = quintic(INSIDE, DURATION)
-    assert_close(derivative(lambda t: quintic(INSIDE + t, DURATION)[0]), sd, DIFFERENCES)
-    assert_close(derivative(lambda t: quintic(INSIDE + t, DURATION)[1]), sdd, DIFFERENCES)
-    assert (np.diff(s) > 0.0).all()
+def test_peaks_of_the_laws() -> None:
+    """Speed 15/8 and acceleration 10 / sqrt(3) of the quintic, speed 35/16 of the septic."""
     peak = DURATION * (0.5 - np.sqrt(3.0) / 6.0)  # where the jerk is zero
     _, sd, sdd = quintic(np.array([DURATION / 2.0, peak]), DURATION)
     assert_close(sd[0], 15.0 / 8.0 / DURATION, 1e-14)
     assert_close(sdd, [0.0, 10.0 / np.sqrt(3.0) / DURATION**2], 1e-14)
+    assert_close(septic(np.array([DURATION / 2.0]), DURATION)[1], [35.0 / 16.0 / DURATION], 1e-14)
 
 
 @pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
@@ -120,102 +111,34 @@ def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
     # The square root of a rounding error at the ends, where x^2 = r^2.
     assert_close(path.p[:, 1], height, 1e-7, 0.9)
     assert (np.diff(path.p[DENSE <= DURATION, 0]) > 0.0).all()
-
-
-@pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
-def test_arc_derivatives(flattening: float) -> None:
-    """Speed and acceleration by differences."""
-    motion = scene(flattening=flattening).motion
     path = arc(INSIDE, motion)
     assert_close(derivative(lambda t: arc(INSIDE + t, motion).p), path.pd, DIFFERENCES)
     assert_close(derivative(lambda t: arc(INSIDE + t, motion).pd), path.pdd, DIFFERENCES)
 
 
+def assert_rates(of: Scene, t: np.ndarray) -> None:
+    """Assert that rates are the coordinates' derivatives at t, by differences."""
+    here = rigid_motion(t, of)
+    for key, rate in (("q", here.qd), ("qd", here.qdd)):
+        found = derivative(lambda h, key=key: getattr(rigid_motion(t + h, of), key), step=2e-3)
+        assert_close(found, rate, DIFFERENCES)
+
+
 @SCENES
-def test_rigid_chain_traces_the_path(keys: dict[str, Any]) -> None:
-    """To rounding, with the elbow on the side asked for and the cart where it should be."""
+def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
+    """With the elbow on the side asked for and the cart where it should be; then all is at rest."""
     of = scene(**keys)
-    motion = rigid_motion(DENSE, of)
-    path = arc(DENSE, of.motion)
+    motion, path = rigid_motion(DENSE, of), arc(DENSE, of.motion)
     assert_close(end_points(motion, of), path.p, 1e-14)
     assert (np.sign(motion.q[:, 2]) == of.motion.elbow).all()
-    follow = of.motion.cart_follow
-    assert np.array_equal(motion.q[:, 0], follow * path.p[:, 0])
-    assert np.array_equal(motion.qd[:, 0], follow * path.pd[:, 0])
-    assert np.array_equal(motion.qdd[:, 0], follow * path.pdd[:, 0])
-
-
-@SCENES
-def test_rates_are_derivatives(keys: dict[str, Any]) -> None:
-    """Of all three coordinates, by differences."""
-    of = scene(**keys)
-    motion = rigid_motion(INSIDE, of)
-    speed = derivative(lambda t: rigid_motion(INSIDE + t, of).q, step=2e-3)
-    acceleration = derivative(lambda t: rigid_motion(INSIDE + t, of).qd, step=2e-3)
-    assert_close(speed, motion.qd, DIFFERENCES)
-    assert_close(acceleration, motion.qdd, DIFFERENCES)
-
-
-@SCENES
-def test_angles_are_continuous_and_rest_at_last(keys: dict[str, Any]) -> None:
-    """No jump by 2 pi; nothing moves once the path has ended."""
-    motion = rigid_motion(DENSE, scene(**keys))
-    steps = np.abs(np.diff(motion.q, axis=0)).max(axis=0)
+    for found, of_path in ((motion.q, path.p), (motion.qd, path.pd), (motion.qdd, path.pdd)):
+        assert np.array_equal(found[:, 0], of.motion.cart_follow * of_path[:, 0])
+    assert_rates(of, INSIDE)
+    steps = np.abs(np.diff(motion.q, axis=0)).max(axis=0)  # no jump by 2 pi
     assert (steps <= 1.1 * np.abs(motion.qd).max(axis=0) * DENSE[1]).all()
     rest = DENSE >= DURATION
-    assert not motion.qd[rest].any()
-    assert not motion.qdd[rest].any()
+    assert not motion.qd[rest].any() and not motion.qdd[rest].any()
     assert_close(motion.q[rest], np.broadcast_to(motion.q[-1], motion.q[rest].shape), 1e-15)
-
-
-@pytest.mark.parametrize(
-    ("keys", "time", "distance", "word"),
-    [
-        ({"radius": 4.0}, 0.95, 4.5, "out of reach"),
-        ({"joint_height": -1.0}, 0.95, 2.0, "stretched"),  # singular, just reached
-        ({"lengths": (1.4, 0.6)}, 0.0, np.sqrt(0.5), "too near"),
-        ({"flattening": 0.0, "joint_height": 0.0, "cart_follow": 0.0}, 0.95, 0.0, "folded"),
-    ],
-    ids=["far", "stretched", "near", "folded"],
-)
-def test_unreachable_or_singular_path(
-    keys: dict[str, Any], time: float, distance: float, word: str
-) -> None:
-    """The worst instant and the distance there stand in the message."""
-    of = scene(**keys)
-    with pytest.raises(InputError) as caught:
-        rigid_motion(np.linspace(0.0, DURATION, 191), of)
-    found = re.fullmatch(
-        r"test\.toml: motion: at t = (\S+) s the end-effector is (\S+) m from the shoulder, (.*)",
-        str(caught.value),
-    )
-    assert found
-    assert float(found[1]) == pytest.approx(time, abs=5e-4)  # four digits
-    assert float(found[2]) == pytest.approx(distance, abs=5e-6)  # six digits
-    assert word in found[3]
-    with pytest.raises(InputError, match=r"motion\.joint_height"):
-        check_motion(of)
-
-
-def test_path_within_reach_is_accepted() -> None:
-    """Close to the stretched position, no message."""
-    check_motion(scene(joint_height=-0.999))
-
-
-def test_septic_is_the_law_with_continuous_jerk() -> None:
-    """Rest outside, derivatives by differences, the peak speed 35/16, no jerk at the ends."""
-    s, sd, sdd = septic(np.array([-1.0, 0.0, DURATION, 5.0]), DURATION)
-    assert s.tolist() == [0.0, 0.0, 1.0, 1.0]
-    assert not sd.any()
-    assert not sdd.any()
-    s, sd, sdd = septic(INSIDE, DURATION)
-    assert (np.diff(s) > 0.0).all()
-    assert_close(derivative(lambda t: septic(INSIDE + t, DURATION)[0]), sd, DIFFERENCES)
-    assert_close(derivative(lambda t: septic(INSIDE + t, DURATION)[1]), sdd, DIFFERENCES)
-    assert_close(septic(np.array([DURATION / 2.0]), DURATION)[1], [35.0 / 16.0 / DURATION], 1e-14)
-    near = np.array([1e-6, DURATION - 1e-6])
-    assert np.abs(septic(near, DURATION)[2]).max() / 1e-6 < 1e-3  # it falls with the square
-    assert np.abs(quintic(near, DURATION)[2]).max() / 1e-6 > 1.0  # of the quintic it does not
 
 
 @pytest.mark.parametrize("law", ["quintic", "septic"])
@@ -302,11 +225,7 @@ def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str)
     knots = TIMES if path.endswith("time") else np.array(breakpoints(of))
     inside = INSIDE[np.abs(INSIDE[:, None] - knots).min(axis=1) > 0.01]
     assert len(inside) >= 12
-    here = rigid_motion(inside, of)
-    speed = derivative(lambda t: rigid_motion(inside + t, of).q, step=2e-3)
-    acceleration = derivative(lambda t: rigid_motion(inside + t, of).qd, step=2e-3)
-    assert_close(speed, here.qd, DIFFERENCES)
-    assert_close(acceleration, here.qdd, DIFFERENCES)
+    assert_rates(of, inside)
     size = np.abs(motion.qdd).max()
     ends = rigid_motion(np.array([0.0, 1e-7, DURATION - 1e-7, DURATION, 2.5]), of)
     # The jerk is some hundred times the acceleration per second.
@@ -379,49 +298,41 @@ def test_angles_do_not_depend_on_the_instants_asked_for(arms: int) -> None:
     assert rigid_motion(np.empty(0), of).q.shape == (0, 1 + arms)
 
 
-@pytest.mark.parametrize(
-    ("lengths", "keys", "pattern"),
-    [
-        (
-            (0.5, 0.5, 0.5),
-            {"cart_follow": 0.0},
-            r"at t = 0\.95 s the end-effector is 1\.5 m from the shoulder, stretched or out of "
-            r"reach: arms of 0\.5 m, 0\.5 m and 0\.5 m, all elbows bent alike, need a distance "
-            r"between 0 m and 1\.5 m; change motion\.radius, motion\.flattening, "
-            r"motion\.cart_follow, motion\.joint_height or the arms' length",
-        ),
-        (
-            (1.0, 0.2, 0.2),
-            {"path": "line", "start": [-1, 0.1], "end": [1, 0.1], "base": "fixed"},
-            r"at t = 0\.95 s the end-effector is 0\.6 m from the shoulder, folded or too near: .*"
-            r"motion\.start, motion\.end, motion\.base_position, motion\.joint_height or .*",
-        ),
-        (
-            (1.2,),
-            {},
-            r"at t = 0\.95 s the end-effector is 1\.5 m above the shoulder, upright or out of "
-            r"reach: one arm of 1\.2 m needs less than 1\.2 m; change motion\.radius, "
-            r"motion\.flattening, motion\.joint_height or the arms' length",
-        ),
-        (
-            (1.2,),
-            {"path": "line", "start": [0, 0], "end": [1, -2]},
-            r"at t = 1\.9 s the end-effector is 1\.5 m below the shoulder, .*",
-        ),
-        (
-            (1.0, 1.0),
-            {"path": "line", "start": [0, 0], "end": [1e4, 1e4], "cart_follow": 1e3},
-            r"at t = .* s the end-effector is .*e\+06 m from the shoulder, stretched .*",
-        ),
-    ],
-    ids=["far", "near", "above", "below", "very far"],
-)
-def test_reach_of_any_number_of_arms(
-    lengths: tuple[float, ...], keys: dict[str, Any], pattern: str
-) -> None:
-    """The worst instant and the distance there; the keys that help."""
-    with pytest.raises(InputError, match=rf"^test\.toml: motion: {pattern}$"):
+LINE = {"path": "line", "base": "fixed", "start": [-1, 0.1], "end": [1, 0.1]}
+FAR = {"path": "line", "start": [0, 0], "end": [1e4, 1e4], "cart_follow": 1e3}
+UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, keys that help
+    ((1.0, 1.0), {"radius": 4.0}, 0.95, 4.5, "out of reach", "motion.joint_height"),
+    ((1.0, 1.0), {"joint_height": -1.0}, 0.95, 2.0, "stretched", "motion.radius"),
+    # Within a millionth of stretched or folded.
+    ((1.0, 1.0), {"joint_height": -0.9999999}, 0.95, 2.0, "stretched", "motion.radius"),
+    ((1.0, 1.0), {"radius": 1e-6, "joint_height": 0.0, "cart_follow": 0.0}, None, 1e-6, "folded",
+     "motion.radius"),
+    ((1.4, 0.6), {}, 0.0, np.sqrt(0.5), "too near", "motion.cart_follow"),
+    ((1.0, 1.0), {"flattening": 0.0, "joint_height": 0.0, "cart_follow": 0.0}, 0.95, 0.0, "folded",
+     "motion.flattening"),
+    ((0.5, 0.5, 0.5), {"cart_follow": 0.0}, 0.95, 1.5, "between 0 m and 1.5 m", "the arms' length"),
+    ((1.0, 0.2, 0.2), LINE, 0.95, 0.6, "folded", "motion.base_position"),
+    ((1.2,), {}, 0.95, 1.5, "above the shoulder, upright", "motion.flattening"),
+    ((1.2,), LINE | {"base": "cart", "end": [1, -2]}, 1.9, 1.5, "below the shoulder", "motion.end"),
+    ((1.0, 1.0), FAR, None, 1e7, "stretched", "motion.start"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("lengths", "keys", "time", "distance", "words", "key"), UNREACHABLE)
+def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) -> None:
+    """In one line the worst instant, the distance there, and the keys that help."""
+    with pytest.raises(InputError) as caught:
         check_motion(scene(lengths, **keys))
+    said = str(caught.value)
+    found = re.match(r"test\.toml: motion: at t = (\S+) s the end-effector is (\S+) m ", said)
+    assert found and words in said and key in said and "\n" not in said
+    assert time is None or float(found[1]) == pytest.approx(time, abs=5e-3)
+    assert float(found[2]) == pytest.approx(distance, rel=1e-3, abs=5e-6)
+
+
+def test_path_within_reach_is_accepted() -> None:
+    """Close to the stretched position, no message."""
+    check_motion(scene(joint_height=-0.999))
 
 
 # -- tables ----------------------------------------------------------------------------------
@@ -478,50 +389,31 @@ def test_changed_table_is_read_anew(tmp_path: Path) -> None:
     after = end_points(rigid_motion(DENSE, of), of)
     assert_close([before[-1], after[-1]], [[0.5, 0.0], [0.5, 0.3]], 1e-14)
     file.unlink()
-    with pytest.raises(InputError, match=r"points\.csv: cannot be read \(No such file"):
+    with refused("points.csv", "cannot be read"):
         rigid_motion(DENSE, of)
 
 
 @pytest.mark.parametrize(
-    ("text", "keys", "reason"),
+    ("text", "keys", "words"),
     [
-        (
-            "t,cart,arm0,arm1\n0,0,0,0\n1.5,1,1,1\n",
-            {},
-            "line 3, column t = 1.5: expected motion.duration = 1.9 [s] in the last row; set "
-            "motion.duration = 1.5",
-        ),
-        (
-            "t,cart,arm0,arm1\n0,0,0,0\n1,0,1,1\n1.9,1,1,1\n",
-            {"law": "septic"},
-            "line 3: a row between two stops with motion.law = 'septic' or limits, by which each "
-            "move runs from stop to stop; repeat the row at a later t to stop there, leave it "
-            "out, or leave out the column t, the law's name and the limits",
-        ),
-        (
-            "arm0,arm1\n0,0\n1,1\n",
-            {},
-            "line 1: missing column 'cart'; expected cart,arm0,arm1 or t,cart,arm0,arm1",
-        ),
-        (
-            "cart,arm0,arm1\n0,0,0\n1,1,1\n",
-            {"base": "fixed"},
-            "line 1: unknown column 'cart'; expected arm0,arm1 or t,arm0,arm1",
-        ),
+        ("t,cart,arm0,arm1\n0,0,0,0\n1.5,1,1,1\n", {},
+         ("line 3", "column t = 1.5", "motion.duration = 1.9", "set motion.duration = 1.5")),
+        ("t,cart,arm0,arm1\n0,0,0,0\n1,0,1,1\n1.9,1,1,1\n", {"law": "septic"},
+         ("line 3", "motion.law = 'septic'", "repeat the row", "leave out the column t")),
+        ("arm0,arm1\n0,0\n1,1\n", {}, ("line 1", "missing column 'cart'", "cart,arm0,arm1")),
+        ("cart,arm0,arm1\n0,0,0\n1,1,1\n", {"base": "fixed"},
+         ("line 1", "unknown column 'cart'", "arm0,arm1 or t,arm0,arm1")),
     ],
     ids=["duration", "law", "no cart", "cart"],
-)
-def test_table_that_does_not_suit_the_scene(
-    tmp_path: Path, text: str, keys: dict[str, Any], reason: str
-) -> None:
+)  # fmt: skip
+def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words) -> None:
     """One line that says what to set."""
     file = tmp_path / "joints.csv"
     file.write_text(text)
     of = scene(path="joints", file=str(file), **keys)
     for call in (check_motion, breakpoints):
-        with pytest.raises(InputError) as caught:
+        with refused(f"{file}: ", *words):
             call(of)
-        assert str(caught.value) == f"{file}: {reason}"
 
 
 @pytest.mark.parametrize("name", ["t", "cart"])
@@ -532,7 +424,7 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
     keys = {"path": "joints", "file": str(file)}
     of = scene(**keys)
     arms = (of.arms[0].model_copy(update={"name": name}), of.arms[1])
-    with pytest.raises(InputError, match=rf"an arm named '{name}'.*another name"):
+    with refused(f"'{name}'", "another name"):
         check_motion(of.model_copy(update={"arms": arms}))
 
 
@@ -541,30 +433,12 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
 HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `scene`'s arms
 
 
-def simulated(of: Scene, density: float = 1.0) -> Trajectory | None:
-    """Return the trajectory of uniform arms; None but on the root."""
-    profile = do.Profile()
-    partition = do.partition_arms(WORLD, of.cell_counts)
-    arms = do.build_arms(of, partition, profile)
-    x_phys = {k: arm.uniform(density) for k, arm in arms.items()}
-    return do.evaluate(of, partition, arms, x_phys, profile)[1]
-
-
-def bar(length: float) -> Cloud:
-    """Return a rigid solid arm as four point masses: those of Gauss' rule, exact to degree 3."""
-    gauss = np.array([-1.0, 1.0]) / np.sqrt(12.0)
-    x, y = np.meshgrid(length * (0.5 + gauss), HEIGHT * gauss)
-    mass = STEEL[1] * length * HEIGHT * THICKNESS
-    none = np.zeros((0, 0))
-    return Cloud(
-        points=np.stack([x.ravel(), y.ravel()], axis=1),
-        masses=np.full(4, 0.25 * mass),
-        modes=np.zeros((4, 2, 0)),
-        K=none,
-        D=none,
-        outboard=np.zeros((3, 0)),
-        outboard_point=np.array([length, 0.0]),
-    )
+def simulated(of: Scene) -> Trajectory:
+    """Return the trajectory of solid arms."""
+    built = built_of(of)
+    _, trajectory = built.evaluate({k: arm.uniform(1.0) for k, arm in built.arms.items()})
+    assert trajectory is not None
+    return trajectory
 
 
 def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> None:
@@ -573,97 +447,41 @@ def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> Non
     file.write_text("t,arm0\n0,0.2\n1.9,2.7\n")  # two rows in time: the quintic law
     length, mass = 0.7, 0.5  # m, kg
     of = scene(
-        (length,),
-        {
-            "payload": {"mass": mass},
-            "arms": [
-                {
-                    "name": "arm0",
-                    "length": length,
-                    "height": HEIGHT,
-                    "thickness": THICKNESS,
-                    "passive": 0.0,
-                    "cells": [70, 6],
-                }
-            ],
-        },
-        path="joints",
-        file=str(file),
-        base="fixed",
+        (length,), {"payload": {"mass": mass}}, (70, 6), path="joints", file=str(file), base="fixed"
     )
     trajectory = simulated(of)
-
-    def check() -> None:
-        assert trajectory is not None
-        s, sd, sdd = quintic(trajectory.t, DURATION)
-        alpha, speed, acceleration = 0.2 + 2.5 * s, 2.5 * sd, 2.5 * sdd
-        assert_close(trajectory.q_r[:, 1], alpha, 1e-13)
-        deviation = (trajectory.deviation @ [1.0, 1j]) * np.exp(-1j * alpha)
-        area, inertia = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0
-        line_mass = STEEL[1] * area
-        bending = STEEL[0] * inertia
-        across = 11.0 * line_mass * length**5 / 120.0 + mass * length**4 / 3.0
-        along = (line_mass * length**3 / 3.0 + mass * length**2) / (STEEL[0] * area)
-        # Six cells across bend too little and shear adds some: 1.5 % together.
-        assert_close(deviation.imag, -across / bending * acceleration, 0.02)
-        # Pulling needs no fine mesh; the ends, held against contraction, make it 0.3 % shorter.
-        assert_close(deviation.real, along * speed**2, 0.01)
-
-    on_root(WORLD, check)
+    s, sd, sdd = quintic(trajectory.t, DURATION)
+    alpha, speed, acceleration = 0.2 + 2.5 * s, 2.5 * sd, 2.5 * sdd
+    assert_close(trajectory.q_r[:, 1], alpha, 1e-13)
+    deviation = (trajectory.deviation @ [1.0, 1j]) * np.exp(-1j * alpha)
+    area, bending = HEIGHT * THICKNESS, STEEL[0] * THICKNESS * HEIGHT**3 / 12.0
+    line = STEEL[1] * area
+    across = 11.0 * line * length**5 / 120.0 + mass * length**4 / 3.0
+    along = (line * length**3 / 3.0 + mass * length**2) / (STEEL[0] * area)
+    # Six cells across bend too little and shear adds some: 1.5 % together.
+    assert_close(deviation.imag, -across / bending * acceleration, 0.02)
+    # Pulling needs no fine mesh; the ends, held against contraction, make it 0.3 % shorter.
+    assert_close(deviation.real, along * speed**2, 0.01)
 
 
 @pytest.mark.parametrize("base", ["cart", "fixed"])
 @pytest.mark.parametrize("arms", [1, 3])
 def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
     """Of the rigid mechanism to differences, and of the flexible one in all but vibration."""
-    path = "joints in time" if arms == 1 else "points"
-    lengths = {1: (0.7,), 3: (0.7, 0.7, 0.7)}[arms]
+    path, lengths = "joints in time" if arms == 1 else "points", (0.7,) * arms
     file = tmp_path / "table.csv"
     file.write_text(table_text(path, arms, base))
-    gravity = [0.5, -9.81]
-    motion = {**PATHS[path], **BASES[base], "file": str(file), "gravity": gravity}
+    gravity = (0.5, -9.81)
+    motion = {**PATHS[path], **BASES[base], "file": str(file), "gravity": list(gravity)}
     of = scene(lengths, {"payload": {"mass": 2.0, "inertia": 0.1}}, **motion)
-    trajectory = simulated(of)
-
-    def check() -> None:
-        assert trajectory is not None
-        at = slice(100, 1900, 300)
-        rigid = RigidMotion(*(getattr(trajectory.motion, key)[at] for key in ("q", "qd", "qdd")))
-        clouds = tuple(bar(length) for length in lengths)
-        chain = Chain(clouds, 2.0, 0.1, (gravity[0], gravity[1]), of.motion.joint_height)
-        rows = zip(rigid.q, rigid.qd, rigid.qdd, strict=True)
-        expected = np.array([chain.forces(*row) for row in rows])
-        still = np.zeros((len(rigid.q), trajectory.mechanism.num_coordinates))
-        found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
-        assert_close(found, expected, 1e-10)  # differences of a function of size ten
-        # The arms bend by some thousandths of their length, and a vibration of 11 % goes on.
-        assert_close(trajectory.joint_forces[at], expected, 0.12)
-
-    on_root(WORLD, check)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arms", "path", "law", "base"),
-    [
-        (1, "joints in time", "quintic", "fixed"),
-        (1, "line", "trapezoidal", "cart"),
-        (3, "points", "quintic", "cart"),
-        (3, "line", "s-curve", "fixed"),
-    ],
-)
-@pytest.mark.usefixtures("three_steps")
-def test_exact_gradient_of_one_and_three_arms(
-    tmp_path: Path, arms: int, path: str, law: str, base: str
-) -> None:
-    """Taylor remainders of the complete chain fall with the square of the step."""
-    motion = dict(of_kind(tmp_path, arms, path, law, base).to_dict()["motion"], horizon=2.2)
-    lengths = {1: (1.0,), 3: (0.7, 0.7, 0.7)}[arms]
-    tables = {"payload": {"mass": 1.0}, "objective": {"load_cases": 5}}
-    of = scene(lengths, tables, **motion)
-    profile = do.Profile()
-    partition = do.partition_arms(WORLD, of.cell_counts)
-    built = do.build_arms(of, partition, profile)
-    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in built.items()}
-    test = taylor_test(of, partition, built, x, profile)
-    assert test.passed, {row.direction: round(row.rate, 3) for row in test.rows}
+    trajectory, at = simulated(of), slice(100, 1900, 300)
+    rigid = trajectory.motion[at]
+    clouds = tuple(bar(one, HEIGHT, STEEL[1] * one * HEIGHT * THICKNESS) for one in lengths)
+    chain = Chain(clouds, 2.0, 0.1, gravity, of.motion.joint_height)
+    rows = zip(rigid.q, rigid.qd, rigid.qdd, strict=True)
+    expected = np.array([chain.forces(*row) for row in rows])
+    still = np.zeros((len(rigid.q), trajectory.mechanism.num_coordinates))
+    found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
+    assert_close(found, expected, 1e-10)  # differences of a function of size ten
+    # The arms bend by some thousandths of their length, and a vibration of 11 % goes on.
+    assert_close(trajectory.joint_forces[at], expected, 0.12)

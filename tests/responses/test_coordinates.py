@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import Built, build, wave
-from runs import TWO_ARM
+from remainders import Built, build, built_of, wave
+from runs import TWO_ARM, overrides, refused, run
 
 import dolfinopt as do
+from dolfinopt.cli.shared import scene_of
 from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.optimization import assessment
@@ -76,23 +77,25 @@ SHAKEN = ("damping.stiffness_proportional=1e-5", "payload.mass=2", "motion.durat
 # -- the estimate ----------------------------------------------------------------------------
 
 
+def moved(built: Built, x, count: int, method: str = "craig-bampton"):
+    """Return motion, on the root, and arms by a number of coordinates, integrated more finely."""
+    data = built.scene.to_dict()
+    data["reduction"] |= {"coordinates": count, "tolerance": 1e-3, "method": method}
+    data["simulation"]["tolerance"] = 3e-5
+    scene = do.scene_from_dict(data)
+    arms = {k: arm.under(scene) for k, arm in built.arms.items()}
+    bodies = gather_arms(built.partition, {k: arm.reduce(x[k]) for k, arm in arms.items()})
+    return simulate(scene, list(bodies.values()), do.Profile()) if bodies else None, arms
+
+
 def padded_error(built: Built, x, few: int, many: int) -> float:
     """Return the error of a number of Craig-Bampton coordinates, by the coordinates alone.
 
     The first of many coordinates are the few: with zeros behind, their motion is one of the many.
     """
-    found = []
-    for count in (few, many):
-        data = built.scene.to_dict()
-        data["reduction"] |= {"coordinates": count, "tolerance": 1e-3}
-        data["simulation"]["tolerance"] = 3e-5
-        scene = do.scene_from_dict(data)
-        arms = {k: arm.under(scene) for k, arm in built.arms.items()}
-        bodies = gather_arms(built.partition, {k: arm.reduce(x[k]) for k, arm in arms.items()})
-        found.append(simulate(scene, list(bodies.values()), do.Profile()) if bodies else None)
+    short, long = (moved(built, x, count)[0] for count in (few, many))
     result = None
     if WORLD.rank == 0:
-        short, long = found
         padded = np.zeros_like(long.q_e)
         for a, b in zip(short.mechanism.slices, long.mechanism.slices, strict=True):
             padded[:, b.start : b.start + few] = short.q_e[:, a]
@@ -123,20 +126,16 @@ def test_estimate_of_other_bases(method):
     built = auto(f"reduction.method={method}", cells=CELLS)
     x = built.fields(wave)
     estimate = error(built, x, 4)
-    moved, fields = [], []
+    motions, fields = [], []
     for kind, count in ((method, 4), ("craig-bampton", 48)):
-        data = built.scene.to_dict()
-        data["reduction"] |= {"coordinates": count, "tolerance": 1e-3, "method": kind}
-        data["simulation"]["tolerance"] = 3e-5
-        scene = do.scene_from_dict(data)
-        arms = {k: arm.under(scene) for k, arm in built.arms.items()}
-        bodies = gather_arms(built.partition, {k: arm.reduce(x[k]) for k, arm in arms.items()})
-        motion = simulate(scene, list(bodies.values()), do.Profile()) if bodies else None
-        moved.append(WORLD.bcast(motion and (motion.q_e, motion.mechanism.slices), root=0))
+        motion, arms = moved(built, x, count, kind)
+        motions.append(WORLD.bcast(motion and (motion.q_e, motion.mechanism.slices), root=0))
         fields.append({k: arm.basis.V for k, arm in arms.items()})
     worst = {}
     for k, arm in built.arms.items():
-        u, richer = (V[k] @ q[::5, parts[k]].T for V, (q, parts) in zip(fields, moved, strict=True))
+        u, richer = (
+            V[k] @ q[::5, parts[k]].T for V, (q, parts) in zip(fields, motions, strict=True)
+        )
         norms = [
             np.sqrt(np.sum(w * arm.elastic.stiffness_times(w), axis=(0, 1)).max())
             for w in (u - richer, richer)
@@ -204,15 +203,9 @@ def test_shared_design_counts_like_two():
 
 
 def test_three_arms():
-    scene = do.load_scene(
-        TWO_ARM.parent / "three_arm.toml",
-        (AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"),
-    )
-    partition = do.partition_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, partition, do.Profile())
-    x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-    choice = do.choose_coordinates(scene, partition, arms, x, do.Profile())
-    assert choice.error <= 1e-2
+    changes = AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"
+    built = built_of(do.load_scene(TWO_ARM.parent / "three_arm.toml", changes))
+    assert choose(built, {k: arm.uniform(0.5) for k, arm in built.arms.items()}).error <= 1e-2
 
 
 def test_a_given_number_costs_nothing():
@@ -235,16 +228,16 @@ def test_more_coordinates_than_dofs_are_not_tried():
 def test_none_is_enough(monkeypatch):
     monkeypatch.setattr(coordinates, "MOST", 6)
     built = auto("reduction.method=modal", tolerance=1e-3)
-    with pytest.raises(do.ConvergenceError, match=r"up to 6 coordinates .*tolerance = 0.001; give"):
+    words = "up to 6 coordinates", "reduction.tolerance = 0.001"
+    with refused(*words, error=do.ConvergenceError):
         choose(built, built.fields(wave))
 
 
 def test_unresolved():
     """Nothing takes "auto" for a number."""
     built = auto()
-    message = r'reduction\.coordinates = "auto".*choose_coordinates'
     for k, arm in built.arms.items():
-        with pytest.raises(do.InputError, match=message):
+        with refused('reduction.coordinates = "auto"', "choose_coordinates"):
             arm.reduce(built.fields(wave)[k])
 
 
@@ -324,19 +317,15 @@ def test_cases():
 
 
 @pytest.mark.serial
-def test_commands(tmp_path):
+def test_commands(tmp_path, capsys):
     """Each says what it chose; a picture drawn anew takes the number from the summary."""
-    from click.testing import CliRunner
 
-    from dolfinopt.cli import commands
-
-    def run(*words: object) -> str:
-        line = [*map(str, words), "--set", "arms.cells=[24,3]", "--set", AUTO]
-        result = CliRunner().invoke(commands, line, obj=WORLD, catch_exceptions=False)
-        return result.output
+    def said(*words: object) -> str:
+        run(*words, *overrides("arms.cells=[24,3]", AUTO))
+        return capsys.readouterr().out
 
     sentence = 'reduction.coordinates = "auto": '
-    assert sentence in run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "s")
+    assert sentence in said("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "s")
     summary = json.loads((tmp_path / "s" / "summary.json").read_text())
     found = summary["reduction"]
     assert found["error_estimate"] <= 1e-3 == summary["scene"]["reduction"]["tolerance"]
@@ -344,23 +333,16 @@ def test_commands(tmp_path):
     assert found["tried"][0]["coordinates"] == 3
     with np.load(tmp_path / "s" / "trajectory.npz") as data:
         assert data["q_e"].shape[1] == 2 * found["coordinates"]
-    said = run("export", TWO_ARM, "--out", tmp_path / "e")
-    assert f"{sentence}{found['coordinates']} coordinates an arm" in said
-    assert sentence in run("gradient", TWO_ARM, "--out", tmp_path / "g.npz")
-    from dolfinopt.cli.shared import scene_of
-
+    chosen = f"{sentence}{found['coordinates']} "
+    assert chosen in said("export", TWO_ARM, "--out", tmp_path / "e")
+    assert sentence in said("gradient", TWO_ARM, "--out", tmp_path / "g.npz")
     assert scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
 
 
 @pytest.mark.serial
 def test_arm_from_a_file(tmp_path):
     """It keeps the coordinates that the file has; the other's are chosen."""
-    from click.testing import CliRunner
-
-    from dolfinopt.cli import commands
-
-    line = ["export", str(TWO_ARM), "--out", str(tmp_path), "--set", "arms.cells=[24,3]"]
-    CliRunner().invoke(commands, line, obj=WORLD, catch_exceptions=False)
+    run("export", TWO_ARM, "--out", tmp_path, "--set", "arms.cells=[24,3]")
     built = auto(f"arms.arm1.sid={tmp_path / 'arm1.sid'}", tolerance=1e-3)
     choice = choose(built, built.fields(wave))
     _, trajectory = built.evaluate(built.fields(wave))

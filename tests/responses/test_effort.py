@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, scene
+from runs import demo, refused, scene
 
 import dolfinopt as do
 from dolfinopt import Model
-from dolfinopt.errors import InputError
 from dolfinopt.responses.constraints import constraint_label, limits_by_column, limits_of
 
 WORLD = MPI.COMM_WORLD
@@ -73,27 +71,6 @@ def test_rigid_limit_is_newtons_law(
     assert result.objective == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_work_of_the_drives_is_what_damping_takes() -> None:
-    """From rest to rest the forces that the effort is made of do no other work."""
-    changes = ["motion.horizon=4.0", "damping.stiffness_proportional=2e-2"]
-    result = Model(scene(*SMALL, *changes)).simulate()
-    if WORLD.rank == 0:
-        trajectory = result.trajectory
-        assert trajectory is not None
-        power = trajectory.joint_forces * trajectory.motion.qd
-        rates = trajectory.unknowns[1]
-        lost = np.zeros(len(rates))
-        for part, body in zip(
-            trajectory.mechanism.slices, trajectory.mechanism.bodies, strict=True
-        ):
-            lost += np.einsum("ni,ij,nj->n", rates[:, part], body.D, rates[:, part])
-        step = trajectory.t[1]
-        work, heat = (float(x.sum()) * step for x in (power, lost))  # zero at both ends
-        assert work == pytest.approx(heat, rel=1e-2)
-        assert heat > 1e-3 * float(np.abs(power).sum()) * step
-
-
 def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
     """Weighted; of a fixed base the joints' alone."""
     for changes in ((), ("motion.base=fixed", "motion.radius=0.6")):
@@ -107,34 +84,30 @@ def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
         assert result.unit == "-"
 
 
+BALANCED, ALPHA = "reduction.method=balanced", "simulation.integrator=generalized-alpha"
+
+
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("changes", "words"),
     [
-        (["constraints.peak_force=[9.0]"], "expected 3 numbers, for cart, arm1, arm2"),
-        (
-            ["reduction.method=balanced", "objective.kind=esl", "constraints.effort=9"],
-            "with constraints.effort: .*no adjoint",
-        ),
-        (["objective.effort_weights=[1.0]"], "expected 3 numbers, for cart, arm1, arm2"),
-        (["objective.effort_weights=[0.0,0.0,0.0]"], "not all of them 0"),
-        (["reduction.method=balanced"], 'with objective.kind = "effort".*no adjoint'),
-        (["simulation.integrator=generalized-alpha"], '"radau" with objective.kind = "effort"'),
+        (["constraints.peak_force=[9.0]"], ("constraints.peak_force", "3 numbers", "cart, arm1")),
+        ([BALANCED, "objective.kind=esl", "constraints.effort=9"], (BALANCED[:16], "effort")),
+        (["objective.effort_weights=[1.0]"], ("effort_weights", "3 numbers", "cart, arm1, arm2")),
+        (["objective.effort_weights=[0.0,0.0,0.0]"], ("effort_weights", "not all of them 0")),
+        ([BALANCED], ("reduction.method", 'objective.kind = "effort"', '"craig-bampton"')),
+        ([ALPHA], ("simulation.integrator", '"radau"', 'objective.kind = "effort"')),
+        # Without a limit of what arms do none of them would be left.
+        (["constraints={mass=3.0}"], ('kind = "effort"', "limit under [constraints]")),
+        (["objective.kind=peak_force", "constraints={mass=3.0}"], ("peak_force", "[constraints]")),
+        (["constraints.peak_force=[inf,inf,inf]"], ("peak_force", "one drive at least")),
+        (["constraints.peak_force=[inf,1.0]"], ("peak_force", "3 numbers")),
     ],
 )
-def test_refusals(changes: list[str], expected: str) -> None:
+def test_refusals(changes, words) -> None:
     """One line that names the key and what is allowed."""
-    with pytest.raises(InputError, match=expected) as caught:
-        do.load_scene(TWO_ARM, [*SMALL, *changes])
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize("kind", ["effort", "peak_force"])
-def test_without_a_limit_no_arm_would_be_left(kind: str) -> None:
-    """What the drives carry least is nothing."""
-    with pytest.raises(InputError, match=r"expected a limit under \[constraints\]"):
-        do.load_scene(TWO_ARM, [f"objective.kind={kind}", "constraints.mass=3.0"])
+    with refused(*words):
+        scene(*SMALL, *changes)
 
 
 def test_peak_forces_are_limited_drive_by_drive() -> None:
@@ -170,10 +143,6 @@ def test_a_drive_may_have_no_limit(shared_tmp_path: Path) -> None:
     assert limits_by_column(made, ["peak_force_arm1"]) == {"peak_force_arm1": 30.0}
     text = json.dumps(made.to_dict(), allow_nan=False)
     assert do.scene_from_dict(json.loads(text)) == made
-    with pytest.raises(InputError, match="expected a limit for one drive at least"):
-        scene("constraints.peak_force=[inf,inf,inf]")
-    with pytest.raises(InputError, match="expected 3 numbers"):
-        scene("constraints.peak_force=[inf,1.0]")
 
 
 def test_weighted_sum_of_peak_forces_as_objective() -> None:
@@ -220,12 +189,7 @@ def test_least_effort_at_the_accuracy_of_least_compliance() -> None:
 @pytest.mark.serial  # ranks have no part in it
 def test_effort_demo(shared_tmp_path: Path) -> None:
     """Runs, tables and draws on few cells."""
-    path = ROOT / "demos" / "demo_effort.py"
-    spec = importlib.util.spec_from_file_location("demo_effort", path)
-    assert spec is not None and spec.loader is not None
-    demo = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(demo)
-    rows = demo.main(shared_tmp_path, (20, 2), 3)
+    rows = demo("demo_effort").main(shared_tmp_path, (20, 2), 3)
     if WORLD.rank == 0:
         assert [row["design"] for row in rows] == ["least compliance", "least effort"]
         lines = (shared_tmp_path / "effort.csv").read_text(encoding="utf-8").splitlines()

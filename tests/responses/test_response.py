@@ -159,7 +159,7 @@ def test_a_new_response_of_the_motion_has_an_exact_gradient() -> None:
 def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     """The same class on the other side: value over limit less 1, with the gradient of that."""
     built = build(*QUICK, "objective.kind=static", "objective.gradient=exact",
-                  "simulation.tolerance=1e-7")  # fmt: skip
+                  "motion.horizon=1.9", "simulation.tolerance=1e-7")  # fmt: skip
     built = rebuilt(built, limited(built.scene, **{name: 0.01}))
     assert needs(built.scene, "motion")
     x, d = built.fields(wave), built.fields(uneven)

@@ -12,9 +12,8 @@ from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.multibody.shape_integrals import TABLE, of_material
-from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import on_root
-from dolfinopt.responses.response import bodies_in, combined, worst_of
+from dolfinopt.responses.response import bodies_in, combined
 from dolfinopt.scene.load import pose_scenarios, scene_from_dict
 
 WORLD = MPI.COMM_WORLD
@@ -117,36 +116,6 @@ def test_one_reduction_for_all_scenarios():
     assert counts[0] == counts[1] == counts[2]
 
 
-@pytest.mark.slow
-@pytest.mark.serial  # ranks: scenarios of test_every_option_gives_the_same_bits_...
-@pytest.mark.parametrize("combination", ["sum", "worst"])
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["objective.kind=esl"],
-        ["objective.kind=deviation", "reduction.coordinates=3"],
-        ["arms.arm2.design=arm1", "reduction.method=modal"],
-        ["arms.arm1.rigid=true"],
-    ],
-    ids=" ".join,
-)
-@pytest.mark.usefixtures("three_steps")
-def test_gradient_of_all_scenarios(combination, options):
-    built = build(
-        *options,
-        "motion.horizon=2.2",
-        f"objective.scenarios={combination}",
-        "objective.load_cases=6",
-        "simulation.tolerance=1e-3",
-        "simulation.sample=0.01",
-        scenarios((*MATERIAL, DAMPING), PATH, weights=[1.0, 0.3]),
-        cells=(16, 3),
-    )
-    x = built.fields(wave)
-    test = taylor_test(built.scene, built.partition, built.arms, x, built.profile)
-    assert test.passed, [row.rate for row in test.rows]
-
-
 @pytest.mark.serial  # ranks have no part in it
 def test_frozen_gradient_adds_up():
     changes, weights = [PATH, MATERIAL], [1.0, 0.25]
@@ -161,20 +130,6 @@ def test_frozen_gradient_adds_up():
         np.testing.assert_allclose(value, total[k], atol=SIMULATED * np.abs(value).max())
     for direction in (uneven, tip):  # of both arms, also where this rank has none of them
         assert np.isfinite(several.dot(slopes, several.fields(direction)))
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_worst_case_bounds_and_slopes():
-    values = [3.0, 2.9, 0.1]
-    worst, slopes = worst_of(values, 20.0)
-    assert 3.0 < worst < 3.0 * 3 ** (1 / 20)
-    step = 1e-6
-    for k in range(3):
-        moved = [v + step * (i == k) for i, v in enumerate(values)]
-        back = [v - step * (i == k) for i, v in enumerate(values)]
-        difference = (worst_of(moved, 20.0)[0] - worst_of(back, 20.0)[0]) / (2.0 * step)
-        assert slopes[k] == pytest.approx(difference, abs=1e-8)
-    assert worst_of([5.0], 20.0) == (5.0, [1.0])
 
 
 @pytest.mark.serial  # ranks have no part in it

@@ -11,7 +11,6 @@ from runs import ROOT, overrides, run
 
 import dolfinopt as do
 from dolfinopt.arms.arm import uniform_design
-from dolfinopt.optimization.gradient_check import taylor_test
 
 pytestmark = pytest.mark.serial
 DEMO = ROOT / "demos" / "spatial_arm.toml"
@@ -90,85 +89,3 @@ def test_no_geometric_stiffness_is_built_where_none_is_asked_for(monkeypatch, st
     do.gradient(scene, partition, arms, trajectory, profile)
     assert bool(built) == (stiffening == "auto")
     assert (stiffening_of(arms).estimate is None) == (stiffening == "false")
-
-
-SCENARIOS = (
-    "scenarios=[{changes=['payload.mass=2']}, {changes=['material.young_modulus=60e9', "
-    "'material.density=2500.0'], weight=2.0}]",
-)
-CONTROL = ("control.stiffness=[2e4,2e4,2e4]", "control.damping=[600.0,600.0,600.0]")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "control"),
-    [
-        ("deviation", SCENARIOS),
-        ("effort", CONTROL),
-        ("stress", ("simulation.stiffening=true",)),
-        ("tip_deflection", ()),
-        ("eigenfrequency", ()),
-    ],
-)
-def test_exact_gradient_in_space(kind, control, monkeypatch):
-    """Taylor's remainders fall by the order 2.00 along directions without any symmetry."""
-    monkeypatch.setattr("dolfinopt.optimization.gradient_check.STEPS", (2.5e-3, 6.25e-4))
-    # Instants that come and go beneath the cut would make small steps of the p-mean.
-    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE", 0.0)
-    limited = ("constraints.deviation=0.1",) if kind == "effort" else ()
-    scene = do.load_scene(DEMO, (*COARSE, *control, f"objective.kind={kind}", *limited))
-    profile = do.Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, profile)
-    x = uniform_design(scene, partition, arms, 0.5)
-    found = taylor_test(scene, partition, arms, x, profile)
-    rates = {row.direction: row.rate for row in found.rows}
-    assert rates["random"] == pytest.approx(2.0, abs=0.02), rates
-    assert rates["smooth"] == pytest.approx(2.0, abs=0.02), rates
-
-
-def forked(folder):
-    """Return a link that carries a rigid hand on its end, a slide and the payload on its side."""
-    (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
-    turned = [0.0, 0.0, 0.5 * np.pi]
-    data = {
-        "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
-        "arms": [
-            {"name": "link", "length": 0.5, "height": 0.04, "thickness": 0.02, "cells": [6, 2, 2],
-             "passive": 0.05,
-             "interfaces": [{"name": "side", "point": [0.29, 0.02, 0.0], "radius": 0.01}]},
-            {"name": "hand", "rigid": True, "length": 0.2, "mass": 1.0,
-             "inertia": [0.01, 0.02, 0.02, 0, 0, 0]},
-            {"name": "slider", "rigid": True, "length": 0.2, "mass": 0.5,
-             "inertia": [0.01, 0.02, 0.02, 0, 0, 0]},
-        ],
-        "joints": [
-            {"name": "swing", "type": "revolute", "parent": "ground", "child": "link",
-             "axis": [0.2, 0.1, 1]},
-            {"name": "wrist", "type": "fixed", "parent": "link", "child": "hand", "rpy": turned},
-            {"name": "slide", "type": "prismatic", "parent": "link", "child": "slider",
-             "parent_interface": "side", "axis": [1, 0, 0], "rpy": turned},
-        ],
-        "motion": {"path": "joints", "file": "table.csv", "horizon": 0.2, "gravity": [0, 0, -9.81]},
-        "payload": {"mass": 1.0, "offset": [0, 0.05, 0], "arm": "link", "interface": "side"},
-        "damping": {"stiffness_proportional": 1e-4},
-        "reduction": {"coordinates": 12},
-        "simulation": {"sample": 0.005, "tolerance": 1e-3, "stiffening": True},
-        "objective": {"load_cases": 6},
-    }  # fmt: skip
-    return do.scene_from_dict(data, str(folder / "fork.toml"))
-
-
-def test_exact_gradient_of_a_fork(tmp_path, monkeypatch):
-    """Of where the payload on the second interface is, and of the frequency with all it carries."""
-    monkeypatch.setattr("dolfinopt.optimization.gradient_check.STEPS", (2.5e-3, 6.25e-4))
-    scene = forked(tmp_path)
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    for kind in ("deviation", "eigenfrequency"):
-        objective = scene.objective.model_copy(update={"kind": kind})
-        other = scene.model_copy(update={"objective": objective})
-        arms = do.build_arms(other, partition, do.Profile())
-        x = uniform_design(other, partition, arms, 0.5)
-        found = taylor_test(other, partition, arms, x, do.Profile())
-        rates = [row.rate for row in found.rows if row.direction in ("random", "smooth")]
-        assert rates == pytest.approx([2.0, 2.0], abs=0.02), kind

@@ -5,14 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from reference_machines import GAINS, slider_crank, two_arm, with_keys
 from remainders import (
     Built,
     build,
-    by_number,
-    objective_along,
-    product,
-    rates,
     uneven,
     wave,
 )
@@ -24,11 +19,9 @@ from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import rotated
 from dolfinopt.multibody.equations import PLANE
 from dolfinopt.multibody.inverse_dynamics import outward_pass
-from dolfinopt.responses import stress as module
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
 from dolfinopt.responses.stress import CellStress, arm_loads, cell_stress, motions_of
 from dolfinopt.responses.stress_report import stress_report
-from dolfinopt.scene.load import scene_from_dict
 
 # Ranks: limits of the stress in test_every_option_gives_the_same_bits_on_any_number_of_ranks.
 pytestmark = pytest.mark.serial
@@ -241,35 +234,6 @@ def test_void_has_no_stress() -> None:
 
 # -- gradients ---------------------------------------------------------------------------------
 
-KINDS = {
-    "linear": ("simulation.stiffening=false",),
-    "stiffened": ("simulation.stiffening=true", "damping.stiffness_proportional=1e-3"),
-    "modal": ("simulation.stiffening=true", "reduction.method=modal"),
-    "krylov": ("reduction.method=krylov",),
-    "linear cells": ("arms.element=linear", "objective.stress_margin=0.1"),
-    "scenarios": ('scenarios=[{changes=["payload.mass=2"]},{changes=["motion.gravity=[0,-9.81]", '
-                   '"material.density=3000", "material.young_modulus=60e9"]}]',),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_exact_gradient(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The remainder of Taylor's formula has order 2.
-
-    All instants count, so that none comes or goes on the way.
-    """
-    monkeypatch.setattr(module, "NEGLIGIBLE", 0.0)
-    built = build(*QUICK, *KINDS[kind])
-    x, d = built.fields(wave), built.fields(uneven)
-    slope = built.dot(Analysed(built, x).gradient(), d)
-
-    def value(h: float) -> float:
-        moved = {k: x[k] + h * d[k] for k in x}
-        return Analysed(built, moved).measure().smooth[0]
-
-    assert rates(value, slope, (4e-3, 1e-3)) == pytest.approx(2.0, abs=0.04)
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -302,31 +266,6 @@ def test_exact_gradient_of_few_instants(keys: tuple[str, ...]) -> None:
     # Instants near the limit of those that count come and go.
     assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
     assert value(0.0) > 0.0
-
-
-@pytest.mark.parametrize("kind", ["control", "slider"])
-def test_exact_gradient_of_machines(kind: str) -> None:
-    """Loads through free rigid coordinates and the closure's force are differentiated, too."""
-    stress = {"kind": "stress", "gradient": "exact"}
-    if kind == "control":
-        tree = two_arm("arms.cells=[20,3]", "motion.horizon=2.2", objective=stress, control=GAINS)
-        tree = with_keys(tree, {"simulation": {"tolerance": 1e-6, "sample": 0.01}})
-    else:
-        keys = {
-            "objective": stress,
-            "design": {"initial": 0.5},
-            "motion": {"speed": 60.0, "duration": 0.05, "horizon": 0.1},
-            "reduction": {"coordinates": 4},
-            "simulation": {"tolerance": 1e-7, "sample": 1e-3},
-        }
-        tree = with_keys(slider_crank(0.008, (24, 3)), keys)
-    model = do.Model(scene_from_dict(tree))
-    x, direction = by_number(model)
-    slope = product(model.gradient(x, "exact"), direction)
-    value = objective_along(model, x, direction)
-    h = 1e-4
-    # Instants near the limit of those that count come and go.
-    assert slope == pytest.approx((value(h) - value(-h)) / (2.0 * h), rel=2e-3)
 
 
 def test_gradient_with_frozen_loads() -> None:

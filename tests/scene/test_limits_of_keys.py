@@ -9,8 +9,8 @@ from mpi4py import MPI
 from runs import TWO_ARM
 
 import dolfinopt as do
+from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.multibody.motion import check_motion
 from dolfinopt.scene.load import describe_keys, load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # a hundred small runs

@@ -1,0 +1,251 @@
+"""The gradient contract: of every response, in every setting, remainders are of second order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from remainders import taylor, wave
+from runs import ROOT
+
+import dolfinopt as do
+from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.scene.tables.objective import EXACT_ONLY, NEEDS
+
+WORLD = MPI.COMM_WORLD
+ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
+SHORT = ("arms.passive=0", "design.filter_radius=0", "motion.horizon=2.2", *ROUGHLY)
+LOOP = ("motion.speed=60", "motion.duration=0.05", "motion.horizon=0.1", "design.initial=0.5")
+# Scene, what makes it small, and its kinds of machine.
+BASES = {
+    "two_arm": ("two_arm", ("arms.cells=[20,3]", *SHORT)),
+    "one_arm": ("two_arm", ("arms.cells=[20,3]", "motion.radius=0.4", *SHORT)),
+    "three_arm": ("three_arm", ("arms.cells=[20,3]", *SHORT)),
+    "controlled": ("controlled_two_arm", ("arms.cells=[20,3]", *SHORT)),
+    "slider": (
+        "slider_crank",
+        ("arms.rod.cells=[24,3]", "arms.rod.height=0.008", "arms.rod.passive=0", *LOOP, *ROUGHLY),
+    ),
+    "pin": (
+        "four_bar",
+        ("arms.coupler.cells=[24,3]", "arms.rocker.cells=[24,3]", "arms.coupler.passive=0",
+         "arms.rocker.passive=0", *LOOP, *ROUGHLY),
+    ),
+    "space": (
+        "spatial_arm",
+        ("arms.link1.cells=[8,2,2]", "arms.link2.cells=[8,2,2]", "arms.passive=0.06",
+         "simulation.stiffening=false", "objective.load_cases=6", *ROUGHLY),
+    ),
+    "fork": ("", ROUGHLY[2:]),
+}  # fmt: skip
+DRIVES = "t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n"
+SKEW = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
+Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+Transfinite Curve {1, 3} = 25; Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
+Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
+"""
+
+
+def fork() -> dict:
+    """Return a link that carries a rigid hand on its end, a slide and the payload on its side."""
+    turned = [0.0, 0.0, 0.5 * np.pi]
+    rigid = {"rigid": True, "length": 0.2, "inertia": [0.01, 0.02, 0.02, 0, 0, 0]}
+    side = {"name": "side", "point": [0.29, 0.02, 0.0], "radius": 0.01}
+    return {
+        "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
+        "arms": [
+            {"name": "link", "length": 0.5, "height": 0.04, "thickness": 0.02, "cells": [6, 2, 2],
+             "passive": 0.05, "interfaces": [side]},
+            {"name": "hand", "mass": 1.0, **rigid},
+            {"name": "slider", "mass": 0.5, **rigid},
+        ],
+        "joints": [
+            {"name": "swing", "type": "revolute", "parent": "ground", "child": "link",
+             "axis": [0.2, 0.1, 1]},
+            {"name": "wrist", "type": "fixed", "parent": "link", "child": "hand", "rpy": turned},
+            {"name": "slide", "type": "prismatic", "parent": "link", "child": "slider",
+             "parent_interface": "side", "axis": [1, 0, 0], "rpy": turned},
+        ],
+        "motion": {"path": "joints", "file": "table.csv", "horizon": 0.2, "gravity": [0, 0, -9.81]},
+        "payload": {"mass": 1.0, "offset": [0, 0.05, 0], "arm": "link", "interface": "side"},
+        "damping": {"stiffness_proportional": 1e-4},
+        "reduction": {"coordinates": 12},
+        "simulation": {"sample": 0.005, "tolerance": 1e-3, "stiffening": True},
+        "objective": {"load_cases": 6},
+    }  # fmt: skip
+
+
+def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
+    """Return a scene of `BASES` with keys changed, FOLDER standing for the files' one."""
+    if WORLD.rank == 0:
+        for name, text in (("drives.csv", DRIVES), ("skew.geo", SKEW)):
+            (folder / name).write_text(text)
+        (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
+    WORLD.barrier()
+    name, quick = BASES[base]
+    told = [*quick, *(one.replace("FOLDER", str(folder)) for one in changes)]
+    if base == "fork":
+        return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
+    path = ROOT / "demos" / f"{name}.toml"
+    if base != "one_arm":
+        return do.load_scene(path, told)
+    tree = do.load_scene(path).to_tree()
+    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
+
+
+def case(base: str, *changes: str, slow: bool = False, ranks: bool = False):
+    marks = [*[pytest.mark.slow] * slow, *[pytest.mark.serial] * (not ranks)]
+    told = [one.removeprefix("objective.") for one in changes]
+    return pytest.param(base, changes, marks=marks, id=" ".join((base, *told)))
+
+
+BENT = "simulation.stiffening=true"
+LINEAR = "simulation.stiffening=false"
+GRAVITY, SKEWED = "motion.gravity=[0.0,-9.81]", "motion.gravity=[0.5,-9.81]"
+LOADED = (SKEWED, "payload.inertia=0.05")
+KEPT = "constraints.compliance=1e6"  # N m; far away
+COMPLIANCE, DEVIATION, STRESS = (
+    f"objective.kind={kind}" for kind in ("compliance", "deviation", "stress")
+)
+EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
+STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
+MODAL = "reduction.method=modal"
+JOINT = ("arms.arm2.joint_mass=0.5", "arms.arm2.joint_inertia=0.01")
+SOFT = ("arms.arm2.joint_stiffness=2e4", "arms.arm2.joint_damping=50.0")
+CRANK = "control={stiffness=[2e3], damping=[20.0]}"
+MATERIAL = '"material.density=3100.0", "material.young_modulus=50e9"'
+TWO = (
+    f'scenarios=[{{changes=[{MATERIAL}, "damping.stiffness_proportional=1e-3"]}}, '
+    '{changes=["motion.flattening=0.5", "motion.horizon=2.5", "payload.mass=8"], weight=0.3}]'
+)
+REPEATED = (
+    "arms.cells=[40,4]", "arms.passive=0.05", "arms.arm2.pattern=arm1", "arms.arm2.length=0.8",
+    "arms.arm2.height=0.045", "arms.arm2.thickness=0.012", "arms.symmetric=true",
+    'arms.arm1.regions=[{kind="void", circle=[0.5, 0.0, 0.016]}, '
+    '{kind="solid", box=[0.2, -0.03, 0.3, -0.01]}]',
+)  # fmt: skip
+CASES = [
+    # Prescribed motions in the plane.
+    case("two_arm", "reduction.coordinates=3"),
+    case("two_arm", COMPLIANCE, "reduction.coordinates=4", ranks=True),
+    case("two_arm", "reduction.coordinates=6", *LOADED),
+    case("two_arm", MODAL, "reduction.coordinates=1"),
+    case("two_arm", MODAL, "reduction.coordinates=4", *LOADED),
+    case("two_arm", "damping.stiffness_proportional=0.0"),
+    case("two_arm", DEVIATION, *LOADED),
+    case("two_arm", COMPLIANCE, "payload.mass=0.2", "arms.passive=0.05", *LOADED),
+    case("two_arm", *EFFORT, "payload.mass=0.5"),
+    case("two_arm", *EFFORT, MODAL, BENT, *LOADED),
+    case("two_arm", *EFFORT, BENT, GRAVITY),
+    case("two_arm", DEVIATION, BENT),
+    case("two_arm", "arms.mesh='FOLDER/skew.geo'", "design.filter_radius=0.02", COMPLIANCE),
+    *(case("two_arm", COMPLIANCE, f"arms.element={name}", bent, "arms.cells=[12,2]")
+      for name in ELEMENTS for bent in (LINEAR, BENT)),
+    *(case("two_arm", COMPLIANCE, "reduction.method=krylov", f"reduction.coordinates={q}",
+           f"reduction.shifts={shifts}", "payload.mass=1", slow=q > 4)
+      for q, shifts in ((3, [0.0]), (4, [0.0]), (8, [0.0]), (13, [0.0]), (8, [0.0, 30.0]))),
+    # Nothing moves: neither basis nor integrator matters.
+    case("two_arm", STATIC, ranks=True),
+    case("two_arm", STATIC, "reduction.method=balanced", "objective.gradient=esl", ranks=True),
+    case("two_arm", STATIC, "arms.arm2.length=0.7", "arms.height=0.1",
+         "objective.loads=[[0.0,1.0,0.0],[30.0,1.0,-2.0],[0.0,0.0,1.0]]", ranks=True),
+    case("two_arm", STATIC, "arms.passive=0.1", "interpolation.law=simp", ranks=True),
+    case("two_arm", STATIC, "arms.arm2.design=arm1", ranks=True),
+    case("two_arm", STATIC, "arms.mesh='FOLDER/skew.geo'", "design.filter_radius=0.02", ranks=True),
+    case("two_arm", FREQUENCY, ranks=True),
+    case("two_arm", FREQUENCY, "simulation.integrator=generalized-alpha",
+         "objective.gradient=esl", ranks=True),
+    case("two_arm", FREQUENCY, "objective.elbow_angle=2.1", "payload.inertia=0.4"),
+    case("two_arm", FREQUENCY, "objective.follow=true"),
+    case("two_arm", FREQUENCY, "objective.attached=point-mass"),
+    case("two_arm", FREQUENCY, "objective.attached=none", "arms.passive=0.1"),
+    case("two_arm", FREQUENCY, "arms.arm2.design=arm1", "objective.exponent=3.0"),
+    case("two_arm", FREQUENCY, "arms.arm2.design=arm1", "objective.attached=point-mass"),
+    case("two_arm", FREQUENCY, "arms.joint_mass=2.0", "arms.joint_inertia=0.1"),
+    case("two_arm", FREQUENCY, "arms.arm1.rigid=true", ranks=True),
+    case("two_arm", FREQUENCY, "arms.arm2.rigid=true"),
+    case("two_arm", FREQUENCY, "arms.arm2.density=8000.0", "arms.arm2.young_modulus=2e11",
+         "interpolation.law=simp"),
+    # Stress.
+    case("two_arm", STRESS, LINEAR, slow=True),
+    case("two_arm", STRESS, BENT, "damping.stiffness_proportional=1e-3", slow=True),
+    case("two_arm", STRESS, BENT, MODAL, slow=True),
+    case("two_arm", STRESS, "reduction.method=krylov", slow=True),
+    case("two_arm", STRESS, "arms.element=linear", "objective.stress_margin=0.1", slow=True),
+    case("two_arm", STRESS, TWO, slow=True),
+    case("controlled", STRESS),
+    case("slider", STRESS),
+    # Scenarios.
+    *(case("two_arm", f"objective.scenarios={combined}", "objective.load_cases=6", TWO, *more,
+           slow=True)
+      for combined in ("sum", "worst")
+      for more in ((), (DEVIATION, "reduction.coordinates=3"),
+                   ("arms.arm2.design=arm1", MODAL), ("arms.arm1.rigid=true",))),
+    # Two arms of one design, by the densities of one; of the same size, or scaled.
+    *(case("two_arm", *REPEATED, kind, ranks=kind == STATIC)
+      for kind in ("objective.kind=esl", STATIC, FREQUENCY, DEVIATION)),
+    # Other numbers of arms.
+    case("one_arm", COMPLIANCE, "motion.law=trapezoidal"),
+    case("three_arm", "motion.law=s-curve", "objective.load_cases=5", slow=True),
+    # Machines: control, hardware at the joints, closed loops.
+    case("controlled"),
+    case("controlled", BENT, GRAVITY, slow=True),
+    case("controlled", COMPLIANCE, GRAVITY, "control.feed_forward=none"),
+    case("controlled", COMPLIANCE, "control.feed_forward=none",
+         "control.forces='FOLDER/drives.csv'"),
+    case("controlled", COMPLIANCE, *JOINT, "motion.cart_mass=2.0", "arms.arm2.rotor_inertia=1e-4",
+         "arms.arm2.gear_ratio=30.0", slow=True),
+    case("controlled", GRAVITY, "arms.joint_stiffness=3e4", "arms.joint_damping=30.0",
+         "arms.rotor_inertia=2e-5", "arms.gear_ratio=100.0"),
+    case("two_arm", DEVIATION, *JOINT, *SOFT),
+    case("controlled", *EFFORT, GRAVITY),
+    case("two_arm", *EFFORT, *JOINT, *SOFT, slow=True),
+    case("controlled", *PEAK, BENT),
+    case("slider"),
+    case("slider", DEVIATION, GRAVITY),
+    case("slider", CRANK, GRAVITY),
+    case("slider", CRANK, "control.limits=[36.0]", GRAVITY, slow=True),  # of 43 N m asked for
+    case("slider", CRANK, "control.stiffness=[0.0]", GRAVITY),
+    case("slider", *EFFORT, GRAVITY),
+    case("slider", *EFFORT, CRANK),
+    case("slider", *PEAK, GRAVITY),
+    case("pin", slow=True),
+    case("pin", *EFFORT, slow=True),
+    # Space.
+    case("space", DEVIATION, 'scenarios=[{changes=["payload.mass=2"]}, {changes=['
+         '"material.young_modulus=60e9", "material.density=2500.0"], weight=2.0}]', slow=True),
+    case("space", "objective.kind=effort", "constraints.deviation=0.1",
+         "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}", slow=True),
+    case("space", STRESS, BENT, slow=True),
+    case("space", "objective.kind=tip_deflection", slow=True),
+    case("space", FREQUENCY, slow=True),
+    case("fork", DEVIATION),
+    case("fork", FREQUENCY),
+    # Every word that a scene knows, through a filter: new ones are tested by their word alone.
+    *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
+      for kind in NEEDS for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("base", "changes"), CASES)
+def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypatch) -> None:
+    """Along a random and a smooth direction; the gradient by ESL points the same way."""
+    # Instants that come and go beneath the cut would make small steps of the p-mean.
+    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE", 0.0)
+    scene = scene_of(base, changes, shared_tmp_path)
+    # Forces are made of accelerations, which leave more rounding.
+    steps = (1e-3, 2.5e-4) if scene.objective.kind in EXACT_ONLY else (4e-4, 1e-4)
+    test = taylor(scene, wave, steps, ("random", "smooth"))
+    rates = [row.rate for row in test.rows]
+    kind = scene.objective.kind
+    if kind == "mass":  # linear in the densities of this law
+        assert rates == [np.inf, np.inf]
+    else:
+        assert rates == pytest.approx([2.0, 2.0], abs=0.1)
+        assert all(row.slope != 0.0 for row in test.rows)
+    assert np.isfinite(test.angle) == ("motion" in NEEDS[kind] and kind not in EXACT_ONLY)
+    # Frozen loads tell the sign, no more; of three fast arms not even that.
+    assert base == "three_arm" or not test.angle > 45.0  # deg
