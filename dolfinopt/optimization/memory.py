@@ -12,7 +12,41 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.problem import Stage
 from dolfinopt.responses.order_selection import OrderSelection
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """The best design so far: of the sharpest projection among those that keep all limits.
+
+    Attributes:
+        x: (n,) this rank's variables.
+        iteration: updates made; -1 of none.
+        beta: steepness of the projection.
+        thresholds: per arm its eta.
+        objective: what is minimised.
+        excess: largest relative violation of a limit.
+    """
+
+    x: np.ndarray
+    iteration: int
+    beta: float
+    thresholds: Mapping[int, float]
+    objective: float
+    excess: float
+
+    @classmethod
+    def none(cls, x: np.ndarray) -> Best:
+        """Return what every design betters."""
+        return cls(x, -1, 0.0, {}, np.inf, np.inf)
+
+    @property
+    def rank(self) -> tuple[bool, float, float]:
+        """What is smaller for a better design; of infeasible ones the least violation counts."""
+        if self.excess > 0.0:
+            return True, self.excess, self.objective
+        return False, -self.beta, self.objective
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,7 +59,10 @@ class IterateMemory:
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
-        multipliers, convexity: MMA's, on all ranks.
+        multipliers, scales, convexity, prices, radius, reach: of the step, on all ranks.
+        stage: that the design belongs to.
+        age: updates since beta rose.
+        best: the best design so far; its variables are the last column of `cells`.
         guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
@@ -39,7 +76,14 @@ class IterateMemory:
     modes: Mapping[int, Sequence[np.ndarray]]
     guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
+    scales: np.ndarray
     convexity: np.ndarray
+    prices: np.ndarray
+    stage: Stage
+    radius: float
+    reach: float
+    age: int
+    best: Best
     solutions: tuple[Solution, ...]
     beta: float
     thresholds: Mapping[int, float]
