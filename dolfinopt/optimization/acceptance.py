@@ -1,12 +1,17 @@
-"""Which steps are taken: those that lower the merit as far as the approximation promised.
+"""Which steps are taken: free ones that lead to something better soon, else strict ones.
 
-The merit is the exact penalty function phi = f0 + sum_i w_i max(0, f_i), see `Stage`. MMA minimises
-its convex approximation of the same function, so that every step promises less. What comes out is
-compared with the promise: Fletcher's trust region by the move limit, and Svanberg's remedy for what
-the approximation does not know, the curvature of the functions: what came out worse is approximated
-more convexly, see GCMMA.
-Sources: Nocedal & Wright, Numerical Optimization (2006), doi:10.1007/978-0-387-40065-5, 18.5;
-Svanberg, SIAM J. Optim. 12 (2002) 555-573, doi:10.1137/S1052623499362822.
+What is better is told by an exact penalty function, the merit phi = f0 + c sum_i max(0, f_i), see
+`Stage`. Vibrations that are left, and limits that are just met, make its valleys narrow and
+curved: a rule that only goes down follows the first of them, in many short steps. So MMA's steps
+are free at first, and it is a watchdog that asks for a lower merit within some steps. Where none
+comes, the search goes back to the best design and takes strict steps: MMA minimises its
+approximation of the merit itself, and what comes out is compared with what it promised. That rules
+the move limit, a trust region, and how convex functions are approximated whose curvature it does
+not know, as in GCMMA. Each time the freedom is halved; so strict steps are the last ones.
+Sources: Chamberlain, Powell, Lemarechal & Pedersen, Math. Program. Study 16 (1982) 1-17,
+doi:10.1007/BFb0120945, for the watchdog; Nocedal & Wright, Numerical Optimization (2006),
+doi:10.1007/978-0-387-40065-5, 18.5, for merit and trust region; Svanberg, SIAM J. Optim. 12 (2002)
+555-573, doi:10.1137/S1052623499362822, for the convexity.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ import numpy as np
 from dolfinopt.optimization.mma import CURVATURE, MMAState
 from dolfinopt.optimization.optimality import Sum
 from dolfinopt.optimization.problem import Problem, Stage
+from dolfinopt.responses.constraints import EXCESS
 
 # Share of the promised fall of the merit that a step must bring, and from which on it may be
 # longer the next time; with frozen loads, whose gradient is no derivative, any fall is enough.
@@ -26,6 +32,14 @@ ENOUGH, GOOD, POOR = 0.05, 0.6, 0.25
 SHORTER, SHORTER_YET, LONGER = 0.5, 0.25, 2.0
 ATTEMPTS = 8  # of a step: the last ones are 1 % as long as the first
 ROUNDING = 1e-10  # of the merit
+# Free steps without a lower merit until the search goes back, at first; strict ones after that. Of
+# thirteen problems the longest way over a hill that ended lower took ten.
+FREEDOM, STRICT = 8, 3
+# A free step is repeated, so many times at most, that takes a limit's value, or the objective of a
+# design that keeps all limits, to so many times what it was.
+FREE_ATTEMPTS, LEAP = 4, 2.0
+# Where strict steps end, free ones are tried again if the merit has fallen to this share since.
+WORTH = 0.98
 # Change of a held smooth limit, relative and for a change of x by 1, from which a new stage begins;
 # and of the objective.
 DRIFT, GREW = 0.05, 2.0
@@ -34,6 +48,31 @@ NEAR = -0.2  # relative value from which on a limit counts for that
 MARGIN, MOST = 1.1, 10.0
 KEPT = 0.5  # of the convexity after a step that did not need it
 SEEN = 1e-6  # relative difference from the promise below which nothing is learnt: noise
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the next step is sought.
+
+    Attributes:
+        radius: factor on the move limit of strict steps, at most 1.
+        reach: move limit of the last step.
+        freedom: free steps without a lower merit until the search goes back.
+        strict: strict steps before the next free one.
+        lag: steps since the merit was lowest.
+        merit: lowest one so far, of limits' true values over `size`, the objective's.
+        size: of the objective where the projection became as steep as it is.
+        released: merit when free steps were allowed again.
+    """
+
+    radius: float = 1.0
+    reach: float = 0.0
+    freedom: int = FREEDOM
+    strict: int = 0
+    lag: int = 0
+    merit: float = np.inf
+    size: float = 1.0
+    released: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +137,18 @@ class Verdict:
 
     accepted: bool
     factor: float
+
+
+def leaps(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether a free step makes things so much worse that it leads nowhere, see `LEAP`.
+
+    Args:
+        before, after: (1 + m,) values.
+    """
+    kept = bool((before[1:] <= EXCESS).all())
+    up = kept and after[0] > before[0] + (LEAP - 1.0) * abs(before[0])
+    far = 1.0 + after[1:] > LEAP * (1.0 + np.maximum(before[1:], 0.0))
+    return bool(up or far.any() or not np.isfinite(after).all())
 
 
 def judge_step(

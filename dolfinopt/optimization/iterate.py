@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -12,12 +13,17 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.acceptance import (
     ATTEMPTS,
     DRIFT,
+    FREE_ATTEMPTS,
+    FREEDOM,
     GREW,
     NEAR,
     SHORTER,
     SHORTER_YET,
-    Promise,
+    STRICT,
+    WORTH,
+    Search,
     judge_step,
+    leaps,
     learnt,
     promise,
 )
@@ -46,46 +52,23 @@ from dolfinopt.responses.constraints import tightest, violated
 from dolfinopt.responses.mass import cell_volumes
 
 
-FREEDOM, STRICT, FREE_ATTEMPTS = 8, 3, 4
-LEAP = 2.0
-WORTH = 0.98
-
-
-def leaps(before, after):
-    """Return whether a step makes things so much worse that its forecast was worth nothing."""
-    f0 = after[0] > before[0] + (LEAP - 1.0) * abs(before[0]) and (before[1:] <= 1e-3).all()
-    return bool(
-        f0
-        or not np.isfinite(after).all()
-        or (1.0 + after[1:] > LEAP * (1.0 + np.maximum(before[1:], 0.0))).any()
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Anchor:
-    """The best design since the stage began: x (n,) of this rank, and its merit."""
-
-    x: np.ndarray
-    merit: float
-
-
 class Iterate:
     """A design, evaluated, and what the method of moving asymptotes remembers.
 
     Attributes:
         x, state: this rank's design variables (n,), and what MMA remembers.
-        convexity: (1 + m,) of objective and constraints, see `acceptance`.
+        convexity: (1 + m,) of objective and constraints, see `acceptance`; empty at first.
         stage: what is held while steps are compared.
-        prices: (m,) of the constraints in the merit, in units of the objective.
-        radius: factor on the move limit, at most 1, by what the last steps have brought.
+        search: how the next step is sought.
+        anchor: (n,) the best design since the projection became steeper.
         problem: at x.
         designs: that x stands for, the nominal one last.
         best: the best design so far, see `Best`.
         iteration, change: updates made, and the largest change of a variable in the last one.
-        reach: what it could have been by the move limit.
         kkt, grayness: residual and grayness of x; the latter is known on the root.
         curved: whether constraints other than volume and mass are to be kept.
         stuck: why no step betters x, "" while one does.
+        failed: why a motion of the last step could not be simulated, "" where all could.
     """
 
     problem: Problem
@@ -99,13 +82,11 @@ class Iterate:
         self.world = evaluator.partition.world
         self.total = partial(sum_over_arms, evaluator.partition)
         self.x, self.state = x, initial_state(x)
-        self.convexity, self.prices = np.empty(0), np.empty(0)
-        self.radius, self.best = 1.0, Best.none(x)
-        self.freedom, self.strict, self.lag = FREEDOM, 0, 0
-        self.anchor, self.size, self.failed = Anchor(x, np.inf), 0.0, ""
-        self.released = np.inf
-        self.iteration, self.change, self.reach = 0, 0.0, 0.0
-        self.kkt, self.grayness, self.stuck = np.nan, 0.0, ""
+        self.convexity, self.search = np.empty(0), Search()
+        self.anchor, self.best = x, Best.none(x)
+        self.iteration, self.change = 0, 0.0
+        self.kkt, self.grayness = np.nan, 0.0
+        self.stuck = self.failed = ""
         self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
 
     @property
@@ -118,33 +99,30 @@ class Iterate:
         self.take(self.evaluator.evaluate(self.x))
 
     def take(self, designs: list[EvaluatedDesign]) -> None:
-        """Begin a stage with the designs that x stands for."""
+        """Begin a stage with the designs that x stands for, and compare steps with them."""
         self.designs = designs
         self.begin_stage()
-        self.size = abs(self.problem.f0) or 1.0
-        self.anchor, self.lag = Anchor(self.x.copy(), self.problem.merit(self.size)), 0
+        self.anchor = self.x.copy()
+        size = abs(self.problem.f0) or 1.0
+        self._seek(size=size, merit=self.problem.merit(size), lag=0)
         self.keep_best()
 
     def begin_stage(self) -> None:
-        """Hold the smooth limits of these designs, and weights by the objective's size."""
+        """Hold the smooth limits of these designs, and a price by the objective's size."""
         held = limits_at(self.scene, self.designs)
         self.problem = problem_of(self.scene, self.designs, held)
-        count = len(self.problem.f)
-        if len(self.prices) != count:
-            self.prices = np.full(count, PRICE)
-            self.convexity = np.zeros(1 + count)
-        size = abs(self.problem.f0)
-        self.stage = Stage(held, self.prices * (size if size > 0.0 else 1.0), size)
+        self.stage = Stage(held, PRICE * (abs(self.problem.f0) or 1.0))
+        if len(self.convexity) != len(self.problem.values):
+            self.convexity = np.zeros(len(self.problem.values))
 
     def keep_best(self) -> None:
         """Remember x where it is better than what was known: of sharper designs, feasible ones."""
-        values, beta = self.problem.values, self.continuation.beta
         new = Best(
             self.x.copy(),
             self.iteration,
-            beta,
+            self.continuation.beta,
             dict(self.continuation.thresholds),
-            float(values[0]),
+            float(self.problem.values[0]),
             self.problem.excess,
         )
         if new.rank < self.best.rank:
@@ -156,7 +134,7 @@ class Iterate:
             self.scene,
             self.iteration,
             self.change,
-            self.reach,
+            self.search.reach,
             self.kkt,
             violated(self.problem.limits),
             self.continuation.complete,
@@ -167,19 +145,19 @@ class Iterate:
         """Go on to another design; where none is found x stays and `stuck` says why (collective).
 
         Free steps first, as long as they lead to something better within `freedom` of them; else
-        back to the best one, and strict steps from there.
+        back to the best design, and strict steps from there.
         """
+        free = self.search.freedom > 0 and self.search.strict == 0
         self.failed = ""
-        free = self.freedom > 0 and self.strict == 0
-        if free and self._free_step():
-            return
         if free:
+            if self._free_step():
+                return
             self._return_to_anchor()
         if self._strict_step():
-            self.strict = max(0, self.strict - 1)
+            self._seek(strict=max(0, self.search.strict - 1))
             return
-        if not free and self.anchor.merit < WORTH * self.released:
-            self.released, self.freedom, self.strict = self.anchor.merit, FREEDOM // 2, 0
+        if not free and self.search.merit < WORTH * self.search.released:
+            self._seek(released=self.search.merit, freedom=FREEDOM // 2, strict=0)
             if self._free_step():
                 return
         self.evaluate_again()
@@ -194,38 +172,48 @@ class Iterate:
             if designs is None:
                 continue
             tried = problem_of(self.scene, designs, self.stage.limits)
-            if leaps(self.problem.values, tried.values):
-                self.evaluator.undo()
-                continue
-            self._take(new, after, designs)
-            return True
+            if not leaps(self.problem.values, tried.values):
+                self._go_on(new, after, designs)
+                return True
+            self.evaluator.undo()
         return False
 
     def _strict_step(self) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         exact = self.scene.objective.gradient == "exact"
-        x, problem = self.x, self.problem
+        before = self.problem.values
         for _ in range(ATTEMPTS):
-            move = self.radius * self.continuation.move
-            new, after = self._proposed(move, self.stage.weights)
+            move = self.search.radius * self.continuation.move
+            new, after = self._proposed(move, self.stage.price)
             designs = self._tried(new, move)
             if designs is None:
-                self.radius *= SHORTER_YET
+                self._seek(radius=SHORTER_YET * self.search.radius)
                 continue
-            tried = problem_of(self.scene, designs, self.stage.limits)
-            hoped = self._promise(x, new, after)
-            verdict = judge_step(self.stage, problem.values, tried.values, hoped, exact)
-            self.convexity = learnt(self.convexity, tried.values, hoped, verdict.accepted)
-            self.radius = min(1.0, verdict.factor * self.radius)
+            tried = problem_of(self.scene, designs, self.stage.limits).values
+            promised = promise(
+                self.x,
+                new,
+                self.variables.xmax - self.variables.xmin,
+                after,
+                self.problem,
+                self.convexity,
+                self.variables.slices,
+                self.total,
+            )
+            verdict = judge_step(self.stage, before, tried, promised, exact)
+            self.convexity = learnt(self.convexity, tried, promised, verdict.accepted)
+            self._seek(radius=min(1.0, verdict.factor * self.search.radius))
             if verdict.accepted:
-                self._take(new, after, designs)
+                self._go_on(new, after, designs)
                 return True
             self.evaluator.undo()
         return False
 
     def _tried(self, new: np.ndarray, move: float) -> list[EvaluatedDesign] | None:
         """Evaluate a step (collective); None where its motion cannot be simulated."""
-        self.change, self.reach = self._largest(new - self.x), move
+        own = np.abs(new - self.x).max() if len(new) else 0.0
+        self.change = float(self.world.allreduce(own, op=MPI.MAX))
+        self._seek(reach=move)
         try:
             return self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
@@ -233,30 +221,34 @@ class Iterate:
             self.evaluator.undo()
             return None
 
-    def _take(self, new: np.ndarray, after: MMAState, designs: list[EvaluatedDesign]) -> None:
-        """Go on to a design that was tried (collective)."""
+    def _go_on(self, new: np.ndarray, after: MMAState, designs: list[EvaluatedDesign]) -> None:
+        """Take a design that was tried, and look where the search stands (collective)."""
         self.x, self.state, self.iteration = new, after, self.iteration + 1
         self.designs = self.evaluator.accepted(designs)
         self.problem = problem_of(self.scene, self.designs, self.stage.limits)
         self.keep_best()
-        merit = self.problem.merit(self.size)
-        if merit < self.anchor.merit or self.strict:
-            self.anchor, self.lag = Anchor(new.copy(), merit), 0
+        merit = self.problem.merit(self.search.size)
+        if merit < self.search.merit or self.search.strict:
+            self.anchor = new.copy()
+            self._seek(merit=merit, lag=0)
         else:
-            self.lag += 1
+            self._seek(lag=self.search.lag + 1)
         self._next_stage()
-        if self.lag > self.freedom > 0:
+        if self.search.lag > self.search.freedom > 0:
             self._return_to_anchor()
 
     def _return_to_anchor(self) -> None:
-        """Go back to the best design since the stage began, for strict steps (collective)."""
-        self.freedom, self.strict, self.radius = self.freedom // 2, STRICT, SHORTER
-        if self.lag:
-            self.x = self.anchor.x.copy()
+        """Go back to the best design, for strict steps from there (collective)."""
+        if self.search.lag:
+            self.x = self.anchor.copy()
             self.state = initial_state(self.x)
             self.designs = self.evaluator.evaluate(self.x)
             self.begin_stage()
-        self.lag = 0
+        freedom = self.search.freedom // 2
+        self._seek(freedom=freedom, strict=STRICT, radius=SHORTER, lag=0)
+
+    def _seek(self, **changes: Any) -> None:
+        self.search = replace(self.search, **changes)
 
     def evaluate_again(self) -> None:
         """Let the arms have x again after steps that were taken back (collective)."""
@@ -275,51 +267,41 @@ class Iterate:
         self.begin_stage()
         return True
 
-    def _proposed(self, move: float, weights: np.ndarray | None) -> tuple[np.ndarray, MMAState]:
-        """Return what MMA makes of x, and what it remembers then (collective)."""
+    def _proposed(self, move: float, price: float | None) -> tuple[np.ndarray, MMAState]:
+        """Return MMA's next design, and what it remembers then (collective).
+
+        Strict steps are those with a price, the merit's, and with the convexity that was learnt.
+        """
+        strict, problem = price is not None, self.problem
         with self.evaluator.profile.phase("mma"):
             return mma_step(
                 self.x,
-                self.problem.df0dx,
-                self.problem.f,
-                self.problem.dfdx,
+                problem.df0dx,
+                problem.f,
+                problem.dfdx,
                 self.variables.xmin,
                 self.variables.xmax,
                 self.state,
                 move=move,
                 widest=CURVED_DISTANCE if self.curved else LARGEST_DISTANCE,
-                convexity=None if weights is None else self.convexity,
-                prices=weights,
+                convexity=self.convexity if strict else None,
+                prices=np.full(len(problem.f), price) if strict else None,
                 comm=self.world,
                 pieces=self.variables.pieces,
             )
 
-    def _promise(self, x: np.ndarray, new: np.ndarray, after: MMAState) -> Promise:
-        width = self.variables.xmax - self.variables.xmin
-        parts = self.variables.slices, self.total
-        return promise(x, new, width, after, self.problem, self.convexity, *parts)
-
-    def _largest(self, step: np.ndarray) -> float:
-        own = np.abs(step).max() if len(step) else 0.0
-        return float(self.world.allreduce(own, op=MPI.MAX))
-
     def _next_stage(self) -> None:
-        """Begin a new stage where the held values have drifted, or the projection rises.
-
-        Collective.
-        """
-        problem, stage = self.problem, self.stage
+        """Begin a stage where held values have drifted, or the projection is due (collective)."""
+        problem, price = self.problem, self.stage.price
         if self.continuation.is_due(problem.excess):
             self.continuation.advance(self.variables.split(self.x))
             self.evaluate()
             return
-        held = limits_at(self.scene, self.designs)
-        now = problem_of(self.scene, self.designs, held)
+        now = problem_of(self.scene, self.designs)
         near = now.f > NEAR
         drift = np.abs(now.f - problem.f)[near].max(initial=0.0)
-        size = abs(problem.f0)
-        grew = size > GREW * stage.size or GREW * size < stage.size
-        if drift > DRIFT * self.change or grew:
+        grown = PRICE * abs(problem.f0) / price
+        if drift > DRIFT * self.change or not 1.0 / GREW <= grown <= GREW:
             self.begin_stage()
 
     def measure(self) -> HistoryRow:
@@ -369,7 +351,15 @@ class Iterate:
     def memory(self) -> IterateMemory:
         """Return all that the next step depends on, but for the problem at x."""
         state = self.state
-        columns = [self.x, state.x_old1, state.x_old2, state.low, state.upp, self.best.x]
+        columns = [
+            self.x,
+            state.x_old1,
+            state.x_old2,
+            state.low,
+            state.upp,
+            self.anchor,
+            self.best.x,
+        ]
         return IterateMemory(
             iteration=self.iteration,
             change=self.change,
@@ -380,10 +370,8 @@ class Iterate:
             multipliers=state.multipliers,
             scales=state.scales,
             convexity=self.convexity,
-            prices=self.prices,
             stage=self.stage,
-            radius=self.radius,
-            reach=self.reach,
+            search=self.search,
             age=self.continuation.age,
             best=self.best,
             solutions=self.evaluator.initial_solutions,
@@ -393,13 +381,14 @@ class Iterate:
 
     def restore(self, memory: IterateMemory) -> None:
         """Go back to what `memory` describes; `evaluate` is to follow."""
-        columns = self.variables.join(memory.cells).reshape(-1, 6)
-        self.x, x_old1, x_old2, low, upp, best = (column.copy() for column in columns.T)
+        columns = self.variables.join(memory.cells).reshape(-1, 7)
+        self.x, x_old1, x_old2, low, upp, self.anchor, best = (
+            column.copy() for column in columns.T
+        )
         self.state = MMAState(
             memory.iteration, x_old1, x_old2, low, upp, memory.multipliers, memory.scales
         )
-        self.convexity, self.prices = memory.convexity, memory.prices
-        self.radius, self.reach, self.stage = memory.radius, memory.reach, memory.stage
+        self.convexity, self.stage, self.search = memory.convexity, memory.stage, memory.search
         self.best = replace(memory.best, x=best)
         self.evaluator.solutions = memory.solutions
         for k, arm in self.evaluator.arms.items():

@@ -11,6 +11,7 @@ import numpy as np
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.optimization.acceptance import Search
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.responses.order_selection import OrderSelection
@@ -59,8 +60,8 @@ class IterateMemory:
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
-        multipliers, scales, convexity, prices, radius, reach: of the step, on all ranks.
-        stage: that the design belongs to.
+        multipliers, scales, convexity: MMA's, on all ranks.
+        stage, search: that the design belongs to, and how the next step is sought.
         age: updates since beta rose.
         best: the best design so far; its variables are the last column of `cells`.
         guesses: per arm what this design's iterative solves set out from, of arms that have them.
@@ -78,10 +79,8 @@ class IterateMemory:
     multipliers: np.ndarray
     scales: np.ndarray
     convexity: np.ndarray
-    prices: np.ndarray
     stage: Stage
-    radius: float
-    reach: float
+    search: Search
     age: int
     best: Best
     solutions: tuple[Solution, ...]

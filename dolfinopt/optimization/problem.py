@@ -55,17 +55,15 @@ class Stage:
 
     Attributes:
         limits: smooth limit (k,) of every constraint of each design that x stands for.
-        weights: (m,) of the constraints in the merit, in units of what is minimised.
-        size: of what is minimised where the weights were chosen.
+        price: of a relative excess, in units of what is minimised.
     """
 
     limits: tuple[np.ndarray, ...]
-    weights: np.ndarray
-    size: float
+    price: float
 
     def merit(self, values: np.ndarray) -> float:
-        """Return phi = f0 + sum_i w_i max(0, f_i) of values (1 + m,)."""
-        return float(values[0] + self.weights @ np.maximum(values[1:], 0.0))
+        """Return phi = f0 + c sum_i max(0, f_i) of values (1 + m,)."""
+        return float(values[0] + self.price * np.maximum(values[1:], 0.0).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ class Problem:
         return max((0.0 if one.met else one.excess for one in self.limits), default=0.0)
 
     def merit(self, size: float) -> float:
-        """Return the merit by the limits' true values; `size` is that of the objective."""
+        """Return the merit by the limits' true values, over the `size` of the objective."""
         over = sum(one.excess for one in self.limits if not one.met)
         return float(self.values[0] / size + PRICE * over)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.optimization.acceptance import Search
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.memory import Best, FurtherMemory, IterateMemory, Memory
 from dolfinopt.optimization.problem import Stage
@@ -261,14 +263,13 @@ def arrays_of(
         return {}
     arrays: dict[str, Any] = {
         "iteration": memory.iteration,
-        "last": [memory.change, memory.kkt, memory.radius, memory.reach, memory.age],
+        "last": [memory.change, memory.kkt, memory.age],
         "multipliers": memory.multipliers,
         "scales": memory.scales,
         "convexity": memory.convexity,
-        "prices": memory.prices,
         "held": memory.stage.limits,
-        "weights": memory.stage.weights,
-        "size": memory.stage.size,
+        "price": memory.stage.price,
+        "search": astuple(memory.search),
         "best": [
             getattr(memory.best, name) for name in ("iteration", "beta", "objective", "excess")
         ],
@@ -330,7 +331,8 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         of = f"solution{len(solutions)}"
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
-    change, kkt, radius, reach, age = arrays["last"].tolist()
+    change, kkt, age = arrays["last"].tolist()
+    radius, reach, freedom, strict, lag, merit, size, released = arrays["search"].tolist()
     iteration, beta, objective, excess = arrays["best"].tolist()
     thresholds = {k: float(arrays[f"arm{k}/best_threshold"]) for k in cells}
     if iteration < 0:
@@ -345,10 +347,8 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         "multipliers": arrays["multipliers"],
         "scales": arrays["scales"],
         "convexity": arrays["convexity"],
-        "prices": arrays["prices"],
-        "stage": Stage(tuple(arrays["held"]), arrays["weights"], float(arrays["size"])),
-        "radius": radius,
-        "reach": reach,
+        "stage": Stage(tuple(arrays["held"]), float(arrays["price"])),
+        "search": Search(radius, reach, int(freedom), int(strict), int(lag), merit, size, released),
         "age": int(age),
         "best": Best(np.empty(0), int(iteration), beta, thresholds, objective, excess),
         "solutions": tuple(solutions),
