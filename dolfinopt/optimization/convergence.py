@@ -11,6 +11,10 @@ from dolfinopt.units import NOT_MET
 MOVING = 0.5
 # Grayness above which a projection has not done its work: as if 2 % of the cells stood at 1/2.
 GREY = 0.02
+# A run whose iterations are spent while it exceeds limits by no more than this share goes on with
+# steps so much shorter, for so many at most: limits that follow the design settle as steps do.
+NEARLY, LANDING, LAST = 0.05, 0.1, 8
+
 Ending = Literal["", "converged", "infeasible", "stuck", "limit"]
 
 

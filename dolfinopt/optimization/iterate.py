@@ -368,7 +368,6 @@ class Iterate:
             modes=self.evaluator.initial_vectors,
             guesses={k: one for k, one in self.evaluator.initial_guesses.items() if one},
             multipliers=state.multipliers,
-            scales=state.scales,
             convexity=self.convexity,
             stage=self.stage,
             search=self.search,
@@ -385,9 +384,7 @@ class Iterate:
         self.x, x_old1, x_old2, low, upp, self.anchor, best = (
             column.copy() for column in columns.T
         )
-        self.state = MMAState(
-            memory.iteration, x_old1, x_old2, low, upp, memory.multipliers, memory.scales
-        )
+        self.state = MMAState(memory.iteration, x_old1, x_old2, low, upp, memory.multipliers)
         self.convexity, self.stage, self.search = memory.convexity, memory.stage, memory.search
         self.best = replace(memory.best, x=best)
         self.evaluator.solutions = memory.solutions

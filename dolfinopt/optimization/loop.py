@@ -13,7 +13,7 @@ from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.optimization.assessment import assess, initial_selection
 from dolfinopt.optimization.certificate import certify
 from dolfinopt.optimization.conflicts import conflict_sentences
-from dolfinopt.optimization.convergence import Ending, stop_reason
+from dolfinopt.optimization.convergence import LANDING, LAST, NEARLY, Ending, stop_reason
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.further import Attempt, FurtherRun
 from dolfinopt.optimization.history import HistoryRow
@@ -123,6 +123,7 @@ class _Run:
                 self._record()
                 self._checkpoint()
         self._checkpoint(force=True)
+        self._land()
         return self._result()
 
     def _begin(self, memory: Memory | None) -> None:
@@ -168,6 +169,23 @@ class _Run:
         self.iterate.evaluate()
         self.iterate.stuck = ""
         return self.iterate.iteration < self.scene.optimizer.max_iterations
+
+    def _land(self) -> None:
+        """Take short steps where the iterations ended just beyond a limit (collective).
+
+        The checkpoint does not know of them: a run that is resumed with more iterations goes on as
+        if it had not ended.
+        """
+        one = self.iterate
+        if self.finished != "limit" or not one.curved:
+            return
+        one.search = replace(one.search, freedom=0, radius=LANDING)
+        for _ in range(LAST):
+            if one.best.excess == 0.0 or one.problem.excess > NEARLY or one.stuck:
+                return
+            one.step()
+            if not one.stuck:
+                self._record()
 
     def _result(self) -> Result:
         """Assess the best design (collective)."""

@@ -60,7 +60,7 @@ class IterateMemory:
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
-        multipliers, scales, convexity: MMA's, on all ranks.
+        multipliers, convexity: MMA's, on all ranks.
         stage, search: that the design belongs to, and how the next step is sought.
         age: updates since beta rose.
         best: the best design so far; its variables are the last column of `cells`.
@@ -77,7 +77,6 @@ class IterateMemory:
     modes: Mapping[int, Sequence[np.ndarray]]
     guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
-    scales: np.ndarray
     convexity: np.ndarray
     stage: Stage
     search: Search

@@ -78,7 +78,6 @@ class MMAState:
         upp: (n,) upper asymptotes of the last step.
         multipliers: (m,) multipliers of the last step for the normalised constraints, the initial
             guess of the next one; any other length stands for none.
-        scales: (1 + m,) by which objective and constraints were divided in the last step.
     """
 
     iteration: int
@@ -87,20 +86,12 @@ class MMAState:
     low: Array
     upp: Array
     multipliers: Array
-    scales: Array
-
-    @property
-    def prices(self) -> Array:
-        """Multipliers (m,) of the constraints as they are, in units of the objective."""
-        if len(self.scales) != 1 + len(self.multipliers):
-            return np.zeros(len(self.multipliers))
-        return self.multipliers * self.scales[0] / self.scales[1:]
 
 
 def initial_state(x: npt.ArrayLike) -> MMAState:
     """Return the state before the first step from the design x (n,), which is copied."""
     x = np.array(x, dtype=np.float64)
-    return MMAState(0, x, x.copy(), x.copy(), x.copy(), np.empty(0), np.empty(0))
+    return MMAState(0, x, x.copy(), x.copy(), x.copy(), np.empty(0))
 
 
 def mma_step(
@@ -179,7 +170,7 @@ def mma_step(
     point = _solve_dual(dual, state.multipliers[active] if known else np.ones(active.sum()))
     multipliers = np.zeros(active.size)
     multipliers[active] = point.multipliers
-    return _conclude(given, dual, point, multipliers, np.where(largest > 0.0, largest, 1.0))
+    return _conclude(given, dual, point, multipliers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -537,7 +528,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
 
 
 def _conclude(
-    given: _Given, dual: _Dual, point: _DualPoint, multipliers: Array, scales: Array
+    given: _Given, dual: _Dual, point: _DualPoint, multipliers: Array
 ) -> tuple[Array, MMAState]:
     """Return the design at the solution of the dual, and the state for the next step."""
     empty: list[Array] = [np.empty(0)]
@@ -551,6 +542,5 @@ def _conclude(
         low=given.x - distance,
         upp=given.x + distance,
         multipliers=multipliers,
-        scales=scales,
     )
     return x_new, state
