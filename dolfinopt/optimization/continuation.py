@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 # Steepness from which on the move limit falls with its square root: up to it the projection's
 # slope, about beta / 2, moves x_phys by no more than twice what x moves.
 GENTLE = 4.0
+RISE = 0.25  # of a doubling at once: each costs an evaluation, four in design.continuation updates
+# Excess of a limit with which beta waits for the design to come back, so many times as long.
+WAITS, PATIENT = 0.02, 4.0
 
 
 class Continuation:
@@ -25,6 +28,7 @@ class Continuation:
 
     Attributes:
         beta: steepness; grows from 1 to design.sharpness.
+        age: updates of the design since it grew.
         patterns: arms that repeat another's design.
         thresholds: eta of every arm of this rank with design variables. Held during a step: a
             threshold that followed x would be one more way to stay grey.
@@ -33,7 +37,7 @@ class Continuation:
     def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
         """Begin with the gentlest projection."""
         self.scene, self.partition, self.arms = scene, partition, arms
-        self.beta = 1.0
+        self.beta, self.age = 1.0, 0
         self._held = False
         self.patterns = Patterns(scene, partition, arms)
         designed = [k for k in arms if k in scene.designed]
@@ -84,16 +88,24 @@ class Continuation:
             smooth = {k: self.arms[k].smoothed(x[k]) for k in self.thresholds}
         return self.patterns.spread(smooth)
 
+    def is_due(self, excess: float) -> bool:
+        """Count an update, and return whether beta is to rise; not as long as limits are far.
+
+        Args:
+            excess: largest relative violation of a limit.
+        """
+        self.age += 1
+        wait = RISE * self.scene.design.continuation
+        patience = wait if excess <= WAITS else PATIENT * wait
+        return not self.complete and self.age >= patience
+
     def advance(self, x: Mapping[int, np.ndarray]) -> None:
         """Raise beta, and move the thresholds so that the volume of x stays (collective).
 
-        A little in every iteration: doubled at once, beta cuts members whose x is near the
-        threshold.
+        A little at a time: doubled at once, beta cuts members whose x is near the threshold.
         """
-        if self.complete:
-            return
         design = self.scene.design
-        self.beta = min(2.0 ** (1.0 / design.continuation) * self.beta, design.sharpness)
+        self.beta, self.age = min(2.0**RISE * self.beta, design.sharpness), 0
         with together(self.partition.world):
             self.thresholds = {
                 k: self.arms[k].preserving_threshold(x[k], self.beta) for k in self.thresholds

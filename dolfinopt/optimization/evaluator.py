@@ -16,6 +16,7 @@ from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
+from dolfinopt.responses.response import constraints_of
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -58,14 +59,48 @@ class Evaluator:
 
     def evaluate(self, x: np.ndarray) -> list[EvaluatedDesign]:
         """Evaluate the designs that x stands for, the nominal one last (collective)."""
+        return self.accepted(self.tried(x))
+
+    def tried(self, x: np.ndarray) -> list[EvaluatedDesign]:
+        """Evaluate the designs that x stands for; the last one without gradients (collective).
+
+        `accepted` adds them, `undo` takes the whole back. Of robust designs the others have theirs
+        at once, as long as their factors are at hand.
+        """
         self.initial_solutions = self.solutions
         self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
         self.initial_guesses = {k: arm.guesses for k, arm in self.arms.items()}
-        # Gradients at once, with the design's factorisation at hand.
-        return [
-            self.differentiated(design, self.evaluate_densities(densities(design)))
-            for design in self.physical_designs(x)
+        *others, nominal = self.physical_designs(x)
+        found = []
+        for design in others:
+            found.append(self.differentiated(design, self.evaluate_densities(densities(design))))
+        evaluation = self.evaluate_densities(densities(nominal))
+        of_nominal = [
+            one.response.of_nominal
+            for one, measured in zip(
+                constraints_of(self.scene), evaluation.responses[1:], strict=True
+            )
+            for _ in measured.values
         ]
+        none = np.empty((len(of_nominal), 0))
+        found.append(
+            EvaluatedDesign(
+                nominal, evaluation, np.empty(0), none, np.array(of_nominal, dtype=bool), False
+            )
+        )
+        return found
+
+    def accepted(self, designs: list[EvaluatedDesign]) -> list[EvaluatedDesign]:
+        """Add the gradients to designs that were `tried` last (collective)."""
+        *others, last = designs
+        return [*others, self.differentiated(last.physical, last.evaluation)]
+
+    def undo(self) -> None:
+        """Set out from where the last evaluation did (collective)."""
+        self.solutions = self.initial_solutions
+        for k, vectors in self.initial_vectors.items():
+            self.arms[k].initial_vectors = vectors
+            self.arms[k].guesses = self.initial_guesses[k]
 
     def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:
         """Evaluate the last x again, from the same initial guesses: in the same bits (collective).
@@ -73,10 +108,7 @@ class Evaluator:
         Args:
             x: (n,) the design variables of the last `evaluate`, whatever the arms have since.
         """
-        self.solutions = self.initial_solutions
-        for k, vectors in self.initial_vectors.items():
-            self.arms[k].initial_vectors = vectors
-            self.arms[k].guesses = self.initial_guesses[k]
+        self.undo()
         return self.evaluate(x)
 
     def with_gradient(self, kind: str) -> Evaluator:

@@ -128,12 +128,15 @@ class FurtherRun:
                 yield from done
                 if len(done) < count:
                     other.restore(self.memory)
-                    other.evaluate()
-                    problem = other.problem
+                    other.evaluate_again()
+            if len(done) < count and not done:
+                other.take(other.evaluator.evaluate_again(self.x))
             while len(done) < count:
                 if done and other.ending() not in ("", "limit"):
                     return
-                other.step(problem)
+                other.step()
+                if other.stuck:
+                    return
                 problem, row = other.problem, other.measure()
                 done.append(attempt(problem))
                 self.memory = FurtherMemory(

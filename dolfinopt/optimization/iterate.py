@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.optimization.conservative import forecast, raised, relaxed, worse_than_promised
-from dolfinopt.optimization.convergence import Ending, ending, leaps
+from dolfinopt.optimization.acceptance import (
+    ATTEMPTS,
+    DRIFT,
+    FREE_ATTEMPTS,
+    FREEDOM,
+    GREW,
+    NEAR,
+    SHORTER,
+    SHORTER_YET,
+    STRICT,
+    WORTH,
+    Search,
+    judge_step,
+    leaps,
+    learnt,
+    promise,
+)
+from dolfinopt.optimization.convergence import Ending, ending
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.memory import IterateMemory
+from dolfinopt.optimization.memory import Best, IterateMemory
 from dolfinopt.optimization.mma import (
     CURVED_DISTANCE,
     LARGEST_DISTANCE,
@@ -21,14 +39,17 @@ from dolfinopt.optimization.mma import (
     mma_step,
 )
 from dolfinopt.optimization.optimality import kkt_residual
-from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
+from dolfinopt.optimization.problem import (
+    PRICE,
+    EvaluatedDesign,
+    Problem,
+    Stage,
+    limits_at,
+    problem_of,
+)
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.responses.constraints import tightest, violated
 from dolfinopt.responses.mass import cell_volumes
-
-# A step that leads astray is repeated so many times, with a move limit so much shorter where
-# its forecast was worth nothing at all.
-SHORTER, ATTEMPTS = 0.25, 4
 
 
 class Iterate:
@@ -36,16 +57,23 @@ class Iterate:
 
     Attributes:
         x, state: this rank's design variables (n,), and what MMA remembers.
-        convexity: (1 + m,) of objective and constraints, see `conservative`; empty at first.
+        convexity: (1 + m,) of objective and constraints, see `acceptance`; empty at first.
+        stage: what is held while steps are compared.
+        search: how the next step is sought.
+        anchor: (n,) the best design since the projection became steeper.
         problem: at x.
-        nominal: the nominal one of the designs that x stands for.
+        designs: that x stands for, the nominal one last.
+        best: the best design so far, see `Best`.
         iteration, change: updates made, and the largest change of a variable in the last one.
         kkt, grayness: residual and grayness of x; the latter is known on the root.
         curved: whether constraints other than volume and mass are to be kept.
+        stuck: why no step betters x, "" while one does.
+        failed: why a motion of the last step could not be simulated, "" where all could.
     """
 
     problem: Problem
-    nominal: EvaluatedDesign
+    stage: Stage
+    designs: list[EvaluatedDesign]
 
     def __init__(self, evaluator: Evaluator, x: np.ndarray):
         """Take what evaluates designs, and the variables (n,) of this rank."""
@@ -54,15 +82,51 @@ class Iterate:
         self.world = evaluator.partition.world
         self.total = partial(sum_over_arms, evaluator.partition)
         self.x, self.state = x, initial_state(x)
-        self.convexity = np.empty(0)
+        self.convexity, self.search = np.empty(0), Search()
+        self.anchor, self.best = x, Best.none(x)
         self.iteration, self.change = 0, 0.0
         self.kkt, self.grayness = np.nan, 0.0
+        self.stuck = self.failed = ""
         self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
+
+    @property
+    def nominal(self) -> EvaluatedDesign:
+        """The nominal one of the designs that x stands for."""
+        return self.designs[-1]
 
     def evaluate(self) -> None:
         """Evaluate x: filter, reduce, simulate, measure, differentiate (collective)."""
-        designs = self.evaluator.evaluate(self.x)
-        self.nominal, self.problem = designs[-1], problem_of(self.scene, designs)
+        self.take(self.evaluator.evaluate(self.x))
+
+    def take(self, designs: list[EvaluatedDesign]) -> None:
+        """Begin a stage with the designs that x stands for, and compare steps with them."""
+        self.designs = designs
+        self.begin_stage()
+        self.anchor = self.x.copy()
+        size = abs(self.problem.f0) or 1.0
+        self._seek(size=size, merit=self.problem.merit(size), lag=0)
+        self.keep_best()
+
+    def begin_stage(self) -> None:
+        """Hold the smooth limits of these designs, and a price by the objective's size."""
+        held = limits_at(self.scene, self.designs)
+        self.problem = problem_of(self.scene, self.designs, held)
+        self.stage = Stage(held, PRICE * (abs(self.problem.f0) or 1.0))
+        if len(self.convexity) != len(self.problem.values):
+            self.convexity = np.zeros(len(self.problem.values))
+
+    def keep_best(self) -> None:
+        """Remember x where it is better than what was known: of sharper designs, feasible ones."""
+        new = Best(
+            self.x.copy(),
+            self.iteration,
+            self.continuation.beta,
+            dict(self.continuation.thresholds),
+            float(self.problem.values[0]),
+            self.problem.excess,
+        )
+        if new.rank < self.best.rank:
+            self.best = new
 
     def ending(self) -> Ending:
         """Return why the iterations end here, "" while they go on; the same on all ranks."""
@@ -70,76 +134,147 @@ class Iterate:
             self.scene,
             self.iteration,
             self.change,
+            self.search.reach,
             self.kkt,
             violated(self.problem.limits),
             self.continuation.complete,
+            self.stuck,
         )
 
-    def step(self, problem: Problem, factor: float = 1.0) -> None:
-        """Update the design and evaluate it; take a step back that spoils things (collective).
+    def step(self) -> None:
+        """Go on to another design; where none is found x stays and `stuck` says why (collective).
 
-        Where a limit is exceeded twice as far as before, or the motion can no longer be
-        simulated, the forecast has failed: MMA is asked again with a shorter move limit. Where a
-        guarded limit that was nearly met is left, or a guarded objective rises, against the
-        forecast, it is asked with a more convex approximation.
-
-        Args:
-            problem: at x.
-            factor: on the move limit.
+        Free steps first, as long as they lead to something better within `freedom` of them; else
+        back to the best design, and strict steps from there.
         """
-        x, state = self.x, self.state
-        projected = self.continuation.beta, dict(self.continuation.thresholds)
-        move = factor * self.continuation.move
-        guarded = self.curved or problem.guarded.any()
-        if len(self.convexity) != len(problem.values):
-            self.convexity = np.zeros(len(problem.values))
-        for attempt in range(ATTEMPTS):
-            last = attempt == ATTEMPTS - 1
-            self._update(problem, move)
-            try:
-                self.evaluate()
-            except ConvergenceError:  # on all ranks
-                if last:
-                    raise
-                move *= SHORTER
-            else:
-                if not guarded:
-                    return
-                if leaps(problem.f, self.problem.f):
-                    move *= SHORTER
-                elif self._keeps_its_promise(x, problem):
-                    return
-                if last:
-                    return
-            self.x, self.state, self.iteration = x, state, self.iteration - 1
-            self.continuation.beta, self.continuation.thresholds = projected
+        free = self.search.freedom > 0 and self.search.strict == 0
+        self.failed = ""
+        if free:
+            if self._free_step():
+                return
+            self._return_to_anchor()
+        if self._strict_step():
+            self._seek(strict=max(0, self.search.strict - 1))
+            return
+        if not free and self.search.merit < WORTH * self.search.released:
+            self._seek(released=self.search.merit, freedom=FREEDOM // 2, strict=0)
+            if self._free_step():
+                return
+        self.evaluate_again()
+        self.stuck = self.failed or "no step, however short, lowers the merit"
 
-    def _keeps_its_promise(self, x: np.ndarray, problem: Problem) -> bool:
-        """Return whether the step from x spoils nothing, and learn from it (collective)."""
-        if not problem.guarded.any():
-            return True
-        variables, after = self.variables, self.problem.values
-        promised = forecast(
-            x,
-            self.x,
-            variables.xmax - variables.xmin,
-            self.state,
-            problem,
-            self.convexity,
-            variables.slices,
-            self.total,
-        )
-        spoilt = worse_than_promised(problem.values, after, promised, problem.guarded)
-        if spoilt.any():
-            self.convexity = raised(self.convexity, spoilt, after, promised)
+    def _free_step(self) -> bool:
+        """Take MMA's step unless it leads astray; return whether there is a new design."""
+        for attempt in range(FREE_ATTEMPTS):
+            move = SHORTER_YET**attempt * self.continuation.move
+            new, after = self._proposed(move, None)
+            designs = self._tried(new, move)
+            if designs is None:
+                continue
+            tried = problem_of(self.scene, designs, self.stage.limits)
+            if not leaps(self.problem.values, tried.values):
+                self._go_on(new, after, designs)
+                return True
+            self.evaluator.undo()
+        return False
+
+    def _strict_step(self) -> bool:
+        """Take a step that lowers the merit; return whether there is one."""
+        exact = self.scene.objective.gradient == "exact"
+        before = self.problem.values
+        for _ in range(ATTEMPTS):
+            move = self.search.radius * self.continuation.move
+            new, after = self._proposed(move, self.stage.price)
+            designs = self._tried(new, move)
+            if designs is None:
+                self._seek(radius=SHORTER_YET * self.search.radius)
+                continue
+            tried = problem_of(self.scene, designs, self.stage.limits).values
+            promised = promise(
+                self.x,
+                new,
+                self.variables.xmax - self.variables.xmin,
+                after,
+                self.problem,
+                self.convexity,
+                self.variables.slices,
+                self.total,
+            )
+            verdict = judge_step(self.stage, before, tried, promised, exact)
+            self.convexity = learnt(self.convexity, tried, promised, verdict.accepted)
+            self._seek(radius=min(1.0, verdict.factor * self.search.radius))
+            if verdict.accepted:
+                self._go_on(new, after, designs)
+                return True
+            self.evaluator.undo()
+        return False
+
+    def _tried(self, new: np.ndarray, move: float) -> list[EvaluatedDesign] | None:
+        """Evaluate a step (collective); None where its motion cannot be simulated."""
+        own = np.abs(new - self.x).max() if len(new) else 0.0
+        self.change = float(self.world.allreduce(own, op=MPI.MAX))
+        self._seek(reach=move)
+        try:
+            return self.evaluator.tried(new)
+        except ConvergenceError as error:  # on all ranks
+            self.failed = str(error)
+            self.evaluator.undo()
+            return None
+
+    def _go_on(self, new: np.ndarray, after: MMAState, designs: list[EvaluatedDesign]) -> None:
+        """Take a design that was tried, and look where the search stands (collective)."""
+        self.x, self.state, self.iteration = new, after, self.iteration + 1
+        self.designs = self.evaluator.accepted(designs)
+        self.problem = problem_of(self.scene, self.designs, self.stage.limits)
+        self.keep_best()
+        merit = self.problem.merit(self.search.size)
+        if merit < self.search.merit or self.search.strict:
+            self.anchor = new.copy()
+            self._seek(merit=merit, lag=0)
+        else:
+            self._seek(lag=self.search.lag + 1)
+        self._next_stage()
+        if self.search.lag > self.search.freedom > 0:
+            self._return_to_anchor()
+
+    def _return_to_anchor(self) -> None:
+        """Go back to the best design, for strict steps from there (collective)."""
+        if self.search.lag:
+            self.x = self.anchor.copy()
+            self.state = initial_state(self.x)
+            self.designs = self.evaluator.evaluate(self.x)
+            self.begin_stage()
+        freedom = self.search.freedom // 2
+        self._seek(freedom=freedom, strict=STRICT, radius=SHORTER, lag=0)
+
+    def _seek(self, **changes: Any) -> None:
+        self.search = replace(self.search, **changes)
+
+    def evaluate_again(self) -> None:
+        """Let the arms have x again after steps that were taken back (collective)."""
+        self.designs = self.evaluator.evaluate(self.x)
+        self.problem = problem_of(self.scene, self.designs, self.stage.limits)
+
+    def return_to_best(self) -> bool:
+        """Go back to the best design so far; return whether it is another one (collective)."""
+        best = self.best
+        if best.iteration in (-1, self.iteration):
             return False
-        self.convexity = relaxed(self.convexity, after, promised)
+        self.x, self.iteration = best.x.copy(), best.iteration
+        self.continuation.beta = best.beta
+        self.continuation.thresholds = dict(best.thresholds)
+        self.designs = self.evaluator.evaluate(self.x)
+        self.begin_stage()
         return True
 
-    def _update(self, problem: Problem, move: float) -> None:
-        """Make one MMA step, and one of the continuation (collective)."""
+    def _proposed(self, move: float, price: float | None) -> tuple[np.ndarray, MMAState]:
+        """Return MMA's next design, and what it remembers then (collective).
+
+        Strict steps are those with a price, the merit's, and with the convexity that was learnt.
+        """
+        strict, problem = price is not None, self.problem
         with self.evaluator.profile.phase("mma"):
-            x, self.state = mma_step(
+            return mma_step(
                 self.x,
                 problem.df0dx,
                 problem.f,
@@ -149,15 +284,25 @@ class Iterate:
                 self.state,
                 move=move,
                 widest=CURVED_DISTANCE if self.curved else LARGEST_DISTANCE,
-                convexity=self.convexity,
+                convexity=self.convexity if strict else None,
+                prices=np.full(len(problem.f), price) if strict else None,
                 comm=self.world,
                 pieces=self.variables.pieces,
             )
-        change = np.abs(x - self.x).max() if len(x) else 0.0
-        self.change = float(self.world.allreduce(change, op=MPI.MAX))
-        self.x = x
-        self.iteration += 1
-        self.continuation.advance(self.variables.split(self.x))
+
+    def _next_stage(self) -> None:
+        """Begin a stage where held values have drifted, or the projection is due (collective)."""
+        problem, price = self.problem, self.stage.price
+        if self.continuation.is_due(problem.excess):
+            self.continuation.advance(self.variables.split(self.x))
+            self.evaluate()
+            return
+        now = problem_of(self.scene, self.designs)
+        near = now.f > NEAR
+        drift = np.abs(now.f - problem.f)[near].max(initial=0.0)
+        grown = PRICE * abs(problem.f0) / price
+        if drift > DRIFT * self.change or not 1.0 / GREW <= grown <= GREW:
+            self.begin_stage()
 
     def measure(self) -> HistoryRow:
         """Return the row of the history that x makes (collective).
@@ -206,7 +351,15 @@ class Iterate:
     def memory(self) -> IterateMemory:
         """Return all that the next step depends on, but for the problem at x."""
         state = self.state
-        columns = [self.x, state.x_old1, state.x_old2, state.low, state.upp]
+        columns = [
+            self.x,
+            state.x_old1,
+            state.x_old2,
+            state.low,
+            state.upp,
+            self.anchor,
+            self.best.x,
+        ]
         return IterateMemory(
             iteration=self.iteration,
             change=self.change,
@@ -216,6 +369,10 @@ class Iterate:
             guesses={k: one for k, one in self.evaluator.initial_guesses.items() if one},
             multipliers=state.multipliers,
             convexity=self.convexity,
+            stage=self.stage,
+            search=self.search,
+            age=self.continuation.age,
+            best=self.best,
             solutions=self.evaluator.initial_solutions,
             beta=self.continuation.beta,
             thresholds=self.continuation.thresholds,
@@ -223,14 +380,17 @@ class Iterate:
 
     def restore(self, memory: IterateMemory) -> None:
         """Go back to what `memory` describes; `evaluate` is to follow."""
-        columns = self.variables.join(memory.cells).reshape(-1, 5)
-        self.x, x_old1, x_old2, low, upp = (column.copy() for column in columns.T)
+        columns = self.variables.join(memory.cells).reshape(-1, 7)
+        self.x, x_old1, x_old2, low, upp, self.anchor, best = (
+            column.copy() for column in columns.T
+        )
         self.state = MMAState(memory.iteration, x_old1, x_old2, low, upp, memory.multipliers)
-        self.convexity = memory.convexity
+        self.convexity, self.stage, self.search = memory.convexity, memory.stage, memory.search
+        self.best = replace(memory.best, x=best)
         self.evaluator.solutions = memory.solutions
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
             arm.guesses = memory.guesses.get(k)
         self.iteration, self.change, self.kkt = memory.iteration, memory.change, memory.kkt
-        self.continuation.beta = memory.beta
+        self.continuation.beta, self.continuation.age = memory.beta, memory.age
         self.continuation.thresholds = dict(memory.thresholds)

@@ -18,7 +18,7 @@ from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.further import Attempt, FurtherRun
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.iterate import Iterate
-from dolfinopt.optimization.memory import FurtherMemory, Memory, fields_of
+from dolfinopt.optimization.memory import Best, FurtherMemory, Memory, fields_of
 from dolfinopt.optimization.problem import Problem
 from dolfinopt.optimization.result import Result
 from dolfinopt.parallel import Partition, together
@@ -114,13 +114,14 @@ class _Run:
     def go(self, memory: Memory | None) -> Result:
         """Iterate until the design converges or the iterations are spent."""
         self._begin(memory)
-        self._evaluate()
+        self._evaluate(anew=memory is None)
         if memory is None:
             self._record()
         while not self._finished() or self._stiffens():
-            self.iterate.step(self.iterate.problem)
-            self._record()
-            self._checkpoint()
+            self.iterate.step()
+            if not self.iterate.stuck:
+                self._record()
+                self._checkpoint()
         self._checkpoint(force=True)
         self._land()
         return self._result()
@@ -135,9 +136,12 @@ class _Run:
         if self.recorder is not None:
             self.recorder.begin(self.history)
 
-    def _evaluate(self) -> None:
-        """Evaluate the first design (collective)."""
-        self.iterate.evaluate()
+    def _evaluate(self, anew: bool) -> None:
+        """Evaluate the first design, or again that of a run that goes on (collective)."""
+        if anew:
+            self.iterate.evaluate()
+        else:
+            self.iterate.evaluate_again()
         trajectory = self.evaluator.trajectory
         if trajectory is not None and len(self.initial_deviation) == 0:
             self.initial_deviation = trajectory.deviation
@@ -161,7 +165,9 @@ class _Run:
         group = [self.scene, *pose_scenarios(self.scene)]
         if not reconsider_stiffening(group, self.partition, self.arms):
             return False
+        self.iterate.best = Best.none(self.iterate.x)  # what was seen without it does not count
         self.iterate.evaluate()
+        self.iterate.stuck = ""
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
     def _land(self) -> None:
@@ -173,15 +179,20 @@ class _Run:
         one = self.iterate
         if self.finished != "limit" or not one.curved:
             return
+        one.search = replace(one.search, freedom=0, radius=LANDING)
         for _ in range(LAST):
-            if not violated(one.problem.limits) or one.problem.f.max() > NEARLY:
+            if one.best.excess == 0.0 or one.problem.excess > NEARLY or one.stuck:
                 return
-            one.step(one.problem, LANDING)
-            self._record()
+            one.step()
+            if not one.stuck:
+                self._record()
 
     def _result(self) -> Result:
-        """Assess the final design (collective)."""
+        """Assess the best design (collective)."""
         one, counts = self.iterate, replace(self.profile.counts)
+        made = one.iteration
+        if one.return_to_best():
+            one.measure()
         certificate = certify(self.evaluator, one.x, one.nominal, one.problem, self._further)
         if self.further is not None:
             self._checkpoint(force=True)
@@ -201,10 +212,18 @@ class _Run:
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
             history=self.history,
-            iterations=one.iteration,
+            iterations=made,
+            best_iteration=one.iteration,
             converged=self.finished == "converged",
             stop_reason=stop_reason(
-                self.scene, self.finished, one.change, one.kkt, not_met, one.grayness
+                self.scene,
+                self.finished,
+                one.change,
+                one.kkt,
+                not_met,
+                one.grayness,
+                one.stuck,
+                "" if one.iteration == made else f"iteration {one.iteration}",
             ),
             kkt=one.kkt,
             certificate=certificate,

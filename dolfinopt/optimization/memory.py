@@ -11,8 +11,43 @@ import numpy as np
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.optimization.acceptance import Search
 from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.problem import Stage
 from dolfinopt.responses.order_selection import OrderSelection
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """The best design so far: of the sharpest projection among those that keep all limits.
+
+    Attributes:
+        x: (n,) this rank's variables.
+        iteration: updates made; -1 of none.
+        beta: steepness of the projection.
+        thresholds: per arm its eta.
+        objective: what is minimised.
+        excess: largest relative violation of a limit.
+    """
+
+    x: np.ndarray
+    iteration: int
+    beta: float
+    thresholds: Mapping[int, float]
+    objective: float
+    excess: float
+
+    @classmethod
+    def none(cls, x: np.ndarray) -> Best:
+        """Return what every design betters."""
+        return cls(x, -1, 0.0, {}, np.inf, np.inf)
+
+    @property
+    def rank(self) -> tuple[bool, float, float]:
+        """What is smaller for a better design; of infeasible ones the least violation counts."""
+        if self.excess > 0.0:
+            return True, self.excess, self.objective
+        return False, -self.beta, self.objective
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,6 +61,9 @@ class IterateMemory:
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
         multipliers, convexity: MMA's, on all ranks.
+        stage, search: that the design belongs to, and how the next step is sought.
+        age: updates since beta rose.
+        best: the best design so far; its variables are the last column of `cells`.
         guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
@@ -40,6 +78,10 @@ class IterateMemory:
     guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
     convexity: np.ndarray
+    stage: Stage
+    search: Search
+    age: int
+    best: Best
     solutions: tuple[Solution, ...]
     beta: float
     thresholds: Mapping[int, float]

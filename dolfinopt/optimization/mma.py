@@ -43,6 +43,7 @@ _AT_REST = 1e-9
 CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
 _RAA0 = 1e-5  # his raa0: convex even where all gradients are zero
 _PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y + y^2 / 2
+_MOST = 1e9  # of it
 
 # The dual is stepped in units of (multiplier + _FLOOR), because multipliers span many decades.
 # Multipliers below raa0 hardly change the design beside the curvature that raa0 adds.
@@ -105,6 +106,7 @@ def mma_step(
     move: float = 0.2,
     widest: float = LARGEST_DISTANCE,
     convexity: npt.ArrayLike | None = None,
+    prices: npt.ArrayLike | None = None,
     comm: MPI.Comm | None = None,
     pieces: Mapping[int, int] | None = None,
 ) -> tuple[Array, MMAState]:
@@ -114,7 +116,7 @@ def mma_step(
     the constraints with them, before the approximation is built: the step depends neither on the
     units of f0 and f_i nor on those of x. A constraint whose gradient is zero says nothing about
     the step and is left out. The approximation is solved to rounding through its dual; where its
-    constraints contradict each other they are violated at a cost of 1000 y_i + y_i^2 / 2.
+    constraints contradict each other they are violated at a cost of c_i y_i + y_i^2 / 2.
 
     Args:
         x: (n,) design, this rank's variables.
@@ -128,6 +130,8 @@ def mma_step(
             nearly linear, which lets curved constraints be left again and again.
         convexity: (1 + m,) least rho_i of objective and constraints, in their units, for Svanberg's
             (2002) 2 rho_i / range_j in H_ij; by default his raa0.
+        prices: (m,) of a unit of every f_i, in units of f0: with them the approximation is that of
+            f0 + sum_i price_i max(0, f_i). By default c_i = 1000.
         comm: communicator over which the variables are distributed; None: all are here.
         pieces: number and length of the consecutive pieces of this rank's variables. Sums are
             taken piece by piece and added in the order of their numbers: as long as no piece is
@@ -156,6 +160,7 @@ def mma_step(
         move,
         widest,
         np.zeros(1 + np.size(f)) if convexity is None else np.asarray(convexity, dtype=np.float64),
+        None if prices is None else np.asarray(prices, dtype=np.float64),
         {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
     )
     f_agreed, largest = _agree(given, comm)
@@ -182,6 +187,7 @@ class _Given:
     move: float
     widest: float
     convexity: Array
+    prices: Array | None
     pieces: Mapping[int, int]
 
     def gradients(self, columns: slice) -> Array:
@@ -334,6 +340,9 @@ class _Dual:
         # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
         with np.errstate(over="ignore"):
             self.f = np.clip(f[active[1:]] / scale[1:], -1e30, 1e30)
+        self.penalty = np.full(self.f.size, _PENALTY)
+        if given.prices is not None:
+            self.penalty = np.clip(given.prices[active[1:]] * scale[1:] / scale[0], _FLOOR, _MOST)
         self.comm = comm
         self.numbers = list(given.pieces)
         self.blocks = [(k, _block(given, columns, active, scale)) for k, columns in given.blocks()]
@@ -365,7 +374,7 @@ class _Dual:
             sums[1 + m :] += ((half_slope * compliance) @ half_slope.T).ravel()
             steps.append(s)
         sums = _sum(parts, self.comm)
-        violation = np.maximum(multipliers - _PENALTY, 0.0)
+        violation = np.maximum(multipliers - self.penalty, 0.0)
         constraints = self.f + sums[1 : 1 + m]
         value = sums[0] + multipliers @ constraints - 0.5 * violation @ violation
         gradient = constraints - violation
@@ -407,10 +416,10 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     radius = np.full(multipliers.size, _FIRST_RADIUS)
     evaluations, kinked = 1, False
     while multipliers.size and evaluations < _MAX_EVALUATIONS:
-        z = _newton_step(point, radius)
+        z = _newton_step(point, radius, dual.penalty)
         if np.abs(z).max() <= _SMALLEST_STEP:
             break
-        trial = dual.at(_stepped(point.multipliers, z))
+        trial = dual.at(_stepped(point.multipliers, z, dual.penalty))
         evaluations += 1
         change = trial.multipliers - point.multipliers
         rise, rise_there = point.gradient * change, trial.gradient * change
@@ -452,29 +461,30 @@ def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
         )
 
 
-def _newton_step(point: _DualPoint, radius: Array) -> Array:
+def _newton_step(point: _DualPoint, radius: Array, penalty: Array) -> Array:
     """Return the Newton step z in units of (multiplier + _FLOOR), limited by the trust region.
 
     A radius r lets a multiplier grow or shrink by the factor 1 + r. The price of violation has a
-    kink where the multiplier reaches _PENALTY: the step ends there at the latest, and the next
+    kink where the multiplier reaches the penalty: the step ends there at the latest, and the next
     one starts with the curvature of the side it goes to.
     """
     old = point.multipliers
     unit = old + _FLOOR
-    violated = (old > _PENALTY) | ((old == _PENALTY) & (point.gradient > 0.0))
-    to_kink = (_PENALTY - old) / unit
+    violated = (old > penalty) | ((old == penalty) & (point.gradient > 0.0))
+    to_kink = (penalty - old) / unit
     lower = np.maximum(np.where(violated, to_kink, -old / unit), -radius / (1.0 + radius))
     upper = np.minimum(np.where(violated, radius, to_kink), radius)
     curvature = (point.curvature + np.diag(violated.astype(float))) * np.outer(unit, unit)
     return _maximise_in_box(point.gradient * unit, curvature, lower, upper)
 
 
-def _stepped(old: Array, z: Array) -> Array:
-    """Return the multipliers after the step z, exactly 0 or _PENALTY if it leads there."""
+def _stepped(old: Array, z: Array, penalty: Array) -> Array:
+    """Return the multipliers after the step z, exactly 0 or the penalty if it leads there."""
     unit = old + _FLOOR
     new = old + unit * z
     new[z <= -old / unit] = 0.0
-    new[np.abs(new - _PENALTY) <= 1e-15 * _PENALTY] = _PENALTY
+    kinked = np.abs(new - penalty) <= 1e-15 * penalty
+    new[kinked] = penalty[kinked]
     return new
 
 

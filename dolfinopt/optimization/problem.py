@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import constraints_of, objective_of, worst_of
+from dolfinopt.responses.response import objective_of, worst_of
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import PhysicalDesign
 
 
+# Price of a limit's excess in units of the objective: an excess by 1 % costs as much as a tenth of
+# the objective. Mass and compliance change by one to three percent with a percent of a limit.
+PRICE = 10.0
+
+
 @dataclass(frozen=True, eq=False)
 class EvaluatedDesign:
     """One design that x stands for, what it does, and the gradients of that by x.
+
 
     Attributes:
         physical: of this rank's arms.
@@ -27,6 +33,7 @@ class EvaluatedDesign:
         objective: (n,) gradient of the objective.
         constraints: (k, n) gradients of `Evaluation.constraints`.
         of_nominal: (k,) True for constraints that the nominal one of robust designs carries alone.
+        differentiated: whether the gradients are known; they are empty of one that is only tried.
     """
 
     physical: Mapping[int, PhysicalDesign]
@@ -34,11 +41,29 @@ class EvaluatedDesign:
     objective: np.ndarray
     constraints: np.ndarray
     of_nominal: np.ndarray
+    differentiated: bool = True
 
     @property
     def x_phys(self) -> dict[int, np.ndarray]:
         """Physical densities of this rank's arms."""
         return {k: one.x_phys for k, one in self.physical.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What is held while designs are compared with each other, so that one function falls.
+
+    Attributes:
+        limits: smooth limit (k,) of every constraint of each design that x stands for.
+        price: of a relative excess, in units of what is minimised.
+    """
+
+    limits: tuple[np.ndarray, ...]
+    price: float
+
+    def merit(self, values: np.ndarray) -> float:
+        """Return phi = f0 + c sum_i max(0, f_i) of values (1 + m,)."""
+        return float(values[0] + self.price * np.maximum(values[1:], 0.0).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +77,6 @@ class Problem:
         limits: the constraints by name, as reports show them.
         rows: (m,) index in `limits` of every constraint: robust designs share a limit.
         turned: whether the objective is maximised.
-        guarded: (1 + m,) which of objective and constraints are guarded, see `Response.guarded`.
     """
 
     f0: float
@@ -62,46 +86,86 @@ class Problem:
     limits: tuple[Limit, ...]
     rows: np.ndarray
     turned: bool = False
-    guarded: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def values(self) -> np.ndarray:
         """What is minimised, and the relative constraints (1 + m,)."""
         return np.append(-self.f0 if self.turned else self.f0, self.f)
 
+    @property
+    def excess(self) -> float:
+        """Largest relative violation of a limit by its true value; 0 where all are met."""
+        return max((0.0 if one.met else one.excess for one in self.limits), default=0.0)
 
-def problem_of(scene: Scene, designs: Sequence[EvaluatedDesign]) -> Problem:
+    def merit(self, size: float) -> float:
+        """Return the merit by the limits' true values, over the `size` of the objective."""
+        over = sum(one.excess for one in self.limits if not one.met)
+        return float(self.values[0] / size + PRICE * over)
+
+
+def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndarray, ...]:
+    """Return the smooth limits of every design, as a stage that begins here holds them.
+
+    Smooth limit = limit times smooth over true value. Where the limits bind the nominal one of
+    robust designs alone, those of the eroded one are scaled so that it meets them as the nominal
+    one does: its gradients keep members from getting thin, and no more is asked of it.
+    """
+    found = [np.array(one.evaluation.smooth_limits) for one in designs]
+    if len(designs) > 1 and scene.design.limits_on == "nominal":
+        eroded, nominal = designs[0].evaluation, designs[-1].evaluation
+        shares = (1.0 + np.array(eroded.constraints)) / (1.0 + np.array(nominal.constraints))
+        found[0] = found[0] * shares
+    return tuple(found)
+
+
+def problem_of(
+    scene: Scene, designs: Sequence[EvaluatedDesign], held: Sequence[np.ndarray] | None = None
+) -> Problem:
     """Return the problem of one design; or of the eroded, dilated and nominal one together.
 
-    Their worst objective is minimised. Every one keeps the limits, but for volume and mass: those
-    are the nominal one's. With a minimum member their gradient is that of the dilated one, scaled
-    to the nominal volume: f = V_dilated / V* - 1 with V* = V_dilated / V_nominal times the limit,
-    chosen anew in every step and held in the gradient.
+    Their worst objective is minimised. Limits of volume and mass are the nominal one's. With a
+    minimum member their gradient is that of the dilated one, scaled to the nominal volume:
+    f = V_dilated / V* - 1 with V* = V_dilated / V_nominal times the limit, chosen anew in every
+    step and held in the gradient. Other limits are kept by all three; where they bind the nominal
+    one alone, by the eroded one with the limits of `limits_at`.
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
+
+    Args:
+        scene: that is asked.
+        designs: at x; of designs without gradients the problem has none either.
+        held: smooth limits of every design; by default those of these designs.
     """
-    nominal = designs[-1]
+    held = limits_at(scene, designs) if held is None else held
+    nominal, robust = designs[-1], len(designs) > 1
+    known = nominal.differentiated
+    scales = [
+        np.array(one.evaluation.smooth_limits) / limits
+        for one, limits in zip(designs, held, strict=True)
+    ]
+    f = [
+        (1.0 + np.array(one.evaluation.constraints)) * scale - 1.0
+        for one, scale in zip(designs, scales, strict=True)
+    ]
     own = nominal.of_nominal
-    f = np.array(nominal.evaluation.constraints)[own]
     dfdx = nominal.constraints[own]
-    if len(designs) > 1 and scene.design.controls_widths:
-        dilated = designs[1]
-        ratio = (1.0 + f) / (1.0 + np.array(dilated.evaluation.constraints)[own])
-        dfdx = ratio[:, None] * dilated.constraints[own]
-    everywhere = [np.array(one.evaluation.constraints)[~own] for one in designs]
+    if robust and known and scene.design.controls_widths:
+        ratio = (1.0 + f[-1][own]) / (1.0 + f[1][own])
+        dfdx = ratio[:, None] * designs[1].constraints[own]
+    bound = [0] if robust and scene.design.limits_on == "nominal" else range(len(designs))
     f0, df0dx = _objective(scene, designs)
-    limits = worst_limits([limits_of(scene, one.evaluation) for one in designs])
-    rows = np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(designs)])
-    objective = objective_of(scene)
-    guards = {one.name: one.response.guarded for one in constraints_of(scene)}
+    variants = [limits_of(scene, one.evaluation) for one in designs]
+    limits = variants[-1] if scene.design.limits_on == "nominal" else worst_limits(variants)
+    rows = [np.flatnonzero(own), *[np.flatnonzero(~own)] * len(bound)]
     return Problem(
         f0,
         df0dx,
-        np.concatenate([f, *everywhere]),
-        np.vstack([dfdx, *(one.constraints[~own] for one in designs)]),
+        np.concatenate([f[-1][own], *(f[i][~own] for i in bound)]),
+        np.vstack([dfdx, *(designs[i].constraints[~own] * scales[i][~own, None] for i in bound)])
+        if known
+        else np.empty((0, 0)),
         limits,
-        rows,
-        objective.turned,
-        np.array([objective.guarded, *(guards[limits[row].quantity] for row in rows)]),
+        np.concatenate(rows),
+        objective_of(scene).turned,
     )
 
 
@@ -111,11 +175,13 @@ def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float,
     turned = -1.0 if response.turned else 1.0
     if response.of_nominal and len(designs) > 1:
         value, by_x = nominal.evaluation.objective, nominal.objective
-        if scene.design.controls_widths:
+        if scene.design.controls_widths and nominal.differentiated:
             dilated = designs[1]
             by_x = value / dilated.evaluation.objective * dilated.objective
         return value, turned * by_x
     values = [one.evaluation.objective for one in designs]
     f0, weights = worst_of(values, scene.objective.exponent, response.turned)
+    if not nominal.differentiated:
+        return f0, np.empty(0)
     parts = [w * one.objective for w, one in zip(weights, designs, strict=True)]
     return f0, turned * np.sum(parts, axis=0)

@@ -37,6 +37,7 @@ class Result:
             only.
         history: one row a design, the initial one first; on the root only.
         iterations: design updates made.
+        best_iteration: updates after which this design was found.
         converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
             within their tolerances and every constraint is met.
         stop_reason: in words.
@@ -60,6 +61,7 @@ class Result:
     initial_deviation: np.ndarray
     history: list[HistoryRow]
     iterations: int
+    best_iteration: int
     converged: bool
     stop_reason: str
     kkt: float

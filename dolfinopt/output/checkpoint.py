@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,10 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.optimization.acceptance import Search
 from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.memory import FurtherMemory, IterateMemory, Memory
+from dolfinopt.optimization.memory import Best, FurtherMemory, IterateMemory, Memory
+from dolfinopt.optimization.problem import Stage
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
@@ -247,6 +250,7 @@ def arrays_of(
         "centroid": gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()}),
         "cells": gather_cells(partition, memory.cells),
         "threshold": gather_arms(partition, memory.thresholds),
+        "best_threshold": gather_arms(partition, memory.best.thresholds or memory.thresholds),
         "points": gather_cells(partition, points),
     }
     for j, by_arm in enumerate(known):
@@ -259,9 +263,15 @@ def arrays_of(
         return {}
     arrays: dict[str, Any] = {
         "iteration": memory.iteration,
-        "last": [memory.change, memory.kkt],
+        "last": [memory.change, memory.kkt, memory.age],
         "multipliers": memory.multipliers,
         "convexity": memory.convexity,
+        "held": memory.stage.limits,
+        "price": memory.stage.price,
+        "search": astuple(memory.search),
+        "best": [
+            getattr(memory.best, name) for name in ("iteration", "beta", "objective", "excess")
+        ],
         "sharpness": memory.beta,
     }
     for k, solution in enumerate(memory.solutions):
@@ -320,7 +330,12 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         of = f"solution{len(solutions)}"
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
-    change, kkt = arrays["last"].tolist()
+    change, kkt, age = arrays["last"].tolist()
+    radius, reach, freedom, strict, lag, merit, size, released = arrays["search"].tolist()
+    iteration, beta, objective, excess = arrays["best"].tolist()
+    thresholds = {k: float(arrays[f"arm{k}/best_threshold"]) for k in cells}
+    if iteration < 0:
+        thresholds = {}
     return {
         "iteration": int(arrays["iteration"]),
         "change": change,
@@ -330,6 +345,10 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         "guesses": guesses,
         "multipliers": arrays["multipliers"],
         "convexity": arrays["convexity"],
+        "stage": Stage(tuple(arrays["held"]), float(arrays["price"])),
+        "search": Search(radius, reach, int(freedom), int(strict), int(lag), merit, size, released),
+        "age": int(age),
+        "best": Best(np.empty(0), int(iteration), beta, thresholds, objective, excess),
         "solutions": tuple(solutions),
         "beta": float(arrays["sharpness"]),
         "thresholds": {k: float(arrays[f"arm{k}/threshold"]) for k in cells},

@@ -48,7 +48,8 @@ class Simulated:
         counts: this rank's, where not all of the profile's belong to the run.
         crisp: evaluation of the design cut at one half.
         x_filtered: what `x_phys` was projected from, see `Result`.
-        iterations, converged, stop_reason, kkt: of the optimisation; kkt is its residual.
+        iterations, best_iteration, converged, stop_reason, kkt: of the optimisation: after which
+            the design was found; kkt is its residual.
         certificate: of the optimised design.
         limits: the constraints; by default those of `evaluation` and `x_phys`.
         initial_deviation: (n, 2) m, of the initial design, kept for the picture.
@@ -66,6 +67,7 @@ class Simulated:
     crisp: Evaluation | None = None
     x_filtered: Mapping[int, np.ndarray] | None = None
     iterations: int = 0
+    best_iteration: int = 0
     converged: bool = True
     stop_reason: str = "simulated"
     kkt: float | None = None
@@ -155,6 +157,7 @@ def write_result(
         crisp=result.crisp,
         x_filtered=result.x_filtered,
         iterations=result.iterations,
+        best_iteration=result.best_iteration,
         converged=result.converged,
         stop_reason=result.stop_reason,
         kkt=result.kkt if np.isfinite(result.kkt) else None,

@@ -82,6 +82,7 @@ def summarise(
             "stiffening": _stiffening(stiffening_of(run.arms)),
             "warnings": _all_warnings(run, traits),
             "iterations": run.iterations,
+            "best_iteration": run.best_iteration,
             "converged": run.converged,
             "stop_reason": run.stop_reason,
             "kkt": run.kkt,

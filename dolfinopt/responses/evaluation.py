@@ -77,10 +77,12 @@ class Evaluation(Motion):
     Attributes:
         objective: sum of its response's values, of all scenarios if there are any.
         constraints: (k,) of everything that the scene limits, relative, kept where <= 0.
+        smooth_limits: (k,) of the smooth values, as of this design.
         responses: the objective's values, then those of every constraint, see `constraints_of`.
     """
 
     constraints: tuple[float, ...] = ()
+    smooth_limits: tuple[float, ...] = ()
     responses: tuple[Measured, ...] = ()
 
     def values_of(self, *names: str) -> tuple[float, ...]:
@@ -239,14 +241,17 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     """Add the responses that the scene asks for (collective)."""
     measured = [objective_of(analysis.scene).measure(analysis)]
     constraints: list[float] = []
+    smooth_limits: list[float] = []
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
         limits = bound.smooth_limits(analysis, found)
         constraints += [float(x) for x in np.array(found.smooth) / limits - 1.0]
+        smooth_limits += [float(x) for x in limits]
         measured.append(found)
     return Evaluation(
         **vars(replace(motion, objective=measured[0].total)),
         constraints=tuple(constraints),
+        smooth_limits=tuple(smooth_limits),
         responses=tuple(measured),
     )
 

@@ -317,11 +317,6 @@ class Settling(Deviation):
 
     name, label = "settling", "p-mean of the deviation after the motion"
 
-    @property
-    def guarded(self) -> bool:
-        """Whether its gradient is the derivative, from which a forecast follows."""
-        return self.options.gradient == "exact"
-
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
         """Return the instants of the vibration that is left."""
         indices = np.flatnonzero(trajectory.after_motion)

@@ -120,14 +120,6 @@ class Response(ABC):
         asked = self.options.direction
         return not self.limited and asked is not None and asked != self.natural
 
-    @property
-    def guarded(self) -> bool:
-        """Whether steps are taken back that spoil it against their forecast.
-
-        Of what is left of vibrations: the gradient tells little of it beyond the next iterate.
-        """
-        return False
-
     @classmethod
     def unit_of(cls, value: str) -> str:
         """Return the unit of the true value of that name, and of its limit."""

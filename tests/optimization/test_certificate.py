@@ -418,7 +418,7 @@ def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept
         assert min(row.objective for row in shown) == best < whole.evaluation.objective
     assert len(WORLD.bcast(whole.history, root=0)) == 3  # the finished design's own
     monkeypatch.setattr(loop, "CHECKPOINT_INTERVAL", 0.0)
-    made, update = [], iterate.Iterate._update
+    made, update = [], iterate.Iterate.step
 
     def counted(one, *arguments):
         if one.evaluator.scene.objective.gradient == "exact":
@@ -428,7 +428,7 @@ def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept
         update(one, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(iterate.Iterate, "_update", counted)
+        patch.setattr(iterate.Iterate, "step", counted)
         with pytest.raises(Killed):
             do.optimize(asked, shared_tmp_path)
         made.clear()

@@ -259,7 +259,7 @@ def test_checkpoint_keeps_the_eigenvectors(shared_tmp_path):
         empty, loaded = memory.modes[k]  # the objective needs no reduced model
         assert empty.shape[1] == 0 and loaded.shape == (arm.elastic.num_dofs, 3)
         assert np.abs(loaded[-3:]).max() > 0.0
-        assert list(memory.cells[k].shape) == [arm.mesh.num_cells, 5]
+        assert list(memory.cells[k].shape) == [arm.mesh.num_cells, 7]
 
 
 def rows_of(folder):

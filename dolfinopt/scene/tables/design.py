@@ -64,6 +64,11 @@ class Design(Table):
         description="distance of the thresholds of the eroded and dilated designs from 0.5; with "
         "a member and a gap of two widths that of the thinner one's [-]",
     )
+    limits_on: Literal["nominal", "eroded"] = Field(
+        default="nominal",
+        description="which of the robust projection's designs keeps the limits: the nominal one, "
+        'as it is meant, or "eroded", every one of them [-]',
+    )
     minimum_member: float = Field(
         default=0.0,
         ge=0,
@@ -185,6 +190,7 @@ class Design(Table):
         projected = self.projection is not False
         self.refuse_unused(projected, "projection", "sharpness", "continuation")
         self.refuse_unused(self.projection == "robust", "projection", "erosion")
+        self.refuse_unused(self.projection == "robust", "projection", "limits_on")
         self.refuse_unused(self.volume_fraction is not None, "volume_fraction", "shared_volume")
         return self
 

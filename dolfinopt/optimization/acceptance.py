@@ -1,0 +1,194 @@
+"""Which steps are taken: free ones that lead to something better soon, else strict ones.
+
+What is better is told by an exact penalty function, the merit phi = f0 + c sum_i max(0, f_i), see
+`Stage`. Vibrations that are left, and limits that are just met, make its valleys narrow and
+curved: a rule that only goes down follows the first of them, in many short steps. So MMA's steps
+are free at first, and it is a watchdog that asks for a lower merit within some steps. Where none
+comes, the search goes back to the best design and takes strict steps: MMA minimises its
+approximation of the merit itself, and what comes out is compared with what it promised. That rules
+the move limit, a trust region, and how convex functions are approximated whose curvature it does
+not know, as in GCMMA. Each time the freedom is halved; so strict steps are the last ones.
+Sources: Chamberlain, Powell, Lemarechal & Pedersen, Math. Program. Study 16 (1982) 1-17,
+doi:10.1007/BFb0120945, for the watchdog; Nocedal & Wright, Numerical Optimization (2006),
+doi:10.1007/978-0-387-40065-5, 18.5, for merit and trust region; Svanberg, SIAM J. Optim. 12 (2002)
+555-573, doi:10.1137/S1052623499362822, for the convexity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.optimization.mma import CURVATURE, MMAState
+from dolfinopt.optimization.optimality import Sum
+from dolfinopt.optimization.problem import Problem, Stage
+from dolfinopt.responses.constraints import EXCESS
+
+# Share of the promised fall of the merit that a step must bring, and from which on it may be
+# longer the next time; with frozen loads, whose gradient is no derivative, any fall is enough.
+ENOUGH, GOOD, POOR = 0.05, 0.6, 0.25
+SHORTER, SHORTER_YET, LONGER = 0.5, 0.25, 2.0
+ATTEMPTS = 8  # of a step: the last ones are 1 % as long as the first
+ROUNDING = 1e-10  # of the merit
+# Free steps without a lower merit until the search goes back, at first; strict ones after that. Of
+# thirteen problems the longest way over a hill that ended lower took ten.
+FREEDOM, STRICT = 8, 3
+# A free step is repeated, so many times at most, that takes a limit's value, or the objective of a
+# design that keeps all limits, to so many times what it was.
+FREE_ATTEMPTS, LEAP = 4, 2.0
+# Where strict steps end, free ones are tried again if the merit has fallen to this share since.
+WORTH = 0.98
+# Change of a held smooth limit, relative and for a change of x by 1, from which a new stage begins;
+# and of the objective.
+DRIFT, GREW = 0.05, 2.0
+NEAR = -0.2  # relative value from which on a limit counts for that
+# Svanberg's 1.1: a little more convexity than what was seen asks for, at most so many times more.
+MARGIN, MOST = 1.1, 10.0
+KEPT = 0.5  # of the convexity after a step that did not need it
+SEEN = 1e-6  # relative difference from the promise below which nothing is learnt: noise
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the next step is sought.
+
+    Attributes:
+        radius: factor on the move limit of strict steps, at most 1.
+        reach: move limit of the last step.
+        freedom: free steps without a lower merit until the search goes back.
+        strict: strict steps before the next free one.
+        lag: steps since the merit was lowest.
+        merit: lowest one so far, of limits' true values over `size`, the objective's.
+        size: of the objective where the projection became as steep as it is.
+        released: merit when free steps were allowed again.
+    """
+
+    radius: float = 1.0
+    reach: float = 0.0
+    freedom: int = FREEDOM
+    strict: int = 0
+    lag: int = 0
+    merit: float = np.inf
+    size: float = 1.0
+    released: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """What the approximation says of a step.
+
+    Attributes:
+        values: (1 + m,) of what is minimised and the relative constraints.
+        spread: d = sum_j 2 relative_j s_j^2 / (1 - s_j^2), what a unit of convexity adds to each;
+            relative_j is the distance of the asymptotes over the range.
+    """
+
+    values: np.ndarray
+    spread: float
+
+
+def promise(
+    x: np.ndarray,
+    x_new: np.ndarray,
+    width: np.ndarray,
+    state: MMAState,
+    problem: Problem,
+    convexity: np.ndarray,
+    parts: Mapping[int, slice],
+    total: Sum,
+) -> Promise:
+    """Return what MMA's approximation about x says of x_new (collective).
+
+    Args:
+        x, x_new: (n,) this rank's variables before and after the step.
+        width: (n,) their ranges.
+        state: after the step, with its asymptotes.
+        problem: at x.
+        convexity: (1 + m,) as `mma_step` had it.
+        parts: this rank's variables arm by arm.
+        total: adds an array an arm to the same bits on all ranks.
+    """
+    distance = 0.5 * (state.upp - state.low)
+    s = (x_new - x) / distance
+    gap = 1.0 - s * s
+    along, curved = distance * s / gap, CURVATURE * distance * s * s / gap
+    apart = 2.0 * distance / np.where(width > 0.0, width, 1.0) * s * s / gap
+    g = np.vstack([problem.df0dx, problem.dfdx])
+    sums = total(
+        {
+            k: np.append(g[:, p] @ along[p] + np.abs(g[:, p]) @ curved[p], apart[p].sum())
+            for k, p in parts.items()
+        }
+    )
+    spread = float(sums[-1])
+    return Promise(problem.values + sums[:-1] + convexity * spread, spread)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is made of a step.
+
+    Attributes:
+        accepted: whether it is taken.
+        factor: on the move limit, for the next attempt or the next step.
+    """
+
+    accepted: bool
+    factor: float
+
+
+def leaps(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether a free step makes things so much worse that it leads nowhere, see `LEAP`.
+
+    Args:
+        before, after: (1 + m,) values.
+    """
+    kept = bool((before[1:] <= EXCESS).all())
+    up = kept and after[0] > before[0] + (LEAP - 1.0) * abs(before[0])
+    far = 1.0 + after[1:] > LEAP * (1.0 + np.maximum(before[1:], 0.0))
+    return bool(up or far.any() or not np.isfinite(after).all())
+
+
+def judge_step(
+    stage: Stage, before: np.ndarray, after: np.ndarray, promised: Promise, exact: bool
+) -> Verdict:
+    """Compare the merit's fall with the promised one.
+
+    Args:
+        stage: that both belong to.
+        before, after: (1 + m,) values.
+        promised: of the step.
+        exact: whether the gradients are derivatives.
+    """
+    if not np.isfinite(after).all():
+        return Verdict(False, SHORTER_YET)
+    merit = stage.merit(before)
+    fall, hoped = merit - stage.merit(after), merit - stage.merit(promised.values)
+    noise = ROUNDING * abs(merit)
+    accepted = fall >= (ENOUGH * hoped if exact else 0.0) - noise
+    if not accepted:
+        return Verdict(False, SHORTER_YET if fall < -2.0 * hoped else SHORTER)
+    if fall >= GOOD * hoped:
+        return Verdict(True, LONGER)
+    return Verdict(True, 1.0 if fall >= POOR * hoped else SHORTER)
+
+
+def learnt(
+    convexity: np.ndarray, after: np.ndarray, promised: Promise, accepted: bool
+) -> np.ndarray:
+    """Return the convexity (1 + m,) that would have told what came out.
+
+    More where something came out worse than promised in a step that is taken back; less where a
+    step that is taken did not need it.
+    """
+    if promised.spread <= 0.0 or not np.isfinite(after).all():
+        return convexity
+    miss = after - promised.values
+    needed = convexity + miss / promised.spread
+    if accepted:
+        return np.minimum(convexity, np.maximum(needed, KEPT * convexity))
+    worse = miss > SEEN * np.abs(after)
+    most = MOST * np.where(convexity > 0.0, convexity, np.inf)
+    return np.where(worse, np.minimum(MARGIN * np.maximum(needed, convexity), most), convexity)
