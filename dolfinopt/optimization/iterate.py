@@ -257,15 +257,26 @@ class Iterate:
 
     def return_to_best(self) -> bool:
         """Go back to the best design so far; return whether it is another one (collective)."""
-        best = self.best
-        if best.iteration in (-1, self.iteration):
+        iteration = self.best.iteration
+        if iteration in (-1, self.iteration):
             return False
-        self.x, self.iteration = best.x.copy(), best.iteration
-        self.continuation.beta = best.beta
-        self.continuation.thresholds = dict(best.thresholds)
+        self._restore_best()
+        self.iteration = iteration
         self.designs = self.evaluator.evaluate(self.x)
         self.begin_stage()
         return True
+
+    def begin_anew(self) -> None:
+        """Go on from the best design; what was seen before does not count any more (collective)."""
+        self._restore_best()
+        self.state, self.best, self.stuck = initial_state(self.x), Best.none(self.x), ""
+        self.evaluate()
+
+    def _restore_best(self) -> None:
+        if self.best.iteration >= 0:
+            self.x = self.best.x.copy()
+            self.continuation.beta = self.best.beta
+            self.continuation.thresholds = dict(self.best.thresholds)
 
     def _proposed(self, move: float, price: float | None) -> tuple[np.ndarray, MMAState]:
         """Return MMA's next design, and what it remembers then (collective).

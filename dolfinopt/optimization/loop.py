@@ -18,7 +18,7 @@ from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.further import Attempt, FurtherRun
 from dolfinopt.optimization.history import HistoryRow
 from dolfinopt.optimization.iterate import Iterate
-from dolfinopt.optimization.memory import Best, FurtherMemory, Memory, fields_of
+from dolfinopt.optimization.memory import FurtherMemory, Memory, fields_of
 from dolfinopt.optimization.problem import Problem
 from dolfinopt.optimization.result import Result
 from dolfinopt.parallel import Partition, together
@@ -165,9 +165,7 @@ class _Run:
         group = [self.scene, *pose_scenarios(self.scene)]
         if not reconsider_stiffening(group, self.partition, self.arms):
             return False
-        self.iterate.best = Best.none(self.iterate.x)  # what was seen without it does not count
-        self.iterate.evaluate()
-        self.iterate.stuck = ""
+        self.iterate.begin_anew()
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
     def _land(self) -> None:

@@ -340,7 +340,7 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
     def killed(*_):
         raise RuntimeError("killed")
 
-    monkeypatch.setattr(iterate.Iterate, "_update", killed)
+    monkeypatch.setattr(iterate.Iterate, "step", killed)
     with pytest.raises(RuntimeError, match="killed"):
         run(*line, "optimizer.max_iterations=3", how)
     WORLD.barrier()

@@ -371,9 +371,9 @@ def test_interrupted_optimisation_goes_on(plan, done, tmp_path, monkeypatch, whe
     assert not (left / "summary.json").exists()
     assert int(np.load(left / "checkpoint.npz")["iteration"]) == reached
     iterations = []
-    step = iterate.Iterate._update
+    step = iterate.Iterate.step
     monkeypatch.setattr(
-        iterate.Iterate, "_update", lambda run, *a: (iterations.append(1), step(run, *a))
+        iterate.Iterate, "step", lambda run, *a: (iterations.append(1), step(run, *a))
     )
     # Under another name: a checkpoint does not depend on it.
     again = run_cases([Case(scene('name="another"'), "optimize")], tmp_path, SELF, shown=False)
