@@ -17,7 +17,12 @@ from dolfinopt.dynamics.build import build_mechanism, closure_of
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.multibody.inverse_dynamics import Stiffening, largest_change, stiffness_change
+from dolfinopt.multibody.inverse_dynamics import (
+    Stiffening,
+    body_loads,
+    largest_change,
+    stiffness_change,
+)
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
@@ -542,13 +547,11 @@ def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
     if not scene.is_spatial:
         mechanism = build_mechanism(scene, bodies)
         return largest_change(mechanism, rigid_motion(t, scene), closure_of(scene))
-    from dolfinopt.multibody.spatial import inverse_dynamics as space
     from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, joint_motion
 
     stiffened, motion = build_spatial_mechanism(scene, bodies), joint_motion(t, scene)
     rigid, none = replace(stiffened, bodies=tuple(map(rigid_part, bodies))), np.zeros((len(t), 0))
-    links = space.outward_pass(rigid, motion, (none, none, none))
-    loads = space.body_loads(links, space.inward_pass(rigid, links).outboard)
+    loads = body_loads(rigid, motion, (none, none, none))
     pairs = zip(stiffened.bodies, loads, strict=True)
     return max((stiffness_change(body, p) for body, p in pairs), default=0.0)
 

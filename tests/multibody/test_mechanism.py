@@ -77,17 +77,6 @@ def test_forces_are_those_of_lagranges_equations(
         assert_close(found[n], expected, DIFFERENCES)
 
 
-def test_deformation_of_the_second_order_with_many_modes(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By products of modes two by two, or load by load: the same forces."""
-    model = chain(rng, 2, bent=True)
-    y, yd, ydd = states(rng, model, 40)
-    few = forces(model, y, yd, ydd)
-    monkeypatch.setattr("dolfinopt.multibody.inverse_dynamics.FEW_MODES", 0)
-    assert_close(forces(model, y, yd, ydd), few, 1e-13)
-
-
 def split_tangent(
     model: Chain, state: np.ndarray, keep: np.ndarray | None, rigid: np.ndarray | None
 ) -> Tangent:

@@ -97,7 +97,7 @@ def test_joints_in_any_order(source):
     scene = scene_from_dict(data, source)
     machine = build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
     assert scene.driven == ("lift", "yaw")
-    assert machine.order == (0, 1, 2) and machine.movable == (1, 0)
+    assert machine.tree.order == (0, 1, 2) and machine.tree.movable == (1, 0)
 
 
 ARM = {"name": "link", "length": 0.4, "height": 0.02, "thickness": 0.01, "cells": [8, 2]}
@@ -168,13 +168,13 @@ def test_interfaces_of_a_scene(source):
     machine = build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
     assert (machine.joints[2].parent, machine.joints[2].interface) == (1, 1)
     assert np.array_equal(machine.bodies[1].points, [[0.4, 0, 0], [0.2, 0.01, 0]])
-    assert machine.sites == ((0,), (0, 1), ()) and set(machine.loads) == {(1, 0)}
+    assert machine.tree.sites == ((0,), (0, 1), ()) and set(machine.tree.loads) == {(1, 0)}
     assert machine.chain == (0, 1)
     data = with_fork()  # the payload at the side, beside the tool
     data["payload"]["interface"] = "Side"
     scene = scene_from_dict(data, source)
     machine = build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
-    assert (machine.end, machine.end_interface) == (1, 1) and set(machine.loads) == {(1, 1)}
+    assert (machine.end, machine.end_interface) == (1, 1) and set(machine.tree.loads) == {(1, 1)}
     data["arms"][2]["interfaces"] = [{**SIDE, "name": "a", "radius": 0.01}]
     data["payload"] = {"mass": 2.0, "arm": "tool", "interface": "a"}
     data["reduction"]["coordinates"] = 12

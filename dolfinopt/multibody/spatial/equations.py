@@ -10,13 +10,6 @@ from dolfinopt.multibody.equations import Equations
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.end_effector import deviation, end_effector, end_effector_gradient
-from dolfinopt.multibody.spatial.inverse_dynamics import (
-    body_gradient,
-    elastic_residual,
-    inverse_dynamics,
-    linearise,
-    load_coefficients,
-)
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 
 
@@ -28,10 +21,6 @@ def _end_effector_gradient(
     rigid: bool,
 ) -> tuple[np.ndarray, np.ndarray | None, list[dict[str, np.ndarray]]]:
     return end_effector_gradient(mechanism, motion, q, weights)
-
-
-def _is_loaded_at_rest(mechanism: SpatialMechanism, motion: RigidMotion) -> bool:
-    return True
 
 
 def _rotations(mechanism: SpatialMechanism, q: np.ndarray) -> np.ndarray:
@@ -56,17 +45,11 @@ def _levers(mechanism: SpatialMechanism) -> np.ndarray:
     bodies, joints = mechanism.bodies, mechanism.joints
     reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in bodies)
     reach += sum(float(np.linalg.norm(one.origin)) for one in joints)
-    slides = [joints[i].kind == "prismatic" for i in mechanism.movable]
+    slides = [joints[i].kind == "prismatic" for i in mechanism.tree.movable]
     return np.where(slides, 1.0, reach)
 
 
 SPACE = Equations(
-    residual=elastic_residual,
-    forces=inverse_dynamics,
-    linearise=linearise,
-    body_gradient=body_gradient,
-    load_coefficients=load_coefficients,
-    is_loaded_at_rest=_is_loaded_at_rest,
     end_effector=end_effector,
     deviation=deviation,
     end_effector_gradient=_end_effector_gradient,
