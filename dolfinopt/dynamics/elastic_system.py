@@ -89,6 +89,11 @@ class ElasticSystem:
         Raises:
             ConvergenceError: no equilibrium near the undeformed state.
         """
+        return self._equilibrium.copy(), np.zeros_like(self._equilibrium)
+
+    @cached_property
+    def _equilibrium(self) -> np.ndarray:
+        """That of `initial_state`: every time grid asks for it."""
         q, found = static_equilibrium(self)
         if not found.all():
             raise ConvergenceError(
@@ -97,7 +102,7 @@ class ElasticSystem:
                 "material.young_modulus or interpolation.floor, lower motion.gravity, or let the "
                 "motion begin at rest"
             )
-        return q, np.zeros_like(q)
+        return q
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return the largest sqrt(q' K q) of every arm, see `System.norm`."""
