@@ -319,15 +319,12 @@ class BodyMotion:
 
     def pushes(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return all P of them (P, n) from those of the interfaces, by number."""
-        inertial = self._of_mass(np.concatenate([self.a, self.alpha]))
-        out = np.zeros(
-            (len(self.constants.T), self.a.shape[1]),
-            dtype=np.result_type(inertial, *outboard.values()),
-        )
-        out[: len(inertial)] = inertial
-        for number, pull in outboard.items():
-            out[self.constants.outboard(number)] = pull
-        return out
+        count = self.a.shape[1]
+        pulls = [
+            outboard[s] if s in outboard else np.zeros((self.dim.b, count))
+            for s in range(len(self.constants.points))
+        ]
+        return np.concatenate([self._of_mass(self.a), self._of_mass(self.alpha), *pulls])
 
     def rows(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the elastic rows (q, n) under pushes of the interfaces, by number."""

@@ -289,8 +289,11 @@ class PlaneTurning:
     @cached_property
     def R(self) -> np.ndarray:
         """The rotation (2, 2, n)."""
-        c, s = np.cos(self.theta[0]), np.sin(self.theta[0])
-        return np.array([[c, -s], [s, c]])
+        out = np.empty((2, 2, self.theta.shape[1]), dtype=self.theta.dtype)
+        np.cos(self.theta[0], out=out[0, 0])
+        np.sin(self.theta[0], out=out[1, 0])
+        out[1, 1], out[0, 1] = out[0, 0], -out[1, 0]
+        return out
 
     def pushed(self, x: np.ndarray) -> np.ndarray:
         """Return J x (r, ..., n): the angular velocity of a rate."""

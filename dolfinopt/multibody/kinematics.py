@@ -30,17 +30,19 @@ class Interface:
     Attributes:
         body: as it moves.
         number: which of its interfaces.
-        place: reference point from the body's origin (d, n), m; of a rigid body (d, 1).
+        place: reference point from the body's origin (d, n), m.
     """
 
     def __init__(self, body: BodyMotion, number: int = 0) -> None:
         """Take the body, and which of its interfaces it is."""
         self.body, self.number, self.dim = body, number, body.dim
         self.places = body.constants.outboard(number)
-        self.place = body.constants.points[number][:, None]
+        point = body.constants.points[number][:, None]
         if body.is_flexible:
             self.u = body.conjugates[self.places][: self.dim.d]
-            self.place = self.place + self.u[:, 0]
+            self.place = point + self.u[:, 0]
+        else:
+            self.place = np.broadcast_to(point, body.a.shape)
 
     @cached_property
     def turning(self) -> Turning:
@@ -52,7 +54,7 @@ class Interface:
     def _unturned(self) -> Motion:
         """Its motion in the body's components."""
         body, dim = self.body, self.dim
-        a = body.a + dim.apply(body.alpha, np.broadcast_to(self.place, body.a.shape))
+        a = body.a + dim.apply(body.alpha, self.place)
         if not body.is_flexible:
             return a, body.w, body.wd
         turning = self.turning
@@ -113,8 +115,7 @@ class Interface:
     def _by_spin(self) -> np.ndarray:
         """Derivative of the acceleration by the body's angular velocity (d, r, n)."""
         body, dim = self.body, self.dim
-        place = np.broadcast_to(self.place, body.a.shape)
-        out = dim.centripetal_by_spin(body.w, place)
+        out = dim.centripetal_by_spin(body.w, self.place)
         return out + 2.0 * dim.by_spin(self.u[:, 1]) if body.is_flexible else out
 
     def moved_by_body(self, motion: np.ndarray) -> np.ndarray:
@@ -122,7 +123,7 @@ class Interface:
         dim, d, r = self.dim, self.dim.d, self.dim.r
         w, wd = motion[d : d + r], motion[d + r :]
         out = motion.copy()
-        out[:d] += dim.velocity(wd, np.broadcast_to(self.place, self.body.a.shape))
+        out[:d] += dim.velocity(wd, self.place)
         out[:d] += product(self._by_spin, w)
         if self.body.is_flexible and r > 1:
             out[d + r :] -= dim.commutator(self.turning.velocity, w)
@@ -184,7 +185,7 @@ class Interface:
         """
         body, dim = self.body, self.dim
         a, w, wd = by
-        place = np.broadcast_to(self.place, body.a.shape)
+        place = self.place
         if not body.is_flexible:
             by_w = w + transposed_product(self._by_spin, a)
             return (a, by_w, wd + dim.moment(place, a)), (a[:0], a[:0], a[:0])
@@ -246,13 +247,11 @@ class MovingJoint:
         if self.slides:
             self.r = self.r + (joint.rotation @ joint.axis)[:, None] * rates[0]
             return
-        S = self.dim.skew(joint.axis)
-        table = np.stack([joint.rotation, joint.rotation @ S, joint.rotation @ S @ S], axis=-1)
         # Of a column NumPy takes other instructions, and another last bit, where the end of its
         # stride touches the memory of the result.
         angle = np.ascontiguousarray(rates[0])
         turns = np.stack([np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)])
-        self.R = table @ turns
+        self.R = joint.turns @ turns
 
     @cached_property
     def _rate(self) -> np.ndarray:

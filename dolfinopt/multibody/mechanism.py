@@ -24,6 +24,7 @@ from dolfinopt.multibody.body_motion import (
     Scale,
     at,
 )
+from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
@@ -230,6 +231,12 @@ class Joint:
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     rotor: float = 0.0
     interface: int = 0
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """A revolute joint's rotation by (1, sin(angle), 1 - cos(angle)) (d, d, 3)."""
+        R, S = self.rotation, DIMENSIONS[len(self.origin)][0].skew(self.axis)
+        return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
