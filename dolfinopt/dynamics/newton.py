@@ -7,6 +7,7 @@ then treats more coordinates densely; where even that fails, it is solved in win
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,8 +45,7 @@ BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordi
 # Angles w h up to which coordinates are slow, tried in turn: 6 Newton iterations with 30 and 40, 10
 # with 20, in an optimisation of the paper's example.
 LIMITS = (40.0, 120.0, np.inf)
-# As long as not all must be, the slowest so many are, or fewer that have room: on short steps
-# nearly all would.
+# As long as not all must be, the slowest so many are: on short steps nearly all would.
 MOST = 24
 SMALL = 12  # coordinates up to which the exact matrix costs less than more iterations
 MEMORY_BYTES = 256e6  # of the factors of steps that are solved together
@@ -69,9 +69,8 @@ def next_slow_coordinates(
         return np.arange(len(angles)), ()
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))
-    most = max(1, min(MOST, int(np.sqrt(MEMORY_BYTES / _bytes(stages)))))
-    if limit < np.inf and len(slow) > most:
-        slow = np.sort(np.argsort(angles, kind="stable")[:most])
+    if limit < np.inf and len(slow) > MOST:
+        slow = np.sort(np.argsort(angles, kind="stable")[:MOST])
     if len(slow) <= more_than and beyond:
         return next_slow_coordinates(stages, tuple(beyond), more_than)
     return slow, tuple(beyond) if len(slow) < len(angles) else ()
@@ -339,23 +338,29 @@ def diagonal_matrix(
     return inverse, loads, transfer, band_of(chain.reshape(-1, 2, 2), stages.length)
 
 
-def solve_once(
-    stages: Stages,
-    q: np.ndarray,
-    qd: np.ndarray,
-    a: np.ndarray,
-    slow: np.ndarray,
-    residual: np.ndarray,
-) -> np.ndarray:
-    """Return the change of q (n, s, N) as `NewtonMatrix.solve`, factors made window by window."""
-    shift = np.empty_like(a)
-    before = np.zeros((2, a.shape[2]))
-    for part in windows(stages, slow):
-        window = stages.window(part.start, part.stop)
-        matrix = factorise(window, q[part], qd[part], a[part], slow)
-        step, shift[part] = matrix.solve(residual[part], before)
-        before = np.stack([x[-1] for x in step_ends(window, (before[0], before[1]), step)])
-    return shift
+@dataclass(frozen=True, eq=False)
+class WindowedNewtonMatrix:
+    """Newton's matrix of more steps than have room: made again window by window in every solve.
+
+    Attributes:
+        stages: n steps of one run.
+        slow: ascending coordinates that are treated densely.
+        make: returns the matrix of a window, which is the steps of a slice.
+    """
+
+    stages: Stages
+    slow: np.ndarray
+    make: Callable[[Stages, slice], NewtonMatrix]
+
+    def solve(self, residual: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the changes of a and q (n, s, N), see `NewtonMatrix.solve`."""
+        step, shift = np.empty_like(residual), np.empty_like(residual)
+        for part in windows(self.stages, self.slow):
+            window = self.stages.window(part.start, part.stop)
+            step[part], shift[part] = self.make(window, part).solve(residual[part], before)
+            ends = step_ends(window, (before[0], before[1]), step[part])
+            before = np.stack([x[-1] for x in ends])
+        return step, shift
 
 
 # -- Newton's method for all stages of all steps at once, of one run of steps or of many ---------

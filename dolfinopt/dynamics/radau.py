@@ -45,12 +45,12 @@ from dolfinopt.dynamics.newton import (
     Iterate,
     NewtonMatrix,
     Tuning,
+    WindowedNewtonMatrix,
     factorise,
     limits_for,
     newton,
     next_slow_coordinates,
     simplified_newton_matrix,
-    solve_once,
     windows,
 )
 from dolfinopt.dynamics.system import LEAST_SHARE, Preconditioner, State, System
@@ -383,6 +383,7 @@ def _first_time_grid(system: System, tolerance: float, stages: int) -> np.ndarra
 
 ROUGHLY = 0.2  # correction of an estimate that still lets it be believed: the next is a fifth
 CORRECTIONS = 4  # of an estimate: mostly one
+AnyMatrix = NewtonMatrix | WindowedNewtonMatrix
 # Contraction of Newton's iteration up to which one answer, with what it may leave, estimates the
 # error; beyond it is corrected, which takes an eighth of the time of all.
 TRUSTED = 0.2
@@ -415,11 +416,9 @@ def estimated_errors(
     q, qd = stage_values(richer, *begin, a)
     residual = residual_at(richer, q, qd, a)
     slow, _ = next_slow_coordinates(richer, limits, 0)
-    one = richer.runs == 1
     error, sure = np.full(richer.runs, np.inf), np.zeros(richer.runs, dtype=bool)
-    simplified = richer.preconditioner.guided
-    if simplified and not (one and len(windows(richer, slow)) > 1):
-        matrix = simplified_newton_matrix(richer, begin, a, slow)
+    if richer.preconditioner.guided:
+        matrix = _simplified(richer, begin, a, slow)
         if rate is not None and rate.max(initial=0.0) <= TRUSTED:
             _, shift = matrix.solve(residual, np.zeros((2, a.shape[2])))
             return richer.relative(shift, q) / (1.0 - rate) + unseen
@@ -450,6 +449,17 @@ def _unresolved_error(
     return stages.relative(missed[:, None], q)
 
 
+def _simplified(stages: Stages, begin: State, a: np.ndarray, slow: np.ndarray) -> AnyMatrix:
+    """Return the simplified matrix: of one run that has no room for it, window by window."""
+    if stages.runs > 1 or len(windows(stages, slow)) == 1:
+        return simplified_newton_matrix(stages, begin, a, slow)
+
+    def make(window: Stages, part: slice) -> NewtonMatrix:
+        return simplified_newton_matrix(window, (begin[0][part], begin[1][part]), a[part], slow)
+
+    return WindowedNewtonMatrix(stages, slow, make)
+
+
 def _with_exact_matrix(
     stages: Stages,
     begin: State,
@@ -467,12 +477,18 @@ def _with_exact_matrix(
         if sure.all():
             return float(error[0])
         slow, limits = next_slow_coordinates(stages, limits, len(slow))
-    return float(stages.relative(solve_once(stages, q, qd, a, slow, residual), q)[0])
+
+    def make(window: Stages, part: slice) -> NewtonMatrix:
+        return factorise(window, q[part], qd[part], a[part], slow)
+
+    exact = WindowedNewtonMatrix(stages, slow, make)
+    _, shift = exact.solve(residual, np.zeros((2, a.shape[2])))
+    return float(stages.relative(shift, q)[0])
 
 
 def _corrected(
     stages: Stages,
-    matrix: NewtonMatrix,
+    matrix: AnyMatrix,
     begin: State,
     a: np.ndarray,
     residual: np.ndarray,
@@ -589,6 +605,7 @@ class March:
     ) -> tuple[np.ndarray, int]:
         found = newton(stages, state, guess, self._tolerance, tuning, simplified=simplified)
         count, spent = len(stages.h), int(found.iterations[0])
+        simplified = simplified and spent == 0  # where it has not failed, but had no room
         self._work += spent * count
         if found.converged[0]:
             self.windows, self._done = self.windows + 1, self._done + count
@@ -608,10 +625,11 @@ class March:
         )
         half = count // 2
         front, back = stages.window(0, half), stages.window(half, count)
-        tuning = replace(tuning, limits=limits_for(stages))
-        first, spent_1 = self._run(front, state, guess[:half], tuning, False)
+        if not simplified:
+            tuning = replace(tuning, limits=limits_for(stages))
+        first, spent_1 = self._run(front, state, guess[:half], tuning, simplified)
         q, qd = step_ends(front, state, first)
-        second, spent_2 = self._run(back, (q[-1:], qd[-1:]), guess[half:], tuning, False)
+        second, spent_2 = self._run(back, (q[-1:], qd[-1:]), guess[half:], tuning, simplified)
         return np.concatenate([first, second]), spent + spent_1 + spent_2
 
 
