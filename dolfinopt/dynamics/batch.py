@@ -35,8 +35,9 @@ from dolfinopt.dynamics.elastic_system import (
 from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.body_motion import Scale
 from dolfinopt.multibody.equations import PLANE
-from dolfinopt.multibody.mechanism import Mechanism, Scale
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, proportional, same_geometry
 from dolfinopt.profiling import Profile

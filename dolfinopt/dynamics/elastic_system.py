@@ -13,8 +13,10 @@ from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
+from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
 ROUNDING = 1e-14  # a step below it changes nothing
@@ -40,13 +42,13 @@ class ElasticInstants:
 
     def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the elastic residual (n, N)."""
-        return self.equations.residual(self.mechanism, self.motion, q, qd, qdd)
+        return elastic_residual(self.mechanism, self.motion, q, qd, qdd)
 
     def linearise(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, keep: np.ndarray | None = None
     ) -> Linearisation:
         """Return its derivative by the coordinates `keep`, or all."""
-        return self.equations.linearise(self.mechanism, self.motion, q, qd, qdd, keep)
+        return linearise(self.mechanism, self.motion, q, qd, qdd, keep)
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,11 @@ class ElasticSystem:
         Raises:
             ConvergenceError: no equilibrium near the undeformed state.
         """
+        return self._equilibrium.copy(), np.zeros_like(self._equilibrium)
+
+    @cached_property
+    def _equilibrium(self) -> np.ndarray:
+        """That of `initial_state`: every time grid asks for it."""
         q, found = static_equilibrium(self)
         if not found.all():
             raise ConvergenceError(
@@ -95,7 +102,7 @@ class ElasticSystem:
                 "material.young_modulus or interpolation.floor, lower motion.gravity, or let the "
                 "motion begin at rest"
             )
-        return q, np.zeros_like(q)
+        return q
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return the largest sqrt(q' K q) of every arm, see `System.norm`."""
@@ -132,7 +139,7 @@ class ElasticSystem:
 
     def is_loaded_at_rest(self) -> bool:
         """Return whether anything may load the bodies at t = 0, while they are not deformed."""
-        return self.equations.is_loaded_at_rest(self.mechanism, self.motion(np.zeros(1)))
+        return is_loaded_at_rest(self.mechanism, self.motion(np.zeros(1)))
 
     def at(self, t: np.ndarray) -> ElasticInstants:
         """Return mechanism and motion at instants t (n,), s."""
@@ -156,8 +163,7 @@ class ElasticSystem:
         multipliers: np.ndarray,
     ) -> list[ShapeIntegrals]:
         """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
-        gradient = self.equations.body_gradient
-        return gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
+        return body_gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
 
 
 def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:

@@ -23,9 +23,11 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
 from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import FEW, Closure, Drives, ElasticBodies, repeated
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, padded, rigid_part
+from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
 ROUNDING = 1e-13  # of a step of that iteration, beside the coordinates
@@ -144,7 +146,7 @@ class MachineInstants:
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        forces = machine.equations.forces(machine.mechanism, motion, q, qd, qdd)[1]
+        forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
         if machine.closure is not None:
             jacobian = interface_place(machine.mechanism, motion, q).jacobian
             forces -= machine.ground_work(multipliers, jacobian[:, : forces.shape[1]])
@@ -162,7 +164,7 @@ class MachineInstants:
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        rows, forces = machine.equations.forces(machine.mechanism, motion, q, qd, qdd)
+        rows, forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)
         drives, springs = self.drive_forces(y, yd), machine.drives.springs
         rigid = forces[:, machine.drives.free] - drives
         pulled = self.spring_forces(y, yd)
@@ -192,7 +194,7 @@ class MachineInstants:
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         matrix = np.zeros((count, S, 3, S))
         free = machine.drives.free
-        tangent = machine.equations.linearise(machine.mechanism, motion, q, qd, qdd, None, free)
+        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, free)
         matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
         passing = machine.drives.passing(self.ahead, self.at_drives(y), self.at_drives(yd))
         springs, every = machine.drives.springs, machine.drive_columns
@@ -318,7 +320,7 @@ class MachineSystem:
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.equations, self.rigid, desired, self.drives, self.closure)
+        return feed_forward(self.rigid, desired, self.drives, self.closure)
 
     @cached_property
     def rigid(self) -> ElasticBodies:
@@ -396,8 +398,7 @@ class MachineSystem:
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
         of_forces = np.zeros_like(motion.q)
         of_forces[:, self.drives.free] = of_rigid
-        bodies = self.equations.body_gradient
-        total = bodies(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
+        total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
         at_drives = instants.at_drives
         passing = self.drives.passing(instants.ahead, at_drives(y), at_drives(yd))
         pushed = -passing * at_drives(multipliers)
@@ -426,7 +427,7 @@ class MachineSystem:
             return total
         of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
         none = np.zeros((len(weights), 0))
-        rigid = self.equations.body_gradient(self.rigid, desired, none, none, none, none, of_forces)
+        rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
         return [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
 
     def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:
@@ -540,7 +541,6 @@ class MachineModes:
 
 
 def feed_forward(
-    equations: Equations,
     rigid: Any,
     desired: RigidMotion,
     drives: Drives,
@@ -552,7 +552,7 @@ def feed_forward(
     ground gives through the constraint.
     """
     none = np.zeros((len(desired.q), 0))
-    forces = equations.forces(rigid, desired, none, none, none)[1]
+    forces = inverse_dynamics(rigid, desired, none, none, none)[1]
     if closure is not None:
         place = interface_place(rigid, desired, none)
         forces = forces - (np.conj(closure.force) * place.jacobian).real

@@ -24,6 +24,8 @@ from dolfinopt.multibody.end_effector import (
     place_gradient,
 )
 from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
 from dolfinopt.multibody.mechanism import Closure, ElasticBodies, compliance
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
@@ -33,6 +35,7 @@ from dolfinopt.multibody.shape_integrals import (
     add_integrals,
     in_basis,
 )
+from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 
@@ -184,7 +187,7 @@ class Trajectory:
         if isinstance(self.problem, MachineSystem):
             return self.problem.at(self.t).forces(*self.unknowns)
         qd, qdd = self.unknowns[1:]
-        return self.equations.forces(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
 
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
@@ -192,7 +195,7 @@ class Trajectory:
         if self.closure is not None:
             return load_coefficients(self.problem, self.t, self.unknowns)
         q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
-        return self.equations.load_coefficients(self.mechanism, self.motion, (q, qd, qdd))
+        return coefficients_of(self.mechanism, self.motion, (q, qd, qdd))
 
     @property
     def is_machine(self) -> bool:
@@ -554,7 +557,7 @@ class _Prescribed:
     def tangent(self) -> Linearisation:
         """By rigid and elastic coordinates."""
         every = np.arange(self.motion.q.shape[1])
-        return self.equations.linearise(self.mechanism, self.motion, *self.rates, None, every)
+        return linearise(self.mechanism, self.motion, *self.rates, None, every)
 
     def by_all(self, weights: np.ndarray) -> np.ndarray:
         """Return the derivatives (3, n, 1 + arms + N) by rigid and elastic coordinates."""
@@ -565,7 +568,7 @@ class _Prescribed:
         """Return those by every body, all coordinates held."""
         none = np.zeros_like(self.rates[0])
         motion = self.motion
-        return self.equations.body_gradient(self.mechanism, motion, *self.rates, none, weights)
+        return body_gradient(self.mechanism, motion, *self.rates, none, weights)
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`; rigid coordinates do not change."""

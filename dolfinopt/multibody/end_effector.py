@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.multibody.mechanism import FEW, Mechanism, ModalConstants, several
+from dolfinopt.multibody.mechanism import FEW, Mechanism, several
 from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
@@ -24,23 +25,21 @@ def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np
         return end_effector(*several(mechanism, motion, q))[: len(q)]
     place = motion.q[:, 0] + 1j * mechanism.joint_height
     joint_rotation = np.ones(len(q), dtype=complex)
-    for k, (part, constants) in enumerate(
-        zip(mechanism.slices, mechanism.modal_constants, strict=True)
-    ):
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
-        d, angle = outboard(constants, q[:, part])
+        d, angle = outboard(body, q[:, part])
         place = place + joint_rotation * d
         joint_rotation = joint_rotation * np.exp(1j * angle)
     return np.stack([place.real, place.imag], axis=1)
 
 
-def outboard(constants: ModalConstants, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outboard point (n,), complex, and rotation, see `inverse_dynamics`."""
-    d, angle = constants.outboard_position + e @ constants.B, e @ constants.rotation
-    if constants.K0 is not None:
-        x, y, bent = (-0.5 * np.einsum("nk,nk->n", e @ K0, e) for K0 in constants.K0[4:])
-        d, angle = d + (x + 1j * y), angle + bent
-    return d, angle
+def outboard(body: ShapeIntegrals, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outboard point (n,), complex, and its rotation, for coordinates e (n, q)."""
+    x, y, angle = body.outboard @ e.T
+    if body.is_stiffened:
+        bent = np.einsum("pkl,nk,nl->pn", body.K0_outboard, e, e, optimize=True)
+        x, y, angle = x - 0.5 * bent[0], y - 0.5 * bent[1], angle - 0.5 * bent[2]
+    return complex(*body.outboard_point) + (x + 1j * y), angle
 
 
 def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
@@ -73,30 +72,24 @@ def end_effector_gradient(
     w = weights[:, 0] + 1j * weights[:, 1]
     rotations, levers = [], []
     joint_rotation = np.ones(len(q), dtype=complex)
-    for k, (part, constants) in enumerate(
-        zip(mechanism.slices, mechanism.modal_constants, strict=True)
-    ):
+    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
         rotations.append(joint_rotation)
-        d, angle = outboard(constants, q[:, part])
+        d, angle = outboard(body, q[:, part])
         levers.append(joint_rotation * d)
         joint_rotation = joint_rotation * np.exp(1j * angle)
     by_q = np.empty_like(q)
     by_outboard: list[dict[str, np.ndarray]] = []
     beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
     for k in reversed(range(len(rotations))):
-        part, constants = mechanism.slices[k], mechanism.modal_constants[k]
+        part, body = mechanism.slices[k], mechanism.bodies[k]
         place = np.conj(rotations[k]) * w
         rotation = (np.conj(w) * 1j * beyond).real
-        by_q[:, part] = (
-            np.outer(place.real, constants.B.real)
-            + np.outer(place.imag, constants.B.imag)
-            + np.outer(rotation, constants.rotation)
-        )
         e, pulls = q[:, part], (place.real, place.imag, rotation)
+        by_q[:, part] = np.stack(pulls, axis=1) @ body.outboard
         by = {"outboard": np.stack([pull @ e for pull in pulls])}
-        if constants.K0 is not None:
-            pairs = zip(pulls, constants.K0[4:], strict=True)
+        if body.is_stiffened:
+            pairs = zip(pulls, body.K0_outboard, strict=True)
             by_q[:, part] -= sum(pull[:, None] * (e @ K0) for pull, K0 in pairs)
             by["K0_outboard"] = np.stack([-0.5 * (e.T * pull) @ e for pull in pulls])
         by_outboard.insert(0, by)
@@ -165,10 +158,10 @@ def interface_place(
         H[:, 1 + k, 1 + k] = 1j * J[:, 1 + k]
         r = turn[:, own]
         H[:, own, own] = -lever[:, None, None] * r[:, :, None] * r[:, None, :]
-        K0 = mechanism.modal_constants[k].K0
-        if K0 is not None:
-            H[:, own, own] -= rotations[k][:, None, None] * (K0[4] + 1j * K0[5])
-            H[:, own, own] -= 1j * lever[:, None, None] * K0[6]
+        if mechanism.bodies[k].is_stiffened:
+            x, y, turned = mechanism.bodies[k].K0_outboard
+            H[:, own, own] -= rotations[k][:, None, None] * (x + 1j * y)
+            H[:, own, own] -= 1j * lever[:, None, None] * turned
     return InterfacePlace(end, J, H)
 
 
@@ -181,14 +174,14 @@ def _frames(
     shifts: list[tuple[np.ndarray, np.ndarray]] = []
     outer = np.ones(len(q), dtype=complex)
     for k, part in enumerate(mechanism.slices):
-        constants, e = mechanism.modal_constants[k], q[:, part]
+        body, e = mechanism.bodies[k], q[:, part]
         rotations.append(outer * motion.joint_rotations[k])
-        d, angle = outboard(constants, e)
+        d, angle = outboard(body, e)
         origins.append(origins[-1] + rotations[-1] * d)
         outer = rotations[-1] * np.exp(1j * angle)
-        B, rotation = constants.B, constants.rotation
-        if constants.K0 is not None:
-            bent = np.tensordot(e, constants.K0[4:], (1, 1))  # K0_p is symmetric
+        B, rotation = body.outboard[0] + 1j * body.outboard[1], body.outboard[2]
+        if body.is_stiffened:
+            bent = np.tensordot(e, body.K0_outboard, (1, 1))  # K0_p is symmetric
             B, rotation = B - bent[:, 0] - 1j * bent[:, 1], rotation - bent[:, 2]
         shifts.append((B, np.broadcast_to(rotation, e.shape)))
     return origins, rotations, shifts
@@ -235,7 +228,7 @@ def place_gradient(
         rates = ((back * pull).real, (back * pull).imag, (np.conj(pull) * 1j * lever).real)
         pairs = list(zip(values, rates, strict=True))
         by = {"outboard": np.stack([a @ e + b @ v for a, b in pairs])}
-        if mechanism.modal_constants[k].K0 is not None:
+        if mechanism.bodies[k].is_stiffened:
             by["K0_outboard"] = -np.stack(
                 [e.T @ (0.5 * a[:, None] * e + b[:, None] * v) for a, b in pairs]
             )

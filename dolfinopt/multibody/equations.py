@@ -1,14 +1,13 @@
-"""The equations of a machine as a table of functions: those of the plane, and in space the same.
+"""What of a machine differs between plane and space, as a table of functions: the plane's.
 
-What simulates, differentiates and judges a machine knows nothing else of its mechanism, so it is
-written once. The table in space is `multibody.spatial.equations.SPACE`.
+Inverse dynamics and its derivatives are one code, see `dimension`; here is where the end-effector
+is, and what sizes are compared by. The table in space is `multibody.spatial.equations.SPACE`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,17 +17,10 @@ from dolfinopt.multibody.end_effector import (
     end_effector_gradient,
     interface_place,
 )
-from dolfinopt.multibody.inverse_dynamics import (
-    body_loads,
-    elastic_residual,
-    inverse_dynamics,
-    largest_change,
-    load_coefficients,
-)
+from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
 
 
 @dataclass(frozen=True)
@@ -36,13 +28,6 @@ class Equations:
     """Functions of a mechanism; d is 2 in the plane, 3 in space.
 
     Attributes:
-        residual: (mechanism, motion, q, qd, qdd): elastic residual (n, N).
-        forces: the same: elastic residual, and forces (n, R) of all rigid coordinates.
-        linearise: (mechanism, motion, q, qd, qdd, keep, rigid): a `Linearisation` of both.
-        body_gradient: (mechanism, motion, q, qd, qdd, multipliers, of_forces): derivative by every
-            body's integrals.
-        load_coefficients: (mechanism, motion, (q, qd, qdd)): what loads every body.
-        is_loaded_at_rest: (mechanism, motion): whether anything may load undeformed bodies.
         end_effector: (mechanism, motion, q): its place (n, d), m.
         deviation: the same: flexible minus rigid place (n, d), m.
         end_effector_gradient: (mechanism, motion, q, weights, rigid): by the elastic coordinates,
@@ -54,12 +39,6 @@ class Equations:
             by the loads of the motion with rigid bodies.
     """
 
-    residual: Callable[..., np.ndarray]
-    forces: Callable[..., tuple[np.ndarray, np.ndarray]]
-    linearise: Callable[..., Any]
-    body_gradient: Callable[..., list[ShapeIntegrals]]
-    load_coefficients: Callable[..., list[np.ndarray]]
-    is_loaded_at_rest: Callable[..., bool]
     end_effector: Callable[..., np.ndarray]
     deviation: Callable[..., np.ndarray]
     end_effector_gradient: Callable[
@@ -69,11 +48,6 @@ class Equations:
     softness: Callable[[Sequence[ShapeIntegrals]], float]
     levers: Callable[..., np.ndarray]
     largest_change: Callable[..., float]
-
-
-def _is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
-    rest = np.zeros((len(motion.q), mechanism.num_coordinates))
-    return any(p.any() for p, _ in body_loads(mechanism, motion, (rest, rest, rest)))
 
 
 def _end_effector_gradient(
@@ -112,12 +86,6 @@ def _levers(mechanism: Mechanism) -> np.ndarray:
 
 
 PLANE = Equations(
-    residual=elastic_residual,
-    forces=inverse_dynamics,
-    linearise=linearise,
-    body_gradient=body_gradient,
-    load_coefficients=load_coefficients,
-    is_loaded_at_rest=_is_loaded_at_rest,
     end_effector=end_effector,
     deviation=deviation,
     end_effector_gradient=_end_effector_gradient,

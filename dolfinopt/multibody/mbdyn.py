@@ -16,8 +16,7 @@ import numpy as np
 
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.kinematics import PERMUTATION
-from dolfinopt.multibody.spatial.mechanism import ONE, inertia_about_centre
+from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION, inertia_about_centre
 from dolfinopt.multibody.standard_input import centrifugal, outboard_interfaces, turning
 
 if TYPE_CHECKING:

@@ -7,15 +7,28 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from dolfinopt.multibody.body_motion import (
+    UNSCALED,
+    Constants,
+    Load,
+    Motion,
+    PerInstant,
+    Scale,
+    at,
+)
+from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+
+if TYPE_CHECKING:
+    from dolfinopt.multibody.motion import RigidMotion
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
 # closures
@@ -169,9 +182,6 @@ def pin(point: complex) -> Closure:
 # Scenarios of the same bodies (other payloads, gravity, materials) lie one after the other in the
 # arrays of instants; what they share is stored once.
 
-# One number, or one at each of the n instants that a function is given.
-PerInstant = float | np.ndarray
-
 # Fewer instants are computed as so many. On processors with AVX-512, NumPy 1.24 multiplies complex
 # arrays of less than 64 bytes in one of two ways that round differently, and chooses by how far the
 # arrays lie from each other in memory: equal runs would end in different bits.
@@ -189,98 +199,156 @@ def several(*arguments: Any) -> tuple[Any, ...]:
     return tuple(x[every] for x in arguments)
 
 
-def at(x: PerInstant, part: slice | np.ndarray) -> PerInstant:
-    """Return a value at some of the instants."""
-    return x[part] if isinstance(x, np.ndarray) else x
+# -- a tree of bodies, in the plane and in space: what inverse dynamics works on
 
-
-def as_column(x: PerInstant) -> PerInstant:
-    """Return what multiplies (n, m) arrays instant by instant."""
-    return x[:, None] if isinstance(x, np.ndarray) else x
+GROUND = -1
+JointType = Literal["revolute", "prismatic", "fixed"]
+Site = tuple[int, int]  # body, and which of its outboard interfaces
 
 
 @dataclass(frozen=True, eq=False)
-class Scale:
-    """Factors of a body's mass integrals, stiffness and damping."""
-
-    mass: PerInstant = 1.0
-    stiffness: PerInstant = 1.0
-    damping: PerInstant = 1.0
-
-    def __getitem__(self, part: slice | np.ndarray) -> Scale:
-        """Return it at some of the instants."""
-        return Scale(*(at(x, part) for x in (self.mass, self.stiffness, self.damping)))
-
-
-UNSCALED = Scale()
-
-
-# -- A cart that carries a chain of flexible arms and a payload: what inverse dynamics works on
-
-# Of the loads (a_x, a_y, wd, -w^2, F_x, F_y, T) those whose work is in `ModalConstants.kinematics`.
-INTERFACE = [0, 1, 4, 5, 6]
-
-
-@dataclass(frozen=True, eq=False)
-class ModalConstants:
-    """One body's constants in complex form, and tables that serve all instants in one product.
+class Joint:
+    """What holds a body.
 
     Attributes:
-        body: real constants.
-        c: first mass moment, complex.
-        C, B: (q,) complex; B is the outboard deflection.
-        rotation: (q,) outboard rotation.
-        outboard_position: outboard reference point, complex.
-        kinematics: (q, 6) real: x and y of C, of B; rotation, 0.
-        loads: (7, q) real: x and y of C; r; j; x and y of B; rotation.
-        K, D: (q, q), or their diagonals (q,) where there is nothing else; no D, None.
-        K0: (7, q, q) geometric stiffness by each of `loads`, or None of a linear body.
-        L: (q, q, q) of `ModalDisplacement`, or None.
+        name: of the joint.
+        kind: revolute, prismatic or fixed.
+        parent: index of the body whose outboard interface it sits on, or `GROUND`.
+        coordinate: its place among the rigid coordinates; None of a fixed one.
+        axis: (3,) unit vector in the joint's frame; (1,) of a plane's joint, which turns.
+        origin: (d,) of the joint's frame in the parent's interface frame, m.
+        rotation: (d, d) from the joint's frame to the parent's interface frame.
+        rotor: inertia of what drives it, times the gear ratio squared, kg m2 (prismatic: kg).
+        interface: number of the parent's outboard interface, 0 for the first.
     """
 
-    body: ShapeIntegrals
-    c: complex
-    C: np.ndarray
-    B: np.ndarray
-    rotation: np.ndarray
-    outboard_position: complex
-    kinematics: np.ndarray
-    loads: np.ndarray
-    K: np.ndarray
-    D: np.ndarray | None
-    K0: np.ndarray | None
-    L: np.ndarray | None
+    name: str
+    kind: JointType
+    parent: int
+    coordinate: int | None
+    axis: np.ndarray
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    rotor: float = 0.0
+    interface: int = 0
 
     @cached_property
-    def second_order(self) -> np.ndarray:
-        """What -1/2 q'K0_p q and its time derivatives are by products of rates (3, q q, 6).
-
-        In the columns of `kinematics`, of the value, the rate and the second rate.
-        """
-        assert self.K0 is not None
-        interface = self.K0[INTERFACE]
-        weights = np.zeros((3, interface[0].size, 6))
-        weights[:, :, :5] = -interface.reshape(5, -1).T
-        weights[0] *= 0.5
-        return weights
+    def turns(self) -> np.ndarray:
+        """A revolute joint's rotation by (1, sin(angle), 1 - cos(angle)) (d, d, 3)."""
+        R, S = self.rotation, DIMENSIONS[len(self.origin)][0].skew(self.axis)
+        return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
-def _modal_constants(body: ShapeIntegrals) -> ModalConstants:
-    C, (B_x, B_y, rotation) = body.C, body.outboard
-    return ModalConstants(
-        body=body,
-        c=complex(*body.moment),
-        C=C[0] + 1j * C[1],
-        B=B_x + 1j * B_y,
-        rotation=rotation,
-        outboard_position=complex(*body.outboard_point),
-        kinematics=np.stack([C[0], C[1], B_x, B_y, rotation, np.zeros_like(rotation)], axis=1),
-        loads=np.stack([C[0], C[1], body.r, body.j, B_x, B_y, rotation]),
-        K=_diagonal_or_matrix(body.K),
-        D=_diagonal_or_matrix(body.D) if body.D.any() else None,
-        K0=np.concatenate([body.K0, body.K0_outboard]) if body.is_stiffened else None,
-        L=body.along_modes if len(body.along_modes) else None,
-    )
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """Bodies and the joints that hold them, as the recursion goes along them.
+
+    Attributes:
+        constants: of the bodies.
+        slices: their places among the N elastic coordinates.
+        joints: that hold them, in the same order.
+        loads: what they carry at interfaces without a joint, by (body, interface).
+        gravity: (d, 1), or (d, n) of instants that differ, m/s2.
+        cart: mass of a cart on the x axis that carries the ground's frame, kg, the first rigid
+            coordinate; None without one.
+        scales: of every body, or none.
+    """
+
+    constants: tuple[Constants, ...]
+    slices: tuple[slice, ...]
+    joints: tuple[Joint, ...]
+    loads: Mapping[Site, Constants]
+    gravity: np.ndarray
+    cart: float | None = None
+    scales: tuple[Scale, ...] = ()
+
+    @property
+    def num_coordinates(self) -> int:
+        """Number N."""
+        return self.slices[-1].stop if self.slices else 0
+
+    @cached_property
+    def sites(self) -> tuple[tuple[int, ...], ...]:
+        """Of every body the interfaces on which something sits, ascending."""
+        found: list[set[int]] = [set() for _ in self.joints]
+        for joint in self.joints:
+            if joint.parent != GROUND:
+                found[joint.parent].add(joint.interface)
+        for body, interface in self.loads:
+            found[body].add(interface)
+        return tuple(tuple(sorted(one)) for one in found)
+
+    @cached_property
+    def hanging(self) -> Mapping[Site, tuple[int, ...]]:
+        """The bodies that hang on every interface on which something sits, and on the ground."""
+        sites = [(GROUND, 0), *((i, s) for i, own in enumerate(self.sites) for s in own)]
+        found: dict[Site, list[int]] = {site: [] for site in sites}
+        for k, joint in enumerate(self.joints):
+            found[joint.parent, joint.interface].append(k)
+        return {site: tuple(bodies) for site, bodies in found.items()}
+
+    @cached_property
+    def order(self) -> tuple[int, ...]:
+        """The bodies, every one behind its parent."""
+        found: list[int] = []
+        while len(found) < len(self.joints):
+            more = [
+                i
+                for i, joint in enumerate(self.joints)
+                if i not in found and (joint.parent == GROUND or joint.parent in found)
+            ]
+            assert more, "joints form a loop"
+            found += more
+        return tuple(found)
+
+    @cached_property
+    def movable(self) -> tuple[int, ...]:
+        """The bodies whose joints have a coordinate, in the order of these."""
+        found = [(j.coordinate, i) for i, j in enumerate(self.joints) if j.coordinate is not None]
+        return tuple(i for _, i in sorted(found))
+
+    @property
+    def cart_coordinate(self) -> int | None:
+        """Place of the cart among the rigid coordinates, None without one."""
+        return None if self.cart is None else 0
+
+    @cached_property
+    def rotors(self) -> np.ndarray:
+        """Mass of the cart and reflected inertia of every rigid coordinate's drive."""
+        cart = [] if self.cart is None else [self.cart]
+        return np.array([*cart, *(self.joints[i].rotor for i in self.movable)])
+
+    def is_felt(self, i: int) -> bool:
+        """Return whether a body inboard of body i deforms under its load."""
+        parent = self.joints[i].parent
+        if parent == GROUND:
+            return False
+        return self.constants[parent].num_modes > 0 or self.is_felt(parent)
+
+    def scale(self, i: int) -> Scale:
+        """Return that of a body."""
+        return self.scales[i] if self.scales else UNSCALED
+
+    def ground(self, motion: RigidMotion) -> Motion:
+        """Return the motion of what the first joints sit on: that of the cart, less gravity."""
+        d, count = len(self.gravity), len(motion.q)
+        a = np.empty((d, count), dtype=motion.qdd.dtype)
+        a[:] = -self.gravity
+        if self.cart is not None:
+            a[0] += motion.qdd[:, 0]
+        still = np.zeros((d * (d - 1) // 2, count))
+        return a, still, still
+
+    def virtual_ground(self, of_forces: np.ndarray) -> Load:
+        """Return its displacement and rotation for virtual rigid coordinates (n, .)."""
+        d, count = len(self.gravity), len(of_forces)
+        p = np.zeros((d, count))
+        if self.cart is not None:
+            p[0] = of_forces[:, 0]
+        return p, np.zeros((d * (d - 1) // 2, count))
+
+
+# -- a cart that carries a chain of flexible arms and a payload
 
 
 def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
@@ -408,11 +476,6 @@ class Mechanism(ElasticBodies):
     joints: tuple[JointHardware, ...] = ()
     cart_mass: float = 0.0
 
-    @cached_property
-    def modal_constants(self) -> tuple[ModalConstants, ...]:
-        """Every body's constants as the equations of motion use them."""
-        return tuple(_modal_constants(body) for body in self.bodies)
-
     @property
     def num_rigid(self) -> int:
         """Number of rigid coordinates, of cart and joints."""
@@ -431,9 +494,33 @@ class Mechanism(ElasticBodies):
             scales=tuple(scale[part] for scale in self.scales),
         )
 
-    def scale(self, k: int) -> Scale:
-        """Return that of a body."""
-        return self.scales[k] if self.scales else UNSCALED
+    @cached_property
+    def tree(self) -> Tree:
+        """Itself as inverse dynamics goes along it."""
+        joints = self.joints or (BARE,) * len(self.bodies)
+        carried = {(k, 0): self.carried(k) for k in range(len(self.bodies))}
+        gravity = np.stack(np.broadcast_arrays(*map(np.atleast_1d, self.gravity)))
+        return Tree(
+            constants=tuple(map(Constants, self.bodies)),
+            slices=self.slices,
+            joints=tuple(
+                Joint(
+                    name=f"joint {k}",
+                    kind="revolute",
+                    parent=k - 1,
+                    coordinate=1 + k,
+                    axis=np.ones(1),
+                    origin=np.zeros(2),
+                    rotation=np.eye(2),
+                    rotor=one.rotor,
+                )
+                for k, one in enumerate(joints)
+            ),
+            loads={k: Constants.of_point(*one) for k, one in carried.items() if one is not None},
+            gravity=gravity,
+            cart=self.cart_mass,
+            scales=self.scales,
+        )
 
     def carried(self, k: int) -> tuple[PerInstant, PerInstant] | None:
         """Return mass and inertia at the outboard interface of body k, kg, kg m2; None for none."""
@@ -442,11 +529,10 @@ class Mechanism(ElasticBodies):
             return (joint.mass, joint.inertia) if joint.mass or joint.inertia else None
         return self.payload_mass + joint.mass, self.payload_inertia + joint.inertia
 
-    @cached_property
+    @property
     def rotors(self) -> np.ndarray:
         """Mass of the cart and reflected inertia of the joints' rotors (1 + arms,), kg, kg m2."""
-        joints = self.joints or (BARE,) * len(self.bodies)
-        return np.array([self.cart_mass, *(joint.rotor for joint in joints)])
+        return self.tree.rotors
 
 
 def compliance(

@@ -44,8 +44,7 @@ from dolfinopt.exchange.sid import (
     taylor,
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.kinematics import PERMUTATION
-from dolfinopt.multibody.spatial.mechanism import ONE, skew
+from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION, skew
 
 # Entries of J, and products of the angular velocity in the columns of Oe.
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
 from dolfinopt.multibody.shape_integrals import linear_part
-from dolfinopt.multibody.spatial.kinematics import Frames, body_frames
+from dolfinopt.multibody.spatial.end_effector import Frames, body_frames
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.part.isosurface import Surface
@@ -67,7 +67,7 @@ class Assembly:
     @property
     def carries(self) -> bool:
         """Whether there is a load at the end-effector."""
-        load = self.mechanism.loads.get((self.mechanism.end, self.mechanism.end_interface))
+        load = self.mechanism.tree.loads.get((self.mechanism.end, self.mechanism.end_interface))
         return load is not None and load.body.mass > 0.0
 
     @property

@@ -148,7 +148,7 @@ def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
     assert np.allclose(corners[node], middle)
     q = trajectory.q_e[:, mechanism.slices[arm]]
     place = complex(*middle) + q @ (modes[node, 0] + 1j * modes[node, 1])
-    chord = outboard(mechanism.modal_constants[arm], q)[0]
+    chord = outboard(mechanism.bodies[arm], q)[0]
     return (np.conj(chord / np.abs(chord)) * place).imag
 
 

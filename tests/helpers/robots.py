@@ -142,7 +142,7 @@ def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> SpatialMech
 def frames_of(mechanism: SpatialMechanism, q: np.ndarray) -> list[np.ndarray]:
     """Return the pose (4, 4) of every body's frame in the world at joint coordinates (k,)."""
     found: dict[int, np.ndarray] = {}
-    for i in mechanism.order:
+    for i in mechanism.tree.order:
         joint = mechanism.joints[i]
         outer = np.eye(4)
         if joint.parent != GROUND:

@@ -20,10 +20,9 @@ from dolfinopt.exchange.mbdyn import Invariants, fem_text, write_fem
 from dolfinopt.exchange.sid import read_sid, read_sid_npz, sid_text
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
+from dolfinopt.multibody.body_motion import BodyMotion, Constants
 from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
 from dolfinopt.multibody.shape_integrals import in_space, plate_moments, shape_integrals
-from dolfinopt.multibody.spatial.kinematics import BodyMotion
-from dolfinopt.multibody.spatial.mechanism import constants_of
 from dolfinopt.multibody.standard_input import load_body
 from dolfinopt.reduction import Options, craig_bampton
 
@@ -169,12 +168,13 @@ def test_forces_of_mbdyn(cloud, stiff_cloud, stiff):
     assert sorted(groups) == [1, 2, *range(5, 11), *range(12, 19), *[19] * stiff]
     s = random_state(np.random.default_rng(6), 4)
     force, moment, rows = mbdyn_forces(groups, s)
-    frame, rates = ((x[None] for x in part) for part in ((s.a, s.w, s.g), (s.q, s.qd, s.qdd)))
-    expected = BodyMotion(constants_of(body), tuple(frame), tuple(rates))
-    assert_close(rows, expected.rows[0])
+    frame = tuple(x[:, None] for x in (s.a, s.w, s.g))
+    rates = np.stack([s.q, s.qd, s.qdd], axis=1)[:, :, None]
+    expected = BodyMotion(Constants(body), frame, rates)
+    assert_close(rows, expected.rows({})[:, 0])
     if not stiff:  # motion of the second order is not in the format
-        assert_close(force, expected.load[0][0])
-        assert_close(moment, expected.load[1][0])
+        assert_close(force, expected.load[0][:, 0])
+        assert_close(moment, expected.load[1][:, 0])
 
 
 def test_mbdyn_stiffens_by_loads_outboard(stiff_cloud):

@@ -23,14 +23,15 @@ from bodies import (
 from runs import ROOT
 
 from dolfinopt.multibody import end_effector as plane_end
-from dolfinopt.multibody import inverse_dynamics as plane
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
 from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.multibody.spatial.equations import SPACE
 from dolfinopt.multibody.spatial.mechanism import exponential
+from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -62,12 +63,12 @@ class Machine:
     def forces(self, states: np.ndarray, mechanism: Any = None) -> np.ndarray:
         """Return the forces of rigid and elastic coordinates (n, S)."""
         motion, rates = self.split(states)
-        rows, drives = self.equations.forces(mechanism or self.mechanism, motion, *rates)
+        rows, drives = inverse_dynamics(mechanism or self.mechanism, motion, *rates)
         return np.hstack([drives, rows])
 
     def tangent(self, keep: Any = None, rigid: Any = None, part: slice = slice(None)) -> Any:
         motion, rates = self.split(self.states[:, part])
-        return self.equations.linearise(self.mechanism, motion, *rates, keep, rigid)
+        return linearise(self.mechanism, motion, *rates, keep, rigid)
 
 
 def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
@@ -113,7 +114,7 @@ def test_forces_are_those_of_the_points(kind: str) -> None:
         expected = one.model.forces(*one.states[:, n])
         assert_close(found[n], expected, DIFFERENCES)
     motion, rates = one.split(one.states)
-    alone = one.equations.residual(one.mechanism, motion, *rates)
+    alone = elastic_residual(one.mechanism, motion, *rates)
     assert_close(alone, found[:, one.rigid :], ROUNDING)
 
 
@@ -128,27 +129,19 @@ def test_plane_machine_in_space(stiff: bool) -> None:
     if stiff:
         chain = replace(chain, bodies=tuple(stiffened(rng, b, 1.0) for b in chain.bodies))
     motion, rates = RigidMotion(*rng.normal(size=(3, 5, 3))), 0.4 * rng.normal(size=(3, 5, 5))
-    expected = plane.inverse_dynamics(chain, motion, *rates)
+    expected = inverse_dynamics(chain, motion, *rates)
     space, joints = posed_machine(chain), posed_motion(motion)
     tilt = exponential(np.array([0.3, -1.0, 0.5]))  # the whole machine, gravity included
     first = replace(space.joints[0], rotation=tilt)
     tilted = replace(space, joints=(first, *space.joints[1:]), gravity=tilt @ space.gravity)
     for one in (space, tilted):
-        for found, value in zip(SPACE.forces(one, joints, *rates), expected, strict=True):
+        for found, value in zip(inverse_dynamics(one, joints, *rates), expected, strict=True):
             assert_close(found, value, ROUNDING)
     e = rates[0]
     assert np.abs(SPACE.end_effector(space, joints, e)[:, 2]).max() == 0.0
     for function in ("end_effector", "deviation"):
         found, value = getattr(SPACE, function)(space, joints, e), getattr(plane_end, function)
         assert_close(found[:, :2], value(chain, motion, e), ROUNDING)
-
-
-def test_deformation_of_the_second_order_with_many_modes(monkeypatch) -> None:
-    """By products of modes two by two, or load by load: the same forces."""
-    one = machine_of("2 arms, stiffened", 40)
-    few = one.forces(one.states)
-    monkeypatch.setattr("dolfinopt.multibody.inverse_dynamics.FEW_MODES", 0)
-    assert_close(one.forces(one.states), few, 1e-13)
 
 
 def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
@@ -210,7 +203,7 @@ def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
     weights = rng.normal(size=states.shape[1:])
     motion, rates = machine.split(states)
     parts = weights[:, machine.rigid :], weights[:, : machine.rigid]
-    gradient = machine.equations.body_gradient(machine.mechanism, motion, *rates, *parts)
+    gradient = body_gradient(machine.mechanism, motion, *rates, *parts)
     for i, body in enumerate(machine.mechanism.bodies):
         change = change_of(rng, body, name)
 
@@ -269,10 +262,10 @@ def test_few_instants_are_those_of_many(kind: str, count: int) -> None:
     for part in (slice(None), slice(count)):
         motion, rates = one.split(one.states[:, part])
         values = [one.forces(one.states[:, part]), one.tangent(part=part).dense()]
-        values += [eq.residual(mechanism, motion, *rates)]
+        values += [elastic_residual(mechanism, motion, *rates)]
         by_q, _, by_end = eq.end_effector_gradient(mechanism, motion, rates[0], pull[part], True)
         by = weights[part, R:], weights[part, :R]
-        bodies = eq.body_gradient(mechanism, motion, *rates, *by)
+        bodies = body_gradient(mechanism, motion, *rates, *by)
         sums = [x for b in bodies for x in (b.w, b.W, b.K)] + [x["outboard"] for x in by_end]
         found.append(([x[:count] for x in (*values, by_q)], sums))
     for whole, few in zip(*(values + sums for values, sums in found), strict=True):
@@ -294,11 +287,11 @@ def test_few_instants_do_not_depend_on_memory() -> None:
             for place in order.permutation(1500)[:700]:
                 kept[place] = kept[0]
             motion, (q, qd, qdd) = one.split(one.states.copy())
-            slopes = PLANE.body_gradient(one.mechanism, motion, q, qd, qdd, qd)
+            slopes = body_gradient(one.mechanism, motion, q, qd, qdd, qd)
             by_q, _, by_end = PLANE.end_effector_gradient(one.mechanism, motion, q, weights, True)
             arrays = [
                 one.forces(one.states),
-                PLANE.residual(one.mechanism, motion, q, qd, qdd),
+                elastic_residual(one.mechanism, motion, q, qd, qdd),
                 one.tangent().dense(),
                 PLANE.end_effector(one.mechanism, motion, q),
                 *(value for by in slopes for value in (by.w, by.W, by.K, by.outboard)),
@@ -361,7 +354,7 @@ def test_rigid_limit_is_the_two_link_arm() -> None:
     q, qd, qdd = np.random.default_rng(3).normal(size=(3, 6, 3))
     zero = np.zeros((6, 2))
     mechanism = Mechanism(bodies, mp, Jp, (0.0, -g), 0.3)
-    _, drives = PLANE.forces(mechanism, RigidMotion(q, qd, qdd), zero, zero, zero)
+    _, drives = inverse_dynamics(mechanism, RigidMotion(q, qd, qdd), zero, zero, zero)
     (x, a1, a2), (alpha, total) = qdd.T, (q[:, 1], q[:, 1] + q[:, 2])
     w1, w2, wd1, wd2 = qd[:, 1], qd[:, 1] + qd[:, 2], a1, a1 + a2
     s1 = m1 * c1 + (m2 + mp) * l1  # first moments that follow each link's direction

@@ -24,7 +24,9 @@ from dolfinopt.exchange.sid import (
     write_sid_npz,
 )
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody import inverse_dynamics as plane
+from dolfinopt.multibody.body_motion import BodyMotion, Constants
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.kinematics import Interface
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
@@ -35,9 +37,6 @@ from dolfinopt.multibody.shape_integrals import (
     plate_moments,
     shape_integrals,
 )
-from dolfinopt.multibody.spatial.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface
-from dolfinopt.multibody.spatial.mechanism import constants_of
 from dolfinopt.multibody.standard_input import from_sid, load_body, to_sid
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
@@ -227,8 +226,8 @@ def test_forces_are_those_of_the_points(flat, seed):
 
 
 def moving(body: ShapeIntegrals, s: State) -> BodyMotion:
-    frame, rates = ((x[None] for x in part) for part in ((s.a, s.w, s.g), (s.q, s.qd, s.qdd)))
-    return BodyMotion(constants_of(body), tuple(frame), tuple(rates))
+    frame = tuple(x[:, None] for x in (s.a, s.w, s.g))
+    return BodyMotion(Constants(body), frame, np.stack([s.q, s.qd, s.qdd], axis=1)[:, :, None])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -243,9 +242,9 @@ def test_forces_of_the_file(tmp_path, dimension, stiff, seed):
     force, moment, rows = forces_of_sid(data, s)
     expected = moving(body if dimension == 3 else in_space(body), s)
     size = 10.0 * float(np.abs(rows).max())
-    assert_close(force, expected.load[0][0], size=size)
-    assert_close(moment, expected.load[1][0], size=size)
-    assert_close(rows + data.Ke.M0 @ s.q + data.De.M0 @ s.qd, expected.rows[0], size=size)
+    assert_close(force, expected.load[0][:, 0], size=size)
+    assert_close(moment, expected.load[1][:, 0], size=size)
+    assert_close(rows + data.Ke.M0 @ s.q + data.De.M0 @ s.qd, expected.rows({})[:, 0], size=size)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -270,7 +269,7 @@ def test_plane_forces_are_the_planar_ones(known, stiff):
         motion = RigidMotion(none, np.array([[0.0, s.w[2]]]), np.array([[0.0, s.g[2]]]))
         machine = Mechanism((from_sid(data, 2),), 0.0, 0.0, (-s.a[0], -s.a[1]), 0.0)
         rates = state.q[None], state.qd[None], state.qdd[None]
-        elastic, drives = plane.inverse_dynamics(machine, motion, *rates)
+        elastic, drives = inverse_dynamics(machine, motion, *rates)
         springs = body.K @ state.q + body.D @ state.qd
         size = max(float(np.abs(springs).max()), 10.0 * float(np.abs(rows).max()))
         assert_close(elastic[0] - springs, rows, size=size)
@@ -288,12 +287,12 @@ def test_outboard_node(dimension, stiff):
     body = body if dimension == 3 else in_space(body)
     held, tip = data.nodes
     assert not (held.phi.M0.any() or held.psi.M0.any() or held.origin.M0.any())
-    interface = Interface(moving(body, s))
-    B = interface.B[0] if stiff else interface.B
+    moved = moving(body, s)
+    B = moved.V[Interface(moved).places][:, :, 0]
     assert_close(np.concatenate([tip.phi.at(s.q), tip.psi.at(s.q)]), B)
     assert_close(tip.origin.at(s.q)[:, 0], body.outboard_point + body.outboard[:3] @ s.q)
     small = 1e-7 * s.q
-    turned = Interface(moving(body, replace(s, q=small))).turning.R[0]
+    turned = Interface(moving(body, replace(s, q=small))).turning.R[:, :, 0]
     assert np.abs(tip.AP.at(small) - turned).max() < 1e-13
 
 

@@ -23,6 +23,7 @@ from dolfinopt.dynamics.adjoint import Adjoint, add_gradients
 from dolfinopt.dynamics.collocation import even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import DriveForces
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import scaled
 from dolfinopt.multibody.spatial.equations import SPACE
@@ -81,7 +82,7 @@ def test_gradient_of_a_trajectory(name: str) -> None:
 
     def seen(system: ElasticSystem, solution) -> dict[str, np.ndarray]:
         rates = np.stack([solution.sample(t, k) for k in range(3)])
-        drives = system.equations.forces(system.mechanism, system.motion(t), *rates)[1]
+        drives = inverse_dynamics(system.mechanism, system.motion(t), *rates)[1]
         return {"coordinates": rates[:1], "rates": rates, "forces": drives[None]}
 
     weights, slopes, here = {}, {}, seen(system, base)

@@ -17,7 +17,7 @@ import dolfinopt as do
 from dolfinopt.dynamics.simulation import load_coefficients
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import rotated
-from dolfinopt.multibody.equations import PLANE
+from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
 from dolfinopt.multibody.inverse_dynamics import outward_pass
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
 from dolfinopt.responses.stress import CellStress, arm_loads, cell_stress, motions_of
@@ -56,19 +56,19 @@ class Analysed:
 # -- displacements and stress against the full model -------------------------------------------
 
 
-def all_loads(arm, frame, rates_at, outboard, n):
+def all_loads(arm, body, rates_at, outboard, n):
     """Return all loads of an instant on nodes and outboard interface, from the frame's motion.
 
     -M (a + S X wd - X w^2 + ...), and what `outboard` (3,) takes away.
     """
     V, X = arm.current.basis.V, arm.current.elastic.points
     u, ud, udd = (V @ x[n] for x in rates_at)
-    a, w, wd = frame.a[n], frame.w[n], frame.wd[n]
+    a, w, wd = body.a[:, n], body.w[0, n], body.wd[0, n]
 
     def turned(field):
         return rotated(field[:, :, None])[:, :, 0]
 
-    acceleration = np.array([a.real, a.imag]) + wd * turned(X + u) - w * w * (X + u)
+    acceleration = a + wd * turned(X + u) - w * w * (X + u)
     acceleration += 2.0 * w * turned(ud) + udd
     elastic = arm.current.elastic
     interior, end = elastic.restrict(-elastic.mass_times(acceleration[:, :, None]))
@@ -112,7 +112,7 @@ def test_both_ways_to_the_loads_agree() -> None:
     n = np.array([0, 500, 1300, 2900])
     rates_at = tuple(x[n] for x in trajectory.unknowns)
     found = load_coefficients(trajectory.problem, trajectory.t[n], rates_at)
-    short = PLANE.load_coefficients(trajectory.mechanism, trajectory.motion[n], rates_at)
+    short = coefficients_of(trajectory.mechanism, trajectory.motion[n], rates_at)
     for one, other, whole in zip(found, short, trajectory.load_coefficients, strict=True):
         scale = np.abs(whole).max(axis=0).clip(1e-300)
         np.testing.assert_allclose(one / scale, other / scale, atol=1e-12)
@@ -135,7 +135,7 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
     one = Analysed(built, built.fields(wave))
     trajectory = one.trajectory
     y, yd, ydd = trajectory.unknowns
-    frames, _ = outward_pass(trajectory.mechanism, trajectory.motion, y, yd, ydd)
+    links = outward_pass(trajectory.mechanism.tree, trajectory.motion, (y, yd, ydd))
     worst = 0.0
     for k, arm in built.arms.items():
         part, c = trajectory.mechanism.slices[k], trajectory.load_coefficients[k]
@@ -143,7 +143,7 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
         cells = cell_stress(arm.current)
         [loads] = arm_loads(built.scene, [trajectory])[k]
         for n in (300, 1200, 2500):
-            right = all_loads(arm, frames[k], rates_at, c[n, 4:7], n)
+            right = all_loads(arm, links[k].body, rates_at, c[n, 4:7], n)
             full = lengths(cells, static_response(arm.current.elastic, *right)[:, :, 0])
             found = np.linalg.norm(cells.A @ loads.coefficients[n], axis=0)
             assert np.abs(found - full).max() < 1e-6 * full.max()
@@ -163,7 +163,7 @@ def test_static_solution_of_the_stiffened_arm() -> None:
     one = Analysed(built, built.fields(wave))
     trajectory = one.trajectory
     y, yd, ydd = trajectory.unknowns
-    frames, _ = outward_pass(trajectory.mechanism, trajectory.motion, y, yd, ydd)
+    links = outward_pass(trajectory.mechanism.tree, trajectory.motion, (y, yd, ydd))
     effect = 0.0
     for k, arm in built.arms.items():
         part, c = trajectory.mechanism.slices[k], trajectory.load_coefficients[k]
@@ -171,7 +171,7 @@ def test_static_solution_of_the_stiffened_arm() -> None:
         [loads] = arm_loads(built.scene, [trajectory])[k]
         elastic = arm.current.elastic
         n = int(np.argmax(np.abs(c[:, 5])))
-        right = all_loads(arm, frames[k], rates_at, c[n, 4:7], n)
+        right = all_loads(arm, links[k].body, rates_at, c[n, 4:7], n)
         linear = static_response(elastic, *right)[:, :, 0]
         Kg, u = geometric_matrix(arm, c[n]), linear
         for _ in range(6):  # K u = f + sum_p p K0_p u

@@ -11,13 +11,15 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.dimension import SpaceTurning
+from dolfinopt.multibody.inverse_dynamics import Link, outward_pass
+from dolfinopt.multibody.kinematics import Interface
+from dolfinopt.multibody.mechanism import GROUND, Site
 from dolfinopt.multibody.motion import RigidMotion, along_curve, curve_of_table, curve_through
-from dolfinopt.multibody.spatial.kinematics import BodyMotion, Interface, MovingJoint
 from dolfinopt.multibody.spatial.mechanism import (
     Pose,
     RigidChain,
     SpatialMechanism,
-    Turning,
     cross,
     end_chain,
     roll_pitch_yaw,
@@ -46,32 +48,27 @@ class _Chain:
         count = len(motion.q)
         self.bodies = mechanism.chain
         outer = [mechanism.joints[i].interface for i in self.bodies[1:]]
-        still = (np.zeros((count, 3)),) * 3
         self.rotations, self.interfaces, self.joints = [], [], []  # type: ignore[var-annotated]
+        links = _at_rest(mechanism, motion.q, q)
         rotation, place = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))
         origins = []
         for i, number in zip(self.bodies, [*outer, mechanism.end_interface], strict=True):
-            k, own = mechanism.joints[i].coordinate, None
-            if k is not None:
-                own = (motion.q[:, k], motion.qd[:, k], motion.qdd[:, k])
-            joint = MovingJoint(mechanism.joints[i], still, own)
-            place = place + times(rotation, np.broadcast_to(joint.r, place.shape))
-            rotation = rotation @ joint.R
-            e = q[:, mechanism.slices[i]]
-            interface = Interface(BodyMotion(mechanism.constants[i], still, (e, e, e)), number)
+            joint, interface = links[i].joint, Interface(links[i].body, number)
+            place = place + times(rotation, _vectors(joint.r, count))
+            rotation = rotation @ _matrices(joint.R, count)
             self.joints.append(joint)
             self.rotations.append(rotation)
             self.interfaces.append(interface)
             origins.append(place)
-            place = place + times(rotation, np.broadcast_to(interface.place, place.shape))
-            if mechanism.constants[i].num_modes:
-                rotation = rotation @ interface.turning.R
+            place = place + times(rotation, _vectors(interface.place, count))
+            if links[i].body.is_flexible:
+                rotation = rotation @ _matrices(interface.turning.R, count)
         self.end = place
         self.at_joints = [
             transposed_times(R, place - x) for R, x in zip(self.rotations, origins, strict=True)
         ]
         self.levers = [
-            x - interface.place
+            x - _vectors(interface.place, count)
             for x, interface in zip(self.at_joints, self.interfaces, strict=True)
         ]
 
@@ -105,26 +102,118 @@ def end_effector_gradient(
     chain = _Chain(mechanism, motion, q)
     by_q, by_joints = np.zeros_like(q), np.zeros_like(motion.q)
     by_bodies: list[dict[str, np.ndarray]] = [
-        {"outboard": np.zeros_like(one.B)} for one in mechanism.constants
+        {"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies
     ]
     for at, i in enumerate(chain.bodies):
         force = transposed_times(chain.rotations[at], weights)
         joint, lever = chain.joints[at], chain.at_joints[at]
         if joint.joint.coordinate is not None:
-            by_joints[:, joint.joint.coordinate] = joint.drive((force, cross(lever, force)))
-        if not mechanism.constants[i].num_modes:
+            load = (force.T, cross(lever, force).T)
+            by_joints[:, joint.joint.coordinate] = joint.drive(load)
+        if not mechanism.bodies[i].num_modes:
             continue
         interface, part = chain.interfaces[at], mechanism.slices[i]
-        load = (force, cross(chain.levers[at], force))
-        by_q[:, part] = interface.rows(load)
-        pull, e = interface.conjugate(load), q[:, part]
-        by_bodies[i]["outboard"][interface.rows_of] = pull.T @ e
-        if (K0 := mechanism.constants[i].K0_outboard) is not None:
-            pulled = np.einsum("np,nk->npk", pull, e).reshape(len(e), -1)
-            bent = (-0.5 * (e.T @ pulled)).reshape(e.shape[1], 6, -1).swapaxes(0, 1)
-            by_bodies[i]["K0_outboard"] = np.zeros_like(K0)
-            by_bodies[i]["K0_outboard"][interface.rows_of] = bent
+        pull, e = interface.pushes((force.T, cross(chain.levers[at], force).T)), q[:, part]
+        by_q[:, part] = np.einsum("pn,pkn->nk", pull, interface.body.V[interface.places])
+        own = slice(6 * interface.number, 6 * interface.number + 6)
+        by_bodies[i]["outboard"][own] = pull @ e
+        if mechanism.bodies[i].is_stiffened:
+            by_bodies[i]["K0_outboard"] = np.zeros_like(mechanism.bodies[i].K0_outboard)
+            by_bodies[i]["K0_outboard"][own] = -0.5 * (pull[:, None] * e.T) @ e
     return by_q, by_joints, by_bodies
+
+
+# -- where every body of a machine in space is: frames and outboard interfaces, n instants -------
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of all bodies against the world's; b bodies in the mechanism's order.
+
+    Attributes:
+        origin: (n, b, 3) of every body's frame, where its joint is, m.
+        rotation: (n, b, 3, 3) from every body's frame to the world's.
+        outboard: (n, b, 3) of every body's first outboard interface, m.
+        parents: of every body, or `GROUND`.
+        axes: (n, b, 3) unit vectors along the joints' axes.
+        held: (n, b, 3) of the interface that every body hangs on; the world's origin of those on
+            the ground, m.
+        end: (n, 3) of the end-effector, m.
+    """
+
+    origin: np.ndarray
+    rotation: np.ndarray
+    outboard: np.ndarray
+    parents: tuple[int, ...]
+    axes: np.ndarray
+    held: np.ndarray
+    end: np.ndarray
+
+    def __getitem__(self, part: slice | np.ndarray) -> Frames:
+        """Return those at some of the instants."""
+        return Frames(
+            self.origin[part],
+            self.rotation[part],
+            self.outboard[part],
+            self.parents,
+            self.axes[part],
+            self.held[part],
+            self.end[part],
+        )
+
+
+def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
+    """Return the frames of all bodies.
+
+    Args:
+        mechanism: b bodies.
+        q_r: (n, joints) rigid coordinates; rad or m.
+        q_e: (n, N) elastic coordinates.
+    """
+    tree, links = mechanism.tree, _at_rest(mechanism, q_r, q_e)
+    count, bodies = len(q_r), len(mechanism.bodies)
+    origin, outboard, held = np.zeros((3, count, bodies, 3))
+    rotation = np.zeros((count, bodies, 3, 3))
+    place: dict[Site, np.ndarray] = {}  # of interfaces
+    turned: dict[Site, np.ndarray] = {}
+    for i in tree.order:
+        link, joint = links[i], mechanism.joints[i]
+        R = np.broadcast_to(np.eye(3), (count, 3, 3))
+        if joint.parent != GROUND:
+            site = joint.parent, joint.interface
+            held[:, i], R = place[site], turned[site]
+        origin[:, i] = held[:, i] + times(R, _vectors(link.joint.r, count))
+        rotation[:, i] = R @ _matrices(link.joint.R, count)
+        for s in range(len(link.body.constants.points)):
+            interface = Interface(link.body, s)
+            away = _vectors(interface.place, count)
+            place[i, s] = origin[:, i] + times(rotation[:, i], away)
+            turned[i, s] = rotation[:, i]
+            if link.body.is_flexible:
+                turned[i, s] = rotation[:, i] @ _matrices(interface.turning.R, count)
+        outboard[:, i] = place[i, 0]
+    axes = np.stack(
+        [rotation[:, i] @ joint.axis for i, joint in enumerate(mechanism.joints)], axis=1
+    )
+    parents = tuple(joint.parent for joint in mechanism.joints)
+    end = place[mechanism.end, mechanism.end_interface]
+    return Frames(origin, rotation, outboard, parents, axes, held, end)
+
+
+def _vectors(x: np.ndarray, count: int) -> np.ndarray:
+    """Return vectors (n, 3) of (3, n), or of one (3, 1)."""
+    return np.broadcast_to(x.T, (count, 3))
+
+
+def _matrices(R: np.ndarray, count: int) -> np.ndarray:
+    """Return rotations (n, 3, 3) of (3, 3, n), or of one (3, 3)."""
+    return np.broadcast_to(R if R.ndim == 2 else R.transpose(2, 0, 1), (count, 3, 3))
+
+
+def _at_rest(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> list[Link]:
+    """Return all bodies in given poses."""
+    rigid, elastic = np.zeros_like(q_r), np.zeros_like(q_e)
+    return outward_pass(mechanism.tree, RigidMotion(q_r, rigid, rigid), (q_e, elastic, elastic))
 
 
 # -- path of an end-effector in space: its points, orientation, and joints that a table
@@ -132,7 +221,7 @@ def end_effector_gradient(
 #
 # The rows of a table are joined like those of joint coordinates. An orientation is interpolated as
 # the rotation vector theta against that of the first row, R = R_0 exp(theta~), whose angular
-# velocity and acceleration `rotations.Turning` knows.
+# velocity and acceleration `SpaceTurning` knows.
 
 RPY = ("roll", "pitch", "yaw")
 VECTOR = ("rx", "ry", "rz")
@@ -178,9 +267,9 @@ def end_path(t: np.ndarray, scene: Scene) -> EndPath:
     (p, v, a), first = (x[:, :3] for x in values), 3
     turning = None
     if found.start is not None:
-        one = Turning(*(x[:, 3:6] for x in values))
+        one = SpaceTurning(*(x[:, 3:6].T for x in values))
         R0, first = found.start, 6
-        turning = R0 @ one.R, one.velocity @ R0.T, one.acceleration @ R0.T
+        turning = R0 @ one.R.transpose(2, 0, 1), one.velocity.T @ R0.T, one.acceleration.T @ R0.T
     q, qd, qdd = (x[:, first:] for x in values)
     return EndPath(p, v, a, turning, (q, qd, qdd))
 

@@ -8,20 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from dolfinopt.multibody.equations import Equations
-from dolfinopt.multibody.inverse_dynamics import stiffness_change
+from dolfinopt.multibody.inverse_dynamics import body_loads, stiffness_change
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_part
 from dolfinopt.multibody.spatial.end_effector import deviation, end_effector, end_effector_gradient
-from dolfinopt.multibody.spatial.inverse_dynamics import (
-    body_gradient,
-    body_loads,
-    elastic_residual,
-    inverse_dynamics,
-    inward_pass,
-    linearise,
-    load_coefficients,
-    outward_pass,
-)
 from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
 
 
@@ -33,10 +23,6 @@ def _end_effector_gradient(
     rigid: bool,
 ) -> tuple[np.ndarray, np.ndarray | None, list[dict[str, np.ndarray]]]:
     return end_effector_gradient(mechanism, motion, q, weights)
-
-
-def _is_loaded_at_rest(mechanism: SpatialMechanism, motion: RigidMotion) -> bool:
-    return True
 
 
 def _rotations(mechanism: SpatialMechanism, q: np.ndarray) -> np.ndarray:
@@ -61,26 +47,19 @@ def _levers(mechanism: SpatialMechanism) -> np.ndarray:
     bodies, joints = mechanism.bodies, mechanism.joints
     reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in bodies)
     reach += sum(float(np.linalg.norm(one.origin)) for one in joints)
-    slides = [joints[i].kind == "prismatic" for i in mechanism.movable]
+    slides = [joints[i].kind == "prismatic" for i in mechanism.tree.movable]
     return np.where(slides, 1.0, reach)
 
 
 def _largest_change(mechanism: SpatialMechanism, motion: RigidMotion, closure: None) -> float:
     rigid = replace(mechanism, bodies=tuple(map(rigid_part, mechanism.bodies)))
     none = np.zeros((len(motion.q), 0))
-    links = outward_pass(rigid, motion, (none, none, none))
-    loads = body_loads(links, inward_pass(rigid, links).outboard)
+    loads = body_loads(rigid, motion, (none, none, none))
     pairs = zip(mechanism.bodies, loads, strict=True)
     return max((stiffness_change(body, p) for body, p in pairs), default=0.0)
 
 
 SPACE = Equations(
-    residual=elastic_residual,
-    forces=inverse_dynamics,
-    linearise=linearise,
-    body_gradient=body_gradient,
-    load_coefficients=load_coefficients,
-    is_loaded_at_rest=_is_loaded_at_rest,
     end_effector=end_effector,
     deviation=deviation,
     end_effector_gradient=_end_effector_gradient,

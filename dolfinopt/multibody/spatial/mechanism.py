@@ -11,107 +11,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import factorial
-from typing import Literal
 
 import numpy as np
 
-from dolfinopt.multibody.mechanism import ElasticBodies
+from dolfinopt.multibody.body_motion import Constants
+from dolfinopt.multibody.dimension import series
+from dolfinopt.multibody.mechanism import GROUND, ElasticBodies, Joint, Site, Tree
 from dolfinopt.multibody.motion import RigidMotion, along_table, columns_of
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.arms import interface_number
-
-GROUND = -1
-JointType = Literal["revolute", "prismatic", "fixed"]
-Site = tuple[int, int]  # body, and which of its outboard interfaces
-TRANSPOSED = np.arange(9).reshape(3, 3).T.ravel()  # of W_ab: the places of W_ba
-
-
-@dataclass(frozen=True, eq=False)
-class Joint:
-    """What holds a body.
-
-    Attributes:
-        name: of the joint.
-        kind: revolute, prismatic or fixed.
-        parent: index of the body whose outboard interface it sits on, or `GROUND`.
-        coordinate: its place among the rigid coordinates; None of a fixed one.
-        axis: (3,) unit vector in the joint's frame.
-        origin: (3,) of the joint's frame in the parent's interface frame, m.
-        rotation: (3, 3) from the joint's frame to the parent's interface frame.
-        rotor: inertia of what drives it, times the gear ratio squared, kg m2 (prismatic: kg).
-        interface: number of the parent's outboard interface, 0 for the first.
-    """
-
-    name: str
-    kind: JointType
-    parent: int
-    coordinate: int | None
-    axis: np.ndarray
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    rotation: np.ndarray = field(default_factory=lambda: ONE)
-    rotor: float = 0.0
-    interface: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Constants:
-    """One body's integrals as the equations use them; q modes.
-
-    Attributes:
-        body: the integrals.
-        c, C: (3,), (3, q) int X and int Phi.
-        W_rest, W_modes: (9 (1 + q),), (q, 9 (1 + q)): W_ab eta = W_rest + e W_modes.
-        modes: (9, q q) of W_ab among the modes.
-        M: (q, q) mass.
-        B: (6 i, q) displacement and rotation of its i outboard interfaces.
-        K0: (12, q, q) of the frame's accelerations a and A_ab, or None of a linear body.
-        K0_outboard: (6 i, q, q), or None.
-        points: (i, 3) reference positions of the interfaces.
-        L: (q, q, q) of `ModalDisplacement`, or None.
-    """
-
-    body: ShapeIntegrals
-    c: np.ndarray
-    C: np.ndarray
-    W_rest: np.ndarray
-    W_modes: np.ndarray
-    modes: np.ndarray
-    M: np.ndarray
-    B: np.ndarray
-    K0: np.ndarray | None
-    K0_outboard: np.ndarray | None
-    points: np.ndarray
-    L: np.ndarray | None
-
-    @property
-    def num_modes(self) -> int:
-        """Number q."""
-        return len(self.M)
-
-
-def constants_of(body: ShapeIntegrals) -> Constants:
-    """Return a spatial body's constants."""
-    q = body.num_modes
-    by_eta = body.W.transpose(2, 0, 1).reshape(1 + q, -1)  # of eta_l: (ab, k)
-    modes = body.W[:, 1:, 1:]
-    stiffened = body.is_stiffened
-    return Constants(
-        body=body,
-        c=body.w[:, 0],
-        C=body.w[:, 1:],
-        W_rest=by_eta[0],
-        W_modes=by_eta[1:],
-        modes=modes.reshape(9, -1),
-        M=modes[0] + modes[4] + modes[8],
-        B=body.outboard,
-        K0=body.K0 if stiffened else None,
-        K0_outboard=body.K0_outboard if stiffened else None,
-        points=body.points,
-        L=body.along_modes if len(body.along_modes) else None,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,55 +47,17 @@ class SpatialMechanism(ElasticBodies):
     carried_further: Mapping[Site, ShapeIntegrals] = field(default_factory=dict)
 
     @cached_property
-    def constants(self) -> tuple[Constants, ...]:
-        """Every body's constants."""
-        return tuple(map(constants_of, self.bodies))
+    def tree(self) -> Tree:
+        """Itself as inverse dynamics goes along it."""
+        loads = {site: Constants(one) for site, one in self.every_load.items()}
+        constants = tuple(map(Constants, self.bodies))
+        return Tree(constants, self.slices, self.joints, loads, self.gravity[:, None])
 
     @cached_property
     def every_load(self) -> dict[Site, ShapeIntegrals]:
         """All that bodies carry, by (body, interface)."""
         first = {(i, 0): one for i, one in enumerate(self.carried) if one is not None}
         return first | dict(self.carried_further)
-
-    @cached_property
-    def loads(self) -> dict[Site, Constants]:
-        """Constants of `every_load`."""
-        return {site: constants_of(one) for site, one in self.every_load.items()}
-
-    @cached_property
-    def sites(self) -> tuple[tuple[int, ...], ...]:
-        """Of every body the interfaces on which something sits, ascending."""
-        found: list[set[int]] = [set() for _ in self.bodies]
-        for joint in self.joints:
-            if joint.parent != GROUND:
-                found[joint.parent].add(joint.interface)
-        for body, interface in self.every_load:
-            found[body].add(interface)
-        return tuple(tuple(sorted(one)) for one in found)
-
-    def hanging(self, body: int, interface: int) -> tuple[int, ...]:
-        """Return the bodies that hang on an interface."""
-        return tuple(k for k in self.children[body] if self.joints[k].interface == interface)
-
-    @cached_property
-    def order(self) -> tuple[int, ...]:
-        """The bodies, every one behind its parent."""
-        found: list[int] = []
-        while len(found) < len(self.joints):
-            more = [
-                i
-                for i, joint in enumerate(self.joints)
-                if i not in found and (joint.parent == GROUND or joint.parent in found)
-            ]
-            assert more, "joints form a loop"
-            found += more
-        return tuple(found)
-
-    @cached_property
-    def children(self) -> tuple[tuple[int, ...], ...]:
-        """The bodies that hang on every body."""
-        every = range(len(self.bodies))
-        return tuple(tuple(i for i in every if self.joints[i].parent == k) for k in every)
 
     @cached_property
     def chain(self) -> tuple[int, ...]:
@@ -195,25 +67,19 @@ class SpatialMechanism(ElasticBodies):
             found.insert(0, self.joints[found[0]].parent)
         return tuple(found)
 
-    @cached_property
-    def movable(self) -> tuple[int, ...]:
-        """For every rigid coordinate the body whose joint it is."""
-        found = [(j.coordinate, i) for i, j in enumerate(self.joints) if j.coordinate is not None]
-        return tuple(i for _, i in sorted(found))
-
     @property
     def num_rigid(self) -> int:
         """Number of rigid coordinates."""
-        return len(self.movable)
+        return len(self.tree.movable)
 
     def __getitem__(self, part: slice | np.ndarray) -> SpatialMechanism:
         """Return itself: it is the same at all instants."""
         return self
 
-    @cached_property
+    @property
     def rotors(self) -> np.ndarray:
         """Reflected inertia of every rigid coordinate's drive."""
-        return np.array([self.joints[i].rotor for i in self.movable])
+        return self.tree.rotors
 
 
 # -- rigid bodies ----------------------------------------------------------------------------
@@ -267,24 +133,10 @@ def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
 
 
-# -- rotations in space: rotation vectors with exact derivatives, axes and angles, URDF's frames
-#
-# A rotation vector theta, x = theta . theta, turns by
-#     R = exp(theta~) = 1 + c_1 theta~ + c_2 theta~^2,
-# and with J = 1 + c_2 theta~ + c_3 theta~^2 the rate theta' is the angular velocity J theta', in
-# the
-# components of the frame that theta turns away from. c_k(x) = sum_j (-x)^j / (2 j + k)! have the
-# derivatives c_k' = (k c_(k+2) - c_(k+1)) / 2 without a division: nothing is lost at small angles.
-# At large ones, where the series cancels, they follow from sine and cosine.
-# All functions take complex numbers, whose imaginary part is then a derivative.
-# Source: Stumpff (1959); Simo & Vu-Quoc (1988), doi:10.1016/0045-7825(88)90073-4; Sola, Deray &
-# Atchuthan (2018), arXiv:1812.01537.
-
-# Terms of the series: 1e-24 at x = 1, and 1e-40 up to x = FAR, where rounding has grown to 1e-15.
-TERMS, NEAR = 10, 1.0
-MANY_TERMS, FAR = 40, 10.0
+# -- rotations in space: axes and angles, URDF's frames; n instants first
 
 ONE: np.ndarray = np.eye(3)
+PERMUTATION = np.cross(ONE[:, None], ONE).transpose(2, 0, 1)  # e_cab
 _NEXT, _OTHER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -301,16 +153,6 @@ def skew(v: np.ndarray) -> np.ndarray:
     return out
 
 
-def axial(A: np.ndarray) -> np.ndarray:
-    """Return (A_yz - A_zy, A_zx - A_xz, A_xy - A_yx) (..., 3) of matrices (..., 3, 3)."""
-    return np.stack([A[..., j, k] - A[..., k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1)
-
-
-def dot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return u . v (...) of vectors (..., 3)."""
-    return (u * v).sum(axis=-1)
-
-
 def times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return A v (n, 3) of matrices (n, 3, 3), or one (3, 3), and vectors (n, 3)."""
     return v @ A.T if A.ndim == 2 else np.einsum("nij,nj->ni", A, v)
@@ -321,44 +163,9 @@ def transposed_times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v @ A if A.ndim == 2 else np.einsum("nji,nj->ni", A, v)
 
 
-def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
-    """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of many turns closed."""
-    far = np.abs(x) > FAR
-    if not far.any():
-        return _series(x, orders)
-    near = _series(np.where(far, 0.0, x), orders)
-    large = _closed(np.where(far, x, FAR), orders)
-    return [np.where(far, b, a) for a, b in zip(near, large, strict=True)]
-
-
-def _closed(x: np.ndarray, orders: int) -> list[np.ndarray]:
-    """Return c_0 = cos(angle), c_1 = sin(angle) / angle, c_(k+2) = (1 / k! - c_k) / x."""
-    angle = np.sqrt(x)
-    found = [np.cos(angle), np.sin(angle) / angle]
-    for k in range(orders - 2):
-        found.append((1.0 / factorial(k) - found[k]) / x)
-    return found
-
-
-def _series(x: np.ndarray, orders: int) -> list[np.ndarray]:
-    terms = TERMS if np.abs(x).max(initial=0.0) <= NEAR else MANY_TERMS
-    last = [_horner(x, k, terms) for k in (orders - 1, orders - 2)]
-    found = last
-    for k in range(orders - 3, -1, -1):
-        found.append(1.0 / factorial(k) - x * found[-2])
-    return found[::-1]
-
-
-def _horner(x: np.ndarray, k: int, terms: int) -> np.ndarray:
-    value = np.zeros_like(x)
-    for j in range(terms - 1, -1, -1):
-        value = 1.0 / factorial(2 * j + k) - x * value
-    return value
-
-
 def exponential(theta: np.ndarray) -> np.ndarray:
     """Return R (..., 3, 3) of rotation vectors (..., 3)."""
-    c = series(dot(theta, theta), 3)
+    c = series((theta * theta).sum(axis=-1), 3)
     A = skew(theta)
     return ONE + c[1][..., None, None] * A + c[2][..., None, None] * (A @ A)
 
@@ -378,108 +185,6 @@ def roll_pitch_yaw(rpy: tuple[float, float, float]) -> np.ndarray:
     x, y, z = (about(ONE[i], np.array([angle]))[0] for i, angle in enumerate(rpy))
     R: np.ndarray = z @ y @ x
     return R
-
-
-@dataclass(frozen=True, eq=False)
-class Turning:
-    """A rotation vector and its rates, and the motion they are; arrays over n instants.
-
-    Attributes:
-        theta, rate, second: (n, 3) rotation vector, its first and second derivative.
-    """
-
-    theta: np.ndarray
-    rate: np.ndarray
-    second: np.ndarray
-
-    @cached_property
-    def _c(self) -> list[np.ndarray]:
-        return [c[:, None] for c in series(dot(self.theta, self.theta))]
-
-    @cached_property
-    def _first(self) -> tuple[np.ndarray, np.ndarray]:
-        """c_2', c_3' (n, 1)."""
-        return _derivative(self._c, 2), _derivative(self._c, 3)
-
-    @cached_property
-    def _second(self) -> tuple[np.ndarray, np.ndarray]:
-        """c_2'', c_3'' (n, 1)."""
-        c = self._c
-        first = {k: _derivative(c, k) for k in (3, 4, 5)}
-        return 0.5 * (2 * first[4] - first[3]), 0.5 * (3 * first[5] - first[4])
-
-    @cached_property
-    def R(self) -> np.ndarray:
-        """The rotation (n, 3, 3)."""
-        A, c = skew(self.theta), self._c
-        return ONE + c[1][..., None] * A + c[2][..., None] * (A @ A)
-
-    @cached_property
-    def J(self) -> np.ndarray:
-        """Angular velocity by the rate (n, 3, 3)."""
-        A, c = skew(self.theta), self._c
-        return ONE + c[2][..., None] * A + c[3][..., None] * (A @ A)
-
-    @cached_property
-    def velocity(self) -> np.ndarray:
-        """Angular velocity J theta' (n, 3)."""
-        return times(self.J, self.rate)
-
-    @cached_property
-    def acceleration(self) -> np.ndarray:
-        """Its derivative J theta'' + J' theta' (n, 3)."""
-        theta, v, c = self.theta, self.rate, self._c
-        along = dot(theta, v)[:, None]
-        first, second = self._first
-        turned = cross(theta, v)
-        bent = 2.0 * along * (first * turned + second * cross(theta, turned))
-        return times(self.J, self.second) + bent + c[3] * cross(v, turned)
-
-    def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray:
-        """Return the derivative of J v by theta (n, 3, 3); of J' v with `sign` = -1."""
-        theta, c = self.theta, self._c
-        x, along = dot(theta, theta)[:, None], dot(theta, v)[:, None]
-        first, second = self._first
-        turned = 2.0 * sign * first * cross(theta, v) + 2.0 * second * (along * theta - x * v)
-        out = -sign * c[2][..., None] * skew(v) + _outer(turned, theta)
-        return out + c[3][..., None] * (
-            along[..., None] * ONE + _outer(theta, v) - 2.0 * _outer(v, theta)
-        )
-
-    @cached_property
-    def acceleration_by_theta(self) -> np.ndarray:
-        """Derivative of `acceleration` by theta (n, 3, 3)."""
-        theta, v, c = self.theta, self.rate, self._c
-        x, s, square = dot(theta, theta)[:, None], dot(theta, v)[:, None], dot(v, v)[:, None]
-        (d2, d3), (dd2, dd3) = self._first, self._second
-        turned, plane = cross(theta, v), s * theta - x * v
-        out = self.by_theta(self.second)
-        out = out + _outer(2.0 * d2 * turned + 2.0 * d3 * plane - c[3] * v, v)
-        out += _outer(4.0 * s * (dd2 * turned + dd3 * plane), theta)
-        out += _outer(2.0 * d3 * (square * theta - s * v), theta)
-        out -= (2.0 * d2 * s)[..., None] * skew(v)
-        out += (c[3] * square + 2.0 * d3 * s * s)[..., None] * ONE
-        return out + (2.0 * d3 * s)[..., None] * (_outer(theta, v) - 2.0 * _outer(v, theta))
-
-    @cached_property
-    def acceleration_by_rate(self) -> np.ndarray:
-        """Derivative of `acceleration` by theta' (n, 3, 3): d(J theta')/d theta + J'."""
-        theta, v, c = self.theta, self.rate, self._c
-        A, B = skew(theta), skew(v)
-        s = 2.0 * dot(theta, v)[:, None, None]
-        first, second = (x[..., None] for x in self._first)
-        rate = c[2][..., None] * B + s * (first * A + second * (A @ A))
-        return self.by_theta(v) + rate + c[3][..., None] * (A @ B + B @ A)
-
-
-def _derivative(c: list[np.ndarray], k: int) -> np.ndarray:
-    """Return c_k' by x."""
-    return 0.5 * (k * c[k + 2] - c[k + 1])
-
-
-def _outer(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return u v' (n, 3, 3)."""
-    return u[..., :, None] * v[..., None, :]
 
 
 # -- the joints from the ground to the end-effector, links rigid: places, Jacobian,

@@ -1,0 +1,584 @@
+"""A body that moves and deforms in the plane or in space: inertia force, rows, derivatives.
+
+The instants are the last axis, see `dimension`. Motions are triples (a, w, wd): acceleration of a
+frame's origin less gravity (d, n), angular velocity and acceleration (r, n), in the components of
+that frame. Loads are pairs (force (d, n), moment (r, n)).
+
+All that loads a body's elastic rows is linear in P numbers, its pushes: the frame's acceleration a,
+the entries alpha_c of A, and the force and moment on every outboard interface. Each has a conjugate
+that the coordinates e displace,
+
+    v_p = T_p e - 1/2 e'K0_p e,   V_p = dv_p/de = T_p - K0_p e,
+
+its geometric stiffness K0 zero of a linear body: first moment s - c for a, int X . E_c u for
+alpha_c, displacement and rotation of an interface for its force and moment.
+
+A body with geometric stiffness deforms by Phi e + psi(e), psi being of second order. Along the
+modes that is z with M z = int Phi . (Phi e + psi); by reciprocity the second-order part is that of
+the inertia M Phi_k as a load: z = e - 1/2 e'L e, L_k = sum_l (M^-1)_kl K0_l, J = dz/de = 1 - L e.
+It takes the place of e in products of the modes with each other: the mass J'M J of the relative
+motion is definite for every deformation. With z = e it would be M, and the second order of the
+interface's motion alone would make the mass of light coordinates negative. Without L, as of bodies
+from files, z is e.
+
+With second moments G_c = int p . E_c p, H_c = int p . E_c p', I_c = int p . E_c p'' of the deformed
+body the inertia force, moment and rows are
+
+    F = m a + A s + 2 Omega s' + s'',   T = s x a + torque(alpha, G) + torque(beta, H) + axial(I),
+    f = p . V + J'(alpha_c W_c z + beta_c W_c z' + M z'') + K e + D e'.
+
+Source: Schwertassek & Wallrapp (1999); Wallrapp & Schwertassek (1991),
+doi:10.1002/nme.1620320818; Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dolfinopt.multibody.dimension import DIMENSIONS, product
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
+
+Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
+Load = tuple[np.ndarray, np.ndarray]
+PerInstant = float | np.ndarray  # one number, or one at each of n instants
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """Factors of a body's mass integrals, stiffness and damping."""
+
+    mass: PerInstant = 1.0
+    stiffness: PerInstant = 1.0
+    damping: PerInstant = 1.0
+
+    def __getitem__(self, part: slice | np.ndarray) -> Scale:
+        """Return it at some of the instants."""
+        return Scale(*(at(x, part) for x in (self.mass, self.stiffness, self.damping)))
+
+
+UNSCALED = Scale()
+
+
+def at(x: PerInstant, part: slice | np.ndarray) -> PerInstant:
+    """Return a value at some of the instants."""
+    return x[part] if isinstance(x, np.ndarray) else x
+
+
+class Constants:
+    """One body's integrals as the equations use them; q modes, P pushes.
+
+    Attributes:
+        body: the integrals.
+        dim: what differs between the plane and space.
+        mass: kg; of a point that the plane's machines carry also (n,), one at each instant.
+        T: (P, q) conjugates of the pushes by the coordinates.
+        K0: (P, q, q) geometric stiffness by every push, None of a linear body.
+        L: (q, q, q) of the displacement along the modes, or None.
+        c, W_rest: (d, 1), (g, 1) of the undeformed body; W_rest also (g, n), as the mass.
+        is_point: whether it is rigid with its centre at the origin.
+        W: (g q, q) of the modes.
+        M: (q, q) mass.
+        K, D: (q, q), or diagonals (q, 1) where there is nothing else; no D, None.
+        points: (i, d) reference positions of the outboard interfaces.
+    """
+
+    def __init__(self, body: ShapeIntegrals) -> None:
+        """Take the integrals."""
+        self.body, q = body, body.num_modes
+        self.dim, self.turning = DIMENSIONS[len(body.w)]
+        self.num_modes = q
+        self.T = np.concatenate([body.w[:, 1:], body.W[:, 1:, 0], body.outboard])
+        self.K0 = self.L = None
+        if body.is_stiffened:
+            self.K0 = np.concatenate([body.K0[self.dim.loads], body.K0_outboard])
+            self.L = body.along_modes if len(body.along_modes) else None
+        self.mass: PerInstant = body.mass
+        self.c, self.W_rest = body.w[:, :1], body.W[:, :1, 0]
+        self.is_point = q == 0 and not self.c.any()
+        self.W = np.ascontiguousarray(body.W[:, 1:, 1:]).reshape(self.dim.g * q, q)
+        self.M = body.M
+        self.K = _diagonal_or_matrix(body.K)
+        self.D = _diagonal_or_matrix(body.D) if body.D.any() else None
+        self.points = body.points if self.dim.d == 3 else body.outboard_point[None]
+
+    @classmethod
+    def of_point(cls, mass: PerInstant, inertia: PerInstant) -> Constants:
+        """Return those of a mass (kg) with rotary inertia (kg m2) at the origin, in the plane."""
+        found = cls(rigid_body(0.0, np.zeros(2), 0.0, np.zeros(2)))
+        inertia = np.atleast_1d(inertia)
+        found.mass, found.W_rest = mass, np.stack([inertia, np.zeros_like(inertia)])
+        return found
+
+    @cached_property
+    def bent(self) -> np.ndarray:
+        """K0, and L behind it where there is one ((P + q) q, q)."""
+        assert self.K0 is not None
+        every = self.K0 if self.L is None else np.concatenate([self.K0, self.L])
+        return every.reshape(-1, self.num_modes)
+
+    def outboard(self, number: int) -> slice:
+        """Return an interface's place among the pushes."""
+        first = self.dim.d + self.dim.g + self.dim.b * number
+        return slice(first, first + self.dim.b)
+
+
+def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
+    """Return the diagonal (q, 1) of a matrix that has nothing else, or the matrix."""
+    diagonal = np.diagonal(A)
+    alone = np.count_nonzero(A) == np.count_nonzero(diagonal)
+    return diagonal[:, None].copy() if alone else A
+
+
+def weighted(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return A x (q, n) of a matrix, or of its diagonal (q, 1)."""
+    return A * x if A.shape[1] != len(A) or len(A) == 1 else A @ x
+
+
+def _scaled(factor: PerInstant, x: np.ndarray) -> np.ndarray:
+    """Return x (q, n) times a factor, which mostly is one."""
+    return x if isinstance(factor, float) and factor == 1.0 else factor * x
+
+
+def _times(x: PerInstant, A: np.ndarray) -> np.ndarray:
+    """Return A times a number, or (n, ...) times one at each instant."""
+    return np.multiply.outer(x, A) if isinstance(x, np.ndarray) else x * A
+
+
+class BodyMotion:
+    """A body's frame and elastic coordinates at n instants.
+
+    Attributes:
+        constants: of the body.
+        a, w, wd: its motion.
+        rates: (q, 3, n) coordinates e, e', e''.
+        scale: of its integrals; its inertia's factor is in all that it makes of accelerations.
+    """
+
+    def __init__(
+        self, constants: Constants, motion: Motion, rates: np.ndarray, scale: Scale = UNSCALED
+    ) -> None:
+        """Take motion and coordinates."""
+        self.constants, self.dim, self.rates = constants, constants.dim, rates
+        self.scale = scale
+        self.a, self.w, self.wd = motion
+        self.is_flexible = constants.num_modes > 0
+        self.alpha = self.dim.alpha(self.w, self.wd)
+
+    @cached_property
+    def beta(self) -> np.ndarray:
+        """Entries of 2 Omega (g, n)."""
+        return self.dim.beta(self.w)
+
+    # -- conjugates of the pushes, displacement along the modes -------------------------------
+
+    def _bent_by(self, rate: int) -> np.ndarray:
+        """Return K0 and L times e, e' or e'' (P + q, q, n)."""
+        q, _, count = self.rates.shape
+        return (self.constants.bent @ self.rates[:, rate]).reshape(-1, q, count)
+
+    @cached_property
+    def _bent(self) -> np.ndarray:
+        return self._bent_by(0)
+
+    @cached_property
+    def _bent_rate(self) -> np.ndarray:
+        return self._bent_by(1)
+
+    @cached_property
+    def _every(self) -> np.ndarray:
+        """Conjugates of all pushes and z, with their rates (P + q, 3, n)."""
+        constants, (q, _, count) = self.constants, self.rates.shape
+        linear = (constants.T @ self.rates.reshape(q, -1)).reshape(-1, 3, count)
+        if constants.K0 is None:
+            return linear
+        if constants.L is not None:
+            linear = np.concatenate([linear, self.rates])
+        e, ed, edd = (self.rates[:, i] for i in range(3))
+        bent = np.empty(linear.shape, dtype=self._bent.dtype)
+        bent[:, 0] = 0.5 * np.einsum("pkn,kn->pn", self._bent, e)
+        bent[:, 1] = np.einsum("pkn,kn->pn", self._bent, ed)
+        bent[:, 2] = np.einsum("pkn,kn->pn", self._bent, edd)
+        bent[:, 2] += np.einsum("pkn,kn->pn", self._bent_rate, ed)
+        return np.asarray(linear - bent)
+
+    @cached_property
+    def conjugates(self) -> np.ndarray:
+        """Conjugates of the pushes and their rates (P, 3, n)."""
+        return self._every[: len(self.constants.T)]
+
+    @cached_property
+    def z(self) -> np.ndarray:
+        """Displacement along the modes and its rates (q, 3, n)."""
+        return self.rates if self.constants.L is None else self._every[len(self.constants.T) :]
+
+    @cached_property
+    def _by_e(self) -> np.ndarray:
+        """V, and J behind it where z is not e (P + q, q, n)."""
+        constants = self.constants
+        if constants.K0 is None:
+            return np.broadcast_to(constants.T[..., None], (*constants.T.shape, self.w.shape[1]))
+        T = constants.T
+        if constants.L is not None:
+            T = np.concatenate([T, np.eye(constants.num_modes)])
+        return T[..., None] - self._bent
+
+    @cached_property
+    def V(self) -> np.ndarray:
+        """Derivative of the conjugates by e (P, q, n)."""
+        return self._by_e[: len(self.constants.T)]
+
+    @cached_property
+    def _J(self) -> np.ndarray:
+        """Derivative of z by e (q, q, n), where z is not e."""
+        return self._by_e[len(self.constants.T) :]
+
+    @cached_property
+    def rates_by_e(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Derivatives of V's and J's first and second rate by e (P + q, q, n); None: zero."""
+        if self.constants.K0 is None:
+            return None
+        return -self._bent_rate, -self._bent_by(2)
+
+    def pulled(self, x: np.ndarray) -> np.ndarray:
+        """Return J' x: forces by z as forces by e, (q, n) or (m, q, n)."""
+        if self.constants.L is None:
+            return x
+        out: np.ndarray = np.einsum("...ln,lkn->...kn", x, self._J)
+        return out
+
+    # -- integrals of the deformed body ------------------------------------------------------
+
+    @cached_property
+    def _Wz(self) -> np.ndarray:
+        """W_c of the modes times z, z', z'' (g, q, 3, n)."""
+        q, _, count = self.rates.shape
+        return (self.constants.W @ self.z.reshape(q, -1)).reshape(-1, q, 3, count)
+
+    @cached_property
+    def Y(self) -> np.ndarray:
+        """Derivative of the rows by alpha_c (g, q, n); that of beta_c is `Yd`."""
+        d, g = self.dim.d, self.dim.g
+        return self.V[d : d + g] + self.pulled(self._Wz[:, :, 0])
+
+    @cached_property
+    def Yd(self) -> np.ndarray:
+        """J' W_c z' (g, q, n)."""
+        return self.pulled(self._Wz[:, :, 1])
+
+    @cached_property
+    def moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """First moment s = int p and its rates (d, n)."""
+        d, c = self.dim.d, self.constants.c
+        if not self.is_flexible:
+            none = np.zeros_like(self.a)
+            return none + c, none, none
+        s, sd, sdd = self.conjugates[:d].swapaxes(0, 1)
+        return c + s, sd, sdd
+
+    @cached_property
+    def second_moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """G, H, I (g, n), see the module."""
+        d, g, rest = self.dim.d, self.dim.g, self.constants.W_rest
+        if not self.is_flexible:
+            none = np.zeros_like(self.alpha)
+            return none + rest, none, none
+        v = self.conjugates[d : d + g]
+        found = np.einsum("ckrn,kn->crn", self._Wz, self.z[:, 0]) + self.dim.transposed(v)
+        return rest + v[:, 0] + found[:, 0], found[:, 1], found[:, 2]
+
+    # -- forces ------------------------------------------------------------------------------
+
+    @cached_property
+    def load(self) -> Load:
+        """Inertia force F and moment T about the frame's origin, N and N m."""
+        dim = self.dim
+        if self.constants.is_point:
+            moment = dim.torque(self.alpha, self.constants.W_rest)
+            return self.constants.mass * self.a, moment
+        (s, sd, sdd), (G, H, second) = self.moments, self.second_moments
+        force = self.constants.mass * self.a + dim.apply(self.alpha, s)
+        moment = dim.moment(s, self.a) + dim.torque(self.alpha, G)
+        if self.is_flexible:
+            force = force + dim.apply(self.beta, sd) + sdd
+            moment = moment + dim.torque(self.beta, H) + dim.axial(second)
+        return self._of_mass(force), self._of_mass(moment)
+
+    def _of_mass(self, x: np.ndarray) -> np.ndarray:
+        """Return inertia (..., n) of the body as it is scaled."""
+        return x if self.scale is UNSCALED else self.scale.mass * x
+
+    @cached_property
+    def modal_inertia(self) -> np.ndarray:
+        """alpha_c W_c z + beta_c W_c z' + M z'' (q, n)."""
+        pushes = np.empty((len(self.alpha), 3, self.alpha.shape[1]), dtype=self.alpha.dtype)
+        pushes[:, 0], pushes[:, 1], pushes[:, 2] = self.alpha, self.beta, self.dim.trace
+        return self._of_mass(np.einsum("crn,ckrn->kn", pushes, self._Wz))
+
+    def pushes(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
+        """Return all P of them (P, n) from those of the interfaces, by number."""
+        count = self.a.shape[1]
+        pulls = [
+            outboard[s] if s in outboard else np.zeros((self.dim.b, count))
+            for s in range(len(self.constants.points))
+        ]
+        return np.concatenate([self._of_mass(self.a), self._of_mass(self.alpha), *pulls])
+
+    def rows(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
+        """Return the elastic rows (q, n) under pushes of the interfaces, by number."""
+        constants, p = self.constants, self.pushes(outboard)
+        f = self.pulled(self.modal_inertia)
+        if constants.K0 is None:
+            f = f + constants.T.T @ p
+        else:
+            f = f + np.einsum("pn,pkn->kn", p, self.V)
+        k, d = self.scale.stiffness, self.scale.damping
+        f = f + weighted(constants.K, _scaled(k, self.rates[:, 0]))
+        if constants.D is not None:
+            f += weighted(constants.D, _scaled(d, self.rates[:, 1]))
+        return f
+
+    # -- derivatives -------------------------------------------------------------------------
+
+    @cached_property
+    def load_by_motion(self) -> np.ndarray:
+        """Derivative of (F, T) by (a, w, wd), (d + r, d + 2 r, n)."""
+        dim, (s, sd, _), (G, H, _) = self.dim, self.moments, self.second_moments
+        d, r = dim.d, dim.r
+        out = np.zeros((d + r, d + 2 * r, self.a.shape[1]))
+        out[range(d), range(d)] = self.constants.mass
+        spun = dim.by_spin(s)
+        out[:d, d : d + r] = dim.centripetal_by_spin(self.w, s) + 2.0 * dim.by_spin(sd)
+        out[:d, d + r :], out[d:, :d] = spun, spun.swapaxes(0, 1)
+        out[d:, d : d + r], out[d:, d + r :] = dim.torque_by_spin(self.w, G, H)
+        return self._of_mass(out)
+
+    @cached_property
+    def rows_by_motion(self) -> np.ndarray:
+        """Derivative of the rows by (a, w, wd), (d + 2 r, q, n)."""
+        by_w, by_wd = self.dim.contracted_by_spin(self.w, self.Y, self.Yd)
+        return self._of_mass(np.concatenate([self.V[: self.dim.d], by_w, by_wd]))
+
+    def load_by_rates(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the derivatives of (F, T) by those e, e', e'' kept (d + r, k, n)."""
+        dim, P = self.dim, len(self.constants.T)
+        d, across = dim.d, slice(dim.d, dim.d + dim.g)
+        C, Y, Yd = self.V[:d, kept], self.Y[:, kept], self.Yd[:, kept]
+        turned = dim.transposed(Y)
+        first, second = Yd, self.pulled(self._Wz[:, :, 2])[:, kept]
+        by_e = dim.apply(self.alpha, C)
+        by_ed = dim.apply(self.beta, C)
+        moved = None
+        if (rates := self.rates_by_e) is not None:
+            vd, vdd = rates[0][:, kept], rates[1][:, kept]
+            by_e += dim.apply(self.beta, vd[:d]) + vdd[:d]
+            by_ed += 2.0 * vd[:d]
+            moved, bending = (dim.transposed(x[across]) for x in (vd, vdd))
+            if self.constants.L is not None:
+                z = dim.transposed(self._Wz[:, :, 0])
+                moved = moved + np.einsum("cln,lkn->ckn", z, vd[P:])
+                bending = bending + np.einsum("cln,lkn->ckn", z, vdd[P:])
+            first, second = first + moved, second + bending
+        T_e = dim.moment(C, self.a) + dim.torque(self.alpha, Y + turned)
+        T_e += dim.torque(self.beta, first) + dim.axial(second)
+        T_ed = dim.torque(self.beta, turned)
+        if moved is not None:
+            T_ed += 2.0 * dim.axial(moved)
+        return (
+            self._of_mass(np.concatenate([by_e, T_e])),
+            self._of_mass(np.concatenate([by_ed, T_ed])),
+            self._of_mass(np.concatenate([C, dim.axial(turned)])),
+        )
+
+    def rows_by_rates(
+        self, kept: np.ndarray, outboard: dict[int, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the derivatives of the rows by those e, e', e'' kept, pushes held.
+
+        (n, q, k); the mass (q, k) if it is the same at all instants.
+        """
+        constants, q = self.constants, self.constants.num_modes
+        if constants.L is None:
+            by_e, by_ed, by_edd = *self._by_z(kept), constants.M[:, kept]
+            if self.scale is not UNSCALED:
+                by_edd = _times(self.scale.mass, by_edd)
+            held = self.pushes(outboard)
+        else:
+            by_z, by_zd = self._by_z(np.arange(q))
+            assert self.rates_by_e is not None
+            P = len(constants.T)
+            J, Jd, Jdd = (
+                np.ascontiguousarray(x[P:].transpose(2, 0, 1))
+                for x in (self._by_e, *self.rates_by_e)
+            )
+            left, own = J.swapaxes(1, 2), J[:, :, kept]
+            M = constants.M
+            if self.scale is not UNSCALED:
+                M = _times(self.scale.mass, M)
+            by_e = left @ (by_z @ own + by_zd @ Jd[:, :, kept] + M @ Jdd[:, :, kept])
+            by_ed = left @ (by_zd @ own + 2.0 * (M @ Jd[:, :, kept]))
+            by_edd = left @ (M @ own)
+            held = np.concatenate([self.pushes(outboard), self.modal_inertia])
+        if constants.K0 is not None:
+            bent = constants.bent.reshape(len(held), q, q)[:, :, kept]
+            by_e -= (held.T @ bent.reshape(len(held), q * len(kept))).reshape(by_e.shape)
+        D, k, d = constants.body.D, self.scale.stiffness, self.scale.damping
+        by_e += _times(k, constants.body.K[:, kept])
+        if constants.D is not None:
+            by_ed += _times(d, D[:, kept])
+        return by_e, by_ed, by_edd
+
+    def _by_z(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of `modal_inertia` by those z and z' kept (n, q, k)."""
+        q = self.constants.num_modes
+        W = self.constants.W.reshape(-1, q, q)[:, :, kept]
+        flat, shape = W.reshape(len(W), q * len(kept)), (self.w.shape[1], q, len(kept))
+        by_z, by_zd = ((self._of_mass(x).T @ flat).reshape(shape) for x in (self.alpha, self.beta))
+        return by_z, by_zd
+
+    # -- gradient ----------------------------------------------------------------------------
+
+    def integral_gradient(
+        self, virtual: Load, multipliers: np.ndarray, outboard: dict[int, Weights]
+    ) -> ShapeIntegrals:
+        """Return the derivative of the virtual work of F, T and the rows by the integrals.
+
+        Args:
+            virtual: displacement of the frame's origin and rotation, multiplies (F, T).
+            multipliers: (q, n) of the rows.
+            outboard: derivatives by the interfaces' displacements, by number.
+        """
+        constants, body, dim = self.constants, self.constants.body, self.dim
+        (p, phi), zeta = virtual, multipliers
+        weights = self._frame_weights(p, phi)
+        count, d, g = p.shape[1], dim.d, dim.g
+        every = Weights(*np.zeros((4, len(constants.T), count)))
+        for place, one in [
+            (slice(0, d + g), weights),
+            *((constants.outboard(s), one) for s, one in outboard.items()),
+        ]:
+            every.value[place], every.rate[place] = one.value, one.rate
+            every.second[place], every.virtual[place] = one.second, one.virtual
+        by_T = every.linear(self.rates, zeta)
+        by_W = self._by_second_moments(phi, self.rates, zeta)
+        along = np.zeros_like(body.along_modes)
+        if constants.L is not None:
+            pushed = product(self._J, zeta)
+            by_W[:, 1:, 1:] = self._by_second_moments(phi, self.z, pushed)[:, 1:, 1:]
+            along = self._by_L(phi, zeta, pushed)
+        K0 = np.zeros((0, *body.K.shape))
+        if constants.K0 is not None:
+            K0 = every.quadratic(self.rates, zeta)
+        ends = K0[d + g :]
+        by_w = np.column_stack([(weights.value[:d]).sum(axis=1), by_T[:d]])
+        inertial = np.zeros_like(body.K0)
+        if constants.K0 is not None:
+            inertial[dim.loads] = K0[: d + g]
+        return ShapeIntegrals(
+            mass=float((p * self.a).sum()),
+            w=by_w,
+            W=by_W,
+            K=zeta @ self.rates[:, 0].T,
+            D=zeta @ self.rates[:, 1].T,
+            outboard=by_T[d + g :],
+            outboard_point=np.zeros(d),
+            K0=inertial,
+            K0_outboard=ends,
+            further_points=np.zeros_like(body.further_points),
+            along_modes=along,
+        )
+
+    def _frame_weights(self, p: np.ndarray, phi: np.ndarray) -> Weights:
+        """Return the derivatives by the conjugates of a and alpha (d + g, n), see `Weights`."""
+        dim = self.dim
+        turned = [dim.turned(phi, x) for x in (self.alpha, self.beta)]
+        trace = dim.turned(phi, np.broadcast_to(dim.trace, self.alpha.shape))
+        G, H, second = (*turned, trace)
+        value = dim.applied_transposed(self.alpha, p) - dim.velocity(phi, self.a)
+        return Weights(
+            np.concatenate([value, G + dim.transposed(G)]),
+            np.concatenate([dim.applied_transposed(self.beta, p), dim.transposed(H)]),
+            np.concatenate([p, dim.transposed(second)]),
+            np.concatenate([self.a, self.alpha]),
+        )
+
+    def accelerations(self, rates: np.ndarray) -> np.ndarray:
+        """Return alpha_c x + beta_c x' + trace_c x'' (g, q, n) of x and its rates (q, 3, n)."""
+        y = self.alpha[:, None] * rates[:, 0] + self.beta[:, None] * rates[:, 1]
+        y += self.dim.trace[:, :, None] * rates[:, 2]
+        return y
+
+    def _by_second_moments(
+        self, phi: np.ndarray, rates: np.ndarray, zeta: np.ndarray
+    ) -> np.ndarray:
+        """Return the derivative of the virtual work by W (g, 1 + q, 1 + q)."""
+        dim, count = self.dim, rates.shape[2]
+        y = np.concatenate([self.alpha[:, None], self.accelerations(rates)], axis=1)
+        t = dim.turned(phi, y)
+        eta = np.concatenate([np.ones((1, count)), rates[:, 0]])
+        moved = np.concatenate([np.zeros((1, count)), zeta])
+        left, right = np.concatenate([moved, eta], axis=1), np.concatenate([y, t], axis=2)
+        found: np.ndarray = left @ right.swapaxes(1, 2)  # of N_l' E_c N_k: l, k
+        return found
+
+    def _by_L(self, phi: np.ndarray, zeta: np.ndarray, pushed: np.ndarray) -> np.ndarray:
+        """Return the derivative of the virtual work by L (q, q, q)."""
+        constants, dim, q = self.constants, self.dim, len(zeta)
+        W = constants.W.reshape(-1, q, q)
+        of_rows = np.einsum("ckl,kn->cln", W, pushed)  # W_c' times the virtual displacement
+        z, zd, zdd = (self._Wz[:, :, i] for i in range(3))
+        across = dim.transposed(z)
+        of_G, of_H = (dim.turned(phi, x) for x in (self.alpha, self.beta))
+        of_I = dim.turned(phi, np.broadcast_to(dim.trace, self.alpha.shape))
+
+        def contracted(pushes: np.ndarray, Y: np.ndarray) -> np.ndarray:
+            out: np.ndarray = np.einsum("cn,ckn->kn", pushes, Y)
+            return out
+
+        by_z = contracted(of_G, z + across) + contracted(of_H, zd) + contracted(of_I, zdd)
+        by_z += contracted(self.alpha, of_rows)
+        by_zd = contracted(of_H, across) + contracted(self.beta, of_rows)
+        by_zdd = contracted(of_I, across) + constants.M @ pushed
+        e, ed, edd = (self.rates[:, i] for i in range(3))
+        by_L = np.zeros((q, q, q))
+        for weight, left, right in (
+            (0.5 * by_z, e, e),
+            (by_zd, e, ed),
+            (by_zdd, e, edd),
+            (by_zdd, ed, ed),
+            (self.modal_inertia, e, zeta),
+        ):
+            by_L -= (weight @ (left[:, None] * right).reshape(q * q, -1).T).reshape(q, q, q)
+        return by_L
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Derivatives (P, n) of the virtual work by P conjugates, T_p e - 1/2 e'K0_p e.
+
+    By their values, rates, second derivatives, and variations by the multipliers.
+    """
+
+    value: np.ndarray
+    rate: np.ndarray
+    second: np.ndarray
+    virtual: np.ndarray
+
+    def linear(self, rates: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Return the derivative (P, q) by T."""
+        every = np.concatenate([self.value, self.rate, self.second, self.virtual], axis=1)
+        q, _, count = rates.shape
+        x = np.concatenate([rates.reshape(q, 3 * count), multipliers], axis=1)
+        out: np.ndarray = every @ x.T
+        return out
+
+    def quadratic(self, rates: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Return the derivative (P, q, q) by K0, of which the symmetric part counts."""
+        e, ed, edd = (rates[:, i] for i in range(3))
+        other = self.virtual[:, None] * multipliers + self.value[:, None] * (0.5 * e)
+        other += self.rate[:, None] * ed
+        other += self.second[:, None] * edd
+        out: np.ndarray = other @ e.T + (self.second[:, None] * ed) @ ed.T
+        return -out.swapaxes(1, 2)
