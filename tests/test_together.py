@@ -212,7 +212,9 @@ def choosing(_):
 
 
 def optimising(folder):
-    scene = load_scene(paper_scene(), (*COARSE, 'design.projection="heaviside"'))
+    scene = load_scene(
+        paper_scene(), (*COARSE, 'design.projection="heaviside"', "design.continuation=1")
+    )
     return lambda: do.optimize(scene, folder, world=COMM)
 
 

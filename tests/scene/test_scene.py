@@ -485,6 +485,7 @@ BAD_VALUES = [
     ("design.minimum", [0.0], "a number >= 1e-09 and < 1"),
     ("design.filter_radius", [1.001], "at most the length of the longest arm, 1.0 [m]"),
     ("design.projection", [True, 0, "tanh"], 'false | "heaviside" | "robust"'),
+    ("design.limits_on", ["dilated", True], '"nominal" | "eroded"'),
     ("design.sharpness interpolation.penalty", [0.9], "a number >= 1"),
     ("design.minimum_member design.minimum_gap", [-1e-9], "a number >= 0 and <= 10000"),
     ("design.erosion", [0.5], "a number >= 0.001 and <= 0.499"),
@@ -1203,6 +1204,7 @@ UNUSED = {
     "design.sharpness": ("64.0", ["design.projection=heaviside"]),
     "design.continuation": ("10", ["design.projection=heaviside"]),
     "design.erosion": ("0.2", ["design.projection=robust"]),
+    "design.limits_on": ("eroded", ["design.projection=robust"]),
 }
 # What does not: the wrong response, or none.
 OTHERS = {
@@ -1210,6 +1212,7 @@ OTHERS = {
     "objective.effort_weights": ["constraints.peak_force=[9.0,9.0,9.0]"],
     "objective.follow": ["objective.kind=first_frequency"],
     "design.erosion": ["design.projection=heaviside"],
+    "design.limits_on": ["design.projection=heaviside"],
 }
 
 
