@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from dolfinopt.bench import arms, iterations, motion, solid
+from dolfinopt.bench import arms, iterations, motion, optimiser, solid
 from dolfinopt.bench.diagram import Frame, curves, fastest, fitted_power
 from dolfinopt.fem.interior import ITERATIVE
+from dolfinopt.responses.constraints import EXCESS
 
 Figure = tuple[float, str]  # nan where it was not measured, or not well enough; a remark
 SECONDS, ERROR = "seconds [s]", "error of elastic coordinates [-]"
@@ -162,6 +163,39 @@ def _memory(frame: Frame) -> Figure:
     return _of(rows, rows["memory [GB]"].max())
 
 
+# -- the optimiser ---------------------------------------------------------------------------
+
+
+def _over_the_best(frame: Frame) -> Figure:
+    """Return the largest objective of a start over the best one of its problem."""
+    made = optimiser.compared(frame[frame["iterations"] > 0])
+    if not len(made):
+        return math.nan, ""
+    worst = made.loc[made[optimiser.OVER].idxmax()]
+    return worst[optimiser.OVER], f"{worst['problem']}, {worst['start']}"
+
+
+def _over_straight(frame: Frame) -> Figure:
+    """Return the rod's least mass over that of the straight one."""
+    kept = frame[(frame["problem"] == optimiser.ROD) & (frame["largest excess [-]"] <= EXCESS)]
+    drawn = kept["start"] == optimiser.BY_HAND
+    ours, straight = (kept[chosen]["objective"].min() for chosen in (~drawn, drawn))
+    said = "" if math.isnan(ours / straight) else f"{ours:.3g} over {straight:.3g} kg"
+    return ours / straight, said
+
+
+def _evaluations(frame: Frame) -> Figure:
+    made = frame[["evaluations", "iterations"]].sum()
+    return made["evaluations"] / (made["iterations"] or math.nan), ""
+
+
+def _infeasible(frame: Frame) -> Figure:
+    made = frame[frame["iterations"] > 0]
+    left = made[made["largest excess [-]"] > EXCESS]
+    names = "; ".join(f"{one.problem}, {one.start}" for one in left.itertuples())
+    return float(len(left)) if len(made) else math.nan, names
+
+
 # -- the table -------------------------------------------------------------------------------
 
 GOALS = (
@@ -184,6 +218,11 @@ GOALS = (
     Goal("mesh", "error of tip compliance, 50 x 3 cells of the default element [%]", 0.5,
          _coarse_error),
     Goal("tolerance", "largest true error over simulation.tolerance [-]", 1.0, _worst_error),
+    Goal("optimiser", "objective from a start over the best of its problem, the largest [-]", 1.05,
+         _over_the_best),
+    Goal("optimiser", "mass of the rod over the best straight one [-]", 1.0, _over_straight),
+    Goal("optimiser", "evaluations for an iteration, mean [-]", 1.3, _evaluations),
+    Goal("optimiser", "runs that end without a feasible design", 0.0, _infeasible),
     *(
         goal
         for ranks, on in ((1, "1 rank"), (2, "2 ranks"))

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from time import perf_counter
 
-from dolfinopt.bench import arms, iterations, motion, solid, tolerance
+from dolfinopt.bench import arms, iterations, motion, optimiser, solid, tolerance
 from dolfinopt.bench.diagram import Diagram, Frame, Plan, Row, draw
 from dolfinopt.bench.goals import goal_table
 from dolfinopt.disk import write_text
@@ -19,7 +19,8 @@ from dolfinopt.plots.style import save
 
 Tell = Callable[[str], None]
 QUICKLY = ("arms.cells=[100,6]",)  # the scene of a quick bench
-# The main one first; solid links, which take hours, only when they are named.
+# The main one first; what takes long, or is about designs, only when it is named.
+NAMED = (optimiser.DIAGRAM, solid.DIAGRAM)
 DIAGRAMS = (
     motion.DIAGRAM,
     iterations.PEERS,
@@ -33,7 +34,7 @@ DIAGRAMS = (
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:
     """Return the diagrams of these names; all of plane arms for none."""
-    known = {one.name: one for one in (*DIAGRAMS, solid.DIAGRAM)}
+    known = {one.name: one for one in (*DIAGRAMS, *NAMED)}
     if wrong := [name for name in names if name not in known]:
         raise InputError(f"bench: no diagram {wrong[0]!r}: expected {' | '.join(known)}")
     return tuple(known[name] for name in names) or DIAGRAMS

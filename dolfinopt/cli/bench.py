@@ -21,8 +21,9 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     """Measure run time against error.
 
     Diagrams of integrators, meshes, reductions and iterations, beside other programs; or those
-    named alone: time, peers, whole, mesh, reduction, tolerance, solvers, and solid, which measures
-    solid links up to a million degrees of freedom (needs 14 GB) and runs only when it is named.
+    named alone: time, peers, whole, mesh, reduction, tolerance, solvers. Two run only when they are
+    named: solid measures solid links up to a million degrees of freedom (needs 14 GB), optimiser
+    solves thirteen problems from three starts (half an hour).
 
     What is measured is kept in DIR; a call that was interrupted goes on.
     """

@@ -257,8 +257,8 @@ class Iterate:
 
     def return_to_best(self) -> bool:
         """Go back to the best design so far; return whether it is another one (collective)."""
-        iteration = self.best.iteration
-        if iteration in (-1, self.iteration):
+        iteration, here = self.best.iteration, (self.iteration, self.continuation.beta)
+        if iteration < 0 or (iteration, self.best.beta) == here:
             return False
         self._restore_best()
         self.iteration = iteration

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from runs import refusal, run
 
-from dolfinopt.bench import goals, iterations, measure, motion, solid
+from dolfinopt.bench import goals, iterations, measure, motion, optimiser, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, curves, fastest, fitted_power
 from dolfinopt.bench.goals import Goal, goal_table
@@ -210,7 +210,7 @@ def measures(diagram, **frames):
     return {goal.what: goal.measure(frames[diagram])[0] for goal in mine}
 
 
-@pytest.mark.parametrize("diagram", (*benches.DIAGRAMS, solid.DIAGRAM), ids=lambda one: one.name)
+@pytest.mark.parametrize("diagram", (*benches.DIAGRAMS, *benches.NAMED), ids=lambda one: one.name)
 def test_nothing_measured_is_no_failure(diagram):
     table = goal_table({diagram.name: diagram.frame([])})
     assert table["measured"].str.startswith("not measured").all() and not table["met"].any()
@@ -284,6 +284,39 @@ def test_goals_of_links():
     titles = [title for panel in solid.DIAGRAM.panels for title, _ in
               panel.parts(solid.DIAGRAM.frame(rows))]  # fmt: skip
     assert titles[:2] == ["ranks: 1", "ranks: 2"]
+
+
+def test_goals_of_the_optimiser():
+    kept, left = 5e-4, 2e-3
+    rows = [
+        (optimiser.ROD, optimiser.BY_HAND, 0, 0, 0, 0.10, 0.0, 0, 1.0, ""),
+        (optimiser.ROD, "half", 100, 120, 101, 0.12, kept, 100, 1.0, ""),
+        (optimiser.ROD, "thin", 100, 140, 101, 0.15, kept, 90, 1.0, ""),
+        (optimiser.ROD, "thick", 50, 65, 51, 0.05, left, 50, 1.0, ""),
+        ("deviation", "half", 50, 55, 51, 3.0, -0.1, 50, 1.0, ""),
+    ]
+    found = measures("optimiser", optimiser=optimiser.DIAGRAM.frame(rows))
+    assert [*found.values()] == pytest.approx([1.25, 1.2, 380.0 / 300.0, 1.0])
+
+
+@pytest.mark.parametrize("name", optimiser.problems())
+def test_problems_are_scenes(name):
+    """From every start, and with an initial design that the limit of the volume allows."""
+    for start, initial in optimiser.STARTS.items():
+        scene = optimiser.posed(optimiser.problems()[name], start, 3)
+        share = scene.design.volume_fraction
+        assert scene.design.initial == min(initial, share or 1.0)
+        assert scene.optimizer.max_iterations == 3
+
+
+@pytest.mark.slow
+def test_problems_are_solved_beside_a_straight_rod():
+    """Its stress is that of its limit: of steel, 5.93 mm high, 0.112 kg."""
+    (hand,) = optimiser.straight_rod()
+    assert abs(hand[6]) < 1e-4 and hand[5] == pytest.approx(7850 * 0.2 * 0.012 * 5.93e-3, rel=1e-3)
+    (row,) = optimiser.solved("frozen loads", "half", 2)
+    frame = optimiser.DIAGRAM.frame([hand, row])
+    assert frame["iterations"].tolist() == [0, 2] and frame["largest excess [-]"].max() < 1e-3
 
 
 def test_links_that_do_not_fit_are_left_out(monkeypatch):
