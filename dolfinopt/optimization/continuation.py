@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 # Steepness from which on the move limit falls with its square root: up to it the projection's
 # slope, about beta / 2, moves x_phys by no more than twice what x moves.
 GENTLE = 4.0
-RISE = 0.25  # of a doubling at once: each costs an evaluation, four in design.continuation updates
 # Excess of a limit with which beta waits for the design to come back, so many times as long.
-WAITS, PATIENT = 0.02, 4.0
+WAITS, PATIENT = 0.02, 4
+AT_ONCE = 4  # strict steps have one function in so many parts of design.continuation
 
 
 class Continuation:
@@ -88,24 +88,28 @@ class Continuation:
             smooth = {k: self.arms[k].smoothed(x[k]) for k in self.thresholds}
         return self.patterns.spread(smooth)
 
-    def is_due(self, excess: float) -> bool:
-        """Count an update, and return whether beta is to rise; not as long as limits are far.
+    def is_due(self, excess: float, strict: bool) -> bool:
+        """Return whether beta is to rise with the next update; not as long as limits are far.
 
         Args:
             excess: largest relative violation of a limit.
+            strict: whether the update is to be compared with the design before.
         """
-        self.age += 1
-        wait = RISE * self.scene.design.continuation
-        patience = wait if excess <= WAITS else PATIENT * wait
-        return not self.complete and self.age >= patience
+        wait = self._updates(strict) * (1 if excess <= WAITS else PATIENT)
+        return not self.complete and self.age >= wait
 
-    def advance(self, x: Mapping[int, np.ndarray]) -> None:
+    def _updates(self, strict: bool) -> int:
+        return max(1, self.scene.design.continuation // AT_ONCE) if strict else 1
+
+    def advance(self, x: Mapping[int, np.ndarray], strict: bool) -> None:
         """Raise beta, and move the thresholds so that the volume of x stays (collective).
 
-        A little at a time: doubled at once, beta cuts members whose x is near the threshold.
+        A little in every iteration: doubled at once, beta cuts members whose x is near the
+        threshold, and what is grey then stays so.
         """
         design = self.scene.design
-        self.beta, self.age = min(2.0**RISE * self.beta, design.sharpness), 0
+        growth = 2.0 ** (self._updates(strict) / design.continuation)
+        self.beta, self.age = min(growth * self.beta, design.sharpness), 0
         with together(self.partition.world):
             self.thresholds = {
                 k: self.arms[k].preserving_threshold(x[k], self.beta) for k in self.thresholds

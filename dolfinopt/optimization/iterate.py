@@ -165,17 +165,22 @@ class Iterate:
 
     def _free_step(self) -> bool:
         """Take MMA's step unless it leads astray; return whether there is a new design."""
+        projection = self.continuation
+        before = projection.beta, dict(projection.thresholds), projection.age
+        rises = projection.is_due(self.problem.excess, strict=False)
         for attempt in range(FREE_ATTEMPTS):
-            move = SHORTER_YET**attempt * self.continuation.move
+            move = SHORTER_YET**attempt * projection.move
             new, after = self._proposed(move, None)
+            if rises:
+                projection.advance(self.variables.split(new), strict=False)
             designs = self._tried(new, move)
-            if designs is None:
-                continue
-            tried = problem_of(self.scene, designs, self.stage.limits)
-            if not leaps(self.problem.values, tried.values):
-                self._go_on(new, after, designs)
-                return True
-            self.evaluator.undo()
+            if designs is not None:
+                tried = problem_of(self.scene, designs, self.stage.limits)
+                if not leaps(self.problem.values, tried.values):
+                    self._go_on(new, after, designs, sharper=rises)
+                    return True
+                self.evaluator.undo()
+            projection.beta, projection.thresholds, projection.age = before
         return False
 
     def _strict_step(self) -> bool:
@@ -221,10 +226,24 @@ class Iterate:
             self.evaluator.undo()
             return None
 
-    def _go_on(self, new: np.ndarray, after: MMAState, designs: list[EvaluatedDesign]) -> None:
-        """Take a design that was tried, and look where the search stands (collective)."""
+    def _go_on(
+        self,
+        new: np.ndarray,
+        after: MMAState,
+        designs: list[EvaluatedDesign],
+        sharper: bool = False,
+    ) -> None:
+        """Take a design that was tried, and look where the search stands (collective).
+
+        With a sharper projection than the last one's it is compared with nothing.
+        """
         self.x, self.state, self.iteration = new, after, self.iteration + 1
-        self.designs = self.evaluator.accepted(designs)
+        self.continuation.age += 1
+        accepted = self.evaluator.accepted(designs)
+        if sharper:
+            self.take(accepted)
+            return
+        self.designs = accepted
         self.problem = problem_of(self.scene, self.designs, self.stage.limits)
         self.keep_best()
         merit = self.problem.merit(self.search.size)
@@ -304,8 +323,9 @@ class Iterate:
     def _next_stage(self) -> None:
         """Begin a stage where held values have drifted, or the projection is due (collective)."""
         problem, price = self.problem, self.stage.price
-        if self.continuation.is_due(problem.excess):
-            self.continuation.advance(self.variables.split(self.x))
+        strict = self.search.freedom == 0 or self.search.strict > 0
+        if strict and self.continuation.is_due(problem.excess, strict):
+            self.continuation.advance(self.variables.split(self.x), strict)
             self.evaluate()
             return
         now = problem_of(self.scene, self.designs)

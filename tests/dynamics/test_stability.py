@@ -528,7 +528,7 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
         field=lambda k, x, y: x_phys[k],
         cells=(48, 6),
     )
-    assert trajectory.interface_rotations.max() > 0.5  # far from small
+    assert trajectory.interface_rotations.max() > 0.15  # far from small
     fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
     assert distance(trajectory, fine) < 1e-4
     # Long steps damp vibrations out by any number of stages: the estimate must know of them.
