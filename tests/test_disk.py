@@ -128,6 +128,8 @@ def test_a_full_disk_ends_a_run_in_one_line(after, tmp_path, monkeypatch, capsys
         checkpoint.check(tmp_path, load_scene(paper_scene(), COARSE))
 
 
+@pytest.mark.serial  # it starts a process
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
 def test_standard_output_without_room(tmp_path):
     line = command("simulate", paper_scene(), "--no-plots", "--out", tmp_path)
     line += overrides(*COARSE[:2])
