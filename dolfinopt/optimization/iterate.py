@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.acceptance import (
     ATTEMPTS,
@@ -17,6 +18,7 @@ from dolfinopt.optimization.acceptance import (
     FREEDOM,
     GREW,
     NEAR,
+    PATIENCE,
     SHORTER,
     SHORTER_YET,
     STRICT,
@@ -215,12 +217,14 @@ class Iterate:
         return False
 
     def _tried(self, new: np.ndarray, move: float) -> list[EvaluatedDesign] | None:
-        """Evaluate a step (collective); None where its motion cannot be simulated."""
+        """Evaluate a step (collective); None where its motion can hardly be simulated."""
         own = np.abs(new - self.x).max() if len(new) else 0.0
         self.change = float(self.world.allreduce(own, op=MPI.MAX))
         self._seek(reach=move)
+        steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
         try:
-            return self.evaluator.tried(new)
+            with counted(PATIENCE * steps if steps else np.inf):
+                return self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.failed = str(error)
             self.evaluator.undo()
