@@ -38,8 +38,8 @@ FREEDOM, STRICT = 8, 3
 # A free step is repeated, so many times at most, that takes a limit's value, or the objective of a
 # design that keeps all limits, to so many times what it was.
 FREE_ATTEMPTS, LEAP = 4, 2.0
-# Newton iterations for each time step of the last design's motion before a step is given up: designs
-# take 3 to 10, machines 16 to 44, what is falling apart thousands.
+# Newton iterations for each time step of the last design's motion before a step is given up: most
+# designs take 3 to 10, machines 16 to 44, what is falling apart thousands.
 PATIENCE = 100.0
 # Where strict steps end, free ones are tried again if the merit has fallen to this share since.
 WORTH = 0.98
