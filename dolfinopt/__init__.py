@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory, simulate
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
-    from dolfinopt.optimization.result import Result
+    from dolfinopt.optimization.loop import Result
     from dolfinopt.output.run import optimize
     from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import abort_together, gather_arms, partition_arms
@@ -58,7 +58,7 @@ _HOME = {
     "Model": "model",
     "OptimizationResult": "model",
     "SimulationResult": "model",
-    "Result": "optimization.result",
+    "Result": "optimization.loop",
     "optimize": "output.run",
     "abort_together": "parallel",
     "partition_arms": "parallel",

@@ -36,7 +36,7 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.optimization.certificate import Certificate
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import physical, read_design
 from dolfinopt.output.run import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views

@@ -20,7 +20,7 @@ from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.motion import rigid_motion
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.run import optimize
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene

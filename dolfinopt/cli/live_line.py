@@ -11,7 +11,7 @@ from contextlib import (
 )
 from typing import TYPE_CHECKING
 
-from dolfinopt.optimization.history import FurtherRow, HistoryRow
+from dolfinopt.optimization.state import FurtherRow, HistoryRow
 
 if TYPE_CHECKING:
     pass

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.optimization.result import Result
+    from dolfinopt.optimization.loop import Result
     from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.optimization.history import HistoryRow
+    from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.views import ArmView
     from dolfinopt.responses.order_selection import OrderSelection
     from dolfinopt.scene.load import Scene

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.optimization.mma import CURVATURE, MMAState
-from dolfinopt.optimization.optimality import Sum
 from dolfinopt.optimization.problem import Problem, Stage
+from dolfinopt.optimization.stopping import Sum
 from dolfinopt.responses.constraints import EXCESS
 
 # Share of the promised fall of the merit that a step must bring, and from which on it may be

@@ -29,10 +29,6 @@ from dolfinopt.optimization.acceptance import (
     learnt,
     promise,
 )
-from dolfinopt.optimization.convergence import Ending, ending
-from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.memory import Best, IterateMemory
 from dolfinopt.optimization.mma import (
     CURVED_DISTANCE,
     LARGEST_DISTANCE,
@@ -40,15 +36,17 @@ from dolfinopt.optimization.mma import (
     initial_state,
     mma_step,
 )
-from dolfinopt.optimization.optimality import kkt_residual
 from dolfinopt.optimization.problem import (
     PRICE,
     EvaluatedDesign,
+    Evaluator,
     Problem,
     Stage,
     limits_at,
     problem_of,
 )
+from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory
+from dolfinopt.optimization.stopping import Ending, ending, kkt_residual
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.responses.constraints import tightest, violated
 from dolfinopt.responses.mass import cell_volumes

@@ -17,9 +17,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.optimization.acceptance import Search
-from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.memory import Best, FurtherMemory, IterateMemory, Memory
 from dolfinopt.optimization.problem import Stage
+from dolfinopt.optimization.state import Best, FurtherMemory, HistoryRow, IterateMemory, Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection

@@ -19,7 +19,7 @@ from dolfinopt.disk import (
     write_text,
 )
 from dolfinopt.errors import InputError
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.response import objective_of

@@ -11,10 +11,8 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.optimization import loop
-from dolfinopt.optimization.history import HistoryRow
-from dolfinopt.optimization.loop import Report
-from dolfinopt.optimization.memory import Memory
-from dolfinopt.optimization.result import Result
+from dolfinopt.optimization.loop import Report, Result
+from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import HistoryWriter
 from dolfinopt.output.folders import RUN_FILES, check_sources, check_unused, working_alone

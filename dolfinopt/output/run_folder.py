@@ -15,7 +15,7 @@ import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.certificate import Certificate
-from dolfinopt.optimization.result import Result
+from dolfinopt.optimization.loop import Result
 from dolfinopt.output.design import write_design, write_fields
 from dolfinopt.output.folders import remove_stale_parts
 from dolfinopt.output.summary import summarise, write_summary

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from dolfinopt.multibody.end_effector import lengths
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.trajectory import drive_units, free_drives
 from dolfinopt.plots.style import (
     BLUE,

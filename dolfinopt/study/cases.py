@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dolfinopt.multibody.end_effector import lengths
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import read_history
 from dolfinopt.reduction import BasisErrors
 from dolfinopt.scene.load import Scene

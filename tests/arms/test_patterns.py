@@ -9,7 +9,7 @@ from runs import STATED, TWO_ARM, overrides, refused, run
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Patterns, uniform_design
-from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.problem import Evaluator
 from dolfinopt.output.design import read_design
 from dolfinopt.parallel import Partition
 

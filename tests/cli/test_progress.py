@@ -6,7 +6,7 @@ import pytest
 
 from dolfinopt.cli.live_line import plain_lines
 from dolfinopt.cli.shared import elapsed
-from dolfinopt.optimization.history import FurtherRow, HistoryRow
+from dolfinopt.optimization.state import FurtherRow, HistoryRow
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 

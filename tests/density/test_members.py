@@ -11,8 +11,7 @@ import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.members import thinnest
 from dolfinopt.mesh.arm_mesh import structured_arm
-from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.problem import problem_of
+from dolfinopt.optimization.problem import Evaluator, problem_of
 from dolfinopt.output.summary import _widths, filter_warnings
 
 WORLD = MPI.COMM_WORLD

@@ -9,8 +9,8 @@ from mpi4py import MPI
 from runs import ROOT, STATED, TWO_ARM, overrides, refusal, run
 
 import dolfinopt as do
-from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import FALL, taylor_test
+from dolfinopt.optimization.problem import Evaluator
 from dolfinopt.output.views import gather_views
 from dolfinopt.plots.design import REGION, design_figure
 from dolfinopt.scene.regions import grid_regions

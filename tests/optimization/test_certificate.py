@@ -18,11 +18,10 @@ from runs import TWO_ARM, overrides, run, shell
 
 import dolfinopt as do
 from dolfinopt.optimization import certificate, iterate, loop
-from dolfinopt.optimization.certificate import Certificate, judge
-from dolfinopt.optimization.further import attempt, best_of
-from dolfinopt.optimization.history import FurtherRow
+from dolfinopt.optimization.certificate import Certificate, attempt, best_of, judge
 from dolfinopt.optimization.mma import initial_state, mma_step
 from dolfinopt.optimization.problem import Problem
+from dolfinopt.optimization.state import FurtherRow
 from dolfinopt.parallel import Partition, sum_over_arms
 from dolfinopt.responses.constraints import Limit
 

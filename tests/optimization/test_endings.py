@@ -10,7 +10,7 @@ from runs import TWO_ARM, overrides, run, shell
 from scipy.integrate import trapezoid
 
 import dolfinopt as do
-from dolfinopt.optimization.optimality import kkt_residual
+from dolfinopt.optimization.stopping import kkt_residual
 from dolfinopt.output.design import read_history, write_fields
 from dolfinopt.output.views import ArmView
 from dolfinopt.parallel import Partition, on_root, sum_over_arms

@@ -152,7 +152,7 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
 
 
 def evaluator_of(built):
-    from dolfinopt.optimization.evaluator import Evaluator
+    from dolfinopt.optimization.problem import Evaluator
 
     partition = do.partition_arms(WORLD, built.cell_counts)
     profile = do.Profile()

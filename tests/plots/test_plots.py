@@ -19,7 +19,7 @@ from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.mechanism import Closure, Mechanism, pin, slider
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
-from dolfinopt.optimization.history import HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.views import ArmView
 from dolfinopt.plots import animation, curves, design, machine, shapes, style
 from dolfinopt.scene.load import scene_from_dict

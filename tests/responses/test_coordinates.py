@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.optimization import assessment
+from dolfinopt.optimization import certificate
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import gather_arms
 from dolfinopt.responses import order_selection as coordinates
@@ -259,7 +259,7 @@ def test_optimises_with_the_choice():
     assert same.choice is None
     for k in found.x_phys:
         np.testing.assert_array_equal(found.x_phys[k], same.x_phys[k])
-    assert dict(found.choice.tried)[count] <= 0.01 / assessment.RESERVE
+    assert dict(found.choice.tried)[count] <= 0.01 / certificate.RESERVE
     built = Built(small(), found.partition, dict(found.arms), do.Profile())
     assert found.choice.error == error(built, found.x_phys, count)
     assert found.choice.error != dict(found.choice.tried)[count]
@@ -292,7 +292,7 @@ def test_any_number_of_ranks():
 
 
 def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
-    monkeypatch.setattr(assessment, "estimated_error", lambda *_: 0.02)
+    monkeypatch.setattr(certificate, "estimated_error", lambda *_: 0.02)
     scene = small(iterations=1)
     written = write_result(scene, shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
     if written is not None:
