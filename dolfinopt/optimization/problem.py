@@ -277,9 +277,9 @@ def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndar
     """
     found = [np.array(one.evaluation.smooth_limits) for one in designs]
     if len(designs) > 1 and scene.design.limits_on == "nominal":
-        eroded, nominal = designs[0].evaluation, designs[-1].evaluation
-        shares = (1.0 + np.array(eroded.constraints)) / (1.0 + np.array(nominal.constraints))
-        found[0] = found[0] * shares
+        eroded, nominal = (1.0 + np.array(designs[i].evaluation.constraints) for i in (0, -1))
+        known = (eroded > 0.0) & (nominal > 0.0)  # what nothing loads has no share
+        found[0] = found[0] * np.divide(eroded, nominal, out=np.ones_like(eroded), where=known)
     return tuple(found)
 
 
