@@ -417,13 +417,14 @@ class ElasticArm:
         self.factorise()
         return self.substructure.interior.inverse(self.K.matrix, right)
 
+    def interior_stiffness_times(self, vector: np.ndarray) -> np.ndarray:
+        """Return K_II times a vector (num_interior,) of owned rows."""
+        return _times(self.interior_stiffness(), vector)
+
     def interior_mass_times(self, vector: np.ndarray) -> np.ndarray:
         """Return M_II times a vector (num_interior,) of owned rows."""
         if self.comm.size > 1:
-            x, y = self.interior_mass().createVecs()
-            x.array = vector
-            self.interior_mass().mult(x, y)
-            return y.array_r
+            return _times(self.interior_mass(), vector)
         nodes = self.substructure.interior.node_mass(self.M.matrix)
         return (nodes @ vector.reshape(-1, self.mesh.dim)).ravel()
 
@@ -454,3 +455,12 @@ class ElasticArm:
         """
         self._static_fields = static_fields(self, loads, self._static_fields)
         return self._static_fields
+
+
+def _times(matrix: PETSc.Mat, vector: np.ndarray) -> np.ndarray:
+    """Return a matrix times owned rows of a vector."""
+    x, y = matrix.createVecs()
+    x.array = vector
+    matrix.mult(x, y)
+    product: np.ndarray = y.array_r
+    return product

@@ -294,15 +294,19 @@ class Pencil:
         arm: for its communicator and profile.
         inverse: K^-1 times a vector.
         mass: M times a vector.
-        matrices: K and M for SLEPc, made when they are asked for.
+        stiffness: K times a vector.
+        rows: owned ones.
         operators: what a search needs where the inverse is dear; None where a factor is at hand.
+        mass_matrix: M, assembled when it is asked for; None where there are its products alone.
     """
 
     arm: ElasticArm
     inverse: Callable[[np.ndarray], np.ndarray]
     mass: Callable[[np.ndarray], np.ndarray]
-    matrices: Callable[[], tuple[PETSc.Mat, PETSc.Mat]]
+    stiffness: Callable[[np.ndarray], np.ndarray]
+    rows: int
     operators: Operators | None = None
+    mass_matrix: Callable[[], PETSc.Mat] | None = None
 
     def total(self, part: np.ndarray) -> np.ndarray:
         """Return the sum over the arm's ranks."""
@@ -315,8 +319,10 @@ def interior_pencil(arm: ElasticArm) -> Pencil:
         arm,
         arm.interior_inverse,
         arm.interior_mass_times,
-        lambda: (arm.interior_stiffness(), arm.interior_mass()),
+        arm.interior_stiffness_times,
+        arm.num_interior,
         interior_operators(arm) if arm.substructure.interior.is_iterative else None,
+        arm.interior_mass,
     )
 
 
@@ -418,7 +424,9 @@ class _Eigenproblem:
 
     def __init__(self, pencil: Pencil):
         self.pencil = pencil
-        self.stiffness, self.mass = pencil.matrices()
+        # K is not assembled, which takes an eighth of a search: its inverse alone is asked for.
+        self.stiffness = _matrix(pencil, pencil.stiffness)
+        self.mass = pencil.mass_matrix() if pencil.mass_matrix else _matrix(pencil, pencil.mass)
 
     def lowest(self, count: int, start: np.ndarray | None) -> Pairs:
         """Return up to `count` pairs; see `lowest_eigenpairs`."""
@@ -519,6 +527,26 @@ class _Eigenproblem:
             order = np.argsort(values, kind="stable")
             values, vectors = values[order], vectors[:, order]
         return values, vectors
+
+
+class _Product:
+    """A product with a vector as the context of a PETSc Python matrix."""
+
+    def __init__(self, times: Callable[[np.ndarray], np.ndarray]):
+        self.times = times
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = A x, called by PETSc."""
+        y.array = self.times(x.array_r)
+
+
+def _matrix(pencil: Pencil, times: Callable[[np.ndarray], np.ndarray]) -> PETSc.Mat:
+    """Return a symmetric matrix of the pencil's rows that knows its products alone."""
+    size = (pencil.rows, None), (pencil.rows, None)
+    mat = PETSc.Mat().createPython(size, _Product(times), comm=pencil.arm.comm)
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    mat.setUp()
+    return mat
 
 
 class _Inverse:

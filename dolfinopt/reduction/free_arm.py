@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from petsc4py import PETSc
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import rigid_motions
@@ -77,9 +76,12 @@ class FreeOperators:
         self.free = FreeArm(arm)
         self._m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
         self._m_corner = m_corner if carried is None else m_corner + carried
+        self.rows = arm.num_interior + (len(self.free.corner) if self.last else 0)
         iterative = arm.substructure.interior.is_iterative
         operators = self._operators(interior_operators(arm)) if iterative else None
-        self.pencil = Pencil(arm, self.solve, self.mass_times, self._matrices, operators)
+        self.pencil = Pencil(
+            arm, self.solve, self.mass_times, self.stiffness_times, self.rows, operators
+        )
 
     def _operators(self, inner: Operators) -> Operators:
         """Return those for columns, with what the interior's approximate inverse gives."""
@@ -92,7 +94,7 @@ class FreeOperators:
             return self._eliminated(inner.precondition, R)
 
         return Operators(
-            self.arm.num_interior + (len(self.free.corner) if self.last else 0),
+            self.rows,
             stiffness,
             lambda V: by_column(self.mass_times, V),
             precondition,
@@ -126,10 +128,8 @@ class FreeOperators:
 
     def stiffness_times(self, rows: np.ndarray) -> np.ndarray:
         """Return T'KT times a vector."""
-        x, y = self.arm.interior_stiffness().createVecs()
-        x.array = self.split(rows)[0]
-        self.arm.interior_stiffness().mult(x, y)
-        return self._bordered(y.array_r, rows, self.free.coupling, self.free.corner)
+        inner = self.arm.interior_stiffness_times(self.split(rows)[0])
+        return self._bordered(inner, rows, self.free.coupling, self.free.corner)
 
     def mass_times(self, rows: np.ndarray) -> np.ndarray:
         """Return T'MT times a vector."""
@@ -143,25 +143,3 @@ class FreeOperators:
         interior, outboard = self.split(rows)
         lower = self.arm.comm.allreduce(coupling.T @ interior)
         return self._joined(inner + coupling @ outboard, lower + corner @ outboard)
-
-    def _matrices(self) -> tuple[PETSc.Mat, PETSc.Mat]:
-        """Return T'KT and T'MT as PETSc's Python matrices."""
-        rows = self.arm.num_interior + (len(self.free.corner) if self.last else 0)
-        size, found = ((rows, None), (rows, None)), []
-        for times in (self.stiffness_times, self.mass_times):
-            mat = PETSc.Mat().createPython(size, _Product(times), comm=self.arm.comm)
-            mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            mat.setUp()
-            found.append(mat)
-        return found[0], found[1]
-
-
-class _Product:
-    """A product with a vector as the context of a PETSc Python matrix."""
-
-    def __init__(self, times: Callable[[np.ndarray], np.ndarray]):
-        self.times = times
-
-    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = A x, called by PETSc."""
-        y.array = self.times(x.array_r)
