@@ -16,8 +16,8 @@ doi:10.1007/978-0-387-40065-5, 18.5, for merit and trust region; Svanberg, SIAM 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,10 @@ FREE_ATTEMPTS, LEAP = 4, 2.0
 PATIENCE = 100.0
 # Where strict steps end, free ones are tried again if the merit has fallen to this share since.
 WORTH = 0.98
+# Where no step lowers the merit of a design beyond a limit, or none has lessened the violation in
+# so many iterations, the price of limits is raised by this factor, up to so much: what is left then
+# is the least violation. Source: Byrd, Nocedal & Waltz (2008), doi:10.1080/10556780701394169.
+UNTIL_DEARER, DEARER, DEAREST = 20, 30.0, 900.0
 # Change of a held smooth limit, relative and for a change of x by 1, from which a new stage begins;
 # and of the objective.
 DRIFT, GREW = 0.05, 2.0
@@ -66,6 +70,7 @@ class Search:
         merit: lowest one so far, of limits' true values over `size`, the objective's.
         size: of the objective where the projection became as steep as it is.
         released: merit when free steps were allowed again.
+        weight: factor on the price of limits, see `DEARER`.
     """
 
     radius: float = 1.0
@@ -76,6 +81,14 @@ class Search:
     merit: float = np.inf
     size: float = 1.0
     released: float = np.inf
+    weight: float = 1.0
+
+    @classmethod
+    def from_numbers(cls, numbers: Sequence[float]) -> Search:
+        """Return it from its attributes, in order."""
+        found = cls(*numbers)  # type: ignore[arg-type]
+        counts = int(found.freedom), int(found.strict), int(found.lag)
+        return replace(found, freedom=counts[0], strict=counts[1], lag=counts[2])
 
 
 @dataclass(frozen=True, eq=False)

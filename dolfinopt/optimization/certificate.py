@@ -180,7 +180,7 @@ class Certificate:
     """What the exact gradient says of a design.
 
     Attributes:
-        kkt: Karush-Kuhn-Tucker residual under it, see `optimality.kkt_residual`; nan if unknown.
+        kkt: Karush-Kuhn-Tucker residual under it, see `stopping.kkt_residual`; nan if unknown.
         angle, ratio: of the objective's gradient with frozen loads beside the exact one, over the
             variables that no bound holds: degrees, and length over length. nan where nothing is
             frozen, or no variable is free.
@@ -247,7 +247,7 @@ def judge(
         parts, total: as for `kkt_residual`.
     """
     where = x, xmin, xmax
-    residual, _ = kkt_residual(*where, exact.df0dx, exact.f, exact.dfdx, parts, total)
+    residual = kkt_residual(*where, exact.df0dx, exact.f, exact.dfdx, parts, total).rms
     angle = ratio = np.nan
     if frozen is not None:
         angle, ratio = _compared(*where, exact.df0dx, frozen, parts, total)

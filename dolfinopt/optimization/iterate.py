@@ -13,6 +13,8 @@ from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.acceptance import (
     ATTEMPTS,
+    DEARER,
+    DEAREST,
     DRIFT,
     FREE_ATTEMPTS,
     FREEDOM,
@@ -22,6 +24,7 @@ from dolfinopt.optimization.acceptance import (
     SHORTER,
     SHORTER_YET,
     STRICT,
+    UNTIL_DEARER,
     WORTH,
     Search,
     judge_step,
@@ -46,7 +49,7 @@ from dolfinopt.optimization.problem import (
     problem_of,
 )
 from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory
-from dolfinopt.optimization.stopping import Ending, ending, kkt_residual
+from dolfinopt.optimization.stopping import Ending, Residual, ending, kkt_residual
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.responses.constraints import tightest, violated
 from dolfinopt.responses.mass import cell_volumes
@@ -65,7 +68,7 @@ class Iterate:
         designs: that x stands for, the nominal one last.
         best: the best design so far, see `Best`.
         iteration, change: updates made, and the largest change of a variable in the last one.
-        kkt, grayness: residual and grayness of x; the latter is known on the root.
+        residual, grayness: of x; the latter is known on the root.
         curved: whether constraints other than volume and mass are to be kept.
         stuck: why no step betters x, "" while one does.
         failed: why a motion of the last step could not be simulated, "" where all could.
@@ -85,7 +88,7 @@ class Iterate:
         self.convexity, self.search = np.empty(0), Search()
         self.anchor, self.best = x, Best.none(x)
         self.iteration, self.change = 0, 0.0
-        self.kkt, self.grayness = np.nan, 0.0
+        self.residual, self.grayness = Residual.unknown(), 0.0
         self.stuck = self.failed = ""
         self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
 
@@ -104,14 +107,14 @@ class Iterate:
         self.begin_stage()
         self.anchor = self.x.copy()
         size = abs(self.problem.f0) or 1.0
-        self._seek(size=size, merit=self.problem.merit(size), lag=0)
+        self._seek(size=size, merit=self.problem.merit(size, self.search.weight), lag=0)
         self.keep_best()
 
     def begin_stage(self) -> None:
         """Hold the smooth limits of these designs, and a price by the objective's size."""
         held = limits_at(self.scene, self.designs)
         self.problem = problem_of(self.scene, self.designs, held)
-        self.stage = Stage(held, PRICE * (abs(self.problem.f0) or 1.0))
+        self.stage = Stage(held, self.search.weight * PRICE * (abs(self.problem.f0) or 1.0))
         if len(self.convexity) != len(self.problem.values):
             self.convexity = np.zeros(len(self.problem.values))
 
@@ -126,7 +129,7 @@ class Iterate:
             self.problem.excess,
         )
         if new.rank < self.best.rank:
-            self.best = new
+            self.best = new.after(self.best)
 
     def ending(self) -> Ending:
         """Return why the iterations end here, "" while they go on; the same on all ranks."""
@@ -135,11 +138,17 @@ class Iterate:
             self.iteration,
             self.change,
             self.search.reach,
-            self.kkt,
+            self.residual,
             violated(self.problem.limits),
             self.continuation.complete,
             self.stuck,
+            self.idle,
         )
+
+    @property
+    def idle(self) -> int:
+        """Iterations since the best design improved."""
+        return self.iteration - self.best.improved
 
     def step(self) -> None:
         """Go on to another design; where none is found x stays and `stuck` says why (collective).
@@ -147,19 +156,26 @@ class Iterate:
         Free steps first, as long as they lead to something better within `freedom` of them; else
         back to the best design, and strict steps from there.
         """
+        late = self.continuation.complete and self.idle >= UNTIL_DEARER
+        if late and self.best.excess > 0.0 and not self._raise_price():
+            self.stuck = "none lessens the violation, however dear it is"
+            return
         free = self.search.freedom > 0 and self.search.strict == 0
         self.failed = ""
         if free:
             if self._free_step():
                 return
             self._return_to_anchor()
-        if self._strict_step():
-            self._seek(strict=max(0, self.search.strict - 1))
-            return
-        if not free and self.search.merit < WORTH * self.search.released:
-            self._seek(released=self.search.merit, freedom=FREEDOM // 2, strict=0)
-            if self._free_step():
+        while True:
+            if self._strict_step():
+                self._seek(strict=max(0, self.search.strict - 1))
                 return
+            if not free and self.search.merit < WORTH * self.search.released:
+                self._seek(released=self.search.merit, freedom=FREEDOM // 2, strict=0)
+                if self._free_step():
+                    return
+            if not self._raise_price() and (self.continuation.complete or not self._sharpen()):
+                break
         self.evaluate_again()
         self.stuck = self.failed or "no step, however short, lowers the merit"
 
@@ -248,7 +264,7 @@ class Iterate:
         self.designs = accepted
         self.problem = problem_of(self.scene, self.designs, self.stage.limits)
         self.keep_best()
-        merit = self.problem.merit(self.search.size)
+        merit = self.problem.merit(self.search.size, self.search.weight)
         if merit < self.search.merit or self.search.strict:
             self.anchor = new.copy()
             self._seek(merit=merit, lag=0)
@@ -275,6 +291,7 @@ class Iterate:
         """Let the arms have x again after steps that were taken back (collective)."""
         self.designs = self.evaluator.evaluate(self.x)
         self.problem = problem_of(self.scene, self.designs, self.stage.limits)
+        self.residual = self._residual()
 
     def return_to_best(self) -> bool:
         """Go back to the best design so far; return whether it is another one (collective)."""
@@ -327,15 +344,44 @@ class Iterate:
         problem, price = self.problem, self.stage.price
         strict = self.search.freedom == 0 or self.search.strict > 0
         if strict and self.continuation.is_due(problem.excess, strict):
-            self.continuation.advance(self.variables.split(self.x), strict)
-            self.evaluate()
+            self._sharpen()
             return
         now = problem_of(self.scene, self.designs)
         near = now.f > NEAR
         drift = np.abs(now.f - problem.f)[near].max(initial=0.0)
-        grown = PRICE * abs(problem.f0) / price
+        grown = self.search.weight * PRICE * abs(problem.f0) / price
         if drift > DRIFT * self.change or not 1.0 / GREW <= grown <= GREW:
             self.begin_stage()
+
+    def _raise_price(self) -> bool:
+        """Make limits dearer where x does not meet them; return whether they are (collective)."""
+        if self.problem.excess == 0.0 or self.search.weight >= DEAREST:
+            return False
+        self._seek(weight=DEARER * self.search.weight, radius=1.0)
+        self._seek(merit=self.problem.merit(self.search.size, self.search.weight))
+        self.best = replace(self.best, improved=self.iteration)
+        self.begin_stage()
+        return True
+
+    @property
+    def least_violated(self) -> bool:
+        """Whether x violates limits, and no step lessens that however dear they are."""
+        return bool(self.stuck) and self.problem.excess > 0.0 and self.search.weight >= DEAREST
+
+    def _sharpen(self) -> bool:
+        """Raise beta for the same x; return whether the design has a motion then (collective)."""
+        projection = self.continuation
+        before = projection.beta, dict(projection.thresholds)
+        projection.advance(self.variables.split(self.x), strict=True)
+        try:
+            self.evaluate()
+        except ConvergenceError:  # on all ranks: the projection is left as steep as it was
+            projection.beta, projection.thresholds = before
+            projection.held = True
+            self.evaluator.undo()
+            self.evaluate_again()
+            return False
+        return True
 
     def measure(self) -> HistoryRow:
         """Return the row of the history that x makes (collective).
@@ -343,7 +389,7 @@ class Iterate:
         Its grayness and volume are the root's; its seconds are none.
         """
         with self.evaluator.profile.phase("kkt residual"):
-            self.kkt = self._residual()
+            self.residual = self._residual()
         parts = {}
         x_phys, arms = self.nominal.x_phys, self.evaluator.arms
         meshes = {k: arm.mesh for k, arm in arms.items()}
@@ -360,12 +406,12 @@ class Iterate:
             volume_fraction=float(volume / total),
             change=self.change,
             seconds=0.0,
-            kkt=self.kkt,
+            kkt=self.residual.rms,
             constraints={one.name: one.value for one in self.problem.limits},
             tightest=tightest(self.problem.limits),
         )
 
-    def _residual(self) -> float:
+    def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
         variables, problem = self.variables, self.problem
         return kkt_residual(
@@ -377,7 +423,7 @@ class Iterate:
             problem.dfdx,
             variables.slices,
             self.total,
-        )[0]
+        )
 
     # -- memory ------------------------------------------------------------------------------
 
@@ -396,7 +442,6 @@ class Iterate:
         return IterateMemory(
             iteration=self.iteration,
             change=self.change,
-            kkt=self.kkt,
             cells=self.variables.split(np.column_stack(columns)),
             modes=self.evaluator.initial_vectors,
             guesses={k: one for k, one in self.evaluator.initial_guesses.items() if one},
@@ -405,6 +450,7 @@ class Iterate:
             stage=self.stage,
             search=self.search,
             age=self.continuation.age,
+            held=self.continuation.held,
             best=self.best,
             solutions=self.evaluator.initial_solutions,
             beta=self.continuation.beta,
@@ -424,6 +470,7 @@ class Iterate:
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
             arm.guesses = memory.guesses.get(k)
-        self.iteration, self.change, self.kkt = memory.iteration, memory.change, memory.kkt
-        self.continuation.beta, self.continuation.age = memory.beta, memory.age
+        self.iteration, self.change = memory.iteration, memory.change
+        projection = self.continuation
+        projection.beta, projection.age, projection.held = memory.beta, memory.age, memory.held
         self.continuation.thresholds = dict(memory.thresholds)

@@ -62,7 +62,7 @@ class Result:
         converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
             within their tolerances and every constraint is met.
         stop_reason: in words.
-        kkt: the residual of the final design by the gradient in use, see `optimality.kkt_residual`.
+        kkt: the residual of the final design by the gradient in use, see `stopping.kkt_residual`.
         certificate: what the exact gradient says of the final design.
         limits: every constraint and its value.
         conflicts: what holds those back that are not met, see `conflicts.conflict_sentences`.
@@ -247,6 +247,7 @@ class _Run:
         if self.finished != "limit" or not one.curved:
             return
         one.search = replace(one.search, freedom=0, radius=LANDING)
+        one.continuation.held = True
         for _ in range(LAST):
             if one.best.excess == 0.0 or one.problem.excess > NEARLY or one.stuck:
                 return
@@ -257,7 +258,7 @@ class _Run:
     def _result(self) -> Result:
         """Assess the best design (collective)."""
         one, counts = self.iterate, replace(self.profile.counts)
-        made = one.iteration
+        made, idle, sought = one.iteration, one.idle, one.least_violated
         if one.return_to_best():
             one.measure()
         certificate = certify(self.evaluator, one.x, one.nominal, one.problem, self._further)
@@ -267,7 +268,7 @@ class _Run:
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        limits, conflicts = one.problem.limits, self._conflicts()
+        limits, conflicts = one.problem.limits, self._conflicts(sought)
         not_met = "; ".join(filter(None, [violated(limits), conflicts]))
         return Result(
             partition=self.partition,
@@ -286,13 +287,14 @@ class _Run:
                 self.scene,
                 self.finished,
                 one.change,
-                one.kkt,
+                one.residual.rms,
                 not_met,
                 one.grayness,
                 one.stuck,
-                "" if one.iteration == made else f"iteration {one.iteration}",
+                idle,
+                None if one.iteration == made else one.iteration,
             ),
-            kkt=one.kkt,
+            kkt=one.residual.rms,
             certificate=certificate,
             limits=limits,
             conflicts=conflicts,
@@ -323,9 +325,15 @@ class _Run:
                 self._checkpoint()
             yield attempt
 
-    def _conflicts(self) -> str:
-        """Return what holds back the limits that x does not meet (collective)."""
+    def _conflicts(self, sought: bool) -> str:
+        """Return what holds back the limits that x does not meet (collective).
+
+        Args:
+            sought: whether the violation was lessened as far as steps could.
+        """
         one, v = self.iterate, self.evaluator.variables
+        if not sought and one.problem.excess > 0.0:
+            return "let the optimisation go on (optimizer.max_iterations)"
         return conflict_sentences(one.problem, one.x, v.xmin, v.xmax, v.slices, one.total)
 
     # -- history -----------------------------------------------------------------------------

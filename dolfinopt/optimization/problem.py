@@ -82,8 +82,7 @@ class Variables:
 # Steepness from which on the move limit falls with its square root: up to it the projection's
 # slope, about beta / 2, moves x_phys by no more than twice what x moves.
 GENTLE = 4.0
-# Excess of a limit with which beta waits for the design to come back, so many times as long.
-WAITS, PATIENT = 0.02, 4
+WAITS = 0.02  # excess of a limit from which on beta waits for the design to come back
 AT_ONCE = 4  # strict steps have one function in so many parts of design.continuation
 
 
@@ -93,6 +92,7 @@ class Continuation:
     Attributes:
         beta: steepness; grows from 1 to design.sharpness.
         age: updates of the design since it grew.
+        held: whether beta stays as it is from here on.
         patterns: arms that repeat another's design.
         thresholds: eta of every arm of this rank with design variables. Held during a step: a
             threshold that followed x would be one more way to stay grey.
@@ -102,7 +102,7 @@ class Continuation:
         """Begin with the gentlest projection."""
         self.scene, self.partition, self.arms = scene, partition, arms
         self.beta, self.age = 1.0, 0
-        self._held = False
+        self.held = False
         self.patterns = Patterns(scene, partition, arms)
         designed = [k for k in arms if k in scene.designed]
         self.thresholds: dict[int, float] = dict.fromkeys(designed, 0.5)
@@ -111,17 +111,17 @@ class Continuation:
     def complete(self) -> bool:
         """Whether beta has reached its final value."""
         design = self.scene.design
-        return self._held or not design.projection or self.beta >= design.sharpness
+        return self.held or not design.projection or self.beta >= design.sharpness
 
     @property
     def move(self) -> float:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
         return self.scene.optimizer.move * min(1.0, (GENTLE / self.beta) ** 0.5)
 
-    def held(self) -> Continuation:
+    def as_it_is(self) -> Continuation:
         """Return one that stays as this one is now."""
         other = copy(self)
-        other._held = True
+        other.held = True
         return other
 
     def physical_designs(
@@ -159,8 +159,7 @@ class Continuation:
             excess: largest relative violation of a limit.
             strict: whether the update is to be compared with the design before.
         """
-        wait = self._updates(strict) * (1 if excess <= WAITS else PATIENT)
-        return not self.complete and self.age >= wait
+        return not self.complete and excess <= WAITS and self.age >= self._updates(strict)
 
     def _updates(self, strict: bool) -> int:
         return max(1, self.scene.design.continuation // AT_ONCE) if strict else 1
@@ -262,10 +261,10 @@ class Problem:
         """Largest relative violation of a limit by its true value; 0 where all are met."""
         return max((0.0 if one.met else one.excess for one in self.limits), default=0.0)
 
-    def merit(self, size: float) -> float:
+    def merit(self, size: float, weight: float) -> float:
         """Return the merit by the limits' true values, over the `size` of the objective."""
         over = sum(one.excess for one in self.limits if not one.met)
-        return float(self.values[0] / size + PRICE * over)
+        return float(self.values[0] / size + weight * PRICE * over)
 
 
 def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndarray, ...]:
@@ -451,7 +450,7 @@ class Evaluator:
         other = copy(self)
         objective = self.scene.objective.model_copy(update={"gradient": kind})
         other.scene = self.scene.model_copy(update={"objective": objective})
-        other.continuation = self.continuation.held()
+        other.continuation = self.continuation.as_it_is()
         return other
 
     def evaluate_densities(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import astuple, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ class HistoryRow:
         volume_fraction: over all arms.
         change: largest change of a design variable in the update that led here.
         seconds: wall-clock time since the run's beginning, earlier parts included.
-        kkt: Karush-Kuhn-Tucker residual of this design, see `optimality.kkt_residual`.
+        kkt: Karush-Kuhn-Tucker residual of this design, see `stopping.kkt_residual`.
         constraints: value of every constraint, by its name, see `constraints.Limit`.
         tightest: how far limits are kept, in words; of the live line, not kept in history.csv.
     """
@@ -79,6 +79,9 @@ class FurtherRow(HistoryRow):
 # -- what an optimisation must remember to go on as if it had never been interrupted -------------
 
 
+WORTH = 1e-3  # relative: what a design must be better to count as improved
+
+
 @dataclass(frozen=True, eq=False)
 class Best:
     """The best design so far: of the sharpest projection among those that keep all limits.
@@ -90,6 +93,8 @@ class Best:
         thresholds: per arm its eta.
         objective: what is minimised.
         excess: largest relative violation of a limit.
+        improved: iteration of the last design that was better than the one before by `WORTH`, and
+            `reference` its objective, of an infeasible one its excess.
     """
 
     x: np.ndarray
@@ -98,6 +103,8 @@ class Best:
     thresholds: Mapping[int, float]
     objective: float
     excess: float
+    improved: int = 0
+    reference: float = np.inf
 
     @classmethod
     def none(cls, x: np.ndarray) -> Best:
@@ -111,6 +118,14 @@ class Best:
             return True, self.excess, self.objective
         return False, -self.beta, self.objective
 
+    def after(self, before: Best) -> Best:
+        """Return it with what it has improved since `before`, which it follows."""
+        value = self.excess or self.objective
+        same = (self.excess > 0.0) == (before.excess > 0.0) and self.beta <= before.beta
+        if same and value > before.reference - WORTH * abs(before.reference):
+            return replace(self, improved=before.improved, reference=before.reference)
+        return replace(self, improved=self.iteration, reference=value)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class IterateMemory:
@@ -118,13 +133,13 @@ class IterateMemory:
 
     Attributes:
         iteration: design updates made.
-        change, kkt: largest change in the last one, and the residual of the design.
+        change: largest one in the last update.
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
         multipliers, convexity: MMA's, on all ranks.
         stage, search: that the design belongs to, and how the next step is sought.
-        age: updates since beta rose.
+        age, held: updates since beta rose, and whether it stays as it is.
         best: the best design so far; its variables are the last column of `cells`.
         guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
@@ -134,7 +149,6 @@ class IterateMemory:
 
     iteration: int
     change: float
-    kkt: float
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
     guesses: Mapping[int, Guesses]
@@ -143,6 +157,7 @@ class IterateMemory:
     stage: Stage
     search: Search
     age: int
+    held: bool
     best: Best
     solutions: tuple[Solution, ...]
     beta: float

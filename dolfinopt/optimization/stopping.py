@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,12 +16,39 @@ from dolfinopt.units import NOT_MET
 
 Sum = Callable[[Mapping[int, np.ndarray]], np.ndarray]
 
-# A relative constraint f below minus that is inactive, its multiplier zero: what counts as met.
-ACTIVE = 1e-3
 ROUNDS = 10  # of choosing the free variables; two or three are the rule
 # Eigenvalues of the scaled Gram matrix below this share of the largest are rounding: constraints
 # whose gradients say the same.
 DEPENDENT = 1e-12
+# Variables can move that are farther than this share of their range from either bound.
+ROOM = 1e-3
+TRIAL = 0.1  # step of the variable that moves most, in ranges: what bounds nearer than that hold
+PEAK = 10.0  # times the tolerance of the root mean square, that of the largest
+EXPONENT = 64  # of the norm that stands for the largest: above it by 20 % at most, of 1e5 cells
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """How far a design is from the Karush-Kuhn-Tucker conditions, see `kkt_residual`.
+
+    Attributes:
+        rms: root mean square over the variables that can move.
+        largest: of any of them, over the largest of the objective's gradient.
+        multipliers: (m,) of the constraints, for the objective scaled to a root mean square of 1.
+    """
+
+    rms: float
+    largest: float
+    multipliers: np.ndarray
+
+    @classmethod
+    def unknown(cls) -> Residual:
+        """Return that of a design without gradients."""
+        return cls(np.nan, np.nan, np.empty(0))
+
+    def is_within(self, tolerance: float) -> bool:
+        """Return whether the design counts as stationary; see `PEAK` for the largest."""
+        return self.rms <= tolerance and self.largest <= PEAK * tolerance
 
 
 def kkt_residual(
@@ -32,17 +60,23 @@ def kkt_residual(
     dfdx: np.ndarray,
     parts: Mapping[int, slice],
     total: Sum,
-) -> tuple[float, np.ndarray]:
+) -> Residual:
     """Return the Karush-Kuhn-Tucker residual of min f0, f_i <= 0, xmin <= x <= xmax (collective).
 
-    With y the variables in units of their range and the objective's gradient scaled to a root
-    mean square of 1, L = df0dy + sum_i l_i df_idy. The residual is the root mean square of the
-    projected gradient step y - P(y - L), P the projection on the bounds: 0 exactly where the
-    conditions hold, |L| / |df0dy| where no bound is near, and independent of the units of f0, f_i
-    and x. The multipliers l_i >= 0 are those that make it least: least squares over the variables
-    whose step is not cut off at a bound, repeated until these no longer change. Inactive
-    constraints have l_i = 0. Feasibility is not part of it.
-    Source: Nocedal & Wright, Numerical Optimization (2006), doi:10.1007/978-0-387-40065-5, 12.3.
+    With y the variables in units of their range and L = df0dy + sum_i l_i df_idy, the projected
+    gradient is s = (y - P(y - t L)) / t, P the projection on the bounds and t |L| at most a tenth:
+    0 where a bound holds a variable back, L where there is room. Variables can move where there is
+    room or s is not 0. Over these, and n in number,
+
+        residual^2 = (sum s^2 + sum_i (l_i min(f_i, 0))^2 / n) / sum (df0dy)^2 :
+
+    0 exactly where the conditions hold, about 1 where no constraint holds the objective back, and
+    independent of the units of f0, f_i and x and of how many variables matter. The second term is
+    complementarity. The multipliers l_i >= 0 are those that make it least: least squares over the
+    variables with room for their step, repeated until these no longer change. Feasibility is not
+    part of it.
+    Source: Nocedal & Wright, Numerical Optimization (2006), doi:10.1007/978-0-387-40065-5, 12.3;
+    Calamai & More, Math. Program. 39 (1987) 93-116, doi:10.1007/BF02592073.
 
     Args:
         x, xmin, xmax: (n,) this rank's variables.
@@ -52,46 +86,65 @@ def kkt_residual(
         total: adds an array an arm to the same bits on all ranks.
 
     Returns:
-        The residual, and the multipliers (m,) of the scaled objective. An objective without
-        gradient has the residual 0.
+        The residual; 0 for an objective without gradient.
     """
     width = xmax - xmin
     free = width > 0.0  # passive variables have no gradient and no room
     unit = np.where(free, width, 1.0)
     down, up = (x - xmin) / unit, (xmax - x) / unit
-    active = np.flatnonzero(f >= -ACTIVE)
-    g0, g = df0dx * width, dfdx[active] * width
-    size = {k: np.array([g0[part] @ g0[part], free[part].sum()]) for k, part in parts.items()}
-    square, count = total(size)
-    multipliers = np.zeros(f.size)
+    roomy = free & (np.minimum(down, up) > ROOM)
+    g0, g = df0dx * width, dfdx * width
+
+    def added(*terms: np.ndarray) -> np.ndarray:
+        """Return the sums of (n,) terms over all variables."""
+        return total({k: np.array([one[part].sum() for one in terms]) for k, part in parts.items()})
+
+    def largest(term: np.ndarray) -> float:
+        """Return the largest |term|, see `EXPONENT`."""
+        return float(added(np.abs(term) ** EXPONENT)[0] ** (1.0 / EXPONENT))
+
+    square, count = added(g0**2, free)
     if square == 0.0:
-        return 0.0, multipliers
+        return Residual(0.0, 0.0, np.zeros(f.size))
     if not np.isfinite(square):
-        return np.inf, multipliers
-    g0 = g0 / np.sqrt(square / count)
-    least, kept = np.inf, np.zeros(active.size)
-    inside = (down > 0.0) & (up > 0.0)
+        return Residual(np.inf, np.inf, np.zeros(f.size))
+    scale = np.sqrt(square / count)
+    g0 = g0 / scale
+    slack = np.maximum(-f, 0.0)
+    best, inside = Residual(np.inf, np.inf, np.zeros(f.size)), roomy
     for _ in range(ROUNDS):
-        found = _multipliers(g0, g, inside, parts, total)
+        movable = inside | roomy
+        n = max(1.0, float(added(movable)[0]))
+        found = _multipliers(g0, g, inside, slack / np.sqrt(n), parts, total)
         L = g0 + found @ g
-        step = np.clip(L, -up, down)
-        squares = total({k: np.array([step[p] @ step[p]]) for k, p in parts.items()})
-        residual = float(np.sqrt(squares[0] / count))
-        if residual < least:
-            least, kept = residual, found
-        moving = step == L
-        changed = total({k: np.array([np.sum(moving[p] != inside[p])]) for k, p in parts.items()})
-        if changed[0] == 0 or active.size == 0:
+        t = TRIAL / (largest(L) or 1.0)
+        moving = free & (t * L <= down) & (t * L >= -up)
+        step = np.where(moving, L, np.clip(t * L, -up, down) / t)
+        movable = roomy | (step != 0.0)
+        sums = added(step**2, np.where(movable, g0, 0.0) ** 2, movable)
+        own = float(sums[0] + ((found * slack) ** 2).sum() / max(1.0, sums[2]))
+        if own == 0.0:
+            return Residual(0.0, 0.0, found)
+        rms = np.sqrt(own / sums[1]) if sums[1] > 0.0 else np.inf
+        if rms < best.rms:
+            most = largest(np.where(movable, g0, 0.0)) or 1.0
+            best = Residual(float(rms), largest(step) / most, found)
+        changed = added(moving != inside)
+        if changed[0] == 0 or f.size == 0:
             break
         inside = moving
-    multipliers[active] = kept
-    return least, multipliers
+    return best
 
 
 def _multipliers(
-    g0: np.ndarray, g: np.ndarray, inside: np.ndarray, parts: Mapping[int, slice], total: Sum
+    g0: np.ndarray,
+    g: np.ndarray,
+    inside: np.ndarray,
+    slack: np.ndarray,
+    parts: Mapping[int, slice],
+    total: Sum,
 ) -> np.ndarray:
-    """Return l >= 0 that makes |g0 + l g| least over the variables inside, the same everywhere."""
+    """Return l >= 0 that makes |g0 + l g|^2 + |l slack|^2 least over the variables inside."""
     m = len(g)
     if m == 0:
         return np.zeros(0)
@@ -100,7 +153,7 @@ def _multipliers(
         chosen = g[:, part] * inside[part]
         sums[k] = np.column_stack([chosen @ chosen.T, chosen @ g0[part]])
     added = total(sums)
-    gram, right = added[:, :m], -added[:, m]
+    gram, right = added[:, :m] + np.diag(slack**2), -added[:, m]
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0.0] = 1.0
     # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
@@ -123,7 +176,10 @@ GREY = 0.02
 # steps so much shorter, for so many at most: limits that follow the design settle as steps do.
 NEARLY, LANDING, LAST = 0.05, 0.1, 8
 
-Ending = Literal["", "converged", "infeasible", "stuck", "limit"]
+Ending = Literal["", "converged", "settled", "stuck", "limit"]
+# Iterations without a better design, the projection complete, after which a run has settled; and in
+# which one counts as still improving that has spent its iterations.
+SETTLED, IMPROVING = 60, 20
 
 
 def small_change(scene: Scene) -> float:
@@ -136,10 +192,11 @@ def ending(
     iteration: int,
     change: float,
     reach: float,
-    kkt: float,
+    residual: Residual,
     violated: str,
     complete: bool,
     stuck: str,
+    idle: int,
 ) -> Ending:
     """Return why the iterations end here, "" where they go on.
 
@@ -148,55 +205,61 @@ def ending(
         iteration: design updates made.
         change: largest change of a design variable in the last one.
         reach: move limit of the last one: a change cut off by it tells nothing.
-        kkt: Karush-Kuhn-Tucker residual of the design.
+        residual: of the design.
         violated: the constraints that it does not meet, "" if it meets all.
         complete: whether the continuation of the projection has come to its end.
         stuck: why no step betters the design, "" where one does.
+        idle: iterations since the best design improved by a tenth of a percent.
     """
     small = change <= min(scene.optimizer.tolerance, MOVING * reach)
     rests = iteration > 0 and small and complete
-    if rests and not violated and kkt <= scene.optimizer.kkt_tolerance:
+    if rests and not violated and residual.is_within(scene.optimizer.kkt_tolerance):
         return "converged"
     if stuck:
-        return "infeasible" if violated else "stuck"
+        return "stuck"
+    if complete and idle >= SETTLED:
+        return "settled"
     return "limit" if iteration >= scene.optimizer.max_iterations else ""
 
 
 def stop_reason(
     scene: Scene,
-    end: str,
+    end: Ending,
     change: float,
     kkt: float,
-    violated: str,
+    not_met: str,
     grayness: float,
     stuck: str,
-    best: str,
+    idle: int,
+    best: int | None,
 ) -> str:
     """Say in words why the iterations ended, and which constraints are not met.
 
     Args:
-        scene, change, kkt: as for `ending`.
-        violated: as for `ending`, and what conflicts with them.
+        scene, change, stuck, idle: as for `ending`.
         end: what that returned.
+        kkt: root mean square of the residual.
+        not_met: the constraints that the design does not meet, and what conflicts with them.
         grayness: of the design.
-        stuck: as for `ending`.
-        best: which design is returned, "" of the last one.
+        best: iteration of the design that is returned, None of the last one.
     """
     options = scene.optimizer
-    reason = f"no step improves the design: {stuck}"
-    if end == "converged":
-        reason = (
-            f"largest change {change:.3g} <= {small_change(scene):g}, "
-            f"residual {kkt:.2g} <= {options.kkt_tolerance:g}"
-        )
-    elif end == "limit":
-        reason = f"optimizer.max_iterations = {options.max_iterations}"
-        if not violated:
-            reason += ", feasible, still improving"
-    if best:
-        reason += f"; the best design is that of {best}"
-    if violated:
-        reason += f"{NOT_MET}{violated}"
+    reason = {
+        "converged": f"converged: largest change {change:.3g} <= {small_change(scene):g}, "
+        f"residual {kkt:.2g} <= {options.kkt_tolerance:g}",
+        "settled": f"settled: no better design by 0.1 % in {SETTLED} iterations",
+        "stuck": f"stopped: no step improves the design ({stuck})",
+    }.get(end, f"optimizer.max_iterations = {options.max_iterations}")
+    if end == "limit" and not not_met:
+        reason += ", feasible, "
+        reason += "still improving" if idle <= IMPROVING else f"not improved in {idle} iterations"
+    if not_met:
+        reason += ", infeasible: least violation"
+        reason += "" if best is None else f", at iteration {best}"
+    elif best is not None:
+        reason += f"; the best design is that of iteration {best}"
+    if not_met:
+        reason += f"{NOT_MET}{not_met}"
     if scene.design.projection and grayness > GREY:
         reason += f"; the projected design is still grey ({grayness:.2g})"
     return reason
@@ -207,8 +270,6 @@ def stop_reason(
 # Share of the violated constraint's gradient that another one must balance to stand against it.
 OPPOSES = 0.05
 NEAR = 0.02  # a limit counts as reached within this share of it: the iterations may end any time
-# Residual up to which nothing that the limits and bounds allow lessens the violation.
-STUCK = 0.2
 
 
 def conflict_sentences(
@@ -221,7 +282,8 @@ def conflict_sentences(
 ) -> str:
     """Say what holds the violated limits back, a sentence each; "" if all are met (collective).
 
-    Of every violated limit f the residual of min f subject to the other limits is taken, with its
+    Of a design whose violation no step lessens: else nothing is known of what is out of reach. Of
+    every violated limit f the residual of min f subject to the other limits is taken, with its
     multipliers l >= 0: where grad f + sum_j l_j grad f_j = 0 within the bounds, f cannot fall
     without some f_j rising, and those with a multiplier conflict with it.
 
@@ -240,14 +302,12 @@ def conflict_sentences(
         row = int(np.flatnonzero(own)[np.argmax(problem.f[own])])
         others = np.flatnonzero(~own & (problem.f >= -NEAR) & eased[problem.rows])
         g, rows = problem.dfdx[row], problem.dfdx[others]
-        residual, multipliers = kkt_residual(
-            x, xmin, xmax, g, np.zeros(len(others)), rows, parts, total
-        )
+        left = kkt_residual(x, xmin, xmax, g, np.zeros(len(others)), rows, parts, total)
         sizes = _sizes(np.vstack([g, rows]) * (xmax - xmin), parts, total)
-        strong = multipliers * sizes[1:] > OPPOSES
+        strong = left.multipliers * sizes[1:] > OPPOSES
         opposed = {problem.limits[k] for k in problem.rows[others[strong]]}
         names = [one for one in problem.limits if one in opposed]
-        found[_sentence(limit, names, residual)] = None
+        found[_sentence(limit, names)] = None
     return "; ".join(found)
 
 
@@ -261,11 +321,9 @@ def _sizes(g: np.ndarray, parts: Mapping[int, slice], total: Sum) -> np.ndarray:
     return np.asarray(np.sqrt(np.array(sums) / count))
 
 
-def _sentence(limit: Limit, others: list[Limit], residual: float) -> str:
+def _sentence(limit: Limit, others: list[Limit]) -> str:
     own = limit.bound
     if others:
         *rest, last = sorted([own, *(one.bound for one in others)])
         return f"{', '.join(rest)} and {last} conflict: relax one of them"
-    if residual <= STUCK:
-        return f"no design near this one meets {own}, whatever its material: relax it"
-    return f"nothing stands against {own}: let the optimisation go on (optimizer.max_iterations)"
+    return f"no design near this one meets {own}, whatever its material: relax it"

@@ -32,6 +32,8 @@ NAME = CHECKPOINT
 SEAL = "digest"  # of all other arrays
 FURTHER = "further/"  # before the names of what further iterations left
 # Keys a resumed run may change: they say when to stop, not what design is computed.
+# Numbers of the best design.
+BEST = "iteration", "beta", "objective", "excess", "improved", "reference"
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
 
 
@@ -262,15 +264,13 @@ def arrays_of(
         return {}
     arrays: dict[str, Any] = {
         "iteration": memory.iteration,
-        "last": [memory.change, memory.kkt, memory.age],
+        "last": [memory.change, memory.age, memory.held],
         "multipliers": memory.multipliers,
         "convexity": memory.convexity,
         "held": memory.stage.limits,
         "price": memory.stage.price,
         "search": astuple(memory.search),
-        "best": [
-            getattr(memory.best, name) for name in ("iteration", "beta", "objective", "excess")
-        ],
+        "best": [getattr(memory.best, name) for name in BEST],
         "sharpness": memory.beta,
     }
     for k, solution in enumerate(memory.solutions):
@@ -329,25 +329,25 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         of = f"solution{len(solutions)}"
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
-    change, kkt, age = arrays["last"].tolist()
-    radius, reach, freedom, strict, lag, merit, size, released = arrays["search"].tolist()
-    iteration, beta, objective, excess = arrays["best"].tolist()
+    change, age, held = arrays["last"].tolist()
+    best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
+    iteration = best["iteration"] = int(best["iteration"])
     thresholds = {k: float(arrays[f"arm{k}/best_threshold"]) for k in cells}
     if iteration < 0:
         thresholds = {}
     return {
         "iteration": int(arrays["iteration"]),
         "change": change,
-        "kkt": kkt,
         "cells": cells,
         "modes": modes,
         "guesses": guesses,
         "multipliers": arrays["multipliers"],
         "convexity": arrays["convexity"],
         "stage": Stage(tuple(arrays["held"]), float(arrays["price"])),
-        "search": Search(radius, reach, int(freedom), int(strict), int(lag), merit, size, released),
+        "search": Search.from_numbers(arrays["search"].tolist()),
         "age": int(age),
-        "best": Best(np.empty(0), int(iteration), beta, thresholds, objective, excess),
+        "held": bool(held),
+        "best": Best(x=np.empty(0), thresholds=thresholds, **best),
         "solutions": tuple(solutions),
         "beta": float(arrays["sharpness"]),
         "thresholds": {k: float(arrays[f"arm{k}/threshold"]) for k in cells},

@@ -166,8 +166,7 @@ def test_two_bars_above_resonance():
     np.testing.assert_allclose(k, [5.0 / 6.0, 7.0 / 6.0])
     found = bars.judged(k)
     assert found.angle == pytest.approx(180.0 - (np.degrees(np.arctan2(8.0, 3.5)) - 45.0))
-    # The step goes to the lower bounds.
-    assert found.kkt == pytest.approx(np.sqrt(np.mean(((k - 0.1) / 1.8) ** 2)), rel=1e-9)
+    assert found.kkt == pytest.approx(1.0, rel=1e-9)  # nothing balances it
     assert bars.judged(k, bars.frozen(k)).kkt < 1e-9
     steps = bars.improved(k, 60)
     np.testing.assert_allclose(steps[-1][0], 0.1, atol=1e-6)
