@@ -36,7 +36,6 @@ from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_motion import Scale
-from dolfinopt.multibody.equations import PLANE
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, proportional, same_geometry
@@ -320,7 +319,7 @@ class BatchSystem:
             if key not in known:
                 known[key] = member.motion(own)
             motions.append(known[key])
-        return ElasticInstants(self._mechanism(len(t) // self.runs), _joined(motions), PLANE)
+        return ElasticInstants(self._mechanism(len(t) // self.runs), _joined(motions))
 
     def _mechanism(self, times: int) -> Mechanism:
         """Return that of all systems at `times` instants each, one system after the other."""

@@ -22,7 +22,6 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
-from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import FEW, Closure, Drives, ElasticBodies, repeated
 from dolfinopt.multibody.motion import RigidMotion
@@ -227,7 +226,6 @@ class MachineSystem:
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
         closure: of the last outboard interface, or None; in the plane.
-        equations: of the mechanism, in the plane or in space.
     """
 
     mechanism: Any
@@ -235,7 +233,6 @@ class MachineSystem:
     breakpoints: tuple[float, ...]
     drives: Drives
     closure: Closure | None = None
-    equations: Equations = PLANE
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
@@ -275,7 +272,7 @@ class MachineSystem:
     @cached_property
     def elastic(self) -> ElasticSystem:
         """The same machine, its rigid coordinates on the desired motion exactly."""
-        return ElasticSystem(self.mechanism, self.motion, self.breakpoints, self.equations)
+        return ElasticSystem(self.mechanism, self.motion, self.breakpoints)
 
     @cached_property
     def gap_scale(self) -> float:
@@ -284,7 +281,7 @@ class MachineSystem:
 
     @cached_property
     def _softness(self) -> float:
-        return self.equations.softness(self.mechanism.bodies) or 1e-6
+        return self.mechanism.softness or 1e-6
 
     @cached_property
     def rigid_scale(self) -> np.ndarray:
@@ -293,7 +290,7 @@ class MachineSystem:
         The energy that a deflection of the same size as the coordinate's at the chain's end would
         store in the softest arm.
         """
-        return self.equations.levers(self.mechanism)[self.drives.free] / np.sqrt(self._softness)
+        return self.mechanism.levers[self.drives.free] / np.sqrt(self._softness)
 
     def ground_force(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the force (n,) on the interface, complex, N, by the multipliers (n, m)."""

@@ -19,14 +19,16 @@ from dolfinopt.dynamics.radau import BEYOND, REMEDY, VALID
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import (
+    deviation,
+    end_effector,
+    end_effector_gradient,
     interface_place,
     lengths,
     place_gradient,
 )
-from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
-from dolfinopt.multibody.mechanism import Closure, ElasticBodies, compliance
+from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism, compliance
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
@@ -114,11 +116,6 @@ class Trajectory:
         """What moved: a `Mechanism`, in space a `SpatialMechanism`."""
         return self.problem.mechanism
 
-    @property
-    def equations(self) -> Equations:
-        """Those of the mechanism."""
-        return self.problem.equations
-
     @cached_property
     def adjoint(self) -> Adjoint:
         """The transposed recursion, for the gradient of any function of the motion."""
@@ -153,9 +150,9 @@ class Trajectory:
         a slider along its line; of a pinned end none but the integrator's error.
         """
         if isinstance(self.problem, ElasticSystem):
-            return self.equations.deviation(self.mechanism, self.motion, self.q_e)
+            return deviation(self.mechanism, self.motion, self.q_e)
         none = np.zeros_like(self.q_e)
-        return self.end - self.equations.end_effector(self.mechanism, self.desired, none)
+        return self.end - end_effector(self.mechanism, self.desired, none)
 
     @property
     def distance(self) -> np.ndarray:
@@ -175,7 +172,7 @@ class Trajectory:
     @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
-        return self.equations.rotations(self.mechanism, self.q_e)
+        return self.mechanism.rotations(self.q_e)
 
     @cached_property
     def joint_forces(self) -> np.ndarray:
@@ -221,7 +218,7 @@ class Trajectory:
     @cached_property
     def end(self) -> np.ndarray:
         """Place of the end-effector (n, 2), m, as it moves."""
-        return self.equations.end_effector(self.mechanism, self.motion, self.q_e)
+        return end_effector(self.mechanism, self.motion, self.q_e)
 
     @cached_property
     def slider_position(self) -> np.ndarray | None:
@@ -279,12 +276,10 @@ class Trajectory:
             By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
         """
         motion, q = self.motion[indices], self.q_e[indices]
-        free = self.problem.drives.free if isinstance(self.problem, MachineSystem) else ()
-        gradient = self.equations.end_effector_gradient
-        by_q, by_rigid, by_bodies = gradient(self.mechanism, motion, q, weights, len(free) > 0)
+        by_q, by_rigid, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
         by = self.by_unknowns(by_q)
-        if len(free):
-            assert by_rigid is not None
+        if isinstance(self.problem, MachineSystem):
+            free = self.problem.drives.free
             by[:, : len(free)] = by_rigid[:, free]
         return by, by_bodies
 
@@ -436,7 +431,7 @@ def _by_radau(
 ) -> list[Solution | ConvergenceError]:
     """Return the solutions in their order: chains on prescribed motions together, others alone."""
     alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if one.equations is PLANE}
+    own = {i: one for i, one in alike.items() if isinstance(one.mechanism, Mechanism)}
     together, begun = list(own), [starts[i] for i in own]
     solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
     found = dict(zip(together, solved, strict=True))
@@ -541,7 +536,7 @@ class DriveForces:
         system, t = self.system, self.t[part]
         if isinstance(system, MachineSystem):
             return _Machine(system.at(t), (y, yd, ydd))
-        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), system.equations)
+        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
 
 
 @dataclass(frozen=True, eq=False)
@@ -551,7 +546,6 @@ class _Prescribed:
     mechanism: ElasticBodies
     motion: RigidMotion
     rates: Rates
-    equations: Equations
 
     @cached_property
     def tangent(self) -> Linearisation:
@@ -588,7 +582,7 @@ class _Machine:
         instants, (y, yd, ydd) = self.instants, self.rates
         q, qd, qdd = (instants.split(x)[1] for x in self.rates)
         motion, machine = instants.motion(y, yd, ydd), instants.machine
-        return _Prescribed(machine.mechanism, motion, (q, qd, qdd), machine.equations)
+        return _Prescribed(machine.mechanism, motion, (q, qd, qdd))
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`."""

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from dolfinopt.multibody.mechanism import FEW, Mechanism, several
+from dolfinopt.multibody.body_motion import Constants
+from dolfinopt.multibody.dimension import product
+from dolfinopt.multibody.kinematics import MovingJoint
+from dolfinopt.multibody.mechanism import FEW, ElasticBodies, Mechanism, several
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -19,18 +23,127 @@ def lengths(vectors: np.ndarray) -> np.ndarray:
     return out
 
 
-def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
-    if 0 < len(q) < FEW:
-        return end_effector(*several(mechanism, motion, q))[: len(q)]
-    place = motion.q[:, 0] + 1j * mechanism.joint_height
-    joint_rotation = np.ones(len(q), dtype=complex)
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
-        d, angle = outboard(body, q[:, part])
-        place = place + joint_rotation * d
-        joint_rotation = joint_rotation * np.exp(1j * angle)
-    return np.stack([place.real, place.imag], axis=1)
+def end_effector(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the end-effector's position (n, d), m, of the flexible mechanism; q (n, N)."""
+    return _Chain(mechanism, motion, q).end.T
+
+
+def deviation(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the flexible minus the equivalent rigid end-effector (n, d), m.
+
+    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
+    """
+    rigid = end_effector(mechanism, motion, np.zeros_like(q))
+    return end_effector(mechanism, motion, q) - rigid
+
+
+def end_effector_gradient(
+    mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
+    """Return the gradient of sum_n weights_n . end_effector_n.
+
+    It is what a force of these weights on the end-effector does on every coordinate.
+
+    Args:
+        mechanism, motion, q: as for `end_effector`, n instants.
+        weights: (n, d).
+
+    Returns:
+        By q (n, N), by the rigid coordinates (n, R), and by every body's outboard modes (b, q) and
+        their geometric stiffness (b, q, q), under the names of the shape integrals.
+    """
+    chain, forces = _Chain(mechanism, motion, q), weights.T
+    by_q, by_rigid = np.zeros_like(q), np.zeros_like(motion.q)
+    by_bodies = [{"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies]
+    if (cart := mechanism.tree.cart_coordinate) is not None:
+        by_rigid[:, cart] = weights[:, 0]
+    for link in chain.links:
+        dim, back = link.joint.dim, link.rotation.swapaxes(0, 1)
+        force, lever = product(back, forces), product(back, chain.end - link.origin)
+        if (k := link.joint.joint.coordinate) is not None:
+            by_rigid[:, k] = link.joint.drive((force, dim.moment(lever, force)))
+        body, part, own = mechanism.bodies[link.body], mechanism.slices[link.body], link.rows
+        if not body.num_modes:
+            continue
+        moment = dim.moment(lever - link.section.place, force)
+        pull, e = np.concatenate([force, link.section.turning.pulled(moment)]), q[:, part]
+        by_q[:, part] = pull.T @ body.outboard[own]
+        by = by_bodies[link.body]
+        by["outboard"][own] = pull @ e
+        if link.section.bent is not None:
+            by_q[:, part] -= np.einsum("pn,pkn->nk", pull, link.section.bent)
+            by["K0_outboard"] = np.zeros_like(body.K0_outboard)
+            by["K0_outboard"][own] = -0.5 * (pull[:, None] * e.T) @ e
+    return by_q, by_rigid, by_bodies
+
+
+class _Section:
+    """An outboard interface where n sets of coordinates e (q, n) take it, in its body's frame.
+
+    Attributes:
+        place: (d, n) or (d, 1), m.
+        turning: its rotation; None of a rigid body.
+        bent: (b, q, n) what geometric stiffness takes from the outboard modes, or None.
+    """
+
+    def __init__(self, constants: Constants, number: int, e: np.ndarray) -> None:
+        self.place, self.turning, self.bent = constants.points[number][:, None], None, None
+        if not constants.num_modes:
+            return
+        places, d = constants.outboard(number), constants.dim.d
+        moved = constants.T[places] @ e
+        if constants.K0 is not None:
+            self.bent = np.tensordot(constants.K0[places], e, 1)
+            moved -= 0.5 * np.einsum("pkn,kn->pn", self.bent, e)
+        self.place = self.place + moved[:d]
+        self.turning = constants.turning(*(moved[d:],) * 3)  # of its rates none is asked for
+
+
+class _Link(NamedTuple):
+    """A body on the way to the end-effector: its joint, frame and the interface that leads on."""
+
+    body: int
+    rows: slice  # of the interface, among the body's outboard modes
+    joint: MovingJoint
+    section: _Section
+    origin: np.ndarray  # (d, n)
+    rotation: np.ndarray  # (d, d, n) or (d, d), to the world's frame
+
+
+class _Chain:
+    """The bodies from the ground to the end-effector and its place (d, n), m."""
+
+    def __init__(self, mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> None:
+        tree, self.links = mechanism.tree, []  # type: ignore[var-annotated]
+        place, d = mechanism.base(motion), len(tree.gravity)
+        still, R = (place, place, place), np.eye(d)  # no motion is asked for
+        for i, number in mechanism.way:
+            k, constants = tree.joints[i].coordinate, tree.constants[i]
+            joint = MovingJoint(tree.joints[i], still, None if k is None else motion.q[:, k][None])
+            if joint.is_offset:
+                place = place + product(R, joint.r)
+            R = _turned(R, joint.R)
+            section = _Section(constants, number, q[:, tree.slices[i]].T)
+            rows = slice(constants.dim.b * number, constants.dim.b * (number + 1))
+            self.links.append(_Link(i, rows, joint, section, place, R))
+            place = place + product(R, section.place)
+            if section.turning is not None:
+                R = _turned(R, section.turning.R)
+        self.end = place
+
+
+def _turned(R: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Return R S of rotations (d, d, n), or one (d, d)."""
+    return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)
+
+
+# -- in the plane: first and second derivatives by all coordinates, for what closes a loop
+#
+# Coordinates are ordered [rigid (1 + arms), elastic (N)]; places are complex, p = p_x + i p_y.
+# Going outwards along the chain every coordinate moves all that lies outboard of it: it shifts it
+# by t and rotates it by r about a point o,  dp = t + i r (p - o). A second coordinate further out
+# is rotated with it, so d2p = i r dp'; this is all there is, but for the second order of the arms'
+# own deformation.
 
 
 def outboard(body: ShapeIntegrals, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -40,70 +153,6 @@ def outboard(body: ShapeIntegrals, e: np.ndarray) -> tuple[np.ndarray, np.ndarra
         bent = np.einsum("pkl,nk,nl->pn", body.K0_outboard, e, e, optimize=True)
         x, y, angle = x - 0.5 * bent[0], y - 0.5 * bent[1], angle - 0.5 * bent[2]
     return complex(*body.outboard_point) + (x + 1j * y), angle
-
-
-def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the flexible minus the equivalent rigid end-effector (n, 2), m.
-
-    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
-    """
-    rigid = end_effector(mechanism, motion, np.zeros_like(q))
-    return end_effector(mechanism, motion, q) - rigid
-
-
-def end_effector_gradient(
-    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-    """Return the gradient of sum_n weights_n . end_effector_n.
-
-    Args:
-        mechanism, motion, q: as for `end_effector`, n instants.
-        weights: (n, 2).
-
-    Returns:
-        By q (n, N), and by every body's outboard modes (3, q) and their geometric stiffness
-        (3, q, q), under the names of the shape integrals.
-    """
-    if 0 < len(q) < FEW:
-        few = several(mechanism, motion, q, weights)
-        few[-1][len(q) :] = 0.0
-        by_q, by_bodies = end_effector_gradient(*few)
-        return by_q[: len(q)], by_bodies
-    w = weights[:, 0] + 1j * weights[:, 1]
-    rotations, levers = [], []
-    joint_rotation = np.ones(len(q), dtype=complex)
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
-        rotations.append(joint_rotation)
-        d, angle = outboard(body, q[:, part])
-        levers.append(joint_rotation * d)
-        joint_rotation = joint_rotation * np.exp(1j * angle)
-    by_q = np.empty_like(q)
-    by_outboard: list[dict[str, np.ndarray]] = []
-    beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
-    for k in reversed(range(len(rotations))):
-        part, body = mechanism.slices[k], mechanism.bodies[k]
-        place = np.conj(rotations[k]) * w
-        rotation = (np.conj(w) * 1j * beyond).real
-        e, pulls = q[:, part], (place.real, place.imag, rotation)
-        by_q[:, part] = np.stack(pulls, axis=1) @ body.outboard
-        by = {"outboard": np.stack([pull @ e for pull in pulls])}
-        if body.is_stiffened:
-            pairs = zip(pulls, body.K0_outboard, strict=True)
-            by_q[:, part] -= sum(pull[:, None] * (e @ K0) for pull, K0 in pairs)
-            by["K0_outboard"] = np.stack([-0.5 * (e.T * pull) @ e for pull in pulls])
-        by_outboard.insert(0, by)
-        beyond = beyond + levers[k]
-    return by_q, by_outboard
-
-
-# -- first and second derivatives of the end-effector's place by all coordinates of a mechanism
-#
-# Coordinates are ordered [rigid (1 + arms), elastic (N)]; places are complex, p = p_x + i p_y.
-# Going outwards along the chain every coordinate moves all that lies outboard of it: it shifts it
-# by t and rotates it by r about a point o,  dp = t + i r (p - o). A second coordinate further out
-# is rotated with it, so d2p = i r dp'; this is all there is, but for the second order of the arms'
-# own deformation.
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -399,6 +399,30 @@ class ElasticBodies:
         """Return it at some of the instants."""
         raise NotImplementedError
 
+    @property
+    def tree(self) -> Tree:
+        """Itself as inverse dynamics goes along it."""
+        raise NotImplementedError
+
+    @property
+    def way(self) -> tuple[Site, ...]:
+        """From the ground to the end-effector: every body and the interface that leads on."""
+        raise NotImplementedError
+
+    def base(self, motion: RigidMotion) -> np.ndarray:
+        """Return where the ground's frame is at n instants (d, n), m."""
+        return np.zeros((len(self.tree.gravity), len(motion.q)))
+
+    @property
+    def softness(self) -> float:
+        """Largest static deflection of a body by a unit force across it, m/N."""
+        raise NotImplementedError
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Deflection of the end by unit rigid coordinates (R,), m."""
+        raise NotImplementedError
+
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Each body's place in the vector of all elastic coordinates."""
@@ -431,17 +455,22 @@ class ElasticBodies:
 
         That of its outboard interfaces in its own frame.
         """
-        found = []
+        lengths = [np.linalg.norm(one.points, axis=1).max() for one in self.tree.constants]
+        pairs = zip(self._interfaces(q, False), lengths, strict=True)
+        return np.array([largest / length if length else 0.0 for largest, length in pairs])
+
+    def rotations(self, q: np.ndarray) -> np.ndarray:
+        """Return the largest rotation of every body's interfaces in q (n, N), rad (bodies,)."""
+        return np.array(list(self._interfaces(q, True)))
+
+    def _interfaces(self, q: np.ndarray, turned: bool) -> Iterator[float]:
+        """Yield the largest displacement, or rotation, of every body's interfaces in q (n, N)."""
+        d = len(self.tree.gravity)
         for part, body in zip(self.slices, self.bodies, strict=True):
-            d, largest = len(body.outboard_point), 0.0
-            points = body.outboard_point[None] if d == 2 else body.points
-            length = float(np.linalg.norm(points, axis=1).max())
-            if body.num_modes and length > 0.0:
-                # Of each interface: displacements, then rotations, of which the plane has one.
-                moved = (q[:, part] @ body.outboard.T).reshape(-1, 3 if d == 2 else 6)[:, :d]
-                largest = float(np.linalg.norm(moved, axis=1).max(initial=0.0)) / length
-            found.append(largest)
-        return np.array(found)
+            # Of each interface: displacements, then rotations, of which the plane has one.
+            every = (q[:, part] @ body.outboard.T).reshape(-1, 3 if d == 2 else 6)
+            own = every[:, d:] if turned else every[:, :d]
+            yield float(np.linalg.norm(own, axis=1).max(initial=0.0))
 
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
@@ -494,8 +523,36 @@ class Mechanism(ElasticBodies):
             scales=tuple(scale[part] for scale in self.scales),
         )
 
+    @property
+    def way(self) -> tuple[Site, ...]:
+        """All arms."""
+        return tuple((k, 0) for k in range(len(self.bodies)))
+
+    def base(self, motion: RigidMotion) -> np.ndarray:
+        """Return where the first joint is (2, n), m."""
+        return np.stack([motion.q[:, 0], np.full(len(motion.q), self.joint_height)])
+
+    @property
+    def softness(self) -> float:
+        """Largest static deflection of an arm's end by a unit force across it, m/N."""
+        # Or a third of the arm's length squared times the end's rotation by a unit moment, which
+        # is the same of a cantilever, and not zero of an arm whose frame is its chord.
+        found = [0.0]
+        for body in self.bodies:
+            if body.num_modes:
+                soft = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
+                square = float(body.outboard_point @ body.outboard_point)
+                found += [float(soft[1, 1]), float(soft[2, 2]) * square / 3.0]
+        return max(found)
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Deflection of the end by unit rigid coordinates (1 + arms,), m."""
+        reach = sum(float(np.hypot(*body.outboard_point)) for body in self.bodies)
+        return np.array([1.0, *[reach] * len(self.bodies)])
+
     @cached_property
-    def tree(self) -> Tree:
+    def tree(self) -> Tree:  # type: ignore[override]
         """Itself as inverse dynamics goes along it."""
         joints = self.joints or (BARE,) * len(self.bodies)
         carried = {(k, 0): self.carried(k) for k in range(len(self.bodies))}
