@@ -9,8 +9,8 @@ from functools import cache, partial
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.bench.diagram import Diagram, Panel, Plan, Rows, Steps
-from dolfinopt.bench.measure import DESIGNS, bodies_of, designs, tidy, timed
+from dolfinopt.bench.measure import DESIGNS, Cells, Plan, bodies_of, designs, tidy, timed
+from dolfinopt.bench.panel import Diagram, Panel, Rows, Steps
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
@@ -43,11 +43,7 @@ ALIKE = "simulation.tolerance=1e-7", "simulation.stages=5"
 
 
 def grid_arm(
-    length: float,
-    height: float,
-    cells: tuple[int, int],
-    triangles: bool = False,
-    graded: bool = False,
+    length: float, height: float, cells: Cells, triangles: bool = False, graded: bool = False
 ) -> ArmMesh:
     """Mesh a rectangular arm by DOLFINx's own grid, on this rank alone.
 
@@ -89,7 +85,7 @@ class Element:
     triangles: bool = False
     graded: bool = False
 
-    def arm(self, scene: Scene, cells: tuple[int, int]) -> Substructure:
+    def arm(self, scene: Scene, cells: Cells) -> Substructure:
         """Mesh the scene's first arm, see `grid_arm`, and lay down its matrices."""
         arm = scene.arms[0]
         assert arm.height is not None
@@ -121,13 +117,8 @@ def solid_body(scene: Scene, substructure: Substructure) -> ShapeIntegrals:
     return shape_integrals(elastic, basis, scene.damping.stiffness_proportional)
 
 
-def moved_alike(scene: Scene, body: ShapeIntegrals) -> Trajectory:
-    """Move the scene's mechanism with all arms like this one."""
-    return simulate(scene, [body] * len(scene.arms), Profile())
-
-
 def respond(
-    scene: Scene, element: Element, cells: tuple[int, int], repeats: int = 1
+    scene: Scene, element: Element, cells: Cells, repeats: int = 1
 ) -> tuple[np.ndarray, int, float, float]:
     """Discretise the scene's first arm, solid, reduce it, and move a mechanism of such arms.
 
@@ -144,7 +135,7 @@ def respond(
         now, _, body = timed(partial(solid_body, scene, substructure))
         seconds = min(seconds, now)
     flexibility = np.linalg.inv(solid(scene, substructure).constraint_modes().stiffness)
-    far = moved_alike(scene, body).max_deviation[0]
+    far = simulate(scene, [body] * len(scene.arms), Profile()).max_deviation[0]
     return np.array([flexibility[1, 1], first_frequency(body), far]), dofs, seconds, setup
 
 
@@ -153,7 +144,7 @@ def _meshes(plan: Plan) -> Steps:
     best = QUICK_REFERENCE if plan.quick else REFERENCE
     right = cache(partial(respond, scene, FINER, best))
 
-    def row(element: Element, cells: tuple[int, int]) -> Rows:
+    def row(element: Element, cells: Cells) -> Rows:
         tidy()
         found, *sizes = respond(scene, element, cells, plan.repeats)
         errors = np.abs(found / right()[0] - 1.0)

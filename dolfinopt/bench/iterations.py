@@ -13,8 +13,17 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.bench import arms
-from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, Rows, Steps
-from dolfinopt.bench.measure import arms_of, bodies_of, in_processes, mpirun, tidy, timed
+from dolfinopt.bench.measure import (
+    Cells,
+    Plan,
+    arms_of,
+    bodies_of,
+    in_processes,
+    mpirun,
+    tidy,
+    timed,
+)
+from dolfinopt.bench.panel import Diagram, Frame, Panel, Rows, Steps
 from dolfinopt.bench.programs import PlainStatics, exudyn_tip, pymoto_iteration
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError
@@ -87,13 +96,13 @@ def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
     return [result.iterations, cpu, *parts, wall, elapsed]
 
 
-def with_cells(scene: Scene, cells: tuple[int, int], *settings: str) -> Scene:
+def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:
     """Return the scene with so many cells an arm."""
     return changed(scene, f"arms.cells={list(cells)}", *settings)
 
 
 def _whole(plan: Plan) -> Steps:
-    def row(cells: tuple[int, int], ranks: int) -> Rows:
+    def row(cells: Cells, ranks: int) -> Rows:
         count = 4 if plan.quick or cells[0] > 800 else 10
         if not plan.quick and ranks == 2 and cells == DEMO:
             count = ITERATIONS
@@ -141,13 +150,14 @@ def place_error(right: Trajectory, t: np.ndarray, place: np.ndarray) -> float:
     return float(np.linalg.norm(place - true, axis=1).max() / right.max_deviation[0])
 
 
-def solid_motion(scene: Scene, cells: tuple[int, int], *settings: str) -> Trajectory:
+def solid_motion(scene: Scene, cells: Cells, *settings: str) -> Trajectory:
     """Move the scene with solid arms of graded Q3."""
     exact = changed(scene, *settings)
-    return arms.moved_alike(exact, arms.solid_body(exact, arms.FINER.arm(exact, cells)))
+    body = arms.solid_body(exact, arms.FINER.arm(exact, cells))
+    return simulate(exact, [body] * len(exact.arms), Profile())
 
 
-def plain_statics(scene: Scene, cells: tuple[int, int]) -> PlainStatics:
+def plain_statics(scene: Scene, cells: Cells) -> PlainStatics:
     """Return plain DOLFINx's iteration of the scene's first arm."""
     arm, solid = scene.arms[0], scene.material_of(0)
     assert arm.height is not None
@@ -156,27 +166,23 @@ def plain_statics(scene: Scene, cells: tuple[int, int]) -> PlainStatics:
 
 
 def _peers(plan: Plan) -> Steps:
-    right = cache(
-        partial(
-            solid_motion, plan.scene, REFERENCE, "simulation.tolerance=1e-6", "simulation.stages=5"
-        )
-    )
+    right = cache(partial(solid_motion, plan.scene, REFERENCE, *arms.EXACTLY))
 
-    def ours(name: str, cells: tuple[int, int], task: Task) -> Rows:
+    def ours(name: str, cells: Cells, task: Task) -> Rows:
         kind = ["objective.kind=static"] if name == STATIC else []
         scene = with_cells(plan.scene, cells, "optimizer.max_iterations=10", *kind)
         two = name == TWO_RANKS
         found = in_processes(iterate, scene, ranks=2)[0] if two else iterate(MPI.COMM_SELF, scene)
         yield *task, found[1], found[-2], np.nan
 
-    def theirs(name: str, cells: tuple[int, int], task: Task) -> Rows:
+    def theirs(name: str, cells: Cells, task: Task) -> Rows:
         make = plain_statics if name == PLAIN else pymoto_iteration
         if one := make(plan.scene, cells):
             x = np.full(cells[0] * cells[1], plan.scene.design.initial)
             one(x)  # what is compiled, ordered and allocated once a run
             yield *task, *timed(partial(one, x), max(3, plan.repeats))[:2], np.nan
 
-    def moved(cells: tuple[int, int], task: Task) -> Rows:
+    def moved(cells: Cells, task: Task) -> Rows:
         scene = with_cells(plan.scene, cells)
         built, best = arms_of(scene), []
         solid = {k: np.ones(arm.mesh.num_cells) for k, arm in built.items()}
@@ -294,7 +300,7 @@ def _band(K: PETSc.Mat, right: np.ndarray) -> tuple[Action, Action]:
 def _solvers(plan: Plan) -> Steps:
     slow: set[str] = set()
 
-    def rows(cells: tuple[int, int], threads: int) -> Rows:
+    def rows(cells: Cells, threads: int) -> Rows:
         scene = with_cells(plan.scene, cells)
         for name, *parts in in_processes(time_solvers, scene, sorted(slow), threads=threads)[0]:
             if sum(parts) > PATIENCE:

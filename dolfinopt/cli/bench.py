@@ -30,7 +30,7 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    from dolfinopt.bench.diagram import Plan
+    from dolfinopt.bench.measure import Plan
     from dolfinopt.bench.run import QUICKLY, named
     from dolfinopt.bench.run import bench as run
     from dolfinopt.paper.reproduction import load_paper

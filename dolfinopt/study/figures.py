@@ -32,9 +32,19 @@ Looks = Mapping[str, Mapping[str, Any]]
 
 def draw_study(study: tables.Study, folder: Path) -> list[Path]:
     """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
-    styles = common_looks(study.figures)
-    files = [folder / f"{tables.joined(study.name, one.name)}.png" for one in study.figures]
-    return [style.save(draw(one, styles), file) for one, file in zip(study.figures, files)]
+    return draw_all({tables.joined(study.name, one.name): one for one in study.figures}, folder)
+
+
+def draw_all(
+    figures: Mapping[str, tables.Figure], folder: Path, narrow: bool = False
+) -> list[Path]:
+    """Draw figures in common looks as FOLDER/<name>.png, curves in one column if `narrow`."""
+    styles, files = common_looks(figures.values()), []
+    for name, one in figures.items():
+        column = narrow and isinstance(one, LineFigure)
+        drawn = column_figure(one, styles) if column else draw(one, styles)
+        files.append(style.save(drawn, folder / f"{name}.png"))
+    return files
 
 
 def common_looks(figures: Iterable[tables.Figure]) -> Looks:
