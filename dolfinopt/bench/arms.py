@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -14,10 +15,10 @@ from dolfinopt.bench.panel import Diagram, Panel, Rows, Steps
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ElementOperators, IncompatibleElement, LagrangeElement
+from dolfinopt.fem.elements import IncompatibleElement, LagrangeElement
+from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
-from dolfinopt.mesh.compat import cell_coordinates, facets_on, local_cell_counts
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency, shape_integrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 from dolfinopt.scene.load import Scene
@@ -59,8 +60,8 @@ def grid_arm(
         u = (mesh.geometry.x[:, :2] - low) / size
         mesh.geometry.x[:, :2] = low + size * u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
     mesh.topology.create_connectivity(1, 2)
-    count, _ = local_cell_counts(mesh)
-    points = cell_coordinates(mesh, count)[:, :, :2]
+    count, _ = compat.local_cell_counts(mesh)
+    points = compat.cell_coordinates(mesh, count)[:, :, :2]
     return ArmMesh(
         name="arm",
         comm=MPI.COMM_SELF,
@@ -69,8 +70,8 @@ def grid_arm(
         area=np.ptp(points, axis=1).prod(axis=1) * (0.5 if triangles else 1.0),
         passive=np.zeros(count, dtype=bool),
         void=np.zeros(count, dtype=bool),
-        inboard_facets=facets_on(mesh, 0.0, 1e-9 * length),
-        outboard_facets=facets_on(mesh, length, 1e-9 * length),
+        inboard_facets=compat.facets_on(mesh, 0.0, 1e-9 * length),
+        outboard_facets=compat.facets_on(mesh, length, 1e-9 * length),
         outboard_point=np.array([length, 0.0]),
     )
 
@@ -80,7 +81,7 @@ class Element:
     """A finite element: its name, its matrices, its shape, and whether its grid is graded."""
 
     name: str
-    operators: Callable[[ArmMesh, float, float], ElementOperators]
+    operators: Callable[[ArmMesh, float, float], Any]
     nodes: int = 1  # a cell, of a large grid
     triangles: bool = False
     graded: bool = False
@@ -136,7 +137,7 @@ def respond(
         seconds = min(seconds, now)
     flexibility = np.linalg.inv(solid(scene, substructure).constraint_modes().stiffness)
     far = simulate(scene, [body] * len(scene.arms), Profile()).max_deviation[0]
-    return np.array([flexibility[1, 1], first_frequency(body), far]), dofs, seconds, setup
+    return np.array([flexibility[1, 1], body.first_frequency, far]), dofs, seconds, setup
 
 
 def _meshes(plan: Plan) -> Steps:

@@ -11,7 +11,6 @@ import pandas as pd
 
 from dolfinopt.bench import arms, iterations, motion, optimiser, solid
 from dolfinopt.bench.panel import Frame, curves, fastest, fitted_power
-from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.responses.constraints import EXCESS
 
 Figure = tuple[float, str]  # nan where it was not measured, or not well enough; a remark
@@ -80,8 +79,9 @@ def _superiority(coordinates: int, frame: Frame) -> Figure:
         there = fastest(found, ours[motion.ERROR])
         short = [one for one in found.values() if one.iloc[:, 1].min() > ours[motion.ERROR]]
         least = min((points.iloc[-1, 0] for points in short), default=math.inf)
-        bound = there is None or least < there[1]
-        ratios.append((least if bound else there[1]) / ours[motion.SECONDS])
+        best = math.inf if there is None else there[1]
+        bound = there is None or least < best
+        ratios.append(min(best, least) / ours[motion.SECONDS])
         words = " or more: SciPy stopped short of that error" if bound else ""
         shown.append(f"{ours['design']} {ratios[-1]:.0f}{words}")
     worst = min(ratios)
@@ -141,9 +141,11 @@ def _beside_plain(design: str, ranks: int, frame: Frame) -> Figure:
 
 def _power_of_dofs(design: str, ranks: int, frame: Frame) -> Figure:
     """Return the power of the dofs that time grows with beyond the range of factors."""
-    ours, other = (_links(frame, f"{who}, {design}", ranks) for who in (solid.OURS, ITERATIVE))
-    factored = ours["dofs"][ours["solver"] != ITERATIVE].max()
-    rows = _at(pd.concat([ours, other]), solver=ITERATIVE)
+    ours, other = (
+        _links(frame, f"{who}, {design}", ranks) for who in (solid.OURS, solid.ITERATIVE)
+    )
+    factored = ours["dofs"][ours["solver"] != solid.ITERATIVE].max()
+    rows = _at(pd.concat([ours, other]), solver=solid.ITERATIVE)
     rows = rows[~(rows["dofs"] <= factored)]
     return _of(rows, fitted_power(rows[["dofs", "iteration [s]"]]))
 

@@ -14,13 +14,12 @@ from scipy.integrate import solve_ivp
 from dolfinopt.bench.measure import DESIGNS, Arms, Densities, Plan, bodies_of, designs, timed
 from dolfinopt.bench.panel import Diagram, Panel, Rows, Steps
 from dolfinopt.dynamics import generalized_alpha, radau
-from dolfinopt.dynamics.build import build_mechanism
+from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import deviation
-from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import reduced
@@ -57,8 +56,9 @@ class Reference:
 
 def problem_of(scene: Scene, arms: Arms, x_phys: Densities) -> ElasticSystem:
     """Return the elastic rows of a scene's motion with these densities."""
-    mechanism = build_mechanism(scene, bodies_of(scene, arms, x_phys))
-    return ElasticSystem(mechanism, partial(rigid_motion, scene=scene), breakpoints(scene))
+    found = build_system(scene, bodies_of(scene, arms, x_phys))
+    assert isinstance(found, ElasticSystem)
+    return found
 
 
 def find_reference(problem: ElasticSystem, tolerance: float) -> Reference:

@@ -15,6 +15,7 @@ from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, Row, markdown, version, write
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.scene.load import Scene
 
 Tell = Callable[[str], None]
 QUICKLY = ("arms.cells=[100,6]",)  # the scene of a quick bench
@@ -24,6 +25,11 @@ DIAGRAMS = (
     motion.DIAGRAM, iterations.PEERS, iterations.WHOLE, arms.MESHES, arms.REDUCTIONS,
     tolerance.DIAGRAM, iterations.SOLVERS,
 )  # fmt: skip
+
+
+def plan_of(load: Callable[[Sequence[str]], Scene], quick: bool) -> Plan:
+    """Return what is measured on, of what loads the scene with "key.path=value" changed."""
+    return Plan(load(QUICKLY if quick else ()), quick)
 
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:

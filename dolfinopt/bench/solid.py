@@ -18,7 +18,6 @@ from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Frame, Panel, Rows, Steps
 from dolfinopt.bench.programs import PlainStatics
 from dolfinopt.fem import interior
-from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.mesh.budget import free_memory, solid_bytes
 from dolfinopt.profiling import Profile
@@ -36,6 +35,7 @@ COMPARED = (90, 9, 6), (120, 12, 8), (150, 15, 10), (180, 18, 12), (220, 22, 14)
 COLD, WARM = "first design", "nearby design"
 # Who is measured: the solver that is chosen, plain DOLFINx, or one of both solvers.
 OURS, PLAIN, FACTOR = "dolfinopt, q = 6", "plain DOLFINx, one load", "factor"
+ITERATIVE = interior.ITERATIVE
 
 Cells = tuple[int, int, int]
 Found = dict[str, Any]  # "dofs" of all ranks, "solver" and "phases", seconds of `PHASES` by design

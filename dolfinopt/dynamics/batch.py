@@ -38,7 +38,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_motion import Scale
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, proportional, same_geometry
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 
 # Of runs that share a matrix. Coordinates are slow up to an angle of 20: dense blocks of many runs
@@ -450,10 +450,11 @@ def _scale(
     body: ShapeIntegrals, other: ShapeIntegrals, damper: np.ndarray
 ) -> tuple[float, float, float] | None:
     """Return what makes one body the other: of its mass, stiffness, damping; None if nothing."""
-    if not same_geometry(body, other):
+    if not body.is_shaped_like(other):
         return None
-    mass = proportion(*proportional(body, other, "mass"))
-    stiffness = proportion(*proportional(body, other, "stiffness"))
+    mass, stiffness = (
+        proportion(body.scaled_by(kind), other.scaled_by(kind)) for kind in ("mass", "stiffness")
+    )
     damping = proportion([damper], [other.D])
     if mass is None or stiffness is None or damping is None:
         return None

@@ -21,8 +21,6 @@ from dolfinopt.multibody.mechanism import (
     JointHardware,
     Mechanism,
     Springs,
-    pin,
-    slider,
 )
 from dolfinopt.multibody.motion import (
     RigidMotion,
@@ -160,8 +158,8 @@ def closure_of(scene: Scene) -> Closure | None:
         return None
     point = complex(*closure.point)
     if closure.kind == "pin":
-        return pin(point)
-    return slider(point, complex(*closure.direction), closure.force)
+        return Closure.pin(point)
+    return Closure.slider(point, complex(*closure.direction), closure.force)
 
 
 def _drives(scene: Scene) -> Drives:

@@ -14,7 +14,7 @@ from dolfinopt.dynamics.system import Linearisation, State, System, relative_err
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
@@ -295,7 +295,7 @@ def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     """Return the body in other coordinates."""
     # Stiffness, and damping in proportion to it, lose the rounding beside their diagonals: whoever
     # uses them sees that the coordinates are uncoupled by them.
-    changed = in_basis(body, T)
+    changed = body.in_basis(T)
     one = np.eye(len(changed.K))
     if np.abs(changed.K - one).max(initial=0.0) > MODE_ROUNDING:
         return changed

@@ -23,9 +23,9 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import FEW, Closure, Drives, ElasticBodies, repeated
+from dolfinopt.multibody.mechanism import Closure, Drives, ElasticBodies, repeated
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, padded, rigid_part
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
@@ -139,8 +139,7 @@ class MachineInstants:
 
         Those of free coordinates by their law; of prescribed ones, what moves them as they move.
         """
-        if 0 < len(y) < FEW:
-            every = repeated(len(y))
+        if (every := repeated(len(y))) is not None:
             return self[every].forces(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
@@ -157,8 +156,7 @@ class MachineInstants:
 
     def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return r (n, S); N m of joints, N of the cart, of modes as they are scaled, m."""
-        if 0 < len(y) < FEW:
-            every = repeated(len(y))
+        if (every := repeated(len(y))) is not None:
             return self[every].residual(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
@@ -184,8 +182,7 @@ class MachineInstants:
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
     ) -> DenseLinearisation:
         """Return its derivative by the coordinates `keep`, or all."""
-        if 0 < len(y) < FEW:
-            every = repeated(len(y))
+        if (every := repeated(len(y))) is not None:
             return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
         (_, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
@@ -322,7 +319,7 @@ class MachineSystem:
     @cached_property
     def rigid(self) -> ElasticBodies:
         """The mechanism with rigid arms of the same mass and inertia."""
-        return replace(self.mechanism, bodies=tuple(map(rigid_part, self.mechanism.bodies)))
+        return self.mechanism.rigid
 
     def initial_state(self) -> State:
         """Return y, yd (1, S): the equilibrium of the controlled machine at t = 0.
@@ -425,7 +422,7 @@ class MachineSystem:
         of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
-        return [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
+        return [a + b.padded(a) for a, b in zip(total, rigid, strict=True)]
 
     def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:
         """Return the derivative by every body of J through the state y (S,) at t = 0."""

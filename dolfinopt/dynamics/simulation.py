@@ -28,14 +28,13 @@ from dolfinopt.multibody.end_effector import (
 )
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
-from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism, compliance
+from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
     Rates,
     ShapeIntegrals,
     add_integrals,
-    in_basis,
 )
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.profiling import Profile
@@ -162,7 +161,7 @@ class Trajectory:
     @cached_property
     def compliance(self) -> np.ndarray:
         """q' K q of every arm (n, arms), N m."""
-        return compliance(self.mechanism.bodies, self.mechanism.slices, self.q_e)
+        return self.mechanism.compliance(self.q_e)
 
     @cached_property
     def deflections(self) -> np.ndarray:
@@ -713,7 +712,7 @@ def load_gradient(
     y, yd, ydd = at
     wide = probe.system.body_gradient(t, y, yd, ydd, multipliers)
     parts = [
-        in_basis(by, np.eye(by.num_modes)[:, : body.num_modes])
+        by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)
     ]
     return LoadGradient(by_rates, parts)
@@ -756,7 +755,7 @@ class _Probe:
 def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body with one coordinate more for every entry of c, which alone loads it."""
     q, more = body.num_modes, load_counts(body).total
-    wide = in_basis(body, np.eye(q, q + more))
+    wide = body.in_basis(np.eye(q, q + more))
     w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
     k = 1 + q + np.arange(more)  # beside the reference position and the modes
     if len(body.W) == len(SPACE):

@@ -63,10 +63,10 @@ def end_effector_gradient(
         if (k := link.joint.joint.coordinate) is not None:
             by_rigid[:, k] = link.joint.drive((force, dim.moment(lever, force)))
         body, part, own = mechanism.bodies[link.body], mechanism.slices[link.body], link.rows
-        if not body.num_modes:
+        if (turning := link.section.turning) is None:
             continue
         moment = dim.moment(lever - link.section.place, force)
-        pull, e = np.concatenate([force, link.section.turning.pulled(moment)]), q[:, part]
+        pull, e = np.concatenate([force, turning.pulled(moment)]), q[:, part]
         by_q[:, part] = pull.T @ body.outboard[own]
         by = by_bodies[link.body]
         by["outboard"][own] = pull @ e

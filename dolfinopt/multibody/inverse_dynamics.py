@@ -7,7 +7,7 @@ Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 5; Schwertassek & Wallr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from dolfinopt.multibody.end_effector import interface_place
 from dolfinopt.multibody.kinematics import Interface, MovingJoint
 from dolfinopt.multibody.mechanism import GROUND, Closure, ElasticBodies, Mechanism, Site, Tree
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals, rigid_part
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
 NOTHING: Mapping[Site, Load] = {}
 
@@ -256,9 +256,9 @@ def largest_change(
         motion: at n instants.
         closure: of the last interface, or None.
     """
-    rigid = replace(mechanism, bodies=tuple(map(rigid_part, mechanism.bodies)))
     largest = 0.0
-    for body, p in zip(mechanism.bodies, _loads(rigid, motion, closure), strict=True):
+    loads = _loads(mechanism.rigid, motion, closure)
+    for body, p in zip(mechanism.bodies, loads, strict=True):
         largest = max(largest, stiffness_change(body, p))
     return largest
 

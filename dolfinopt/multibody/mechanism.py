@@ -7,7 +7,7 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -28,6 +28,8 @@ from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from dolfinopt.multibody.motion import RigidMotion
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
@@ -159,22 +161,22 @@ class Closure:
         shape = (1, -1) + (1,) * (derivative.ndim - 1)
         return (np.conj(self.normals).reshape(shape) * derivative[:, None]).real
 
+    @classmethod
+    def slider(cls, point: complex, direction: complex, force: float = 0.0) -> Closure:
+        """Return the closure of a slider on the line through `point` along `direction`.
 
-def slider(point: complex, direction: complex, force: float = 0.0) -> Closure:
-    """Return the closure of a slider on the line through `point` along `direction`.
+        Args:
+            point: m.
+            direction: of any length.
+            force: on the slider along the direction, N.
+        """
+        unit = direction / abs(direction)
+        return cls(point, np.array([1j * unit]), force * unit)
 
-    Args:
-        point: m.
-        direction: of any length.
-        force: on the slider along the direction, N.
-    """
-    unit = direction / abs(direction)
-    return Closure(point, np.array([1j * unit]), force * unit)
-
-
-def pin(point: complex) -> Closure:
-    """Return the closure of a pin at `point`, m."""
-    return Closure(point, np.array([1.0, 1j]))
+    @classmethod
+    def pin(cls, point: complex) -> Closure:
+        """Return the closure of a pin at `point`, m."""
+        return cls(point, np.array([1.0, 1j]))
 
 
 # -- values that are the same at all instants, or given at each: several mechanisms in one batch
@@ -188,15 +190,15 @@ def pin(point: complex) -> Closure:
 FEW = 4
 
 
-def repeated(count: int) -> np.ndarray:
-    """Return indices that make `count` instants `FEW`, the last one repeated."""
-    return np.minimum(np.arange(FEW), count - 1)
+def repeated(count: int) -> np.ndarray | None:
+    """Return indices that make few instants `FEW`, the last one repeated; None: not so few."""
+    return np.minimum(np.arange(FEW), count - 1) if 0 < count < FEW else None
 
 
 def several(*arguments: Any) -> tuple[Any, ...]:
     """Return the arguments at `FEW` instants, the last one as often as it takes."""
     every = repeated(len(arguments[-1]))
-    return tuple(x[every] for x in arguments)
+    return arguments if every is None else tuple(x[every] for x in arguments)
 
 
 # -- a tree of bodies, in the plane and in space: what inverse dynamics works on
@@ -472,6 +474,16 @@ class ElasticBodies:
             own = every[:, d:] if turned else every[:, :d]
             yield float(np.linalg.norm(own, axis=1).max(initial=0.0))
 
+    def compliance(self, q: np.ndarray) -> np.ndarray:
+        """Return q_e' K_ee q_e of every body (n, bodies), N m; eq. (7) of the paper; q (n, N)."""
+        pairs = zip(self.bodies, (q[:, part] for part in self.slices), strict=True)
+        return np.stack([np.einsum("nk,nk->n", e @ body.K, e) for body, e in pairs], axis=1)
+
+    @property
+    def rigid(self) -> Self:
+        """The same of bodies of the same mass and inertia that do not deform."""
+        return replace(self, bodies=tuple(body.rigid_part for body in self.bodies))
+
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
         K = np.zeros((self.num_coordinates, self.num_coordinates))
@@ -590,16 +602,3 @@ class Mechanism(ElasticBodies):
     def rotors(self) -> np.ndarray:
         """Mass of the cart and reflected inertia of the joints' rotors (1 + arms,), kg, kg m2."""
         return self.tree.rotors
-
-
-def compliance(
-    bodies: Sequence[ShapeIntegrals], parts: Sequence[slice], q: np.ndarray
-) -> np.ndarray:
-    """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper."""
-    return np.stack(
-        [
-            np.einsum("nk,nk->n", q[:, part] @ body.K, q[:, part])
-            for part, body in zip(parts, bodies, strict=True)
-        ],
-        axis=1,
-    )

@@ -41,8 +41,10 @@ def draw_all(
     """Draw figures in common looks as FOLDER/<name>.png, curves in one column if `narrow`."""
     styles, files = common_looks(figures.values()), []
     for name, one in figures.items():
-        column = narrow and isinstance(one, LineFigure)
-        drawn = column_figure(one, styles) if column else draw(one, styles)
+        if narrow and isinstance(one, LineFigure):
+            drawn = column_figure(one, styles)
+        else:
+            drawn = draw(one, styles)
         files.append(style.save(drawn, folder / f"{name}.png"))
     return files
 

@@ -30,7 +30,7 @@ from dolfinopt.multibody.end_effector import (
     place_gradient,
 )
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism, compliance
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.multibody.spatial.mechanism import exponential
@@ -375,10 +375,10 @@ def test_compliance_is_twice_the_elastic_energy() -> None:
     """Arm by arm, from the block-diagonal stiffness."""
     mechanism = machine_of("3 arms").mechanism
     q = np.random.default_rng(4).normal(size=(4, mechanism.num_coordinates))
-    found = compliance(mechanism.bodies, mechanism.slices, q)
+    found = mechanism.compliance(q)
     assert_close(found.sum(axis=1), np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q), 1e-13)
     alone = np.zeros_like(q)
     alone[:, mechanism.slices[1]] = q[:, mechanism.slices[1]]
-    parts = compliance(mechanism.bodies, mechanism.slices, alone)
+    parts = mechanism.compliance(alone)
     assert not parts[:, [0, 2]].any()
     assert_close(parts[:, 1], found[:, 1], 1e-14)

@@ -139,13 +139,6 @@ def rigid_spatial_body(
     )
 
 
-def inertia_about_centre(body: ShapeIntegrals) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre (3,), m, and inertia tensor (3, 3) about it, kg m2, of the undeformed body."""
-    centre = body.w[:, 0] / body.mass if body.mass else np.zeros(3)
-    second = body.W[:, 0, 0].reshape(3, 3) - body.mass * np.outer(centre, centre)
-    return centre, np.trace(second) * ONE - second
-
-
 def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
     """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = inertia
