@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
-from dolfinopt.multibody.dimension import product
+from dolfinopt.multibody.dimension import Turning, product
 from dolfinopt.multibody.kinematics import MovingJoint
-from dolfinopt.multibody.mechanism import FEW, ElasticBodies, Mechanism, several
+from dolfinopt.multibody.mechanism import FEW, GROUND, ElasticBodies, Mechanism, Site, several
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -25,7 +24,7 @@ def lengths(vectors: np.ndarray) -> np.ndarray:
 
 def end_effector(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the end-effector's position (n, d), m, of the flexible mechanism; q (n, N)."""
-    return _Chain(mechanism, motion, q).end.T
+    return Posed(mechanism, motion.q, q).interface(*mechanism.way[-1])[0].T
 
 
 def deviation(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
@@ -52,32 +51,34 @@ def end_effector_gradient(
         By q (n, N), by the rigid coordinates (n, R), and by every body's outboard modes (b, q) and
         their geometric stiffness (b, q, q), under the names of the shape integrals.
     """
-    chain, forces = _Chain(mechanism, motion, q), weights.T
+    posed, forces = Posed(mechanism, motion.q, q), weights.T
+    end = posed.interface(*mechanism.way[-1])[0]
     by_q, by_rigid = np.zeros_like(q), np.zeros_like(motion.q)
     by_bodies = [{"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies]
     if (cart := mechanism.tree.cart_coordinate) is not None:
         by_rigid[:, cart] = weights[:, 0]
-    for link in chain.links:
-        dim, back = link.joint.dim, link.rotation.swapaxes(0, 1)
-        force, lever = product(back, forces), product(back, chain.end - link.origin)
-        if (k := link.joint.joint.coordinate) is not None:
-            by_rigid[:, k] = link.joint.drive((force, dim.moment(lever, force)))
-        body, part, own = mechanism.bodies[link.body], mechanism.slices[link.body], link.rows
-        if (turning := link.section.turning) is None:
+    for i, number in mechanism.way:
+        joint, origin, R = posed.body(i)
+        section, dim, back = posed.section(i, number), joint.dim, R.swapaxes(0, 1)
+        force, lever = product(back, forces), product(back, end - origin)
+        if (k := joint.joint.coordinate) is not None:
+            by_rigid[:, k] = joint.drive((force, dim.moment(lever, force)))
+        if section.turning is None:
             continue
-        moment = dim.moment(lever - link.section.place, force)
-        pull, e = np.concatenate([force, turning.pulled(moment)]), q[:, part]
+        body, part, by = mechanism.bodies[i], mechanism.slices[i], by_bodies[i]
+        own = slice(dim.b * number, dim.b * (number + 1))
+        moment = dim.moment(lever - section.place, force)
+        pull, e = np.concatenate([force, section.turning.pulled(moment)]), q[:, part]
         by_q[:, part] = pull.T @ body.outboard[own]
-        by = by_bodies[link.body]
         by["outboard"][own] = pull @ e
-        if link.section.bent is not None:
-            by_q[:, part] -= np.einsum("pn,pkn->nk", pull, link.section.bent)
+        if section.bent is not None:
+            by_q[:, part] -= np.einsum("pn,pkn->nk", pull, section.bent)
             by["K0_outboard"] = np.zeros_like(body.K0_outboard)
             by["K0_outboard"][own] = -0.5 * (pull[:, None] * e.T) @ e
     return by_q, by_rigid, by_bodies
 
 
-class _Section:
+class Section:
     """An outboard interface where n sets of coordinates e (q, n) take it, in its body's frame.
 
     Attributes:
@@ -87,7 +88,10 @@ class _Section:
     """
 
     def __init__(self, constants: Constants, number: int, e: np.ndarray) -> None:
-        self.place, self.turning, self.bent = constants.points[number][:, None], None, None
+        """Take the body's constants, which of its interfaces it is, and e."""
+        self.place = constants.points[number][:, None]
+        self.turning: Turning | None = None
+        self.bent: np.ndarray | None = None
         if not constants.num_modes:
             return
         places, d = constants.outboard(number), constants.dim.d
@@ -99,37 +103,48 @@ class _Section:
         self.turning = constants.turning(*(moved[d:],) * 3)  # of its rates none is asked for
 
 
-class _Link(NamedTuple):
-    """A body on the way to the end-effector: its joint, frame and the interface that leads on."""
+class Posed:
+    """A mechanism at n poses, q_r (n, R) and q (n, N): what is asked for of its frames, each once.
 
-    body: int
-    rows: slice  # of the interface, among the body's outboard modes
-    joint: MovingJoint
-    section: _Section
-    origin: np.ndarray  # (d, n)
-    rotation: np.ndarray  # (d, d, n) or (d, d), to the world's frame
+    Rotations, to the ground's frame, are (d, d, n), or (d, d) where they are the same in all poses.
+    """
 
+    def __init__(self, mechanism: ElasticBodies, q_r: np.ndarray, q: np.ndarray) -> None:
+        """Take the poses."""
+        self.tree, self.q_r, self.q = mechanism.tree, q_r, q
+        base = mechanism.base(q_r)
+        self._still = base, base, base  # no motion is asked for
+        self._interfaces: dict[Site, tuple[np.ndarray, np.ndarray]] = {}
+        self._interfaces[GROUND, 0] = base, np.eye(len(base))
+        self._bodies: dict[int, tuple[MovingJoint, np.ndarray, np.ndarray]] = {}
+        self._sections: dict[Site, Section] = {}
 
-class _Chain:
-    """The bodies from the ground to the end-effector and its place (d, n), m."""
+    def body(self, i: int) -> tuple[MovingJoint, np.ndarray, np.ndarray]:
+        """Return the joint of body i, the place (d, n) and the rotation of its frame."""
+        if i not in self._bodies:
+            joint = self.tree.joints[i]
+            place, R = self.interface(joint.parent, joint.interface)
+            k = joint.coordinate
+            moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
+            if moving.is_offset:
+                place = place + product(R, moving.r)
+            self._bodies[i] = moving, place, _turned(R, moving.R)
+        return self._bodies[i]
 
-    def __init__(self, mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> None:
-        tree, self.links = mechanism.tree, []  # type: ignore[var-annotated]
-        place, d = mechanism.base(motion), len(tree.gravity)
-        still, R = (place, place, place), np.eye(d)  # no motion is asked for
-        for i, number in mechanism.way:
-            k, constants = tree.joints[i].coordinate, tree.constants[i]
-            joint = MovingJoint(tree.joints[i], still, None if k is None else motion.q[:, k][None])
-            if joint.is_offset:
-                place = place + product(R, joint.r)
-            R = _turned(R, joint.R)
-            section = _Section(constants, number, q[:, tree.slices[i]].T)
-            rows = slice(constants.dim.b * number, constants.dim.b * (number + 1))
-            self.links.append(_Link(i, rows, joint, section, place, R))
-            place = place + product(R, section.place)
-            if section.turning is not None:
-                R = _turned(R, section.turning.R)
-        self.end = place
+    def section(self, i: int, number: int) -> Section:
+        """Return an outboard interface of body i."""
+        if (i, number) not in self._sections:
+            e = self.q[:, self.tree.slices[i]].T
+            self._sections[i, number] = Section(self.tree.constants[i], number, e)
+        return self._sections[i, number]
+
+    def interface(self, i: int, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return its place (d, n) and its rotation; of `GROUND` where that is."""
+        if (i, number) not in self._interfaces:
+            (_, place, R), section = self.body(i), self.section(i, number)
+            turned = R if section.turning is None else _turned(R, section.turning.R)
+            self._interfaces[i, number] = place + product(R, section.place), turned
+        return self._interfaces[i, number]
 
 
 def _turned(R: np.ndarray, S: np.ndarray) -> np.ndarray:

@@ -411,9 +411,9 @@ class ElasticBodies:
         """From the ground to the end-effector: every body and the interface that leads on."""
         raise NotImplementedError
 
-    def base(self, motion: RigidMotion) -> np.ndarray:
-        """Return where the ground's frame is at n instants (d, n), m."""
-        return np.zeros((len(self.tree.gravity), len(motion.q)))
+    def base(self, q_r: np.ndarray) -> np.ndarray:
+        """Return where the first joints' frame is (d, n), m, for rigid coordinates (n, R)."""
+        return np.zeros((len(self.tree.gravity), len(q_r)))
 
     @property
     def softness(self) -> float:
@@ -540,9 +540,9 @@ class Mechanism(ElasticBodies):
         """All arms."""
         return tuple((k, 0) for k in range(len(self.bodies)))
 
-    def base(self, motion: RigidMotion) -> np.ndarray:
+    def base(self, q_r: np.ndarray) -> np.ndarray:
         """Return where the first joint is (2, n), m."""
-        return np.stack([motion.q[:, 0], np.full(len(motion.q), self.joint_height)])
+        return np.stack([q_r[:, 0], np.full(len(q_r), self.joint_height)])
 
     @property
     def softness(self) -> float:

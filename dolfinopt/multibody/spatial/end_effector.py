@@ -12,17 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.multibody.inverse_dynamics import Link, outward_pass
-from dolfinopt.multibody.kinematics import Interface
-from dolfinopt.multibody.mechanism import GROUND, Site
-from dolfinopt.multibody.motion import RigidMotion, along_curve, curve_of_table, curve_through
+from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
 from dolfinopt.multibody.spatial.mechanism import (
     Pose,
     RigidChain,
     SpatialMechanism,
     end_chain,
     roll_pitch_yaw,
-    times,
 )
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
@@ -73,50 +70,20 @@ def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -
         q_r: (n, joints) rigid coordinates; rad or m.
         q_e: (n, N) elastic coordinates.
     """
-    tree, links = mechanism.tree, _at_rest(mechanism, q_r, q_e)
-    count, bodies = len(q_r), len(mechanism.bodies)
-    origin, outboard, held = np.zeros((3, count, bodies, 3))
-    rotation = np.zeros((count, bodies, 3, 3))
-    place: dict[Site, np.ndarray] = {}  # of interfaces
-    turned: dict[Site, np.ndarray] = {}
-    for i in tree.order:
-        link, joint = links[i], mechanism.joints[i]
-        R = np.broadcast_to(np.eye(3), (count, 3, 3))
-        if joint.parent != GROUND:
-            site = joint.parent, joint.interface
-            held[:, i], R = place[site], turned[site]
-        origin[:, i] = held[:, i] + times(R, _vectors(link.joint.r, count))
-        rotation[:, i] = R @ _matrices(link.joint.R, count)
-        for s in range(len(link.body.constants.points)):
-            interface = Interface(link.body, s)
-            away = _vectors(interface.place, count)
-            place[i, s] = origin[:, i] + times(rotation[:, i], away)
-            turned[i, s] = rotation[:, i]
-            if link.body.is_flexible:
-                turned[i, s] = rotation[:, i] @ _matrices(interface.turning.R, count)
-        outboard[:, i] = place[i, 0]
-    axes = np.stack(
-        [rotation[:, i] @ joint.axis for i, joint in enumerate(mechanism.joints)], axis=1
-    )
-    parents = tuple(joint.parent for joint in mechanism.joints)
-    end = place[mechanism.end, mechanism.end_interface]
-    return Frames(origin, rotation, outboard, parents, axes, held, end)
-
-
-def _vectors(x: np.ndarray, count: int) -> np.ndarray:
-    """Return vectors (n, 3) of (3, n), or of one (3, 1)."""
-    return np.broadcast_to(x.T, (count, 3))
-
-
-def _matrices(R: np.ndarray, count: int) -> np.ndarray:
-    """Return rotations (n, 3, 3) of (3, 3, n), or of one (3, 3)."""
-    return np.broadcast_to(R if R.ndim == 2 else R.transpose(2, 0, 1), (count, 3, 3))
-
-
-def _at_rest(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> list[Link]:
-    """Return all bodies in given poses."""
-    rigid, elastic = np.zeros_like(q_r), np.zeros_like(q_e)
-    return outward_pass(mechanism.tree, RigidMotion(q_r, rigid, rigid), (q_e, elastic, elastic))
+    posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
+    origin, rotation, outboard, axes, held = [], [], [], [], []
+    for i, joint in enumerate(joints):
+        _, place, R = posed.body(i)
+        R = np.broadcast_to(R if R.ndim == 3 else R[..., None], (3, 3, len(q_r)))
+        origin.append(place.T)
+        rotation.append(R.transpose(2, 0, 1))
+        outboard.append(posed.interface(i, 0)[0].T)
+        axes.append(rotation[-1] @ joint.axis)
+        held.append(posed.interface(joint.parent, joint.interface)[0].T)
+    frames = (np.stack(x, axis=1) for x in (origin, rotation, outboard))
+    parents = tuple(joint.parent for joint in joints)
+    end = posed.interface(*mechanism.way[-1])[0].T
+    return Frames(*frames, parents, np.stack(axes, axis=1), np.stack(held, axis=1), end)
 
 
 # -- path of an end-effector in space: its points, orientation, and joints that a table

@@ -170,11 +170,6 @@ def times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v @ A.T if A.ndim == 2 else np.einsum("nij,nj->ni", A, v)
 
 
-def transposed_times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return A' v (n, 3)."""
-    return v @ A if A.ndim == 2 else np.einsum("nji,nj->ni", A, v)
-
-
 def exponential(theta: np.ndarray) -> np.ndarray:
     """Return R (..., 3, 3) of rotation vectors (..., 3)."""
     c = series((theta * theta).sum(axis=-1), 3)
