@@ -169,10 +169,9 @@ MESHES = Diagram(
         for x in ("seconds [s]", "degrees of freedom")
         for what in QUANTITIES
     ),
-    f"Reference: Q3 on {REFERENCE} cells ({QUICK_REFERENCE} in a quick bench), graded towards the "
-    "corners of the clamped end, which are singular and limit every order on uniform grids. "
-    f"Seconds of one design of the solid arm: assembly, factorisation, {COORDINATES} coordinates, "
-    "integrals.",
+    f"Reference: Q3 on {REFERENCE} cells (quick: {QUICK_REFERENCE}), graded towards the corners, "
+    "which are singular and limit every order on uniform grids. Seconds of one design of the solid "
+    f"arm: assembly, factorisation, {COORDINATES} coordinates, integrals.",
 )
 
 
@@ -228,8 +227,7 @@ REDUCTIONS = Diagram(
         Panel("seconds [s]", "error of deviation [-]", "method", each=("design",),
               errors=(1e-2, 1e-3, 1e-4, 1e-6)),
     ),
-    f"Reference: Craig-Bampton with {MOST} coordinates per arm ({QUICK_MOST} in a quick bench). "
-    "Errors of the largest compliance of both arms, and of the deviation, largest in time over "
-    "the largest value. Seconds of both arms from cold: assembly, factorisation, basis, inertia "
-    "integrals.",
+    f"Reference: Craig-Bampton with {MOST} coordinates per arm (quick: {QUICK_MOST}). Errors of "
+    "the largest compliance, and of the deviation, largest in time over the largest value. Seconds "
+    "of both arms from cold: assembly, factorisation, basis, inertia integrals.",
 )  # fmt: skip

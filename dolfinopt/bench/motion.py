@@ -194,11 +194,9 @@ DIAGRAM = Diagram(
         Panel(SECONDS, ERROR, "method", each=("design", "coordinates per arm"),
               errors=(1e-2, 1e-4)),
     ),
-    f"Reference: Radau with {REFERENCE_STAGES} stages to {REFERENCE_TOLERANCE:g} "
-    f"({QUICK_REFERENCE:g} in a quick bench). Errors of the elastic coordinates in the energy "
-    "norm, largest in time over the largest value. Radau from cold, its error estimate and "
-    "refinements included; the others on given steps or tolerances, without an estimate. SciPy "
-    "solves the same residual, with its exact Jacobian, in the arms' own vibrations. Newmark is "
-    f"generalised-alpha with rho_inf = 1. No finer setting where it would take over {PATIENCE:g} "
-    f"s ({QUICK_PATIENCE:g}).",
+    f"Reference: Radau with {REFERENCE_STAGES} stages to {REFERENCE_TOLERANCE:g} (quick: "
+    f"{QUICK_REFERENCE:g}). Errors in the energy norm, largest in time over the largest value. "
+    "Radau from cold, estimate and refinements included; the others on given steps or tolerances. "
+    "SciPy solves the same residual, with its exact Jacobian, in the arms' own vibrations. No "
+    f"finer setting where it would take over {PATIENCE:g} s ({QUICK_PATIENCE:g}).",
 )  # fmt: skip

@@ -151,9 +151,8 @@ DIAGRAM = Diagram(
         Panel("dofs", "memory [GB]", "what", "peak", each=("ranks",), rows=_of(OURS, PLAIN)),
         Panel("dofs", "seconds [s]", "phase", f"phases, {COLD}", each=("ranks",), rows=_phases),
     ),
-    "CPU seconds of the slowest rank; a box beam with a core of nearly void. The first design "
-    f"makes the factor or hierarchy, a nearby one (densities moved by up to {MOVE:g}) starts from "
-    "its fields: filter, K, six interface fields, body, energies. Plain DOLFINx: K, one load by "
-    "conjugate gradients with GAMG to the same tolerance, energies. Factors are made up to a "
-    f"bandwidth of {interior.WIDEST}, where memory allows.",
+    "CPU seconds of the slowest rank; a box beam. The first design makes the factor or hierarchy, "
+    f"a nearby one (densities moved by up to {MOVE:g}) starts from its fields. Plain DOLFINx: K, "
+    "one load by conjugate gradients with GAMG to the same tolerance, energies. Factors are made "
+    f"up to a bandwidth of {interior.WIDEST}, where memory allows.",
 )

@@ -213,8 +213,7 @@ DIAGRAM = Diagram(
         Panel("tolerance [-]", column, "over", "over the cases", rows=partial(_ranges, column))
         for column in ("true error [-]", "true error over estimate [-]")
     ),
-    f"Radau with {STAGES} stages from cold; {CELLS[0]} x {CELLS[1]} cells an arm. Errors of the "
-    f"elastic coordinates in the energy norm at {INSTANTS} instants, largest in time over the "
-    f"largest value, against Radau with {REFERENCE_STAGES} stages on other steps to a hundredth of "
-    f"a case's finest tolerance; {FINEST:g} in every {EVERY}th case.",
+    f"Radau with {STAGES} stages from cold; {CELLS[0]} x {CELLS[1]} cells an arm. Errors in the "
+    f"energy norm, largest in time over the largest value, against {REFERENCE_STAGES} stages on "
+    f"other steps to a hundredth of a case's finest tolerance; {FINEST:g} in every {EVERY}th case.",
 )

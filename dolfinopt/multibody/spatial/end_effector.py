@@ -80,10 +80,15 @@ def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -
         outboard.append(posed.interface(i, 0)[0].T)
         axes.append(rotation[-1] @ joint.axis)
         held.append(posed.interface(joint.parent, joint.interface)[0].T)
-    frames = (np.stack(x, axis=1) for x in (origin, rotation, outboard))
-    parents = tuple(joint.parent for joint in joints)
-    end = posed.interface(*mechanism.way[-1])[0].T
-    return Frames(*frames, parents, np.stack(axes, axis=1), np.stack(held, axis=1), end)
+    return Frames(
+        origin=np.stack(origin, axis=1),
+        rotation=np.stack(rotation, axis=1),
+        outboard=np.stack(outboard, axis=1),
+        parents=tuple(joint.parent for joint in joints),
+        axes=np.stack(axes, axis=1),
+        held=np.stack(held, axis=1),
+        end=posed.interface(*mechanism.way[-1])[0].T,
+    )
 
 
 # -- path of an end-effector in space: its points, orientation, and joints that a table
