@@ -118,9 +118,8 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     for number, what in enumerate(QUANTITIES, 14):
         losses = 100.0 * loss(by["path"], what).to_numpy()
         title = f"Loss of {what.partition(' [')[0]} against the design made for the path [%]"
-        of = SWEEPS["path"][1], labels
-        table = studies.square_table("", title, *of, losses)
-        figures[number] = studies.square_figure("", title, *of, {"": losses}), table
+        table = studies.square_table("", title, SWEEPS["path"][1], labels, losses)
+        figures[number] = studies.square_figure("", title, {"": table}), table
     return dict(sorted(figures.items()))
 
 

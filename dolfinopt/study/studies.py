@@ -34,7 +34,6 @@ from dolfinopt.study.tables import (
     FrameFigure,
     Line,
     LineFigure,
-    MatrixFigure,
     Panel,
     Study,
     Table,
@@ -410,13 +409,14 @@ def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
         values = crossed.pivot(index="made for", columns="point", values=what).to_numpy()
         quantity = what.partition(" [")[0]
         name = joined(prefix, f"cross_{quantity.replace(' ', '_')}")
-        loss = losses[f"loss of {quantity} [%]"] = 100.0 * (values / np.diag(values) - 1.0)
+        loss = 100.0 * (values / np.diag(values) - 1.0)
         title = f"{what[0].upper()}{what[1:]} of design i in scenario j."
         lost = f"Loss of {quantity} against the design made for j [%]."
         tables.append(square_table(name, title, axis, labels, values))
         tables.append(square_table(f"{name}_loss", lost, axis, labels, loss))
+        losses[f"loss of {quantity} [%]"] = tables[-1]
     title = "What a design loses where it was not made for"
-    figures: list[Figure] = [square_figure(joined(prefix, "cross"), title, axis, labels, losses)]
+    figures: list[Figure] = [square_figure(joined(prefix, "cross"), title, losses)]
     if optima := _good(frame.loc[frame["role"] == "optimum", "outcome"]):
         figures.append(design_figure(joined(prefix, "designs"), "Designs by scenario", optima))
     return tables, figures
@@ -431,12 +431,10 @@ def square_table(
     return Table(name, title, wide)
 
 
-def square_figure(
-    name: str, title: str, axis: str, labels: Sequence[str], panels: Mapping[str, np.ndarray]
-) -> MatrixFigure:
-    """Return such values, a panel by its title."""
-    sides = f"made for {axis}", f"used at {axis}"
-    return MatrixFigure(name, title, *sides, tuple(labels), tuple(panels.items()))
+def square_figure(name: str, title: str, panels: Mapping[str, Table]) -> FrameFigure:
+    """Return such tables, a panel by its title."""
+    parts = [table.frame.assign(panel=panel) for panel, table in panels.items()]
+    return FrameFigure(name, title, "matrix", pd.concat(parts, ignore_index=True))
 
 
 def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
