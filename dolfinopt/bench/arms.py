@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.bench.diagram import Diagram, Panel, Plan, Rows, Steps
-from dolfinopt.bench.measure import DESIGNS, bodies_of, designs, tidy, timed
+from dolfinopt.bench.measure import DESIGNS, Cells, Plan, bodies_of, designs, tidy, timed
+from dolfinopt.bench.panel import Diagram, Panel, Rows, Steps
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ElementOperators, IncompatibleElement, LagrangeElement
+from dolfinopt.fem.elements import IncompatibleElement, LagrangeElement
+from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
-from dolfinopt.mesh.compat import cell_coordinates, facets_on, local_cell_counts
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, first_frequency, shape_integrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 from dolfinopt.scene.load import Scene
@@ -43,11 +44,7 @@ ALIKE = "simulation.tolerance=1e-7", "simulation.stages=5"
 
 
 def grid_arm(
-    length: float,
-    height: float,
-    cells: tuple[int, int],
-    triangles: bool = False,
-    graded: bool = False,
+    length: float, height: float, cells: Cells, triangles: bool = False, graded: bool = False
 ) -> ArmMesh:
     """Mesh a rectangular arm by DOLFINx's own grid, on this rank alone.
 
@@ -63,8 +60,8 @@ def grid_arm(
         u = (mesh.geometry.x[:, :2] - low) / size
         mesh.geometry.x[:, :2] = low + size * u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
     mesh.topology.create_connectivity(1, 2)
-    count, _ = local_cell_counts(mesh)
-    points = cell_coordinates(mesh, count)[:, :, :2]
+    count, _ = compat.local_cell_counts(mesh)
+    points = compat.cell_coordinates(mesh, count)[:, :, :2]
     return ArmMesh(
         name="arm",
         comm=MPI.COMM_SELF,
@@ -73,8 +70,8 @@ def grid_arm(
         area=np.ptp(points, axis=1).prod(axis=1) * (0.5 if triangles else 1.0),
         passive=np.zeros(count, dtype=bool),
         void=np.zeros(count, dtype=bool),
-        inboard_facets=facets_on(mesh, 0.0, 1e-9 * length),
-        outboard_facets=facets_on(mesh, length, 1e-9 * length),
+        inboard_facets=compat.facets_on(mesh, 0.0, 1e-9 * length),
+        outboard_facets=compat.facets_on(mesh, length, 1e-9 * length),
         outboard_point=np.array([length, 0.0]),
     )
 
@@ -84,12 +81,12 @@ class Element:
     """A finite element: its name, its matrices, its shape, and whether its grid is graded."""
 
     name: str
-    operators: Callable[[ArmMesh, float, float], ElementOperators]
+    operators: Callable[[ArmMesh, float, float], Any]
     nodes: int = 1  # a cell, of a large grid
     triangles: bool = False
     graded: bool = False
 
-    def arm(self, scene: Scene, cells: tuple[int, int]) -> Substructure:
+    def arm(self, scene: Scene, cells: Cells) -> Substructure:
         """Mesh the scene's first arm, see `grid_arm`, and lay down its matrices."""
         arm = scene.arms[0]
         assert arm.height is not None
@@ -121,13 +118,8 @@ def solid_body(scene: Scene, substructure: Substructure) -> ShapeIntegrals:
     return shape_integrals(elastic, basis, scene.damping.stiffness_proportional)
 
 
-def moved_alike(scene: Scene, body: ShapeIntegrals) -> Trajectory:
-    """Move the scene's mechanism with all arms like this one."""
-    return simulate(scene, [body] * len(scene.arms), Profile())
-
-
 def respond(
-    scene: Scene, element: Element, cells: tuple[int, int], repeats: int = 1
+    scene: Scene, element: Element, cells: Cells, repeats: int = 1
 ) -> tuple[np.ndarray, int, float, float]:
     """Discretise the scene's first arm, solid, reduce it, and move a mechanism of such arms.
 
@@ -144,8 +136,8 @@ def respond(
         now, _, body = timed(partial(solid_body, scene, substructure))
         seconds = min(seconds, now)
     flexibility = np.linalg.inv(solid(scene, substructure).constraint_modes().stiffness)
-    far = moved_alike(scene, body).max_deviation[0]
-    return np.array([flexibility[1, 1], first_frequency(body), far]), dofs, seconds, setup
+    far = simulate(scene, [body] * len(scene.arms), Profile()).max_deviation[0]
+    return np.array([flexibility[1, 1], body.first_frequency, far]), dofs, seconds, setup
 
 
 def _meshes(plan: Plan) -> Steps:
@@ -153,7 +145,7 @@ def _meshes(plan: Plan) -> Steps:
     best = QUICK_REFERENCE if plan.quick else REFERENCE
     right = cache(partial(respond, scene, FINER, best))
 
-    def row(element: Element, cells: tuple[int, int]) -> Rows:
+    def row(element: Element, cells: Cells) -> Rows:
         tidy()
         found, *sizes = respond(scene, element, cells, plan.repeats)
         errors = np.abs(found / right()[0] - 1.0)
@@ -177,10 +169,9 @@ MESHES = Diagram(
         for x in ("seconds [s]", "degrees of freedom")
         for what in QUANTITIES
     ),
-    f"Reference: Q3 on {REFERENCE} cells ({QUICK_REFERENCE} in a quick bench), graded towards the "
-    "corners of the clamped end, which are singular and limit every order on uniform grids. "
-    f"Seconds of one design of the solid arm: assembly, factorisation, {COORDINATES} coordinates, "
-    "integrals.",
+    f"Reference: Q3 on {REFERENCE} cells (quick: {QUICK_REFERENCE}), graded towards the corners, "
+    "which are singular and limit every order on uniform grids. Seconds of one design of the solid "
+    f"arm: assembly, factorisation, {COORDINATES} coordinates, integrals.",
 )
 
 
@@ -236,8 +227,7 @@ REDUCTIONS = Diagram(
         Panel("seconds [s]", "error of deviation [-]", "method", each=("design",),
               errors=(1e-2, 1e-3, 1e-4, 1e-6)),
     ),
-    f"Reference: Craig-Bampton with {MOST} coordinates per arm ({QUICK_MOST} in a quick bench). "
-    "Errors of the largest compliance of both arms, and of the deviation, largest in time over "
-    "the largest value. Seconds of both arms from cold: assembly, factorisation, basis, inertia "
-    "integrals.",
+    f"Reference: Craig-Bampton with {MOST} coordinates per arm (quick: {QUICK_MOST}). Errors of "
+    "the largest compliance, and of the deviation, largest in time over the largest value. Seconds "
+    "of both arms from cold: assembly, factorisation, basis, inertia integrals.",
 )  # fmt: skip

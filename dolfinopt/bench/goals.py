@@ -5,19 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from dolfinopt.bench import arms, iterations, motion, optimiser, solid
-from dolfinopt.bench.diagram import Frame, curves, fastest, fitted_power
-from dolfinopt.fem.interior import ITERATIVE
+from dolfinopt.bench.panel import Frame, curves, fastest, fitted_power
 from dolfinopt.responses.constraints import EXCESS
 
 Figure = tuple[float, str]  # nan where it was not measured, or not well enough; a remark
-SECONDS, ERROR = "seconds [s]", "error of elastic coordinates [-]"
-OURS = solid.OURS
 FASTER = 50.0  # than SciPy
 LARGE = 4e4  # elements per arm up to which the exponent is fitted
 SETTLED, DEMO = (math.prod(cells) for cells in (iterations.SETTLED, iterations.DEMO))
@@ -36,10 +32,10 @@ class Goal(NamedTuple):
     def cells(self, frame: Frame) -> tuple[str, str, str, str]:
         """Return goal, limit, measured, met."""
         value, said = self.measure(frame)
-        limit = f"at {'least' if self.least else 'most'} {self.limit:g}"
         met = value >= self.limit if self.least else value <= self.limit
         verdict = "" if math.isnan(value) else "yes" if met else "no"
         figure = f"{value:.3g}" if verdict else "not measured"
+        limit = f"at {'least' if self.least else 'most'} {self.limit:g}"
         return self.what, limit, f"{figure} ({said})" if said else figure, verdict
 
 
@@ -56,36 +52,41 @@ def _at(frame: Frame, **values: object) -> Frame:
     return frame
 
 
-# -- the motion ------------------------------------------------------------------------------
+def _ratio(one: float, other: float, unit: str) -> Figure:
+    found = one / other
+    return found, "" if math.isnan(found) else f"{one:.3g} {unit} over {other:.3g} {unit}"
+
+
+# -- plane arms ------------------------------------------------------------------------------
 
 
 def _simulation(coordinates: int, frame: Frame) -> Figure:
     """Return the seconds of a simulation as scenes have it by default, of the slower design."""
     usual = _at(frame, **motion.USUAL, coordinates_per_arm=coordinates)
-    cells = usual[["design", SECONDS, ERROR]].itertuples(index=False)
-    return usual[SECONDS].max(), "; ".join(f"{name} {s:.3g}, error {e:.1e}" for name, s, e in cells)
+    cells = usual[["design", motion.SECONDS, motion.ERROR]].itertuples(index=False)
+    said = "; ".join(f"{name} {seconds:.3g}, error {e:.1e}" for name, seconds, e in cells)
+    return usual[motion.SECONDS].max(), said
 
 
 def _superiority(coordinates: int, frame: Frame) -> Figure:
     """Return how many times as long SciPy takes to our error, of the less superior design."""
     # A method that did not get there takes longer than its finest setting did: a bound. One that is
     # too low tells nothing.
-    here, ratios, bounds, shown = _at(frame, coordinates_per_arm=coordinates), [], 0, []
-    for design, seconds, error in _at(here, **motion.USUAL)[["design", SECONDS, ERROR]].values:
-        theirs = here[here["method"].str.startswith("SciPy") & (here["design"] == design)]
-        found = curves(theirs, SECONDS, ERROR, "method")
-        there = fastest(found, error)
-        best, bound = (there[1], False) if there else (math.nan, True)
-        for points in found.values():
-            last = points[SECONDS].iloc[-1]
-            if points[ERROR].min() > error and not last >= best:
-                best, bound = last, True
-        ratios.append(best / seconds)
-        bounds += bound
+    here, ratios, shown = _at(frame, coordinates_per_arm=coordinates), [math.inf], []
+    for _, ours in _at(here, **motion.USUAL).iterrows():
+        theirs = here[here["method"].str.startswith("SciPy") & (here["design"] == ours["design"])]
+        found = curves(theirs, motion.SECONDS, motion.ERROR, "method")
+        there = fastest(found, ours[motion.ERROR])
+        short = [one for one in found.values() if one.iloc[:, 1].min() > ours[motion.ERROR]]
+        least = min((points.iloc[-1, 0] for points in short), default=math.inf)
+        best = math.inf if there is None else there[1]
+        bound = there is None or least < best
+        ratios.append(min(best, least) / ours[motion.SECONDS])
         words = " or more: SciPy stopped short of that error" if bound else ""
-        shown.append(f"{design} {ratios[-1]:.0f}{words}")
-    least = np.min(ratios) if ratios else math.nan
-    return math.nan if bounds and least < FASTER else least, "; ".join(shown)
+        shown.append(f"{ours['design']} {ratios[-1]:.0f}{words}")
+    worst = min(ratios)
+    untold = math.isinf(worst) or (worst < FASTER and "or more" in " ".join(shown))
+    return math.nan if untold else worst, "; ".join(shown)
 
 
 def _worst_error(frame: Frame) -> Figure:
@@ -96,15 +97,11 @@ def _worst_error(frame: Frame) -> Figure:
     return known.max(), said
 
 
-# -- iterations ------------------------------------------------------------------------------
-
-
 def _over_plain(program: str, column: str, frame: Frame) -> Figure:
     """Return the seconds of a program's iteration over those of plain DOLFINx's."""
     here = _at(frame, task=iterations.ITERATION, elements_per_arm=SETTLED)
     ours, plain = (_at(here, program=name)[column].min() for name in (program, iterations.PLAIN))
-    ratio = ours / plain
-    return ratio, "" if math.isnan(ratio) else f"{ours:.3g} s over {plain:.3g} s"
+    return _ratio(ours, plain, "s")
 
 
 def _power_of_elements(frame: Frame) -> Figure:
@@ -115,16 +112,9 @@ def _power_of_elements(frame: Frame) -> Figure:
     return fitted_power(here), reach if len(here) else ""
 
 
-def _demo(frame: Frame) -> Figure:
-    """Return the seconds of a whole optimisation."""
-    done = _at(frame, ranks=2, elements_per_arm=DEMO, iterations=iterations.ITERATIONS)
-    return done["all iterations, wall clock [s]"].min(), ""
-
-
-def _coarse_error(frame: Frame) -> Figure:
-    """Return the default element's error on the coarsest cells, %."""
-    here = _at(frame, element=arms.DEFAULT, cells="{} x {}".format(*arms.CELLS[0]))
-    return 100.0 * here["error of tip compliance [-]"].min(), ""
+def _least(column: str, scale: float, where: dict[str, Any], frame: Frame) -> Figure:
+    """Return the least value of a column in the rows with these values, times `scale`."""
+    return scale * _at(frame, **where)[column].min(), ""
 
 
 # -- solid links -----------------------------------------------------------------------------
@@ -143,7 +133,7 @@ def _of(rows: Frame, value: float) -> Figure:
 
 def _beside_plain(design: str, ranks: int, frame: Frame) -> Figure:
     """Return the largest ratio of an iteration to plain DOLFINx's of all sizes."""
-    ours, plain = (_links(frame, what, ranks) for what in (f"{OURS}, {design}", solid.PLAIN))
+    ours, plain = (_links(frame, w, ranks) for w in (f"{solid.OURS}, {design}", solid.PLAIN))
     if len(ours) != len(plain):  # some failed
         return math.nan, ""
     return _of(ours, (ours["iteration [s]"] / plain["iteration [s]"].to_numpy()).max())
@@ -151,15 +141,17 @@ def _beside_plain(design: str, ranks: int, frame: Frame) -> Figure:
 
 def _power_of_dofs(design: str, ranks: int, frame: Frame) -> Figure:
     """Return the power of the dofs that time grows with beyond the range of factors."""
-    ours, iterative = (_links(frame, f"{who}, {design}", ranks) for who in (OURS, ITERATIVE))
-    factored = ours["dofs"][ours["solver"] != ITERATIVE].max()
-    rows = pd.concat([ours, iterative])
-    rows = rows[(rows["solver"] == ITERATIVE) & ~(rows["dofs"] <= factored)]
+    ours, other = (
+        _links(frame, f"{who}, {design}", ranks) for who in (solid.OURS, solid.ITERATIVE)
+    )
+    factored = ours["dofs"][ours["solver"] != solid.ITERATIVE].max()
+    rows = _at(pd.concat([ours, other]), solver=solid.ITERATIVE)
+    rows = rows[~(rows["dofs"] <= factored)]
     return _of(rows, fitted_power(rows[["dofs", "iteration [s]"]]))
 
 
 def _memory(frame: Frame) -> Figure:
-    rows = _links(frame, f"{OURS}, {solid.COLD}", 2, MILLION)
+    rows = _links(frame, f"{solid.OURS}, {solid.COLD}", 2, MILLION)
     return _of(rows, rows["memory [GB]"].max())
 
 
@@ -179,9 +171,7 @@ def _over_straight(frame: Frame) -> Figure:
     """Return the rod's least mass over that of the straight one."""
     kept = frame[(frame["problem"] == optimiser.ROD) & (frame["largest excess [-]"] <= EXCESS)]
     drawn = kept["start"] == optimiser.BY_HAND
-    ours, straight = (kept[chosen]["objective"].min() for chosen in (~drawn, drawn))
-    said = "" if math.isnan(ours / straight) else f"{ours:.3g} over {straight:.3g} kg"
-    return ours / straight, said
+    return _ratio(kept[~drawn]["objective"].min(), kept[drawn]["objective"].min(), "kg")
 
 
 def _evaluations(frame: Frame) -> Figure:
@@ -199,43 +189,36 @@ def _infeasible(frame: Frame) -> Figure:
 # -- the table -------------------------------------------------------------------------------
 
 GOALS = (
-    Goal("time", "simulation to 1e-4 from cold, 4 coordinates per arm [s]", 0.03,
-         partial(_simulation, 4)),
-    Goal("time", "simulation to 1e-4 from cold, 48 coordinates per arm [s]", 0.3,
-         partial(_simulation, 48)),
-    Goal("time", "times as fast as solve_ivp at the same error, 4 coordinates per arm [-]", FASTER,
-         partial(_superiority, 4), least=True),
-    Goal("time", "times as fast as solve_ivp at the same error, 48 coordinates per arm [-]", FASTER,
-         partial(_superiority, 48), least=True),
+    *(Goal("time", f"simulation to 1e-4 from cold, {q} coordinates per arm [s]", limit,
+           partial(_simulation, q)) for q, limit in ((4, 0.03), (48, 0.3))),
+    *(Goal("time", f"times as fast as solve_ivp at the same error, {q} coordinates per arm [-]",
+           FASTER, partial(_superiority, q), least=True) for q in (4, 48)),
     Goal("peers", "dynamic iteration of two arms of 400 x 24 cells over plain DOLFINx's static one "
-         "of one arm [-]", 1.6, partial(_over_plain, iterations.DYNAMIC, SECONDS)),
+         "of one arm [-]", 1.6, partial(_over_plain, iterations.DYNAMIC, "seconds [s]")),
     Goal("peers", "the same on two ranks, wall clock [-]", 1.1,
          partial(_over_plain, iterations.TWO_RANKS, "wall clock [s]")),
     Goal("whole", "exponent of an iteration's time, elements up to 40000 per arm, 1 rank [-]", 1.3,
          _power_of_elements),
     Goal("whole", "400 iterations of demos/two_arm.toml on two ranks, set-up included, wall clock "
-         "[s]", 20.0, _demo),
+         "[s]", 20.0, partial(_least, "all iterations, wall clock [s]", 1.0, dict(
+             ranks=2, elements_per_arm=DEMO, iterations=iterations.ITERATIONS))),
     Goal("mesh", "error of tip compliance, 50 x 3 cells of the default element [%]", 0.5,
-         _coarse_error),
+         partial(_least, "error of tip compliance [-]", 100.0, dict(
+             element=arms.DEFAULT, cells="{} x {}".format(*arms.CELLS[0])))),
     Goal("tolerance", "largest true error over simulation.tolerance [-]", 1.0, _worst_error),
     Goal("optimiser", "objective from a start over the best of its problem, the largest [-]", 1.05,
          _over_the_best),
     Goal("optimiser", "mass of the rod over the best straight one [-]", 1.0, _over_straight),
     Goal("optimiser", "evaluations for an iteration, mean [-]", 1.3, _evaluations),
     Goal("optimiser", "runs that end without a feasible design", 0.0, _infeasible),
-    *(
-        goal
-        for ranks, on in ((1, "1 rank"), (2, "2 ranks"))
-        for goal in (
-            Goal("solid", f"iteration beside plain DOLFINx, the largest of all links, {on} [-]",
-                 3.0, partial(_beside_plain, solid.COLD, ranks)),
-            Goal("solid", f"with warm starts beside it, the largest of all links, {on} [-]",
-                 1.5, partial(_beside_plain, solid.WARM, ranks)),
-            Goal("solid", f"exponent of a first design beyond the range of factors, {on} [-]",
-                 1.15, partial(_power_of_dofs, solid.COLD, ranks)),
-            Goal("solid", f"exponent of a nearby design beyond the range of factors, {on} [-]",
-                 1.15, partial(_power_of_dofs, solid.WARM, ranks)),
-        )
-    ),
+    *(Goal("solid", f"{what}, {ranks} rank{'s' * (ranks > 1)} [-]", limit,
+           partial(measure, design, ranks))
+      for ranks in (1, 2) for what, limit, measure, design in (
+       ("iteration beside plain DOLFINx, the largest of all links", 3.0, _beside_plain, solid.COLD),
+       ("with warm starts beside it, the largest of all links", 1.5, _beside_plain, solid.WARM),
+       ("exponent of a first design beyond the range of factors", 1.15, _power_of_dofs, solid.COLD),
+       ("exponent of a nearby design beyond the range of factors", 1.15, _power_of_dofs,
+        solid.WARM),
+    )),
     Goal("solid", "memory of a million dofs on two ranks [GB]", 20.0, _memory),
 )  # fmt: skip

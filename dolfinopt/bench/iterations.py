@@ -13,8 +13,17 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.bench import arms
-from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, Rows, Steps
-from dolfinopt.bench.measure import arms_of, bodies_of, in_processes, mpirun, tidy, timed
+from dolfinopt.bench.measure import (
+    Cells,
+    Plan,
+    arms_of,
+    bodies_of,
+    in_processes,
+    mpirun,
+    tidy,
+    timed,
+)
+from dolfinopt.bench.panel import Diagram, Frame, Panel, Rows, Steps
 from dolfinopt.bench.programs import PlainStatics, exudyn_tip, pymoto_iteration
 from dolfinopt.dynamics.simulation import Trajectory, simulate
 from dolfinopt.errors import ConvergenceError
@@ -87,13 +96,13 @@ def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
     return [result.iterations, cpu, *parts, wall, elapsed]
 
 
-def with_cells(scene: Scene, cells: tuple[int, int], *settings: str) -> Scene:
+def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:
     """Return the scene with so many cells an arm."""
     return changed(scene, f"arms.cells={list(cells)}", *settings)
 
 
 def _whole(plan: Plan) -> Steps:
-    def row(cells: tuple[int, int], ranks: int) -> Rows:
+    def row(cells: Cells, ranks: int) -> Rows:
         count = 4 if plan.quick or cells[0] > 800 else 10
         if not plan.quick and ranks == 2 and cells == DEMO:
             count = ITERATIONS
@@ -141,13 +150,14 @@ def place_error(right: Trajectory, t: np.ndarray, place: np.ndarray) -> float:
     return float(np.linalg.norm(place - true, axis=1).max() / right.max_deviation[0])
 
 
-def solid_motion(scene: Scene, cells: tuple[int, int], *settings: str) -> Trajectory:
+def solid_motion(scene: Scene, cells: Cells, *settings: str) -> Trajectory:
     """Move the scene with solid arms of graded Q3."""
     exact = changed(scene, *settings)
-    return arms.moved_alike(exact, arms.solid_body(exact, arms.FINER.arm(exact, cells)))
+    body = arms.solid_body(exact, arms.FINER.arm(exact, cells))
+    return simulate(exact, [body] * len(exact.arms), Profile())
 
 
-def plain_statics(scene: Scene, cells: tuple[int, int]) -> PlainStatics:
+def plain_statics(scene: Scene, cells: Cells) -> PlainStatics:
     """Return plain DOLFINx's iteration of the scene's first arm."""
     arm, solid = scene.arms[0], scene.material_of(0)
     assert arm.height is not None
@@ -156,27 +166,23 @@ def plain_statics(scene: Scene, cells: tuple[int, int]) -> PlainStatics:
 
 
 def _peers(plan: Plan) -> Steps:
-    right = cache(
-        partial(
-            solid_motion, plan.scene, REFERENCE, "simulation.tolerance=1e-6", "simulation.stages=5"
-        )
-    )
+    right = cache(partial(solid_motion, plan.scene, REFERENCE, *arms.EXACTLY))
 
-    def ours(name: str, cells: tuple[int, int], task: Task) -> Rows:
+    def ours(name: str, cells: Cells, task: Task) -> Rows:
         kind = ["objective.kind=static"] if name == STATIC else []
         scene = with_cells(plan.scene, cells, "optimizer.max_iterations=10", *kind)
         two = name == TWO_RANKS
         found = in_processes(iterate, scene, ranks=2)[0] if two else iterate(MPI.COMM_SELF, scene)
         yield *task, found[1], found[-2], np.nan
 
-    def theirs(name: str, cells: tuple[int, int], task: Task) -> Rows:
+    def theirs(name: str, cells: Cells, task: Task) -> Rows:
         make = plain_statics if name == PLAIN else pymoto_iteration
         if one := make(plan.scene, cells):
             x = np.full(cells[0] * cells[1], plan.scene.design.initial)
             one(x)  # what is compiled, ordered and allocated once a run
             yield *task, *timed(partial(one, x), max(3, plan.repeats))[:2], np.nan
 
-    def moved(cells: tuple[int, int], task: Task) -> Rows:
+    def moved(cells: Cells, task: Task) -> Rows:
         scene = with_cells(plan.scene, cells)
         built, best = arms_of(scene), []
         solid = {k: np.ones(arm.mesh.num_cells) for k, arm in built.items()}
@@ -225,11 +231,10 @@ PEERS = Diagram(
         Panel("seconds [s]", "error of deviation [-]", "program", "the motion of solid arms",
               rows=lambda frame: frame[frame["task"] == MOTION]),
     ),
-    "Static iterations: K assembled anew, factorised (plain DOLFINx: MUMPS Cholesky; pyMOTO: the "
-    "solver it chooses), one load, the compliance's gradient; the least of the repeats. Dynamic: "
-    "the median of whole iterations; on two ranks CPU seconds of the first one. Motion: two "
-    "solid arms; errors of the end-effector's place over the largest deviation, against graded "
-    "Q3 to 1e-6. Beams are another model of the arms, which ends the fall of their error.",
+    "Static iterations: K assembled and factorised anew (plain DOLFINx: MUMPS Cholesky), one load, "
+    "the gradient; the least of the repeats. Dynamic: the median of whole iterations; on two ranks "
+    "of the first one. Motion: errors of the end-effector's place over the largest deviation, "
+    "against graded Q3 to 1e-6. Beams are another model, which ends the fall of their error.",
     uses=("pymoto", "exudyn"),
 )  # fmt: skip
 
@@ -244,7 +249,7 @@ def time_solvers(comm: MPI.Comm, scene: Scene, left_out: list[str]) -> list[list
     size = K.getSize()[0]
     right = np.random.default_rng(0).normal(size=size)
     for solver, order in CHOICES:
-        name, best = f"{solver}, {order}", np.full(2, np.inf)
+        name, repeats = f"{solver}, {order}", 3 if size < MOST_BAND else 1
         if name in left_out or (solver == "lapack" and size > MOST_BAND):
             continue
         try:
@@ -252,16 +257,15 @@ def time_solvers(comm: MPI.Comm, scene: Scene, left_out: list[str]) -> list[list
             factorise, solve = make(K, right)
         except PETSc.Error:  # PETSc was built without it
             continue
-        for _ in range(3 if size < MOST_BAND else 1):
-            begun = perf_counter()
-            factorise()
-            ready = perf_counter()
-            for _ in range(SOLVES):
-                solve()
-            best = np.minimum(best, [ready - begun, perf_counter() - ready])
-        rows.append([name, *best.tolist()])
+        every = timed(factorise, repeats)[1], timed(partial(_all_solves, solve), repeats)[1]
+        rows.append([name, *every])
         tidy()
     return rows
+
+
+def _all_solves(solve: Action) -> None:
+    for _ in range(SOLVES):
+        solve()
 
 
 def _sparse(solver: str, order: str, K: PETSc.Mat, right: np.ndarray) -> tuple[Action, Action]:
@@ -294,7 +298,7 @@ def _band(K: PETSc.Mat, right: np.ndarray) -> tuple[Action, Action]:
 def _solvers(plan: Plan) -> Steps:
     slow: set[str] = set()
 
-    def rows(cells: tuple[int, int], threads: int) -> Rows:
+    def rows(cells: Cells, threads: int) -> Rows:
         scene = with_cells(plan.scene, cells)
         for name, *parts in in_processes(time_solvers, scene, sorted(slow), threads=threads)[0]:
             if sum(parts) > PATIENCE:

@@ -2,7 +2,7 @@
 
 These have several ranks or threads and a memory of their own:
 `python -m dolfinopt.bench.measure MODULE FUNCTION FILE`, also under mpirun, calls a function of
-`dolfinopt.bench.MODULE` with all ranks, the scene and the arguments in FILE; prints one line of
+MODULE with all ranks, the scene and the arguments in FILE; prints one line of
 JSON: what the root's returned, and the peak memory of all ranks, MB.
 """
 
@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -29,7 +30,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.arms.arm import Arm, build_arms, chain_of, uniform_design
-from dolfinopt.bench.diagram import Plan
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.run import optimize
@@ -40,6 +40,7 @@ from dolfinopt.study.variants import changed
 
 Arms: TypeAlias = dict[int, Arm]
 Densities: TypeAlias = dict[int, np.ndarray]
+Cells: TypeAlias = tuple[int, int]  # of an arm
 DESIGNS = INITIAL, OPTIMISED = "initial design", "optimised design"
 # As dolfinopt.sh has it: containers run as root; more ranks than cores are fine; ranks are not
 # bound to the cores of another run. Open MPI 4 (OMPI), then 5 (PRTE).
@@ -51,6 +52,19 @@ ENVIRONMENT = {
     "OMPI_MCA_hwloc_base_binding_policy": "none",
     "PRTE_MCA_hwloc_default_binding_policy": "none",
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is measured on: a scene; a quick plan has coarse settings and a single repeat."""
+
+    scene: Scene
+    quick: bool
+
+    @property
+    def repeats(self) -> int:
+        """How often a short computation is timed; the fastest counts."""
+        return 1 if self.quick else 5
 
 
 def tidy() -> None:
@@ -116,13 +130,11 @@ def in_processes(
     Raises:
         ConvergenceError: the processes failed.
     """
-    name = function.__module__.rpartition(".")[2], function.__name__
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "given.json"
         path.write_text(json.dumps([scene.to_dict(), *given]), encoding="utf-8")
-        command = [sys.executable, "-m", __name__, *name, str(path)]
-        if ranks > 1:
-            command = [str(mpirun()), "-n", str(ranks), *command]
+        command = [sys.executable, "-m", __name__, function.__module__, function.__name__]
+        command = [str(mpirun()), "-n", str(ranks)] * (ranks > 1) + [*command, str(path)]
         # os.environ is as Python found it: without what MPI added for this process alone.
         environment = {**ENVIRONMENT, **os.environ, "OMP_NUM_THREADS": str(threads)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -137,15 +149,13 @@ def _peak() -> float:
     status = Path("/proc/self/status")
     if not status.exists():
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    lines = dict(line.split(":", 1) for line in status.read_text().splitlines() if ":" in line)
-    return float(lines["VmHWM"].split()[0]) / 1024.0
+    return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 1024.0
 
 
 def _main(module: str, name: str, file: str) -> None:
     comm = MPI.COMM_WORLD
     scene, *given = json.loads(Path(file).read_text(encoding="utf-8"))
-    function = getattr(import_module(f"dolfinopt.bench.{module}"), name)
-    found = function(comm, scene_from_dict(scene), *given)
+    found = getattr(import_module(module), name)(comm, scene_from_dict(scene), *given)
     memory = comm.allreduce(_peak())
     if comm.rank == 0:
         print(json.dumps([found, memory]), flush=True)

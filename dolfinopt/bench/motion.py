@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from dolfinopt.bench.diagram import Diagram, Panel, Plan, Rows, Steps
-from dolfinopt.bench.measure import DESIGNS, Arms, Densities, bodies_of, designs, timed
+from dolfinopt.bench.measure import DESIGNS, Arms, Densities, Plan, bodies_of, designs, timed
+from dolfinopt.bench.panel import Diagram, Panel, Rows, Steps
 from dolfinopt.dynamics import generalized_alpha, radau
-from dolfinopt.dynamics.build import build_mechanism
+from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import deviation
-from dolfinopt.multibody.motion import breakpoints, rigid_motion
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import reduced
@@ -32,6 +32,7 @@ TOLERANCES = 1e-2, 1e-3, 1e-4, 1e-5, 1e-6  # the points of a curve
 QUICK_PATIENCE, PATIENCE = 1.0, 20.0
 SHORT = 0.3  # s; what takes less is timed several times
 FEW, MANY, QUICK_MANY = 4, 48, 12  # coordinates per arm
+SECONDS, ERROR = "seconds [s]", "error of elastic coordinates [-]"
 # A simulation as scenes have it by default.
 USUAL = {"method": "Radau, 4 stages", "setting": "tolerance 0.0001"}
 
@@ -55,8 +56,9 @@ class Reference:
 
 def problem_of(scene: Scene, arms: Arms, x_phys: Densities) -> ElasticSystem:
     """Return the elastic rows of a scene's motion with these densities."""
-    mechanism = build_mechanism(scene, bodies_of(scene, arms, x_phys))
-    return ElasticSystem(mechanism, partial(rigid_motion, scene=scene), breakpoints(scene))
+    found = build_system(scene, bodies_of(scene, arms, x_phys))
+    assert isinstance(found, ElasticSystem)
+    return found
 
 
 def find_reference(problem: ElasticSystem, tolerance: float) -> Reference:
@@ -123,7 +125,7 @@ def scipy_motion(
 
 # -- measured --------------------------------------------------------------------------------
 
-Solver = Callable[[Reference], np.ndarray]
+Solver = Callable[[Any, Any, Reference], np.ndarray]
 
 
 def _radau(stages: int, tolerance: float, to: Reference) -> np.ndarray:
@@ -142,66 +144,59 @@ def _scipy(method: str, tolerance: float, to: Reference) -> np.ndarray:
     return modes.from_modes(scipy_motion(modes.system, method, tolerance, to.t, sizes))
 
 
-def _methods(plan: Plan) -> Iterator[tuple[str, list[tuple[str, Solver]]]]:
-    """Yield every method: its name, and its settings and solvers, coarse to fine."""
-    tolerances = TOLERANCES[:3] if plan.quick else TOLERANCES
-    counts = [250 * 3**k for k in range(3)] if plan.quick else [500 * 2**k for k in range(5)]
-    for s in (2, 3, 4, 5):
-        yield (
-            f"Radau, {s} stages",
-            [(f"tolerance {x:g}", partial(_radau, s, x)) for x in tolerances],
-        )
-    for rho in (0.5, 0.8, 1.0):
-        name = f"generalised-alpha, {rho}" if rho < 1.0 else "Newmark"
-        yield name, [(f"{n} steps", partial(_alpha, rho, n)) for n in counts]
-    for name in ("Radau", "BDF", "LSODA"):
-        yield f"SciPy {name}", [(f"rtol {x:g}", partial(_scipy, name, x)) for x in tolerances]
+# Name of a method, what it takes its name from, how its settings are called.
+METHODS: tuple[tuple[str, Any, Solver, str], ...] = (
+    *((f"Radau, {stages} stages", stages, _radau, "tolerance {:g}") for stages in (2, 3, 4, 5)),
+    *((f"generalised-alpha, {rho}", rho, _alpha, "{} steps") for rho in (0.5, 0.8)),
+    ("Newmark", 1.0, _alpha, "{} steps"),
+    *((f"SciPy {name}", name, _scipy, "rtol {:g}") for name in ("Radau", "BDF", "LSODA")),
+)
 
 
 def _steps(plan: Plan) -> Steps:
     tolerance = QUICK_REFERENCE if plan.quick else REFERENCE_TOLERANCE
     patience = QUICK_PATIENCE if plan.quick else PATIENCE
+    tolerances = TOLERANCES[:3] if plan.quick else TOLERANCES  # coarse to fine
+    counts = [250 * 3**k for k in range(3)] if plan.quick else [500 * 2**k for k in range(5)]
 
     @cache
     def reference(design: str, q: int) -> Reference:
         scene = reduced(plan.scene, "craig-bampton", q)
         return find_reference(problem_of(scene, *designs(plan)[design]), tolerance)
 
-    def curve(design: str, q: int, method: str, solvers: list[tuple[str, Solver]]) -> Rows:
+    def curve(design: str, q: int, method: str, of: Any, solver: Solver, words: str) -> Rows:
         right = reference(design, q)
-        for setting, solver in solvers:
-            solve = partial(solver, right)
+        for setting in counts if solver is _alpha else tolerances:
+            solve = partial(solver, of, setting, right)
             try:
                 seconds, _, found = timed(solve)
             except ConvergenceError:
                 continue  # no point of the curve
             if seconds < SHORT and plan.repeats > 1:
                 seconds = min(seconds, timed(solve, plan.repeats - 1)[0])
-            yield design, q, method, setting, seconds, *right.errors(found)
+            yield design, q, method, words.format(setting), seconds, *right.errors(found)
             if 2.0 * seconds > patience:
                 return
 
     for design in DESIGNS:
         for q in (FEW, QUICK_MANY if plan.quick else MANY):
-            for method, solvers in _methods(plan):
-                yield f"{method}, {design}, q = {q}", partial(curve, design, q, method, solvers)
+            for method in METHODS:
+                yield f"{method[0]}, {design}, q = {q}", partial(curve, design, q, *method)
 
 
 DIAGRAM = Diagram(
     "time",
     "Simulating the motion: error against time",
-    "design | coordinates per arm | method | setting | seconds [s] | "
-    "error of elastic coordinates [-] | error of deviation [-]",
+    f"design | coordinates per arm | method | setting | {SECONDS} | {ERROR} | "
+    "error of deviation [-]",
     _steps,
     (
-        Panel("seconds [s]", "error of elastic coordinates [-]", "method",
-              each=("design", "coordinates per arm"), errors=(1e-2, 1e-4)),
+        Panel(SECONDS, ERROR, "method", each=("design", "coordinates per arm"),
+              errors=(1e-2, 1e-4)),
     ),
-    f"Reference: Radau with {REFERENCE_STAGES} stages to {REFERENCE_TOLERANCE:g} "
-    f"({QUICK_REFERENCE:g} in a quick bench). Errors of the elastic coordinates in the energy "
-    "norm, largest in time over the largest value. Radau from cold, its error estimate and "
-    "refinements included; the others on given steps or tolerances, without an estimate. SciPy "
-    "solves the same residual, with its exact Jacobian, in the arms' own vibrations. Newmark is "
-    f"generalised-alpha with rho_inf = 1. No finer setting where it would take over {PATIENCE:g} "
-    f"s ({QUICK_PATIENCE:g}).",
+    f"Reference: Radau with {REFERENCE_STAGES} stages to {REFERENCE_TOLERANCE:g} (quick: "
+    f"{QUICK_REFERENCE:g}). Errors in the energy norm, largest in time over the largest value. "
+    "Radau from cold, estimate and refinements included; the others on given steps or tolerances. "
+    "SciPy solves the same residual, with its exact Jacobian, in the arms' own vibrations. No "
+    f"finer setting where it would take over {PATIENCE:g} s ({QUICK_PATIENCE:g}).",
 )  # fmt: skip

@@ -16,8 +16,8 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 from dolfinopt.arms.arm import uniform_design
-from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, Row, Rows, Steps
-from dolfinopt.bench.measure import arms_of
+from dolfinopt.bench.measure import Plan, arms_of
+from dolfinopt.bench.panel import Diagram, Frame, Panel, Row, Rows, Steps
 from dolfinopt.data import template_folder
 from dolfinopt.output.run import optimize
 from dolfinopt.parallel import partition_arms

@@ -74,8 +74,7 @@ class PlainStatics:
         self.load = petsc.assemble_vector(compat.compile_form(load))
         self.load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         petsc.set_bc(self.load, [self._clamp])
-        self.solution = self.load.duplicate()
-        self.K: Any = None
+        self.solution, self.K = self.load.duplicate(), petsc.create_matrix(self._stiffness)
         self._ksp = PETSc.KSP().create(arm.comm)
         self._ksp.setType("preonly" if d == 2 else "cg")
         self._ksp.getPC().setType("cholesky" if d == 2 else "gamg")
@@ -84,11 +83,10 @@ class PlainStatics:
         self._ksp.setTolerances(rtol=tolerance)
 
     def assemble(self, x: np.ndarray) -> None:
-        """Assemble K of these densities, anew from the second time on."""
+        """Assemble K of these densities."""
         young = x if self.in_plane else self.modulus * (FLOOR + x**PENALTY)
         self.x.x.array[: self.count] = young
         compat.scatter_forward(self.x)
-        self.K = self.K or petsc.create_matrix(self._stiffness)
         self.K.zeroEntries()
         petsc.assemble_matrix(self.K, self._stiffness, bcs=[self._clamp])
         self.K.assemble()
@@ -135,17 +133,18 @@ def pymoto_iteration(scene: Scene, cells: tuple[int, int]) -> Iteration | None:
         return None
     (along, across), arm, solid = cells, scene.arms[0], scene.material_of(0)
     assert arm.height is not None
-    sizes = {"unitx": arm.length / along, "unity": arm.height / across, "unitz": arm.thickness}
-    domain = pym.DomainDefinition(along, across, **sizes)
+    domain = pym.DomainDefinition(
+        along, across, unitx=arm.length / along, unity=arm.height / across, unitz=arm.thickness
+    )
     rows = np.arange(across + 1)
     left, right = domain.get_nodenumber(0, rows), domain.get_nodenumber(along, rows)
     force, fixed = np.zeros(2 * domain.nnodes), (2 * left[:, None] + np.arange(2)).ravel()
     force[2 * right + 1] = np.where((rows == 0) | (rows == across), 0.5, 1.0) / across
     density, load = pym.Signal("x", np.ones(domain.nel)), pym.Signal("f", force)
     stiff, matrix, u, compliance = (pym.Signal(name) for name in "sKuc")
-    law = f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
     elastic = {"e_modulus": solid.young_modulus, "poisson_ratio": solid.poisson_ratio}
     options = {"domain": domain, "bc": fixed, "plane": "stress", **elastic}
+    law = f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
     network = pym.Network(
         pym.MathGeneral(density, stiff, expression=law),
         pym.AssembleStiffness(stiff, matrix, **options),
@@ -235,7 +234,6 @@ def _beams(system: Any, scene: Scene, elements: int, steps: int) -> int:
             for point in place + np.arange(elements + 1)[:, None] * along
         ]
         beam = _section(scene, index) | {"length": arm.length / elements}
-        beam["includeReferenceRotations"] = False
         for pair in pairwise(nodes):
             system.AddObject(items.ObjectBeamGeometricallyExact2D(nodeNumbers=list(pair), **beam))
         drives = partial(offset, 0) if index == 0 else 0, 0, partial(offset, 1 + index)
@@ -256,15 +254,9 @@ def _section(scene: Scene, index: int) -> dict[str, Any]:
     area, second = arm.height * arm.thickness, arm.thickness * arm.height**3 / 12.0
     E, nu, damping = solid.young_modulus, solid.poisson_ratio, scene.damping.stiffness_proportional
     shear = 10.0 * (1.0 + nu) / (12.0 + 11.0 * nu)  # Cowper (1966), doi:10.1115/1.3625046
-    stiffness = {
-        "bending": E * second,
-        "axial": E * area,
-        "shear": shear * E / (2.0 * (1.0 + nu)) * area,
-    }
-    inertia = {
-        "massPerLength": solid.density * area,
-        "crossSectionInertia": solid.density * second,
-    }
-    for kind, value in stiffness.items():
-        inertia |= {f"{kind}Stiffness": value, f"{kind}Damping": damping * value}
-    return inertia
+    known: dict[str, Any] = {"includeReferenceRotations": False}
+    known |= {"massPerLength": solid.density * area, "crossSectionInertia": solid.density * second}
+    shears = shear * E / (2.0 * (1.0 + nu)) * area
+    for kind, stiffness in (("bending", E * second), ("axial", E * area), ("shear", shears)):
+        known |= {f"{kind}Stiffness": stiffness, f"{kind}Damping": damping * stiffness}
+    return known

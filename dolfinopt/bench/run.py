@@ -6,30 +6,30 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from time import perf_counter
 
 from dolfinopt.bench import arms, iterations, motion, optimiser, solid, tolerance
-from dolfinopt.bench.diagram import Diagram, Frame, Plan, Row, draw
 from dolfinopt.bench.goals import goal_table
+from dolfinopt.bench.measure import Plan
+from dolfinopt.bench.panel import Diagram, Frame, Row, markdown, version, write
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.plots.style import save
+from dolfinopt.scene.load import Scene
 
 Tell = Callable[[str], None]
 QUICKLY = ("arms.cells=[100,6]",)  # the scene of a quick bench
 # The main one first; what takes long, or is about designs, only when it is named.
 NAMED = (optimiser.DIAGRAM, solid.DIAGRAM)
 DIAGRAMS = (
-    motion.DIAGRAM,
-    iterations.PEERS,
-    iterations.WHOLE,
-    arms.MESHES,
-    arms.REDUCTIONS,
-    tolerance.DIAGRAM,
-    iterations.SOLVERS,
-)
+    motion.DIAGRAM, iterations.PEERS, iterations.WHOLE, arms.MESHES, arms.REDUCTIONS,
+    tolerance.DIAGRAM, iterations.SOLVERS,
+)  # fmt: skip
+
+
+def plan_of(load: Callable[[Sequence[str]], Scene], quick: bool) -> Plan:
+    """Return what is measured on, of what loads the scene with "key.path=value" changed."""
+    return Plan(load(QUICKLY if quick else ()), quick)
 
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:
@@ -52,32 +52,28 @@ def bench(
         plan: what is measured on.
         folder: for <name>.json, .csv, .png and bench.md.
         diagrams: in the order of the summary.
-        tell: takes a line for every step.
-        done: takes a line for every diagram that is finished.
+        tell, done: take a line for every step, and for every diagram that is finished.
     """
-    how = f"`dolfinopt bench{' --quick' if plan.quick else ''}`"
+    head = (
+        f"# Run time against error\n\nMeasured by `dolfinopt bench{' --quick' * plan.quick}`: CPU "
+        "seconds of this process, the least of the repeats, one thread, unless a table says "
+        "otherwise."
+    )
     frames: dict[str, Frame] = {}
     parts, failures = [], []
     for k, diagram in enumerate(diagrams, 1):
         begun = perf_counter()
         rows, failed = measured(diagram, plan, folder, tell)
         frame = frames[diagram.name] = diagram.frame(rows)
-        parts.append(_write(diagram, frame, folder))
+        parts.append(write(diagram, frame, folder))
         failures += failed
-        head = [
-            "# Run time against error",
-            f"Measured by {how}: CPU seconds of this process, the least of the repeats, one "
-            "thread, unless a table says otherwise.",
-            *(f"Failed: {failure}" for failure in failures),
-        ]
+        told = [f"Failed: {failure}" for failure in failures]
         if rest := [one.name for one in diagrams[k:]]:
-            head.append(f"Not finished: {', '.join(rest)} are missing.")
+            told.append(f"Not finished: {', '.join(rest)} are missing.")
         if len(goals := goal_table(frames)):
-            coarse = (
-                "A quick bench is coarser than what some goals are about: the table is partial."
-            )
-            head += ["## Goals", *([coarse] if plan.quick else []), _markdown(goals)]
-        write_text(folder / "bench.md", "\n\n".join([*head, *parts]) + "\n")
+            coarse = "A quick bench is coarser than what some goals are about."
+            told += ["## Goals", *[coarse] * plan.quick, markdown(goals)]
+        write_text(folder / "bench.md", "\n\n".join([head, *told, *parts]) + "\n")
         done(f"{diagram.name}: {diagram.title}, {perf_counter() - begun:.0f} s")
     return failures
 
@@ -88,8 +84,7 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
     Rows that another source of this package, or other versions of what they use, left there are
     measured anew: they must not stand beside those of today's.
     """
-    path = folder / f"{diagram.name}.json"
-    versions = [_version(package) for package in diagram.uses]
+    path, versions = folder / f"{diagram.name}.json", [version(one) for one in diagram.uses]
     asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
     content = {"stamp": json.loads(json.dumps(asked)), "complete": False, "rows": {}}
     try:
@@ -99,7 +94,11 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
     except (OSError, ValueError, KeyError, TypeError):
         pass  # not there, or cut off: measured anew
     kept: dict[str, list[Row]] = content["rows"]
-    failures = []
+    failures: list[str] = []
+
+    def keep() -> None:
+        write_text(path, json.dumps(content, default=lambda one: one.item()))
+
     for name, step in () if content["complete"] else diagram.steps(plan):
         if name in kept:
             continue
@@ -108,9 +107,9 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
             kept[name] = [*step()]
         except ConvergenceError as error:
             failures.append(f"{diagram.name}, {name}: {error}")
-        write_text(path, json.dumps(content, default=lambda one: one.item()))
+        keep()
     content["complete"] = not failures
-    write_text(path, json.dumps(content, default=lambda one: one.item()))
+    keep()
     return [row for rows in kept.values() for row in rows], failures
 
 
@@ -121,30 +120,3 @@ def source(folder: Path = Path(__file__).parents[1]) -> str:
     for path in sorted(folder.rglob("*.py")):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-def _write(diagram: Diagram, frame: Frame, folder: Path) -> str:
-    """Write <name>.csv and <name>.png; return the diagram's part of the summary."""
-    text = frame.to_csv(index=False, float_format="%.10g", lineterminator="\n")
-    write_text(folder / f"{diagram.name}.csv", text)
-    save(draw(diagram, frame), folder / f"{diagram.name}.png")
-    notes = [note for panel in diagram.panels for note in panel.notes(frame)]
-    for package in diagram.uses:
-        if not _version(package):
-            notes.append(f"Left out, not installed (pip install 'dolfinopt[bench]'): {package}.")
-    head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)", diagram.note]
-    listed = "\n".join(f"- {note}" for note in notes)
-    return "\n\n".join(filter(None, [*head, listed, _markdown(frame)]))
-
-
-def _markdown(frame: Frame) -> str:
-    """Return a table, four digits a number, nothing for nan."""
-    cells = frame.astype(object).where(frame.notna(), None)
-    return str(cells.to_markdown(index=False, floatfmt=".4g"))

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.special import ndtr
 
 from dolfinopt.arms.arm import Arm
-from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, Row, Rows, Steps
-from dolfinopt.bench.measure import Arms, Densities, arms_of, timed
+from dolfinopt.bench.measure import Arms, Densities, Plan, arms_of, timed
 from dolfinopt.bench.motion import problem_of
+from dolfinopt.bench.panel import Diagram, Frame, Panel, Row, Rows, Steps
 from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.batch import attempted
 from dolfinopt.dynamics.collocation import Solution, even_steps
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import relative_error
@@ -60,7 +61,13 @@ def random_case(scene: Scene, arms: Arms, number: int, folder: Path) -> Case:
     rng, kind = np.random.default_rng((SEED, number)), KINDS[number % len(KINDS)]
     while True:
         x_phys = {k: random_design(kind, arm, rng) for k, arm in arms.items()}
-        words = {**_load(rng), **_motion(scene, rng, folder / f"{number}.csv")}
+        damping = 0.0 if rng.random() < 0.5 else 10.0 ** rng.uniform(-6.0, -3.5)
+        words = {
+            "payload.mass": rng.uniform(0.0, 50.0),
+            "damping.stiffness_proportional": damping,
+            "reduction.coordinates": rng.choice((4, 12)),
+        }
+        words |= _motion(scene, rng, folder / f"{number}.csv")
         try:
             s = changed(scene, *(f"{key}={value}" for key, value in words.items()))
         except InputError:
@@ -105,16 +112,6 @@ def random_field(points: np.ndarray, scale: float, rng: np.random.Generator) -> 
     return np.sqrt(2.0 / WAVES) * np.cos(points @ waves + phases).sum(axis=1)
 
 
-def _load(rng: np.random.Generator) -> dict[str, object]:
-    """Return payload, damping, none in half of the cases, and coordinates."""
-    damping = 0.0 if rng.random() < 0.5 else 10.0 ** rng.uniform(-6.0, -3.5)
-    return {
-        "payload.mass": rng.uniform(0.0, 50.0),
-        "damping.stiffness_proportional": damping,
-        "reduction.coordinates": rng.choice((4, 12)),
-    }
-
-
 def _motion(scene: Scene, rng: np.random.Generator, file: Path) -> dict[str, object]:
     """Return the keys of an arc, a line or a spline of joint angles; `file` is for these."""
     path, duration = rng.choice(PATHS), rng.uniform(0.5, 6.0)
@@ -140,14 +137,6 @@ def _motion(scene: Scene, rng: np.random.Generator, file: Path) -> dict[str, obj
 # -- measured --------------------------------------------------------------------------------
 
 
-def solved(problem: ElasticSystem, tolerance: float) -> Solution | ConvergenceError:
-    """Simulate from cold, as `simulate` does; return the solution or why there is none."""
-    try:
-        return radau.integrate(problem, tolerance, STAGES, Profile())
-    except ConvergenceError as error:
-        return error
-
-
 def reference(problem: ElasticSystem, start: Solution, tolerance: float) -> Solution:
     """Return the motion to a hundredth of the tolerance of a solution, by its own steps and order.
 
@@ -169,7 +158,10 @@ def reference(problem: ElasticSystem, start: Solution, tolerance: float) -> Solu
 def compared(case: Case, tolerances: Sequence[float]) -> Rows:
     """Yield a row for every tolerance: the case's estimated and true error."""
     problem, t = case.problem, np.linspace(0.0, case.problem.breakpoints[-1], INSTANTS)
-    runs = {tol: timed(partial(solved, problem, tol)) for tol in tolerances}
+    cold = (STAGES, Profile(), None)
+    runs = {
+        tol: timed(partial(attempted, radau.integrate, problem, tol, *cold)) for tol in tolerances
+    }
     done = [(one, tol) for tol, (*_, one) in runs.items() if isinstance(one, Solution)]
     right, known, failure = np.empty(0), np.nan, ""
     try:
@@ -221,8 +213,7 @@ DIAGRAM = Diagram(
         Panel("tolerance [-]", column, "over", "over the cases", rows=partial(_ranges, column))
         for column in ("true error [-]", "true error over estimate [-]")
     ),
-    f"Radau with {STAGES} stages from cold; {CELLS[0]} x {CELLS[1]} cells an arm. Errors of the "
-    f"elastic coordinates in the energy norm at {INSTANTS} instants, largest in time over the "
-    f"largest value, against Radau with {REFERENCE_STAGES} stages on other steps to a hundredth of "
-    f"a case's finest tolerance; {FINEST:g} in every {EVERY}th case.",
+    f"Radau with {STAGES} stages from cold; {CELLS[0]} x {CELLS[1]} cells an arm. Errors in the "
+    f"energy norm, largest in time over the largest value, against {REFERENCE_STAGES} stages on "
+    f"other steps to a hundredth of a case's finest tolerance; {FINEST:g} in every {EVERY}th case.",
 )

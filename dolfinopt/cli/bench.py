@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import click
@@ -30,16 +31,15 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    from dolfinopt.bench.diagram import Plan
-    from dolfinopt.bench.run import QUICKLY, named
     from dolfinopt.bench.run import bench as run
+    from dolfinopt.bench.run import named, plan_of
     from dolfinopt.paper.reproduction import load_paper
 
     chosen = named(names)
     begun = time.perf_counter()
     folder = out or Path("results") / "bench"
     prepare(world, folder)
-    plan = Plan(load_paper(False, QUICKLY if quick else ()), quick)
+    plan = plan_of(partial(load_paper, False), quick)
     with _progress(len(chosen)) as (tell, done):
         failures = run(plan, folder, chosen, tell, done)
     seconds = time.perf_counter() - begun

@@ -119,10 +119,9 @@ def _why(scene: Scene, index: int) -> str:
         return "it comes from a file"
     from dolfinopt.arms.arm import fixed_body
     from dolfinopt.multibody.shape_integrals import in_space
-    from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
 
     body = in_space(fixed_body(scene, index))
-    centre, tensor = inertia_about_centre(body)
+    centre, tensor = body.inertia_about_centre()
     place = ", ".join(f"{x:.6g}" for x in centre)
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor
     moments = ", ".join(f"{x:.6g}" for x in (xx, yy, zz, xy, xz, yz))

@@ -24,13 +24,9 @@ if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.robot import Inertia, Robot, SceneBody
     from dolfinopt.exchange.urdf.scene import Origin, RobotScene
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-    from dolfinopt.output.views import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene
-    from dolfinopt.study.before_after import Side
     from dolfinopt.study.tables import Table
-
-SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
 @click.command(name="import")
@@ -96,24 +92,21 @@ def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
 
 def _read(
     model: Robot, links: str, trajectory: Path, tool: str | None, boxes: bool
-) -> tuple[RobotScene, list[str], np.ndarray, np.ndarray]:
-    """Return the scene, names of the joints that move, instants (n,) and rows (n, joints)."""
+) -> tuple[RobotScene, np.ndarray, np.ndarray]:
+    """Return the scene, instants (n,) and rows (n, joints) of its table."""
     from dolfinopt.exchange.urdf.read import implausible_inertias
-    from dolfinopt.exchange.urdf.robot import check_links, default_tool, scene_bodies
-    from dolfinopt.exchange.urdf.scene import RobotScene, scene_names
+    from dolfinopt.exchange.urdf.robot import scene_bodies
+    from dolfinopt.exchange.urdf.scene import RobotScene, read_trajectory
 
     chosen = tuple(name for word in links.split(",") if (name := word.strip()))
     if not chosen:
         raise InputError(f"--links {links!r}: expected names of links of {model.file}, A,B")
-    check_links(model, chosen, tool)
-    bodies = scene_bodies(model, chosen, tool or default_tool(model, chosen))
-    joints = scene_names(body.joint.name for body in bodies)
-    t, rows = _trajectory(model, os.fspath(trajectory))
-    warn(implausible_inertias(model))
+    bodies = scene_bodies(model, chosen, tool)
+    t, rows, said = read_trajectory(model, os.fspath(trajectory))
+    warn([*said, *implausible_inertias(model)])
     if not boxes:
         bodies = tuple(_meshed(model, one) if one.is_solid else one for one in bodies)
-    scene = RobotScene(model, bodies, float(t[-1]))
-    return scene, [joints[joint.name] for joint in model.movable], t, rows
+    return RobotScene(model, bodies, float(t[-1])), t, rows
 
 
 def _meshed(model: Robot, body: SceneBody) -> SceneBody:
@@ -152,45 +145,18 @@ def _meshed(model: Robot, body: SceneBody) -> SceneBody:
     return replace(body, size=(height, thickness), mesh=mesh)
 
 
-def _trajectory(model: Robot, file: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the instants (n,) and all joints (n, joints) of a table that the robot can follow."""
-    import numpy as np
-
-    from dolfinopt.exchange.urdf.scene import check_positions, columns_of, complete, too_fast
-    from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_table
-
-    names = columns_of(model, file, column_names(file))
-    table = read_table(file, names)
-    assert table.t is not None
-    rows, held = complete(model, names, table.rows)
-    check_positions(model, file, table.lines, rows)
-    curve = curve_in_time(Table(file, table.lines, table.t, rows))
-    rates = curve(np.linspace(0.0, curve.end, SAMPLES))[1]
-    warn([*held, *too_fast(model, file, rates)])
-    return table.t, rows
-
-
-def _write_scene(
-    folder: Path, scene: RobotScene, joints: list[str], t: np.ndarray, rows: np.ndarray
-) -> None:
+def _write_scene(folder: Path, scene: RobotScene, t: np.ndarray, rows: np.ndarray) -> None:
     """Write scene, table and record, and say what they are."""
-    from dolfinopt.exchange.urdf.scene import RECORD, TRAJECTORY, trajectory_text
-    from dolfinopt.output.folders import check_new, prepare_folder, write_new
+    from dolfinopt.output.folders import prepare_folder, write_new
     from dolfinopt.scene.load import load_scene
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
-    path = folder / f"{scene.robot.file.stem}.toml"
-    new: dict[Path, str | bytes] = {
-        folder / scene.mesh_name(one): one.mesh.data for one in scene.bodies if one.mesh
-    }
-    new[folder / TRAJECTORY] = trajectory_text(joints, t, rows)
-    new[folder / RECORD] = json.dumps(scene.record(folder), indent=2) + "\n"
-    new[path] = scene.text()  # last: where it is, the others are
-    check_new(new)
+    new = scene.files(folder, t, rows)
+    *_, path = new
     prepare_folder(folder)
     write_new(new, {folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
     click.echo(
-        f"{path}: {len(scene.bodies)} arms, {len(joints)} joints that move, "
+        f"{path}: {len(scene.bodies)} arms, {rows.shape[1]} joints that move, "
         f"{float(t[-1]):g} s of motion"
     )
     for body in scene.bodies:
@@ -244,7 +210,7 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     scene: Scene = on_root(world, scene_of, run)
     origin = on_root(world, _origin_of, scene, run)
     folder = out or run / "urdf"
-    table = None if before is None else on_root(world, _table, before, run)
+    table = None if before is None else on_root(world, _before_after, before, run)
     names = [origin.file.name, *(f"{arm}.stl" for arm in origin.links)]
     on_root(world, _check_robot, origin.file, folder, names)
     claim(world, folder, overwrite, [*names, *PAGES])
@@ -258,7 +224,7 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
             with ending_at_once():
                 files, said = _robot_files(scene, origin, folder, after.bodies, cells)
                 if table is not None:
-                    files = _pages(table, *sides) | files
+                    files = _pages(table, sides) | files
                     said.append(table.markdown())
             _write_robot(folder, files, origin.file.name)
             click.echo("\n".join(said))
@@ -266,13 +232,11 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
 
 def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
     """Raise InputError if the new robot would replace the one it is made of, or its meshes."""
-    from dolfinopt.exchange.urdf.read import mesh_path, safe_xml
+    from dolfinopt.exchange.urdf.read import sources_of
 
     if not file.is_file():
         return  # told by whoever reads it
-    meshes = [one.get("filename", "") for one in safe_xml(file).getroot().iter("mesh")]
-    sources = [file, *(mesh_path(file, name) for name in meshes)]
-    read = {path.resolve(): path for path in sources if path is not None}
+    read = {path.resolve(): path for path in sources_of(file)}
     for name in names:
         if source := read.get((folder / name).resolve()):
             raise InputError(
@@ -310,53 +274,33 @@ def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
 # -- before and after ------------------------------------------------------------------------
 
 
-def _table(before: Path, after: Path) -> Table:
-    """Return what two runs do."""
-    from dolfinopt.study.before_after import before_after
-
-    return before_after(*(_summary(run) for run in (before, after)))
-
-
-def _summary(run: Path) -> dict[str, Any]:
-    path = run / "summary.json"
-    try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return found
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({type(error).__name__}); name a finished run"
-        ) from None
-
-
-def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Side]:
+def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Any]:
     """Return both runs as the page needs them, on the root (collective)."""
     from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import on_root, together
+    from dolfinopt.study.before_after import read_side
 
     sides = []
     for one in (_reduced(world, before, on_root(world, scene_of, before)), after):
         views = gather_views(one.scene, one.partition, one.arms, one.x_phys)
         with together(world):
             if world.rank == 0:
-                sides.append(_side(one, views))
+                sides.append(read_side(one.folder, one.scene, views, one.bodies))
     return sides
 
 
-def _side(run: _Run, views: list[ArmView]) -> Side:
-    """Return what the page needs of a run (root only)."""
-    from dolfinopt.arms.arm import chain_of
-    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
-    from dolfinopt.study.before_after import read_side
+def _before_after(before: Path, after: Path) -> Table:
+    """Return what two runs do."""
+    from dolfinopt.study.before_after import compare_runs
 
-    scene = run.scene
-    mechanism = build_spatial_mechanism(scene, chain_of(scene, run.bodies))
-    return read_side(run.folder, scene, _summary(run.folder), views, mechanism)
+    return compare_runs(before, after)
 
 
-def _pages(table: Table, before: Side, after: Side) -> dict[str, bytes]:
+def _pages(table: Table, sides: list[Any]) -> dict[str, bytes]:
     """Return table and page of both runs by the names of their files (root only)."""
     from dolfinopt.study.before_after import before_after_page
 
+    before, after = sides
     texts = {
         ".md": table.markdown(),
         ".csv": table.csv(),
@@ -377,11 +321,11 @@ def _corners(arm: Arm) -> np.ndarray:
 
 def _origin_of(scene: Scene, run: Path) -> Origin:
     """Return where the scene's solids come from: the record is beside the trajectory."""
-    from dolfinopt.exchange.urdf.scene import RECORD, read_origin
+    from dolfinopt.exchange.urdf.scene import read_origin
 
     if scene.motion.file is None:
         raise InputError(f"{run}: no scene of a robot, it has no table of joint coordinates")
-    return read_origin(Path(scene.motion.file).with_name(RECORD))
+    return read_origin(Path(scene.motion.file))
 
 
 def _robot_files(
@@ -428,10 +372,9 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
     import numpy as np
 
     from dolfinopt.exchange.urdf.robot import Inertia
-    from dolfinopt.multibody.spatial.mechanism import inertia_about_centre
 
     arm = scene.arms[index]
-    own = Inertia(float(body.mass), *inertia_about_centre(body))
+    own = Inertia(float(body.mass), *body.inertia_about_centre())
     motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
     return own + motor
 

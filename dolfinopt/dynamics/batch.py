@@ -36,10 +36,9 @@ from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_motion import Scale
-from dolfinopt.multibody.equations import PLANE
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, proportional, same_geometry
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 
 # Of runs that share a matrix. Coordinates are slow up to an angle of 20: dense blocks of many runs
@@ -320,7 +319,7 @@ class BatchSystem:
             if key not in known:
                 known[key] = member.motion(own)
             motions.append(known[key])
-        return ElasticInstants(self._mechanism(len(t) // self.runs), _joined(motions), PLANE)
+        return ElasticInstants(self._mechanism(len(t) // self.runs), _joined(motions))
 
     def _mechanism(self, times: int) -> Mechanism:
         """Return that of all systems at `times` instants each, one system after the other."""
@@ -451,10 +450,11 @@ def _scale(
     body: ShapeIntegrals, other: ShapeIntegrals, damper: np.ndarray
 ) -> tuple[float, float, float] | None:
     """Return what makes one body the other: of its mass, stiffness, damping; None if nothing."""
-    if not same_geometry(body, other):
+    if not body.is_shaped_like(other):
         return None
-    mass = proportion(*proportional(body, other, "mass"))
-    stiffness = proportion(*proportional(body, other, "stiffness"))
+    mass, stiffness = (
+        proportion(body.scaled_by(kind), other.scaled_by(kind)) for kind in ("mass", "stiffness")
+    )
     damping = proportion([damper], [other.D])
     if mass is None or stiffness is None or damping is None:
         return None

@@ -13,7 +13,7 @@ from scipy.interpolate import make_interp_spline
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
@@ -21,8 +21,6 @@ from dolfinopt.multibody.mechanism import (
     JointHardware,
     Mechanism,
     Springs,
-    pin,
-    slider,
 )
 from dolfinopt.multibody.motion import (
     RigidMotion,
@@ -83,21 +81,19 @@ class Family:
     """How scenes in the plane, or in space, become machines.
 
     Attributes:
-        equations: of their mechanisms.
         build: (scene, bodies): the mechanism.
         motion: (t, scene): the desired rigid motion at instants t (n,), s.
         check: (scene): raises `InputError` where that motion is impossible.
         curve: (scene): the curve through its table, and whether its parameter is time.
     """
 
-    equations: Equations
     build: Callable[[Scene, list[ShapeIntegrals]], Any]
     motion: Callable[..., RigidMotion]
     check: Callable[[Scene], None]
     curve: Callable[[Scene], tuple[Curve, bool]]
 
 
-IN_PLANE = Family(PLANE, build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
+IN_PLANE = Family(build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
 
 
 def family_of(scene: Scene) -> Family:
@@ -105,14 +101,13 @@ def family_of(scene: Scene) -> Family:
     if not scene.is_spatial:
         return IN_PLANE
     from dolfinopt.multibody.spatial.end_effector import curve_in_space
-    from dolfinopt.multibody.spatial.equations import SPACE
     from dolfinopt.multibody.spatial.mechanism import (
         build_spatial_mechanism,
         check_joint_motion,
         joint_motion,
     )
 
-    return Family(SPACE, build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)
+    return Family(build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)
 
 
 def check_motion(scene: Scene) -> None:
@@ -141,9 +136,9 @@ def build_system(
     mechanism: ElasticBodies = family.build(scene, bodies)
     instants = breakpoints(scene, family.curve)
     if not is_machine(scene):
-        return ElasticSystem(mechanism, motion, instants, family.equations)
+        return ElasticSystem(mechanism, motion, instants)
     instants, closure = _with_rows(instants, scene), closure_of(scene)
-    return MachineSystem(mechanism, motion, instants, _drives(scene), closure, family.equations)
+    return MachineSystem(mechanism, motion, instants, _drives(scene), closure)
 
 
 def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
@@ -153,7 +148,7 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
     """
     family = family_of(scene)
     mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
-    return family.equations.largest_change(mechanism, motion, closure_of(scene))
+    return largest_change(mechanism, motion, closure_of(scene))
 
 
 def closure_of(scene: Scene) -> Closure | None:
@@ -163,8 +158,8 @@ def closure_of(scene: Scene) -> Closure | None:
         return None
     point = complex(*closure.point)
     if closure.kind == "pin":
-        return pin(point)
-    return slider(point, complex(*closure.direction), closure.force)
+        return Closure.pin(point)
+    return Closure.slider(point, complex(*closure.direction), closure.force)
 
 
 def _drives(scene: Scene) -> Drives:

@@ -12,10 +12,9 @@ from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, in_basis
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
@@ -26,11 +25,10 @@ STALLED = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ElasticInstants:
-    """A mechanism, its prescribed motion at n instants, and its equations."""
+    """A mechanism and its prescribed motion at n instants."""
 
     mechanism: Any
     motion: RigidMotion
-    equations: Equations
 
     def __len__(self) -> int:
         """Return n."""
@@ -38,7 +36,7 @@ class ElasticInstants:
 
     def __getitem__(self, part: slice | np.ndarray) -> ElasticInstants:
         """Return it at some of the instants."""
-        return ElasticInstants(self.mechanism[part], self.motion[part], self.equations)
+        return ElasticInstants(self.mechanism[part], self.motion[part])
 
     def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the elastic residual (n, N)."""
@@ -60,13 +58,11 @@ class ElasticSystem:
         motion: rigid coordinates at given instants (n,) s.
         breakpoints: ascending instants, first 0 and last the horizon, between which the
             prescribed motion is smooth; steps end there. s.
-        equations: of the mechanism, in the plane or in space.
     """
 
     mechanism: Any
     motion: Callable[[np.ndarray], RigidMotion]
     breakpoints: tuple[float, ...]
-    equations: Equations = PLANE
 
     @property
     def num_coordinates(self) -> int:
@@ -143,11 +139,11 @@ class ElasticSystem:
 
     def at(self, t: np.ndarray) -> ElasticInstants:
         """Return mechanism and motion at instants t (n,), s."""
-        return ElasticInstants(self.mechanism, self.motion(t), self.equations)
+        return ElasticInstants(self.mechanism, self.motion(t))
 
     def describe(self, q: np.ndarray) -> str:
         """Say how far the arms' ends turn in a motion q (n, N)."""
-        angle = self.equations.rotations(self.mechanism, q).max(initial=0.0)
+        angle = self.mechanism.rotations(q).max(initial=0.0)
         return f"the arms' ends turn by {angle:.2g} rad"
 
     def deflection(self, q: np.ndarray) -> float:
@@ -299,7 +295,7 @@ def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     """Return the body in other coordinates."""
     # Stiffness, and damping in proportion to it, lose the rounding beside their diagonals: whoever
     # uses them sees that the coordinates are uncoupled by them.
-    changed = in_basis(body, T)
+    changed = body.in_basis(T)
     one = np.eye(len(changed.K))
     if np.abs(changed.K - one).max(initial=0.0) > MODE_ROUNDING:
         return changed

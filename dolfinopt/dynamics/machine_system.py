@@ -22,11 +22,10 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
-from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import FEW, Closure, Drives, ElasticBodies, repeated
+from dolfinopt.multibody.mechanism import Closure, Drives, ElasticBodies, repeated
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, padded, rigid_part
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 
 MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
@@ -140,8 +139,7 @@ class MachineInstants:
 
         Those of free coordinates by their law; of prescribed ones, what moves them as they move.
         """
-        if 0 < len(y) < FEW:
-            every = repeated(len(y))
+        if (every := repeated(len(y))) is not None:
             return self[every].forces(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
@@ -158,8 +156,7 @@ class MachineInstants:
 
     def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return r (n, S); N m of joints, N of the cart, of modes as they are scaled, m."""
-        if 0 < len(y) < FEW:
-            every = repeated(len(y))
+        if (every := repeated(len(y))) is not None:
             return self[every].residual(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
@@ -185,8 +182,7 @@ class MachineInstants:
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
     ) -> DenseLinearisation:
         """Return its derivative by the coordinates `keep`, or all."""
-        if 0 < len(y) < FEW:
-            every = repeated(len(y))
+        if (every := repeated(len(y))) is not None:
             return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
         (_, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
@@ -227,7 +223,6 @@ class MachineSystem:
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
         closure: of the last outboard interface, or None; in the plane.
-        equations: of the mechanism, in the plane or in space.
     """
 
     mechanism: Any
@@ -235,7 +230,6 @@ class MachineSystem:
     breakpoints: tuple[float, ...]
     drives: Drives
     closure: Closure | None = None
-    equations: Equations = PLANE
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
@@ -275,7 +269,7 @@ class MachineSystem:
     @cached_property
     def elastic(self) -> ElasticSystem:
         """The same machine, its rigid coordinates on the desired motion exactly."""
-        return ElasticSystem(self.mechanism, self.motion, self.breakpoints, self.equations)
+        return ElasticSystem(self.mechanism, self.motion, self.breakpoints)
 
     @cached_property
     def gap_scale(self) -> float:
@@ -284,7 +278,7 @@ class MachineSystem:
 
     @cached_property
     def _softness(self) -> float:
-        return self.equations.softness(self.mechanism.bodies) or 1e-6
+        return self.mechanism.softness or 1e-6
 
     @cached_property
     def rigid_scale(self) -> np.ndarray:
@@ -293,7 +287,7 @@ class MachineSystem:
         The energy that a deflection of the same size as the coordinate's at the chain's end would
         store in the softest arm.
         """
-        return self.equations.levers(self.mechanism)[self.drives.free] / np.sqrt(self._softness)
+        return self.mechanism.levers[self.drives.free] / np.sqrt(self._softness)
 
     def ground_force(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the force (n,) on the interface, complex, N, by the multipliers (n, m)."""
@@ -325,7 +319,7 @@ class MachineSystem:
     @cached_property
     def rigid(self) -> ElasticBodies:
         """The mechanism with rigid arms of the same mass and inertia."""
-        return replace(self.mechanism, bodies=tuple(map(rigid_part, self.mechanism.bodies)))
+        return self.mechanism.rigid
 
     def initial_state(self) -> State:
         """Return y, yd (1, S): the equilibrium of the controlled machine at t = 0.
@@ -428,7 +422,7 @@ class MachineSystem:
         of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
-        return [a + padded(b, a) for a, b in zip(total, rigid, strict=True)]
+        return [a + b.padded(a) for a, b in zip(total, rigid, strict=True)]
 
     def start_gradient(self, y: np.ndarray, by_y: np.ndarray) -> list[ShapeIntegrals]:
         """Return the derivative by every body of J through the state y (S,) at t = 0."""

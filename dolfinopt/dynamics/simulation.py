@@ -19,21 +19,22 @@ from dolfinopt.dynamics.radau import BEYOND, REMEDY, VALID
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import (
+    deviation,
+    end_effector,
+    end_effector_gradient,
     interface_place,
     lengths,
     place_gradient,
 )
-from dolfinopt.multibody.equations import PLANE, Equations
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
-from dolfinopt.multibody.mechanism import Closure, ElasticBodies, compliance
+from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
     Rates,
     ShapeIntegrals,
     add_integrals,
-    in_basis,
 )
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.profiling import Profile
@@ -114,11 +115,6 @@ class Trajectory:
         """What moved: a `Mechanism`, in space a `SpatialMechanism`."""
         return self.problem.mechanism
 
-    @property
-    def equations(self) -> Equations:
-        """Those of the mechanism."""
-        return self.problem.equations
-
     @cached_property
     def adjoint(self) -> Adjoint:
         """The transposed recursion, for the gradient of any function of the motion."""
@@ -153,9 +149,9 @@ class Trajectory:
         a slider along its line; of a pinned end none but the integrator's error.
         """
         if isinstance(self.problem, ElasticSystem):
-            return self.equations.deviation(self.mechanism, self.motion, self.q_e)
+            return deviation(self.mechanism, self.motion, self.q_e)
         none = np.zeros_like(self.q_e)
-        return self.end - self.equations.end_effector(self.mechanism, self.desired, none)
+        return self.end - end_effector(self.mechanism, self.desired, none)
 
     @property
     def distance(self) -> np.ndarray:
@@ -165,7 +161,7 @@ class Trajectory:
     @cached_property
     def compliance(self) -> np.ndarray:
         """q' K q of every arm (n, arms), N m."""
-        return compliance(self.mechanism.bodies, self.mechanism.slices, self.q_e)
+        return self.mechanism.compliance(self.q_e)
 
     @cached_property
     def deflections(self) -> np.ndarray:
@@ -175,7 +171,7 @@ class Trajectory:
     @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
-        return self.equations.rotations(self.mechanism, self.q_e)
+        return self.mechanism.rotations(self.q_e)
 
     @cached_property
     def joint_forces(self) -> np.ndarray:
@@ -221,7 +217,7 @@ class Trajectory:
     @cached_property
     def end(self) -> np.ndarray:
         """Place of the end-effector (n, 2), m, as it moves."""
-        return self.equations.end_effector(self.mechanism, self.motion, self.q_e)
+        return end_effector(self.mechanism, self.motion, self.q_e)
 
     @cached_property
     def slider_position(self) -> np.ndarray | None:
@@ -279,12 +275,10 @@ class Trajectory:
             By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
         """
         motion, q = self.motion[indices], self.q_e[indices]
-        free = self.problem.drives.free if isinstance(self.problem, MachineSystem) else ()
-        gradient = self.equations.end_effector_gradient
-        by_q, by_rigid, by_bodies = gradient(self.mechanism, motion, q, weights, len(free) > 0)
+        by_q, by_rigid, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
         by = self.by_unknowns(by_q)
-        if len(free):
-            assert by_rigid is not None
+        if isinstance(self.problem, MachineSystem):
+            free = self.problem.drives.free
             by[:, : len(free)] = by_rigid[:, free]
         return by, by_bodies
 
@@ -436,7 +430,7 @@ def _by_radau(
 ) -> list[Solution | ConvergenceError]:
     """Return the solutions in their order: chains on prescribed motions together, others alone."""
     alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if one.equations is PLANE}
+    own = {i: one for i, one in alike.items() if isinstance(one.mechanism, Mechanism)}
     together, begun = list(own), [starts[i] for i in own]
     solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
     found = dict(zip(together, solved, strict=True))
@@ -541,7 +535,7 @@ class DriveForces:
         system, t = self.system, self.t[part]
         if isinstance(system, MachineSystem):
             return _Machine(system.at(t), (y, yd, ydd))
-        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd), system.equations)
+        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
 
 
 @dataclass(frozen=True, eq=False)
@@ -551,7 +545,6 @@ class _Prescribed:
     mechanism: ElasticBodies
     motion: RigidMotion
     rates: Rates
-    equations: Equations
 
     @cached_property
     def tangent(self) -> Linearisation:
@@ -588,7 +581,7 @@ class _Machine:
         instants, (y, yd, ydd) = self.instants, self.rates
         q, qd, qdd = (instants.split(x)[1] for x in self.rates)
         motion, machine = instants.motion(y, yd, ydd), instants.machine
-        return _Prescribed(machine.mechanism, motion, (q, qd, qdd), machine.equations)
+        return _Prescribed(machine.mechanism, motion, (q, qd, qdd))
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`."""
@@ -719,7 +712,7 @@ def load_gradient(
     y, yd, ydd = at
     wide = probe.system.body_gradient(t, y, yd, ydd, multipliers)
     parts = [
-        in_basis(by, np.eye(by.num_modes)[:, : body.num_modes])
+        by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)
     ]
     return LoadGradient(by_rates, parts)
@@ -762,7 +755,7 @@ class _Probe:
 def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body with one coordinate more for every entry of c, which alone loads it."""
     q, more = body.num_modes, load_counts(body).total
-    wide = in_basis(body, np.eye(q, q + more))
+    wide = body.in_basis(np.eye(q, q + more))
     w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
     k = 1 + q + np.arange(more)  # beside the reference position and the modes
     if len(body.W) == len(SPACE):

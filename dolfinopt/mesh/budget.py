@@ -11,8 +11,8 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.parallel import partition_arms
-from dolfinopt.scene.schema import Scene
-from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT, Arm
+from dolfinopt.scene.load import Arm, Scene
+from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT
 
 # Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
 # quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm (`_bytes`, `_seconds`):

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
-from dolfinopt.scene.tables.arms import Arm
+from dolfinopt.scene.load import Arm
 
 # How far an interface's middle may be off its joint axis and the mesh's height off `height`,
 # relative to `height`: far more than a polygon in place of a circle needs.

@@ -46,7 +46,8 @@ from dolfinopt.mesh.gmsh_session import (
     silent_terminal,
     unknown_names,
 )
-from dolfinopt.scene.tables.arms import SIZE_PARAMETER, Arm
+from dolfinopt.scene.load import Arm
+from dolfinopt.scene.tables.arms import SIZE_PARAMETER
 
 if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.geometry import LinkCells

@@ -2,7 +2,7 @@
 
 `shape_integrals` (inertia of one body) -> `mechanism` (bodies on a cart, payload) -> `motion`
 (rigid coordinates that follow a path) -> `inverse_dynamics` (forces and elastic residual).
-Derivatives: `tangent` by rigid and elastic coordinates, `body_gradient` by the bodies' integrals,
-`end_effector` of its position. Scenarios side by side: `instants`. Other programs: `mbdyn`,
-`standard_input`.
+The recursion, by the dimension of the world (`dimension`): `body_motion` (one body), `kinematics`
+(from body to body). Derivatives: `tangent` by coordinates and by the bodies' integrals;
+`end_effector`, its place and theirs. Other programs: `mbdyn`, `standard_input`.
 """

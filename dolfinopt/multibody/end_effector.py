@@ -6,7 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.multibody.mechanism import FEW, Mechanism, several
+from dolfinopt.multibody.body_motion import Constants
+from dolfinopt.multibody.dimension import Turning, product
+from dolfinopt.multibody.kinematics import MovingJoint
+from dolfinopt.multibody.mechanism import FEW, GROUND, ElasticBodies, Mechanism, Site, several
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -19,18 +22,143 @@ def lengths(vectors: np.ndarray) -> np.ndarray:
     return out
 
 
-def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the end-effector's position (n, 2), m, of the flexible mechanism."""
-    if 0 < len(q) < FEW:
-        return end_effector(*several(mechanism, motion, q))[: len(q)]
-    place = motion.q[:, 0] + 1j * mechanism.joint_height
-    joint_rotation = np.ones(len(q), dtype=complex)
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
-        d, angle = outboard(body, q[:, part])
-        place = place + joint_rotation * d
-        joint_rotation = joint_rotation * np.exp(1j * angle)
-    return np.stack([place.real, place.imag], axis=1)
+def end_effector(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the end-effector's position (n, d), m, of the flexible mechanism; q (n, N)."""
+    return Posed(mechanism, motion.q, q).interface(*mechanism.way[-1])[0].T
+
+
+def deviation(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+    """Return the flexible minus the equivalent rigid end-effector (n, d), m.
+
+    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
+    """
+    rigid = end_effector(mechanism, motion, np.zeros_like(q))
+    return end_effector(mechanism, motion, q) - rigid
+
+
+def end_effector_gradient(
+    mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
+    """Return the gradient of sum_n weights_n . end_effector_n.
+
+    It is what a force of these weights on the end-effector does on every coordinate.
+
+    Args:
+        mechanism, motion, q: as for `end_effector`, n instants.
+        weights: (n, d).
+
+    Returns:
+        By q (n, N), by the rigid coordinates (n, R), and by every body's outboard modes (b, q) and
+        their geometric stiffness (b, q, q), under the names of the shape integrals.
+    """
+    posed, forces = Posed(mechanism, motion.q, q), weights.T
+    end = posed.interface(*mechanism.way[-1])[0]
+    by_q, by_rigid = np.zeros_like(q), np.zeros_like(motion.q)
+    by_bodies = [{"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies]
+    if (cart := mechanism.tree.cart_coordinate) is not None:
+        by_rigid[:, cart] = weights[:, 0]
+    for i, number in mechanism.way:
+        joint, origin, R = posed.body(i)
+        section, dim, back = posed.section(i, number), joint.dim, R.swapaxes(0, 1)
+        force, lever = product(back, forces), product(back, end - origin)
+        if (k := joint.joint.coordinate) is not None:
+            by_rigid[:, k] = joint.drive((force, dim.moment(lever, force)))
+        if section.turning is None:
+            continue
+        body, part, by = mechanism.bodies[i], mechanism.slices[i], by_bodies[i]
+        own = slice(dim.b * number, dim.b * (number + 1))
+        moment = dim.moment(lever - section.place, force)
+        pull, e = np.concatenate([force, section.turning.pulled(moment)]), q[:, part]
+        by_q[:, part] = pull.T @ body.outboard[own]
+        by["outboard"][own] = pull @ e
+        if section.bent is not None:
+            by_q[:, part] -= np.einsum("pn,pkn->nk", pull, section.bent)
+            by["K0_outboard"] = np.zeros_like(body.K0_outboard)
+            by["K0_outboard"][own] = -0.5 * (pull[:, None] * e.T) @ e
+    return by_q, by_rigid, by_bodies
+
+
+class Section:
+    """An outboard interface where n sets of coordinates e (q, n) take it, in its body's frame.
+
+    Attributes:
+        place: (d, n) or (d, 1), m.
+        turning: its rotation; None of a rigid body.
+        bent: (b, q, n) what geometric stiffness takes from the outboard modes, or None.
+    """
+
+    def __init__(self, constants: Constants, number: int, e: np.ndarray) -> None:
+        """Take the body's constants, which of its interfaces it is, and e."""
+        self.place = constants.points[number][:, None]
+        self.turning: Turning | None = None
+        self.bent: np.ndarray | None = None
+        if not constants.num_modes:
+            return
+        places, d = constants.outboard(number), constants.dim.d
+        moved = constants.T[places] @ e
+        if constants.K0 is not None:
+            self.bent = np.tensordot(constants.K0[places], e, 1)
+            moved -= 0.5 * np.einsum("pkn,kn->pn", self.bent, e)
+        self.place = self.place + moved[:d]
+        self.turning = constants.turning(*(moved[d:],) * 3)  # of its rates none is asked for
+
+
+class Posed:
+    """A mechanism at n poses, q_r (n, R) and q (n, N): what is asked for of its frames, each once.
+
+    Rotations, to the ground's frame, are (d, d, n), or (d, d) where they are the same in all poses.
+    """
+
+    def __init__(self, mechanism: ElasticBodies, q_r: np.ndarray, q: np.ndarray) -> None:
+        """Take the poses."""
+        self.tree, self.q_r, self.q = mechanism.tree, q_r, q
+        base = mechanism.base(q_r)
+        self._still = base, base, base  # no motion is asked for
+        self._interfaces: dict[Site, tuple[np.ndarray, np.ndarray]] = {}
+        self._interfaces[GROUND, 0] = base, np.eye(len(base))
+        self._bodies: dict[int, tuple[MovingJoint, np.ndarray, np.ndarray]] = {}
+        self._sections: dict[Site, Section] = {}
+
+    def body(self, i: int) -> tuple[MovingJoint, np.ndarray, np.ndarray]:
+        """Return the joint of body i, the place (d, n) and the rotation of its frame."""
+        if i not in self._bodies:
+            joint = self.tree.joints[i]
+            place, R = self.interface(joint.parent, joint.interface)
+            k = joint.coordinate
+            moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
+            if moving.is_offset:
+                place = place + product(R, moving.r)
+            self._bodies[i] = moving, place, _turned(R, moving.R)
+        return self._bodies[i]
+
+    def section(self, i: int, number: int) -> Section:
+        """Return an outboard interface of body i."""
+        if (i, number) not in self._sections:
+            e = self.q[:, self.tree.slices[i]].T
+            self._sections[i, number] = Section(self.tree.constants[i], number, e)
+        return self._sections[i, number]
+
+    def interface(self, i: int, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return its place (d, n) and its rotation; of `GROUND` where that is."""
+        if (i, number) not in self._interfaces:
+            (_, place, R), section = self.body(i), self.section(i, number)
+            turned = R if section.turning is None else _turned(R, section.turning.R)
+            self._interfaces[i, number] = place + product(R, section.place), turned
+        return self._interfaces[i, number]
+
+
+def _turned(R: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Return R S of rotations (d, d, n), or one (d, d)."""
+    return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)
+
+
+# -- in the plane: first and second derivatives by all coordinates, for what closes a loop
+#
+# Coordinates are ordered [rigid (1 + arms), elastic (N)]; places are complex, p = p_x + i p_y.
+# Going outwards along the chain every coordinate moves all that lies outboard of it: it shifts it
+# by t and rotates it by r about a point o,  dp = t + i r (p - o). A second coordinate further out
+# is rotated with it, so d2p = i r dp'; this is all there is, but for the second order of the arms'
+# own deformation.
 
 
 def outboard(body: ShapeIntegrals, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -40,70 +168,6 @@ def outboard(body: ShapeIntegrals, e: np.ndarray) -> tuple[np.ndarray, np.ndarra
         bent = np.einsum("pkl,nk,nl->pn", body.K0_outboard, e, e, optimize=True)
         x, y, angle = x - 0.5 * bent[0], y - 0.5 * bent[1], angle - 0.5 * bent[2]
     return complex(*body.outboard_point) + (x + 1j * y), angle
-
-
-def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the flexible minus the equivalent rigid end-effector (n, 2), m.
-
-    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
-    """
-    rigid = end_effector(mechanism, motion, np.zeros_like(q))
-    return end_effector(mechanism, motion, q) - rigid
-
-
-def end_effector_gradient(
-    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-    """Return the gradient of sum_n weights_n . end_effector_n.
-
-    Args:
-        mechanism, motion, q: as for `end_effector`, n instants.
-        weights: (n, 2).
-
-    Returns:
-        By q (n, N), and by every body's outboard modes (3, q) and their geometric stiffness
-        (3, q, q), under the names of the shape integrals.
-    """
-    if 0 < len(q) < FEW:
-        few = several(mechanism, motion, q, weights)
-        few[-1][len(q) :] = 0.0
-        by_q, by_bodies = end_effector_gradient(*few)
-        return by_q[: len(q)], by_bodies
-    w = weights[:, 0] + 1j * weights[:, 1]
-    rotations, levers = [], []
-    joint_rotation = np.ones(len(q), dtype=complex)
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
-        joint_rotation = joint_rotation * np.exp(1j * motion.q[:, k + 1])
-        rotations.append(joint_rotation)
-        d, angle = outboard(body, q[:, part])
-        levers.append(joint_rotation * d)
-        joint_rotation = joint_rotation * np.exp(1j * angle)
-    by_q = np.empty_like(q)
-    by_outboard: list[dict[str, np.ndarray]] = []
-    beyond = np.zeros(len(q), dtype=complex)  # from this arm's outboard point to the end
-    for k in reversed(range(len(rotations))):
-        part, body = mechanism.slices[k], mechanism.bodies[k]
-        place = np.conj(rotations[k]) * w
-        rotation = (np.conj(w) * 1j * beyond).real
-        e, pulls = q[:, part], (place.real, place.imag, rotation)
-        by_q[:, part] = np.stack(pulls, axis=1) @ body.outboard
-        by = {"outboard": np.stack([pull @ e for pull in pulls])}
-        if body.is_stiffened:
-            pairs = zip(pulls, body.K0_outboard, strict=True)
-            by_q[:, part] -= sum(pull[:, None] * (e @ K0) for pull, K0 in pairs)
-            by["K0_outboard"] = np.stack([-0.5 * (e.T * pull) @ e for pull in pulls])
-        by_outboard.insert(0, by)
-        beyond = beyond + levers[k]
-    return by_q, by_outboard
-
-
-# -- first and second derivatives of the end-effector's place by all coordinates of a mechanism
-#
-# Coordinates are ordered [rigid (1 + arms), elastic (N)]; places are complex, p = p_x + i p_y.
-# Going outwards along the chain every coordinate moves all that lies outboard of it: it shifts it
-# by t and rotates it by r about a point o,  dp = t + i r (p - o). A second coordinate further out
-# is rotated with it, so d2p = i r dp'; this is all there is, but for the second order of the arms'
-# own deformation.
 
 
 @dataclass(frozen=True, eq=False)

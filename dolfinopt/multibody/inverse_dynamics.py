@@ -7,7 +7,7 @@ Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 5; Schwertassek & Wallr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,9 @@ import numpy as np
 from dolfinopt.multibody.body_motion import BodyMotion, Load
 from dolfinopt.multibody.end_effector import interface_place
 from dolfinopt.multibody.kinematics import Interface, MovingJoint
-from dolfinopt.multibody.mechanism import GROUND, Closure, Mechanism, Site, Tree
+from dolfinopt.multibody.mechanism import GROUND, Closure, ElasticBodies, Mechanism, Site, Tree
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals, rigid_part
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
 NOTHING: Mapping[Site, Load] = {}
 
@@ -245,7 +245,7 @@ class Stiffening:
 
 
 def largest_change(
-    mechanism: Mechanism, motion: RigidMotion, closure: Closure | None = None
+    mechanism: ElasticBodies, motion: RigidMotion, closure: Closure | None = None
 ) -> float:
     """Return the largest |eigenvalue| of K^-1 sum_p p K0_p over arms and instants.
 
@@ -256,9 +256,9 @@ def largest_change(
         motion: at n instants.
         closure: of the last interface, or None.
     """
-    rigid = replace(mechanism, bodies=tuple(map(rigid_part, mechanism.bodies)))
     largest = 0.0
-    for body, p in zip(mechanism.bodies, _loads(rigid, motion, closure), strict=True):
+    loads = _loads(mechanism.rigid, motion, closure)
+    for body, p in zip(mechanism.bodies, loads, strict=True):
         largest = max(largest, stiffness_change(body, p))
     return largest
 
@@ -273,11 +273,12 @@ def stiffness_change(body: ShapeIntegrals, p: np.ndarray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _loads(rigid: Mechanism, motion: RigidMotion, closure: Closure | None) -> list[np.ndarray]:
-    """Return (a_x, a_y, wd, -w^2, F_x, F_y, T) of every body, each (n, 7)."""
+def _loads(rigid: ElasticBodies, motion: RigidMotion, closure: Closure | None) -> list[np.ndarray]:
+    """Return what loads every body (n, loads); in the plane a_x, a_y, wd, -w^2, F_x, F_y, T."""
     none = np.zeros((len(motion.q), 0))
     pull: dict[Site, Load] = {}
     if closure is not None:
+        assert isinstance(rigid, Mechanism)
         force = _ground_force(rigid, motion, closure)
         pull[len(rigid.bodies) - 1, 0] = (
             np.stack([force.real, force.imag]),

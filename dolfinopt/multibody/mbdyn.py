@@ -16,7 +16,7 @@ import numpy as np
 
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION, inertia_about_centre
+from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION
 from dolfinopt.multibody.standard_input import centrifugal, outboard_interfaces, turning
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def modal_element(body: ShapeIntegrals, nodes: LumpedNodes | None = None) -> Mod
     if nodes is not None:
         lumped = np.concatenate([np.zeros((len(points), 6)), nodes.masses])
         points, modes = np.concatenate([points, nodes.points]), np.concatenate([modes, nodes.modes])
-    centre, inertia = inertia_about_centre(body)
+    centre, inertia = body.inertia_about_centre()
     loads, stiffening = _stiffening(body, np.concatenate(K0))
     return ModalElement(
         labels=tuple(str(k) for k in range(1, len(points) + 1)),

@@ -7,7 +7,7 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -28,6 +28,8 @@ from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from dolfinopt.multibody.motion import RigidMotion
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
@@ -159,22 +161,22 @@ class Closure:
         shape = (1, -1) + (1,) * (derivative.ndim - 1)
         return (np.conj(self.normals).reshape(shape) * derivative[:, None]).real
 
+    @classmethod
+    def slider(cls, point: complex, direction: complex, force: float = 0.0) -> Closure:
+        """Return the closure of a slider on the line through `point` along `direction`.
 
-def slider(point: complex, direction: complex, force: float = 0.0) -> Closure:
-    """Return the closure of a slider on the line through `point` along `direction`.
+        Args:
+            point: m.
+            direction: of any length.
+            force: on the slider along the direction, N.
+        """
+        unit = direction / abs(direction)
+        return cls(point, np.array([1j * unit]), force * unit)
 
-    Args:
-        point: m.
-        direction: of any length.
-        force: on the slider along the direction, N.
-    """
-    unit = direction / abs(direction)
-    return Closure(point, np.array([1j * unit]), force * unit)
-
-
-def pin(point: complex) -> Closure:
-    """Return the closure of a pin at `point`, m."""
-    return Closure(point, np.array([1.0, 1j]))
+    @classmethod
+    def pin(cls, point: complex) -> Closure:
+        """Return the closure of a pin at `point`, m."""
+        return cls(point, np.array([1.0, 1j]))
 
 
 # -- values that are the same at all instants, or given at each: several mechanisms in one batch
@@ -188,15 +190,15 @@ def pin(point: complex) -> Closure:
 FEW = 4
 
 
-def repeated(count: int) -> np.ndarray:
-    """Return indices that make `count` instants `FEW`, the last one repeated."""
-    return np.minimum(np.arange(FEW), count - 1)
+def repeated(count: int) -> np.ndarray | None:
+    """Return indices that make few instants `FEW`, the last one repeated; None: not so few."""
+    return np.minimum(np.arange(FEW), count - 1) if 0 < count < FEW else None
 
 
 def several(*arguments: Any) -> tuple[Any, ...]:
     """Return the arguments at `FEW` instants, the last one as often as it takes."""
     every = repeated(len(arguments[-1]))
-    return tuple(x[every] for x in arguments)
+    return arguments if every is None else tuple(x[every] for x in arguments)
 
 
 # -- a tree of bodies, in the plane and in space: what inverse dynamics works on
@@ -399,6 +401,30 @@ class ElasticBodies:
         """Return it at some of the instants."""
         raise NotImplementedError
 
+    @property
+    def tree(self) -> Tree:
+        """Itself as inverse dynamics goes along it."""
+        raise NotImplementedError
+
+    @property
+    def way(self) -> tuple[Site, ...]:
+        """From the ground to the end-effector: every body and the interface that leads on."""
+        raise NotImplementedError
+
+    def base(self, q_r: np.ndarray) -> np.ndarray:
+        """Return where the first joints' frame is (d, n), m, for rigid coordinates (n, R)."""
+        return np.zeros((len(self.tree.gravity), len(q_r)))
+
+    @property
+    def softness(self) -> float:
+        """Largest static deflection of a body by a unit force across it, m/N."""
+        raise NotImplementedError
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Deflection of the end by unit rigid coordinates (R,), m."""
+        raise NotImplementedError
+
     @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Each body's place in the vector of all elastic coordinates."""
@@ -431,17 +457,32 @@ class ElasticBodies:
 
         That of its outboard interfaces in its own frame.
         """
-        found = []
+        lengths = [np.linalg.norm(one.points, axis=1).max() for one in self.tree.constants]
+        pairs = zip(self._interfaces(q, False), lengths, strict=True)
+        return np.array([largest / length if length else 0.0 for largest, length in pairs])
+
+    def rotations(self, q: np.ndarray) -> np.ndarray:
+        """Return the largest rotation of every body's interfaces in q (n, N), rad (bodies,)."""
+        return np.array(list(self._interfaces(q, True)))
+
+    def _interfaces(self, q: np.ndarray, turned: bool) -> Iterator[float]:
+        """Yield the largest displacement, or rotation, of every body's interfaces in q (n, N)."""
+        d = len(self.tree.gravity)
         for part, body in zip(self.slices, self.bodies, strict=True):
-            d, largest = len(body.outboard_point), 0.0
-            points = body.outboard_point[None] if d == 2 else body.points
-            length = float(np.linalg.norm(points, axis=1).max())
-            if body.num_modes and length > 0.0:
-                # Of each interface: displacements, then rotations, of which the plane has one.
-                moved = (q[:, part] @ body.outboard.T).reshape(-1, 3 if d == 2 else 6)[:, :d]
-                largest = float(np.linalg.norm(moved, axis=1).max(initial=0.0)) / length
-            found.append(largest)
-        return np.array(found)
+            # Of each interface: displacements, then rotations, of which the plane has one.
+            every = (q[:, part] @ body.outboard.T).reshape(-1, 3 if d == 2 else 6)
+            own = every[:, d:] if turned else every[:, :d]
+            yield float(np.linalg.norm(own, axis=1).max(initial=0.0))
+
+    def compliance(self, q: np.ndarray) -> np.ndarray:
+        """Return q_e' K_ee q_e of every body (n, bodies), N m; eq. (7) of the paper; q (n, N)."""
+        pairs = zip(self.bodies, (q[:, part] for part in self.slices), strict=True)
+        return np.stack([np.einsum("nk,nk->n", e @ body.K, e) for body, e in pairs], axis=1)
+
+    @property
+    def rigid(self) -> Self:
+        """The same of bodies of the same mass and inertia that do not deform."""
+        return replace(self, bodies=tuple(body.rigid_part for body in self.bodies))
 
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
@@ -494,8 +535,36 @@ class Mechanism(ElasticBodies):
             scales=tuple(scale[part] for scale in self.scales),
         )
 
+    @property
+    def way(self) -> tuple[Site, ...]:
+        """All arms."""
+        return tuple((k, 0) for k in range(len(self.bodies)))
+
+    def base(self, q_r: np.ndarray) -> np.ndarray:
+        """Return where the first joint is (2, n), m."""
+        return np.stack([q_r[:, 0], np.full(len(q_r), self.joint_height)])
+
+    @property
+    def softness(self) -> float:
+        """Largest static deflection of an arm's end by a unit force across it, m/N."""
+        # Or a third of the arm's length squared times the end's rotation by a unit moment, which
+        # is the same of a cantilever, and not zero of an arm whose frame is its chord.
+        found = [0.0]
+        for body in self.bodies:
+            if body.num_modes:
+                soft = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
+                square = float(body.outboard_point @ body.outboard_point)
+                found += [float(soft[1, 1]), float(soft[2, 2]) * square / 3.0]
+        return max(found)
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Deflection of the end by unit rigid coordinates (1 + arms,), m."""
+        reach = sum(float(np.hypot(*body.outboard_point)) for body in self.bodies)
+        return np.array([1.0, *[reach] * len(self.bodies)])
+
     @cached_property
-    def tree(self) -> Tree:
+    def tree(self) -> Tree:  # type: ignore[override]
         """Itself as inverse dynamics goes along it."""
         joints = self.joints or (BARE,) * len(self.bodies)
         carried = {(k, 0): self.carried(k) for k in range(len(self.bodies))}
@@ -533,16 +602,3 @@ class Mechanism(ElasticBodies):
     def rotors(self) -> np.ndarray:
         """Mass of the cart and reflected inertia of the joints' rotors (1 + arms,), kg, kg m2."""
         return self.tree.rotors
-
-
-def compliance(
-    bodies: Sequence[ShapeIntegrals], parts: Sequence[slice], q: np.ndarray
-) -> np.ndarray:
-    """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper."""
-    return np.stack(
-        [
-            np.einsum("nk,nk->n", q[:, part] @ body.K, q[:, part])
-            for part, body in zip(parts, bodies, strict=True)
-        ],
-        axis=1,
-    )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.mechanism import FEW, repeated
+from dolfinopt.multibody.mechanism import repeated
 from dolfinopt.paths.tables import (
     TIME,
     Curve,
@@ -97,8 +97,8 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
         InputError: the path leaves the arms' reach or passes a singular position, names the time
             and the distance; or the table cannot be used.
     """
-    if 0 < len(t) < FEW:
-        return rigid_motion(t[repeated(len(t))], scene)[: len(t)]
+    if (every := repeated(len(t))) is not None:
+        return rigid_motion(t[every], scene)[: len(t)]
     motion = scene.motion
     if motion.path in ("joints", "rotation"):
         joints = _prescribed_joints(t, scene)

@@ -165,6 +165,53 @@ class ShapeIntegrals:
         """Int Phi_k . (S Phi_l) (q, q), skew; plane bodies."""
         return np.ascontiguousarray(self.W[1, 1:, 1:])
 
+    def inertia_about_centre(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return centre (3,), m, and inertia (3, 3) about it, kg m2, undeformed and in space."""
+        centre = self.w[:, 0] / self.mass if self.mass else np.zeros(3)
+        second = self.W[:, 0, 0].reshape(3, 3) - self.mass * np.outer(centre, centre)
+        return centre, np.trace(second) * np.eye(3) - second
+
+    # -- the same body otherwise -----------------------------------------------------------------
+
+    def in_basis(self, T: np.ndarray) -> ShapeIntegrals:
+        """Return the body in the coordinates z with q = T z; T is (q, q')."""
+        changed: dict[str, Any] = {}
+        for one in TABLE:
+            if one.modes:
+                first = 1 if one.rigid else 0
+                value = getattr(self, one.name)
+                changed[one.name] = _transformed(value, T, len(one.modes), first)
+        return replace(self, **changed)
+
+    @property
+    def rigid_part(self) -> ShapeIntegrals:
+        """The body with its elastic coordinates held at zero."""
+        return linear_part(self).in_basis(np.zeros((self.num_modes, 0)))
+
+    def padded(self, like: ShapeIntegrals) -> ShapeIntegrals:
+        """Return derivatives by a `rigid_part` as those by the whole body: zero by its modes."""
+        whole = self.in_basis(np.zeros((0, like.num_modes)))
+        zero: dict[str, Any] = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
+        return replace(whole, **zero)
+
+    def scaled_by(self, scale: str | None) -> list[np.ndarray]:
+        """Return the integrals that `scale` multiplies, see `Integral`; None: the geometry."""
+        return [np.asarray(getattr(self, one.name)) for one in TABLE if one.scale == scale]
+
+    def is_shaped_like(self, other: ShapeIntegrals) -> bool:
+        """Return whether number of coordinates, outboard modes and point are equal."""
+        pairs = zip(self.scaled_by(None), other.scaled_by(None), strict=True)
+        return self.num_modes == other.num_modes and all(np.array_equal(a, b) for a, b in pairs)
+
+    @property
+    def first_frequency(self) -> float:
+        """Lowest natural frequency of the reduced clamped-free body, Hz; inf if rigid."""
+        if self.num_modes == 0:
+            return float("inf")
+        inverse = np.linalg.inv(np.linalg.cholesky(self.M))
+        values = np.linalg.eigvalsh(inverse @ self.K @ inverse.T)
+        return float(np.sqrt(max(values[0], 0.0)) / (2.0 * np.pi))
+
 
 def plane_body(
     mass: float,
@@ -231,16 +278,6 @@ def of_material(
     return replace(other, D=damping * other.K)
 
 
-def in_basis(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
-    """Return the body in the coordinates z with q = T z; T is (q, q')."""
-    changed: dict[str, Any] = {}
-    for one in TABLE:
-        if one.modes:
-            first = 1 if one.rigid else 0
-            changed[one.name] = _transformed(getattr(body, one.name), T, len(one.modes), first)
-    return replace(body, **changed)
-
-
 def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.ndarray:
     """Return x T or T' x T in the last `rank` axes behind their `first` entries, which stay."""
     # Of three axes the first one is that of coordinates themselves: T^-1 x.
@@ -258,23 +295,6 @@ def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.
     out[..., first:, :first] = (value[..., first:, :first].swapaxes(-1, -2) @ T).swapaxes(-1, -2)
     out[..., first:, first:] = T.T @ value[..., first:, first:] @ T
     return out
-
-
-def proportional(
-    body: ShapeIntegrals, other: ShapeIntegrals, scale: str
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the integrals of both that `scale` multiplies, as arrays."""
-    names = [one.name for one in TABLE if one.scale == scale]
-    here, there = ([np.asarray(getattr(x, name)) for name in names] for x in (body, other))
-    return here, there
-
-
-def same_geometry(body: ShapeIntegrals, other: ShapeIntegrals) -> bool:
-    """Return whether number of coordinates, outboard modes and point are equal."""
-    names = [one.name for one in TABLE if one.scale is None]
-    return body.num_modes == other.num_modes and all(
-        np.array_equal(getattr(body, name), getattr(other, name)) for name in names
-    )
 
 
 # -- from finite elements --------------------------------------------------------------------
@@ -478,32 +498,10 @@ def rigid_bar(
     return rigid_body(mass, np.array([0.5 * mass * length, 0.0]), inertia, np.array([length, 0.0]))
 
 
-def padded(by: ShapeIntegrals, like: ShapeIntegrals) -> ShapeIntegrals:
-    """Return derivatives by `rigid_part` as those by the whole body `like`: zero by its modes."""
-    whole = in_basis(by, np.zeros((0, like.num_modes)))
-    zero: dict[str, Any] = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
-    return replace(whole, **zero)
-
-
 def linear_part(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body without geometric stiffness."""
     linear: Any = np.zeros((0, body.num_modes, body.num_modes))
     return replace(body, **dict.fromkeys(STIFFENING, linear))
-
-
-def rigid_part(body: ShapeIntegrals) -> ShapeIntegrals:
-    """Return the body with its elastic coordinates held at zero."""
-    return in_basis(linear_part(body), np.zeros((body.num_modes, 0)))
-
-
-def first_frequency(body: ShapeIntegrals) -> float:
-    """Return the lowest natural frequency of the reduced clamped-free body, Hz; inf if rigid."""
-    if body.num_modes == 0:
-        return float("inf")
-    lower = np.linalg.cholesky(body.M)
-    inverse = np.linalg.inv(lower)
-    values = np.linalg.eigvalsh(inverse @ body.K @ inverse.T)
-    return float(np.sqrt(max(values[0], 0.0)) / (2.0 * np.pi))
 
 
 # -- a plane body in space, as files of spatial codes hold it --------------------------------------

@@ -19,7 +19,6 @@ from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import WARN, Stiffening
-from dolfinopt.multibody.shape_integrals import first_frequency
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -168,7 +167,7 @@ def _first_frequencies(run: Simulated, by_arm: Mapping[str, _Traits]) -> dict[st
     bodies = () if run.trajectory is None else run.trajectory.mechanism.bodies
     for arm, body in zip(run.scene.arms, bodies, strict=False):
         own = by_arm[arm.name].frequency if arm.name in by_arm else None
-        value = first_frequency(body) if own is None else own
+        value = body.first_frequency if own is None else own
         if np.isfinite(value):
             found[arm.name] = value
     return found
@@ -319,7 +318,7 @@ def _frequencies(
             if arm.basis is not None:
                 state = arm.state(x_phys[index])
                 own = state.first_frequency
-                found[index] = own, max(0.0, first_frequency(state.body) / own - 1.0)
+                found[index] = own, max(0.0, state.body.first_frequency / own - 1.0)
     profile.counts = counts
     return gather_arms(partition, found)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,8 @@ import pandas as pd
 
 from dolfinopt.density.interpolation import interpolate
 from dolfinopt.paper.reproduction import (
-    CRAIG_BAMPTON,
     INITIAL,
-    MODAL,
+    METHODS,
     OPTIMUM,
     SOLID,
     SOLID_ENDS,
@@ -73,7 +72,8 @@ def check_paper(results: pd.DataFrame, scene: Scene) -> list[Check]:
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(undefined=StrictUndefined)
-    environment.filters |= {"mm": mm, "percent": percent, "Nm": torque, "listed": listed}
+    environment.filters |= {"mm": mm, "percent": percent, "Nm": "{:.4g} N m".format}
+    environment.filters["listed"] = lambda x: "; ".join(f"{k} {percent(x[k])}" for k in x)
     values = TOLERANCE | quantities(results, scene)
 
     def filled(text: str) -> str:
@@ -111,16 +111,6 @@ def percent(part: float) -> str:
     return f"{100.0 * part:.2f} %" if abs(part) < 0.1 else f"{100.0 * part:.1f} %"
 
 
-def torque(value: float) -> str:
-    """Return a compliance with its unit."""
-    return f"{value:.4g} N m"
-
-
-def listed(parts: Mapping[str, float]) -> str:
-    """Return parts with their labels."""
-    return "; ".join(f"{label} {percent(part)}" for label, part in parts.items())
-
-
 # -- quantities ------------------------------------------------------------------------------
 
 
@@ -155,10 +145,8 @@ def _of_objectives(rows: pd.DataFrame) -> dict[str, Any]:
         "dynamic_is_best": all(dynamic.compliance < c for c in rivals if not math.isnan(c)),
         "fourths": others.kind[ratios.between(*TOLERANCE["fourth"])].nunique(),
         "ratios": dict(zip(others.label, ratios)),
-        "low": ratios.min(),
-        "high": ratios.max(),
-        "best": best.compliance,
-        "best_label": best.label,
+        **dict(zip(("low", "high"), ratios.agg(["min", "max"]))),
+        **dict(zip(("best", "best_label"), best[["compliance", "label"]])),
     }
 
 
@@ -176,37 +164,32 @@ def _of_solid_ends(objectives: pd.DataFrame, reductions: pd.DataFrame) -> dict[s
         "ends": ends,
         "ends_ratios": dict(zip(made.label, made.deviation / initial)),
         "ends_dynamic": made[made.kind == "esl"].iloc[0].deviation,
-        "ends_worst": worst.deviation,
-        "ends_worst_label": worst.label,
+        **dict(zip(("ends_worst", "ends_worst_label"), worst[["deviation", "label"]])),
         "ends_modal": f"{ends} designs made with modes lose {behind} coordinates.",
     }
 
 
 def _of_reductions(rows: pd.DataFrame) -> dict[str, Any]:
     ordered = rows.sort_values("x").astype({"x": int})
-    cms, modal = (ordered[ordered.kind == method] for method in (CRAIG_BAMPTON, MODAL))
+    cms, modal = (ordered[ordered.kind == method] for method in METHODS)
     return {
-        "few_cms": cms.iloc[0],
-        "many_cms": cms.iloc[-1],
-        "few_modal": modal.iloc[0],
-        "many_modal": modal.iloc[-1],
+        **{"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]},
+        **{"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]},
         "cms_change": abs(cms.compliance.iloc[0] / cms.compliance.iloc[-1] - 1.0),
     }
 
 
 def _of_coordinates(rows: pd.DataFrame) -> dict[str, Any]:
     """Return what one design's curves over the number of coordinates do."""
-    cms, modal = (rows[rows.kind == method] for method in (CRAIG_BAMPTON, MODAL))
+    cms, modal = (rows[rows.kind == method] for method in METHODS)
     c, m = cms.compliance.to_numpy(), modal.compliance.to_numpy()
     climbs = (np.diff(m) >= -TOLERANCE["flat"] * m[-1]).all() and m[-1] > m[0]
     return {
         "level": c[-1],
         "flat": span(c),
-        "modal_first": m[0],
-        "modal_last": m[-1],
+        **dict(zip(("modal_first", "modal_last"), m[[0, -1]])),
         "climbs_below": climbs and m.max() < c.min(),
-        "first": int(modal.x.iloc[0]),
-        "last": int(modal.x.iloc[-1]),
+        **dict(zip(("first", "last"), modal.x.iloc[[0, -1]].astype(int))),
         "apart": np.max(cms.apart.to_numpy()),
         "below": 1.0 - modal.deviation.to_numpy()[[0, -1]] / cms.deviation.iloc[-1],
     }
@@ -218,15 +201,11 @@ def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
     initial = designs[INITIAL].compliance
     made = rows.pivot(index="made_for", columns="x", values="compliance").loc[made_for].to_numpy()
     return {
-        "lightest": x[0],
-        "heaviest": x[-1],
-        "light": made_for[0],
-        "heavy": made_for[-1],
+        **dict(zip(("lightest", "heaviest"), x[[0, -1]])),
+        **dict(zip(("light", "heavy"), made_for[[0, -1]])),
         "bend_deviation": np.max([bend(x, one.deviation) for one in designs.values()]),
-        "bend_initial": bend(x, initial),
-        "bend_optimum": bend(x, made[1]),
-        "power_initial": power(x, initial),
-        "power_optimum": power(x, made[1]),
+        **{"bend_initial": bend(x, initial), "bend_optimum": bend(x, made[1])},
+        **{"power_initial": power(x, initial), "power_optimum": power(x, made[1])},
         "payload_differ": np.max(np.abs(made[0] / made[-1] - 1.0)),
         "payload_loss": _losses(rows),
     }
@@ -242,12 +221,10 @@ def _of_paths(rows: pd.DataFrame) -> dict[str, Any]:
     return {
         "change_initial": span(initial.compliance),
         "change_optimum": span(designs[nominal].compliance),
-        "path_low": ratios.min(),
-        "path_high": ratios.max(skipna=False),
+        **{"path_low": ratios.min(), "path_high": ratios.max(skipna=False)},
         "over_solid": (own / solid[own.index]).max(skipna=False),
         "solid": solid.iloc[-1],
-        "solid_low": solid_ratios.min(),
-        "solid_high": solid_ratios.max(),
+        **dict(zip(("solid_low", "solid_high"), solid_ratios.agg(["min", "max"]))),
         "path_loss": _losses(rows),
     }
 
@@ -261,14 +238,10 @@ def _of_stiffness(scene: Scene) -> dict[str, Any]:
     """Return what flanges allow: those of a part V of the material have 1 - (1 - V)^3 of EI."""
     law, x, volume = scene.interpolation, scene.design.initial, scene.design.volume_fraction or 1.0
     stiffness = interpolate(np.array([x]), law.law, law.penalty, law.floor).stiffness
-    power = (
-        f"with q = {law.penalty:g} of RAMP"
-        if law.law == "ramp"
-        else f"to the power {law.penalty:g}"
-    )
+    words = "with q = {:g} of RAMP" if law.law == "ramp" else "to the power {:g}"
     return {
         "stiffness": round(float(stiffness[0]), 4),
-        "interpolation": f"{x:g} {power}",
+        "interpolation": f"{x:g} {words.format(law.penalty)}",
         "volume": volume,
         "flanges": 1.0 - (1.0 - volume) ** 3,
         "more": "twice the material" if volume == 0.5 else f"{1.0 / volume:.3g} times the material",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, htm
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
+    from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
     from dolfinopt.output.views import ArmView
 
@@ -31,6 +33,24 @@ MM = 1e3  # of a metre
 
 
 # -- table -----------------------------------------------------------------------------------
+
+
+def compare_runs(before: Path, after: Path) -> Table:
+    """Return `before_after` of the runs in two folders."""
+    return before_after(*map(_summary, (before, after)))
+
+
+def _summary(run: Path) -> Summary:
+    path = run / "summary.json"
+    try:
+        found: Summary = json.loads(path.read_text(encoding="utf-8"))
+        return found
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: cannot be read ({type(error).__name__}); name a finished run")
 
 
 def before_after(before: Summary, after: Summary) -> Table:
@@ -103,17 +123,18 @@ class Side:
 
 
 def read_side(
-    folder: Path,
-    scene: Scene,
-    summary: Summary,
-    views: list[ArmView],
-    mechanism: SpatialMechanism,
+    folder: Path, scene: Scene, views: list[ArmView], bodies: Mapping[int, ShapeIntegrals]
 ) -> Side:
-    """Return a finished run with its motion, see `Side`.
+    """Return a finished run with its motion, see `Side`; `bodies` of the arms that it designs.
 
     Raises:
-        InputError: it has no trajectory.npz, or another machine's.
+        InputError: it has no summary.json or trajectory.npz, or another machine's.
     """
+    from dolfinopt.arms.arm import chain_of
+    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
+
+    summary = _summary(folder)
+    mechanism = build_spatial_mechanism(scene, chain_of(scene, bodies))
     path = folder / "trajectory.npz"
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -122,9 +143,7 @@ def read_side(
             motion = data["t"], data["q_r"], lengths(data["deviation"]), by_drive
             return Side(folder, scene, summary, views, mechanism, *motion)
     except Exception as error:  # whatever a foreign file may raise
-        raise InputError(
-            f"{path}: cannot be read ({type(error).__name__}); name a finished run"
-        ) from None
+        raise _unreadable(path, error) from None
 
 
 def before_after_page(before: Side, after: Side, table: Table) -> str:

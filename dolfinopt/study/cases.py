@@ -20,7 +20,7 @@ from dolfinopt.reduction import BasisErrors
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, program, with_digests
 from dolfinopt.study import variants
-from dolfinopt.study.simulate import MODES
+from dolfinopt.study.simulate import MODES, SCALING
 
 Action = Literal["optimize", "simulate", "compare", "sample"]
 
@@ -29,10 +29,7 @@ SCENARIO = frozenset(
     "motion control closure payload damping reduction simulation objective constraints optimizer "
     "scenarios".split()
 )
-# These values of material and arms scale the integrals of the reduced arms, where the basis does
-# not depend on them: Krylov's shifts and the Gramian's band are frequencies. The thickness in the
-# plane alone: in space it is one of the cells' sides.
-SCALING = ("young_modulus", "density", "thickness")
+# Bases that do not depend on `SCALING`: Krylov's shifts and the Gramian's band are frequencies.
 SCALABLE = ("craig-bampton", "modal")
 
 

@@ -13,7 +13,7 @@ from dolfinopt.output.views import designed
 from dolfinopt.plots import style
 from dolfinopt.plots.style import GREY, PALETTE
 from dolfinopt.study import tables
-from dolfinopt.study.tables import FrameFigure, LineFigure, MatrixFigure, Panel
+from dolfinopt.study.tables import FrameFigure, LineFigure, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,9 +32,21 @@ Looks = Mapping[str, Mapping[str, Any]]
 
 def draw_study(study: tables.Study, folder: Path) -> list[Path]:
     """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
-    styles = common_looks(study.figures)
-    files = [folder / f"{tables.joined(study.name, one.name)}.png" for one in study.figures]
-    return [style.save(draw(one, styles), file) for one, file in zip(study.figures, files)]
+    return draw_all({tables.joined(study.name, one.name): one for one in study.figures}, folder)
+
+
+def draw_all(
+    figures: Mapping[str, tables.Figure], folder: Path, narrow: bool = False
+) -> list[Path]:
+    """Draw figures in common looks as FOLDER/<name>.png, curves in one column if `narrow`."""
+    styles, files = common_looks(figures.values()), []
+    for name, one in figures.items():
+        if narrow and isinstance(one, LineFigure):
+            drawn = column_figure(one, styles)
+        else:
+            drawn = draw(one, styles)
+        files.append(style.save(drawn, folder / f"{name}.png"))
+    return files
 
 
 def common_looks(figures: Iterable[tables.Figure]) -> Looks:
@@ -53,8 +65,6 @@ def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
     styles = styles or common_looks([figure])
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
-    if isinstance(figure, MatrixFigure):
-        return matrix_figure(figure)
     if isinstance(figure, FrameFigure):
         return FRAMES[figure.kind](figure, styles)
     return design_figure(figure)
@@ -186,20 +196,26 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
 # -- tables and samples ------------------------------------------------------------------------
 
 
-def matrix_figure(figure: MatrixFigure) -> Figure:
-    """Return heat maps with their numbers."""
-    count = len(figure.labels)
+def matrix_figure(figure: FrameFigure, styles: Looks) -> Figure:
+    """Return heat maps with their numbers: design i in scenario j.
+
+    Columns: "made for ...", what designs i were made for; their values, one for each j; panel.
+    """
+    panels = list(figure.frame.groupby("panel", sort=False))
+    made = figure.frame.columns[0]
+    count = len(panels[0][1])
     side = max(3.6, 0.62 * count + 1.6)
-    drawn, grid = _grid(figure.title, (1, len(figure.panels)), (side, side))
-    for axes, (title, values) in zip(grid[0], figure.panels, strict=True):
+    drawn, grid = _grid(figure.title, (1, len(panels)), (side, side))
+    for axes, (title, part) in zip(grid[0], panels, strict=True):
+        values = part.iloc[:, 1:-1].to_numpy(dtype=float)
         image = axes.imshow(values, cmap="RdBu_r", vmin=-LOSS, vmax=LOSS)
         for (i, j), value in np.ndenumerate(values):
             dark = abs(value) > 0.6 * LOSS
             axes.text(j, i, f"{value:.2f}", ha="center", va="center", color="w" if dark else "k",
                       fontsize=9 if count <= CROWD else 7)  # fmt: skip
-        axes.set_xticks(range(count), figure.labels)
-        axes.set_yticks(range(count), figure.labels)
-        _label(axes, title, figure.column_label, figure.row_label)
+        axes.set_xticks(range(count), part[made])
+        axes.set_yticks(range(count), part[made])
+        _label(axes, title, made.replace("made for", "used at", 1), made)
         ends = {(False, False): "neither", (True, False): "min", (False, True): "max"}
         beyond = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
         drawn.colorbar(image, ax=axes, shrink=0.8, extend=ends.get(beyond, "both"))
@@ -305,6 +321,7 @@ def scatter_figure(figure: FrameFigure, styles: Looks) -> Figure:
 
 
 FRAMES = {
+    "matrix": matrix_figure,
     "tornado": tornado_figure,
     "bars": bar_figure,
     "histogram": histogram_figure,

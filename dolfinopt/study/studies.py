@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,6 +20,7 @@ import pandas as pd
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import arms_with_design, read_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
@@ -33,7 +34,6 @@ from dolfinopt.study.tables import (
     FrameFigure,
     Line,
     LineFigure,
-    MatrixFigure,
     Panel,
     Study,
     Table,
@@ -403,30 +403,38 @@ def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[tuple[Pane
 def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
     """Return design i in scenario j, and what it loses against the one made for j."""
     labels = [", ".join(f"{value:g}" for value in point) for point in points.to_numpy()]
-    axis = ", ".join(points.columns)
-    made, used = f"made for {axis}", f"used at {axis}"
+    axis, tables, losses = ", ".join(points.columns), [], {}
     crossed = frame[frame["role"] == "crossed"]
-    tables, panels = [], []
     for what in QUANTITIES:
         values = crossed.pivot(index="made for", columns="point", values=what).to_numpy()
-        loss = 100.0 * (values / np.diag(values) - 1.0)
         quantity = what.partition(" [")[0]
-        for ending, title, matrix in (
-            ("", f"{what[0].upper()}{what[1:]} of design i in scenario j.", values),
-            ("_loss", f"Loss of {quantity} against the design made for j [%].", loss),
-        ):
-            wide = pd.DataFrame(matrix, columns=[f"used at {label}" for label in labels])
-            wide.insert(0, made, labels)
-            name = joined(prefix, f"cross_{quantity.replace(' ', '_')}{ending}")
-            tables.append(Table(name, title, wide))
-        panels.append((f"loss of {quantity} [%]", loss))
+        name = joined(prefix, f"cross_{quantity.replace(' ', '_')}")
+        loss = 100.0 * (values / np.diag(values) - 1.0)
+        title = f"{what[0].upper()}{what[1:]} of design i in scenario j."
+        lost = f"Loss of {quantity} against the design made for j [%]."
+        tables.append(square_table(name, title, axis, labels, values))
+        tables.append(square_table(f"{name}_loss", lost, axis, labels, loss))
+        losses[f"loss of {quantity} [%]"] = tables[-1]
     title = "What a design loses where it was not made for"
-    figures: list[Figure] = [
-        MatrixFigure(joined(prefix, "cross"), title, made, used, tuple(labels), tuple(panels))
-    ]
+    figures: list[Figure] = [square_figure(joined(prefix, "cross"), title, losses)]
     if optima := _good(frame.loc[frame["role"] == "optimum", "outcome"]):
         figures.append(design_figure(joined(prefix, "designs"), "Designs by scenario", optima))
     return tables, figures
+
+
+def square_table(
+    name: str, title: str, axis: str, labels: Sequence[str], values: np.ndarray
+) -> Table:
+    """Return values (n, n) of designs made for i and used at j, by the labels on the axis."""
+    wide = pd.DataFrame(values, columns=[f"used at {label}" for label in labels])
+    wide.insert(0, f"made for {axis}", labels)
+    return Table(name, title, wide)
+
+
+def square_figure(name: str, title: str, panels: Mapping[str, Table]) -> FrameFigure:
+    """Return such tables, a panel by its title."""
+    parts = [table.frame.assign(panel=panel) for panel, table in panels.items()]
+    return FrameFigure(name, title, "matrix", pd.concat(parts, ignore_index=True))
 
 
 def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
@@ -585,7 +593,8 @@ def _reductions(frame: pd.DataFrame, called: str) -> Report:
         figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
         figures.append(design_figure("designs", title, simulated))
     if good := _good(own["outcome"]):
-        figures.append(_convergence(good))
+        panels = tuple((panel,) for panel in convergence(good))
+        figures.append(LineFigure("convergence", "Convergence", panels))
     return tables, figures
 
 
@@ -627,17 +636,17 @@ def _percent(share: float) -> float:
     return round(100.0 * share, 4) + 0.0
 
 
-def _convergence(found: Sequence[Outcome]) -> LineFigure:
+def convergence(found: Sequence[Outcome]) -> tuple[Panel, Panel]:
     """Return objective and grayness against the iteration."""
     rows = [
         {"made": outcome.case.label, **vars(row)} for outcome in found for row in outcome.history()
     ]
-    frame = pd.DataFrame(rows)
+    frame = pd.DataFrame(rows, columns=["made", *(one.name for one in fields(HistoryRow))])
     unit = {"compliance": "N m s", "deviation": "m", "eigenfrequency": "s2"}
-    label = f"objective [{unit.get(found[0].case.scene.objective.kind, 'N m')}]"
+    kind = found[0].case.scene.objective.kind if found else ""
+    label, x = f"objective [{unit.get(kind, 'N m')}]", "iteration [-]"
     objective, grayness = (
-        lines_by(frame, "made", "iteration", name) for name in ("objective", "grayness")
+        lines_by(frame, "made", "iteration", y) for y in ("objective", "grayness")
     )
-    first = Panel("as the own model sees it", "iteration [-]", label, objective, y_log=True)
-    second = Panel("", "iteration [-]", "grayness [-]", grayness)
-    return LineFigure("convergence", "Convergence", ((first,), (second,)))
+    first = Panel("as the own model sees it", x, label, objective, y_log=True)
+    return first, Panel("", x, "grayness [-]", grayness)

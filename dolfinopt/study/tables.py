@@ -124,28 +124,16 @@ class DesignFigure:
 
 
 @dataclass(frozen=True, eq=False)
-class MatrixFigure:
-    """Design i in scenario j: values (n, n) with row and column labels."""
-
-    name: str
-    title: str
-    row_label: str
-    column_label: str
-    labels: tuple[str, ...]
-    panels: tuple[tuple[str, np.ndarray], ...]
-
-
-@dataclass(frozen=True, eq=False)
 class FrameFigure:
     """A figure of a data frame; see `figures.FRAMES` for the columns that each kind needs."""
 
     name: str
     title: str
-    kind: Literal["tornado", "bars", "histogram", "scatter"]
+    kind: Literal["matrix", "tornado", "bars", "histogram", "scatter"]
     frame: pd.DataFrame
 
 
-Figure = LineFigure | DesignFigure | MatrixFigure | FrameFigure
+Figure = LineFigure | DesignFigure | FrameFigure
 
 
 # -- files -----------------------------------------------------------------------------------

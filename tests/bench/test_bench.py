@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from runs import refusal, run
 
-from dolfinopt.bench import goals, iterations, measure, motion, optimiser, solid
+from dolfinopt.bench import goals, iterations, measure, motion, optimiser, panel, solid
 from dolfinopt.bench import run as benches
-from dolfinopt.bench.diagram import Diagram, Frame, Panel, Plan, curves, fastest, fitted_power
 from dolfinopt.bench.goals import Goal, goal_table
+from dolfinopt.bench.measure import Plan
+from dolfinopt.bench.panel import Diagram, Frame, Panel, curves, fastest, fitted_power
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.paper.reproduction import load_paper
@@ -48,8 +49,8 @@ def measured(tmp_path):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr(benches, "draw", lambda *_: None)
-    monkeypatch.setattr(benches, "save", lambda figure, path: path)
+    monkeypatch.setattr(panel, "draw", lambda *_: None)
+    monkeypatch.setattr(panel, "save", lambda figure, path: path)
 
 
 # -- kept ------------------------------------------------------------------------------------
@@ -94,7 +95,7 @@ def test_rows_of_another_source_are_measured_anew(measured, monkeypatch):
     assert again() == 1 and again() == 1
     monkeypatch.setattr(benches, "source", lambda: "another")
     assert again() == 2 and again() == 2
-    monkeypatch.setattr(benches, "_version", lambda package: "9.9")
+    monkeypatch.setattr(benches, "version", lambda package: "9.9")
     assert again() == 3
 
 

@@ -136,10 +136,10 @@ def test_exudyn_moves_alike():
 
 def test_both_links():
     """The same link: dofs of all nodes in DOLFINx, less the clamped and the rigid ones here."""
-    found = solid.iterate_link(MPI.COMM_SELF, SCENE, (4, 3, 2), "ours")
+    found = solid.iterate_link(MPI.COMM_SELF, SCENE, (4, 3, 2), solid.OURS)
     assert found["dofs"] == 3 * 3 * 4 * 3 + 6 and found["solver"] == "LAPACK's band"
     assert [len(row) for row in found["phases"]] == 2 * [len(solid.PHASES)]
-    found = solid.plain_link(MPI.COMM_SELF, SCENE, (4, 3, 2), "plain")
+    found = solid.plain_link(MPI.COMM_SELF, SCENE, (4, 3, 2), solid.PLAIN)
     assert found["dofs"] == 3 * 5 * 4 * 3 and len(found["phases"]) == 1
 
 
@@ -223,7 +223,7 @@ def test_errors_of_a_damped_case(draw):
     case = next(c for n in range(1, 20) if (c := draw(number=n)).cells[5] > 1e-5)
     rows = rows_of(case)
     assert rows["tolerance [-]"].tolist() == list(tolerance.TOLERANCES)
-    found = tolerance.solved(case.problem, 1e-3)
+    found = radau.integrate(case.problem, 1e-3, tolerance.STAGES, Profile())
     right = tolerance.reference(case.problem, found, 1e-3)
     assert right.error <= 1e-5 and len(right.a) > len(found.a) and right.a.shape[1] == 5
     t = np.linspace(0.0, case.scene.motion.horizon, 4001)

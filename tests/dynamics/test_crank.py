@@ -17,7 +17,7 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.mechanism import Drives, Mechanism, slider
+from dolfinopt.multibody.mechanism import Closure, Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
 
@@ -132,7 +132,7 @@ def crank(body: ShapeIntegrals) -> Crank:
         desired,
         (0.0, END),
         drives,
-        slider(0j, 1.0 + 0j),
+        Closure.slider(0j, 1.0 + 0j),
         start=(np.array([[0.0, *q, 0.0]]), np.array([[slower, *qd, 0.0]])),
     )
 

@@ -10,10 +10,9 @@ from spatial_beams import DURATION, quintic_motion, reference_chain
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.multibody.end_effector import deviation
 from dolfinopt.multibody.mechanism import Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.spatial.end_effector import deviation
-from dolfinopt.multibody.spatial.equations import SPACE
 from dolfinopt.paths.time_laws import quintic
 from dolfinopt.profiling import Profile
 
@@ -37,14 +36,14 @@ def test_plane_machine_in_space(controlled):
     plane = Mechanism(bodies, 0.5, 0.01, (0.0, -9.81), -0.3)
     ends = (0.0, 0.5)
     posed = posed_machine(plane), lambda t: posed_motion(plane_motion(t)), ends
-    systems = [ElasticSystem(plane, plane_motion, ends), ElasticSystem(*posed, SPACE)]
+    systems = [ElasticSystem(plane, plane_motion, ends), ElasticSystem(*posed)]
     if controlled:
         gains = np.array([2e3, 400.0, 200.0])
         limits, driven = np.full(3, np.inf), np.ones(3, dtype=bool)
         drives = Drives(np.arange(3), gains, 0.05 * gains, limits, driven, True)
         systems = [
             MachineSystem(plane, plane_motion, ends, drives),
-            MachineSystem(*posed, drives, equations=SPACE),
+            MachineSystem(*posed, drives),
         ]
     grid = radau.integrate(systems[0], TOLERANCE, 4, Profile()).time_grid
     expected, found = (radau.on_grid(one, grid, TOLERANCE, 4) for one in systems)
@@ -59,7 +58,7 @@ def test_plane_machine_in_space(controlled):
 
 def test_chain_of_beams():
     """Largest deviation of nonlinear Saint-Venant beams, 19.05 mm, within 1 %; static start."""
-    system = ElasticSystem(reference_chain(2), quintic_motion, (0.0, DURATION), SPACE)
+    system = ElasticSystem(reference_chain(2), quintic_motion, (0.0, DURATION))
     solution = radau.integrate(system, TOLERANCE, 4, Profile())
     t = np.linspace(0.0, DURATION, 601)
     motion = quintic_motion(t)

@@ -15,7 +15,6 @@ from dolfinopt.dynamics.machine_system import DenseLinearisation, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.multibody.mechanism import Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import in_basis
 from dolfinopt.paths.time_laws import quintic
 from dolfinopt.profiling import Profile
 
@@ -117,7 +116,7 @@ def desired(t: np.ndarray) -> RigidMotion:
 
 def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
     """Return an arm of one mode on a cart, its drives with or without gains, no feed-forward."""
-    one_mode = in_basis(beam(damping=1e-3).body(), np.array([[1.0], [0.5], [0.0]]))
+    one_mode = beam(damping=1e-3).body().in_basis(np.array([[1.0], [0.5], [0.0]]))
     drives = Drives(
         np.arange(2), gains * np.array([4e3, 100.0]), gains * np.array([40.0, 0.5]),
         np.full(2, np.inf), np.ones(2, dtype=bool),

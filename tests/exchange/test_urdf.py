@@ -33,9 +33,9 @@ from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
 from dolfinopt.mesh.geometry import TENSOR
+from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.spatial.end_effector import end_effector
 from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms

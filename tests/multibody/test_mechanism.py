@@ -22,14 +22,17 @@ from bodies import (
 )
 from runs import ROOT
 
-from dolfinopt.multibody import end_effector as plane_end
-from dolfinopt.multibody.end_effector import interface_place, place_gradient
-from dolfinopt.multibody.equations import PLANE, Equations
+from dolfinopt.multibody.end_effector import (
+    deviation,
+    end_effector,
+    end_effector_gradient,
+    interface_place,
+    place_gradient,
+)
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism, compliance
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import plane_body
-from dolfinopt.multibody.spatial.equations import SPACE
 from dolfinopt.multibody.spatial.mechanism import exponential
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.scene.load import load_scene
@@ -45,9 +48,8 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Machine:
-    """A mechanism with its equations, what it was made of, and states y, yd, ydd (3, n, S)."""
+    """A mechanism, what it was made of, and states y, yd, ydd (3, n, S)."""
 
-    equations: Equations
     model: Any
     mechanism: Any
     states: np.ndarray
@@ -93,7 +95,7 @@ def machine_of(kind: str, count: int = 4) -> Machine:
         mechanism = model.mechanism()
     size = mechanism.num_rigid + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
-    return Machine(SPACE if arms == "tree" else PLANE, model, mechanism, states)
+    return Machine(model, mechanism, states)
 
 
 CHAINS = [f"{arms}{bent}" for arms in ("1 arm", "2 arms", "3 arms") for bent in ("", ", stiffened")]
@@ -138,10 +140,9 @@ def test_plane_machine_in_space(stiff: bool) -> None:
         for found, value in zip(inverse_dynamics(one, joints, *rates), expected, strict=True):
             assert_close(found, value, ROUNDING)
     e = rates[0]
-    assert np.abs(SPACE.end_effector(space, joints, e)[:, 2]).max() == 0.0
-    for function in ("end_effector", "deviation"):
-        found, value = getattr(SPACE, function)(space, joints, e), getattr(plane_end, function)
-        assert_close(found[:, :2], value(chain, motion, e), ROUNDING)
+    assert np.abs(end_effector(space, joints, e)[:, 2]).max() == 0.0
+    for function in (end_effector, deviation):
+        assert_close(function(space, joints, e)[:, :2], function(chain, motion, e), ROUNDING)
 
 
 def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
@@ -217,22 +218,22 @@ def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
 
 def test_end_effector(machine: Machine) -> None:
     """Its place, the deviation from the rigid machine, and derivatives by all they depend on."""
-    eq, mechanism, rng = machine.equations, machine.mechanism, np.random.default_rng(9)
+    mechanism, rng = machine.mechanism, np.random.default_rng(9)
     motion, (q, _, _) = machine.split(machine.states)
-    place = eq.end_effector(mechanism, motion, q)
+    place = end_effector(mechanism, motion, q)
     if isinstance(machine.model, Chain):
         expected = [machine.model.frames(y)[0][-1] for y in machine.states[0]]
         assert_close(place, expected, 1e-14)
-    stiff = eq.end_effector(mechanism, motion, 0.0 * q)
-    assert_close(eq.deviation(mechanism, motion, q), place - stiff, 1e-14, np.abs(place).max())
-    assert not eq.deviation(mechanism, motion, 0.0 * q).any()
+    stiff = end_effector(mechanism, motion, 0.0 * q)
+    assert_close(deviation(mechanism, motion, q), place - stiff, 1e-14, np.abs(place).max())
+    assert not deviation(mechanism, motion, 0.0 * q).any()
     weights = rng.normal(size=place.shape)
-    by_q, by_rigid, by_bodies = eq.end_effector_gradient(mechanism, motion, q, weights, True)
+    by_q, by_rigid, by_bodies = end_effector_gradient(mechanism, motion, q, weights)
     step, turn = rng.normal(size=q.shape), rng.normal(size=motion.q.shape)
 
     def along(h: float) -> float:
         moved = RigidMotion(motion.q + h * turn, motion.qd, motion.qdd)
-        return float(np.sum(weights * eq.end_effector(mechanism, moved, q + h * step)))
+        return float(np.sum(weights * end_effector(mechanism, moved, q + h * step)))
 
     expected = np.sum(by_q * step) + np.sum(by_rigid * turn)
     assert_close(expected, derivative(along), DIFFERENCES, 10.0)
@@ -244,7 +245,7 @@ def test_end_effector(machine: Machine) -> None:
 
             def moved(h: float, i: int = i, name: str = name, x: np.ndarray = change) -> float:
                 one = changed(mechanism, i, name, h * x)
-                return float(np.sum(weights * eq.end_effector(one, motion, q)))
+                return float(np.sum(weights * end_effector(one, motion, q)))
 
             assert_close(np.sum(gradient * change), derivative(moved), DIFFERENCES, 10.0)
 
@@ -254,16 +255,16 @@ def test_end_effector(machine: Machine) -> None:
 def test_few_instants_are_those_of_many(kind: str, count: int) -> None:
     """Values at up to three instants, which are computed as four, and sums over them."""
     one = machine_of(kind, 8)
-    eq, mechanism, R = one.equations, one.mechanism, one.rigid
+    mechanism, R = one.mechanism, one.rigid
     weights, rng = np.zeros_like(one.states[0]), np.random.default_rng(2)
     weights[:count] = rng.normal(size=weights[:count].shape)  # none at the others
-    pull = rng.normal(size=(8, 2 if eq is PLANE else 3)) * (np.arange(8) < count)[:, None]
+    pull = rng.normal(size=(8, 3 if kind == "tree" else 2)) * (np.arange(8) < count)[:, None]
     found = []
     for part in (slice(None), slice(count)):
         motion, rates = one.split(one.states[:, part])
         values = [one.forces(one.states[:, part]), one.tangent(part=part).dense()]
         values += [elastic_residual(mechanism, motion, *rates)]
-        by_q, _, by_end = eq.end_effector_gradient(mechanism, motion, rates[0], pull[part], True)
+        by_q, _, by_end = end_effector_gradient(mechanism, motion, rates[0], pull[part])
         by = weights[part, R:], weights[part, :R]
         bodies = body_gradient(mechanism, motion, *rates, *by)
         sums = [x for b in bodies for x in (b.w, b.W, b.K)] + [x["outboard"] for x in by_end]
@@ -288,12 +289,12 @@ def test_few_instants_do_not_depend_on_memory() -> None:
                 kept[place] = kept[0]
             motion, (q, qd, qdd) = one.split(one.states.copy())
             slopes = body_gradient(one.mechanism, motion, q, qd, qdd, qd)
-            by_q, _, by_end = PLANE.end_effector_gradient(one.mechanism, motion, q, weights, True)
+            by_q, _, by_end = end_effector_gradient(one.mechanism, motion, q, weights)
             arrays = [
                 one.forces(one.states),
                 elastic_residual(one.mechanism, motion, q, qd, qdd),
                 one.tangent().dense(),
-                PLANE.end_effector(one.mechanism, motion, q),
+                end_effector(one.mechanism, motion, q),
                 *(value for by in slopes for value in (by.w, by.W, by.K, by.outboard)),
                 *(by_q, *(by["outboard"] for by in by_end)),
                 *vars(rigid_motion(t, scene)).values(),
@@ -317,7 +318,7 @@ def test_interface_and_its_variation(kind: str) -> None:
 
     here = at(y, second=True)
     motion, (q, _, _) = one.split(one.states)
-    assert_close(here.place, PLANE.end_effector(mechanism, motion, q) @ [1.0, 1j], 1e-14)
+    assert_close(here.place, end_effector(mechanism, motion, q) @ [1.0, 1j], 1e-14)
     for c, unit in enumerate(np.eye(y.shape[1])):
         for found, key in ((here.jacobian, "place"), (here.hessian, "jacobian")):
             by = derivative(lambda t, unit=unit, key=key: getattr(at(y + t * unit), key))
@@ -374,10 +375,10 @@ def test_compliance_is_twice_the_elastic_energy() -> None:
     """Arm by arm, from the block-diagonal stiffness."""
     mechanism = machine_of("3 arms").mechanism
     q = np.random.default_rng(4).normal(size=(4, mechanism.num_coordinates))
-    found = compliance(mechanism.bodies, mechanism.slices, q)
+    found = mechanism.compliance(q)
     assert_close(found.sum(axis=1), np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q), 1e-13)
     alone = np.zeros_like(q)
     alone[:, mechanism.slices[1]] = q[:, mechanism.slices[1]]
-    parts = compliance(mechanism.bodies, mechanism.slices, alone)
+    parts = mechanism.compliance(alone)
     assert not parts[:, [0, 2]].any()
     assert_close(parts[:, 1], found[:, 1], 1e-14)

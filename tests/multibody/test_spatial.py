@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from scipy.linalg import expm
 
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import rigid_part
 from dolfinopt.multibody.spatial.frozen import FrozenTree
 from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw, skew
 from dolfinopt.multibody.tangent import linearise
@@ -77,7 +75,7 @@ def test_carried_inertia_of_a_frozen_tree():
     pose = RigidMotion(*rng.normal(size=(3, 1, 4)))
     rest = np.zeros((1, 8))
     mass = linearise(mechanism, pose, rest, rest, rest).dense()[0, :3, 16:19]
-    rigid = replace(mechanism, bodies=tuple(map(rigid_part, mechanism.bodies)))
+    rigid = mechanism.rigid
     frozen = FrozenTree(rigid, pose, "rigid-body")
     carried, B = frozen.carried()[1].matrix(), mechanism.bodies[1].outboard
     expected = mechanism.bodies[1].M + B.T @ carried @ B

@@ -16,7 +16,7 @@ from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.mechanism import Closure, Mechanism, pin, slider
+from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.state import HistoryRow
@@ -493,7 +493,7 @@ def slider_crank(count: int = 61) -> tuple[list[ArmView], Any]:
     angle = 80.0 * t
     desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
     q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
-    closure = slider(0.0, 1.0)
+    closure = Closure.slider(0.0, 1.0)
     actual = shapes.close_loop(mechanism, closure, desired, q_e)
     assert actual is not None
     return views, motion(mechanism, t, actual, q_e, desired, closure)
@@ -505,13 +505,13 @@ def test_a_drawn_loop_is_closed_by_its_last_joints(kind):
     q_r = np.array([[0.2, 0.5, -0.9, 0.7], [0.2, 0.48, -0.9, 0.8]])
     q_e = 0.02 * np.sin(np.arange(12.0)).reshape(2, 6)
     rigid_end = shapes.chain(mechanism, q_r[:1], 0.0 * q_e[:1])[0][0, -1]
-    closure = pin(rigid_end) if kind == "pin" else slider(rigid_end, 1.0 + 0.5j)
+    closure = Closure.pin(rigid_end) if kind == "pin" else Closure.slider(rigid_end, 1.0 + 0.5j)
     closed = shapes.close_loop(mechanism, closure, q_r, q_e)
     end = shapes.chain(mechanism, closed, q_e)[0][:, -1]
     assert np.abs(closure.gap(end)).max() < 3e-6
     free = 4 - closure.count
     np.testing.assert_array_equal(closed[:, :free], q_r[:, :free])
-    assert shapes.close_loop(mechanism, pin(5.0), q_r, q_e) is None  # out of reach
+    assert shapes.close_loop(mechanism, Closure.pin(5.0), q_r, q_e) is None  # out of reach
     assert shapes.close_loop(mechanism, None, q_r, q_e) is q_r
 
 
@@ -528,7 +528,7 @@ def test_magnification_is_less_where_the_loop_does_not_reach_its_pin():
     views, mechanism = manipulator(3)
     t, desired = np.arange(2.0), np.array([[0.0, 0.5, -0.6, 0.8], [0.0, 0.52, -0.6, 0.8]])
     shortened = np.tile([-0.01, 0.0], (2, 3))
-    closure = pin(shapes.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
+    closure = Closure.pin(shapes.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
     actual = shapes.close_loop(mechanism, closure, desired, shortened)
     moving = motion(mechanism, t, actual, shortened, desired, closure)
     film = animation.make_film(views, moving, 50.0, 2)

@@ -10,7 +10,8 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.multibody.spatial.end_effector import body_frames, end_effector
+from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.spatial.end_effector import body_frames
 from dolfinopt.output.views import AROUND, ArmView, designed
 from dolfinopt.part.isosurface import surface_at
 from dolfinopt.plots import animation, solid_design, solid_machine

@@ -26,7 +26,6 @@ from dolfinopt.dynamics.simulation import DriveForces
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import scaled
-from dolfinopt.multibody.spatial.equations import SPACE
 from dolfinopt.optimization.gradient_check import TaylorTest
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.reduction import METHODS, AdjointFields, Method
@@ -64,7 +63,7 @@ SYSTEMS = {  # with steps and stages
     "2 arms": (lambda: plane_system(2, (0.0, 0.0)), 15, 3),
     "3 arms": (lambda: plane_system(3, (1.0, -9.81)), 15, 2),
     "space": (
-        lambda: ElasticSystem(reference_chain(2), quintic_motion, (0.0, DURATION), SPACE), 30, 3,
+        lambda: ElasticSystem(reference_chain(2), quintic_motion, (0.0, DURATION)), 30, 3,
     ),
 }  # fmt: skip
 

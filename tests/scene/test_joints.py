@@ -185,7 +185,7 @@ def test_interfaces_of_a_scene(source):
     assert (machine.joints[2].parent, machine.joints[2].interface) == (1, 1)
     assert np.array_equal(machine.bodies[1].points, [[0.4, 0, 0], [0.2, 0.01, 0]])
     assert machine.tree.sites == ((0,), (0, 1), ()) and set(machine.tree.loads) == {(1, 0)}
-    assert machine.chain == (0, 1)
+    assert machine.way == ((0, 0), (1, 0))
     data = with_fork()  # the payload at the side, beside the tool
     data["payload"]["interface"] = "Side"
     machine = machine_of(scene_from_dict(data, source))

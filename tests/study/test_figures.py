@@ -24,9 +24,8 @@ from dolfinopt.study.figures import (
     common_looks,
     draw,
     line_figure,
-    matrix_figure,
 )
-from dolfinopt.study.tables import FrameFigure, Line, LineFigure, MatrixFigure, Panel
+from dolfinopt.study.tables import FrameFigure, Line, LineFigure, Panel
 
 PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -188,12 +187,12 @@ def test_column_of_panels():
 @pytest.mark.parametrize("factor", [0.1, 1.0, 100.0])
 def test_losses_have_one_scale(factor):
     values = factor * np.array([[0.0, 1.5], [-2.0, 0.0]])
-    panels = (("loss [%]", values),)
-    labels = "made for [kg]", "used at [kg]", ("4", "8")
-    axes = matrix_figure(MatrixFigure("", "T", *labels, panels)).axes[0]
+    frame = pd.DataFrame(values, columns=["used at 4", "used at 8"]).assign(panel="loss [%]")
+    frame.insert(0, "made for [kg]", ["4", "8"])
+    axes = draw(FrameFigure("", "T", "matrix", frame)).axes[0]
     assert axes.images[0].get_clim() == (-10.0, 10.0)
     assert [text.get_text() for text in axes.texts] == [f"{value:.2f}" for value in values.flat]
-    assert axes.get_ylabel() == "made for [kg]"
+    assert (axes.get_ylabel(), axes.get_xlabel()) == ("made for [kg]", "used at [kg]")
 
 
 def test_tornado():

@@ -334,6 +334,13 @@ def _mesh(file: Path, mesh: Any, package_path: Sequence[Path]) -> Trimesh:
     return found
 
 
+def sources_of(file: Path) -> list[Path]:
+    """Return the files that a robot is read from: itself and its meshes, where they are found."""
+    meshes = [one.get("filename", "") for one in safe_xml(file).getroot().iter("mesh")]
+    found = (mesh_path(file, name) for name in meshes)
+    return [file, *(path for path in found if path is not None)]
+
+
 def mesh_path(file: Path, name: str, package_path: Sequence[Path] = ()) -> Path | None:
     """Return where a mesh that a URDF file names lies; None where it is not found.
 

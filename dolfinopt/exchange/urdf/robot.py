@@ -408,17 +408,21 @@ class SceneBody:
         return self.size is not None
 
 
-def scene_bodies(robot: Robot, chosen: tuple[str, ...], tool: str) -> tuple[SceneBody, ...]:
+def scene_bodies(
+    robot: Robot, chosen: tuple[str, ...], tool: str | None = None
+) -> tuple[SceneBody, ...]:
     """Return the bodies of a scene, every one behind its parent, the end-effector's last.
 
     Args:
         robot: of any links.
         chosen: names of the links that become solids.
-        tool: name of the link whose frame is the end-effector's.
+        tool: name of the link whose frame is the end-effector's; None: see `default_tool`.
 
     Raises:
-        InputError: a link cannot be a solid.
+        InputError: there is no such link, or it cannot be a solid.
     """
+    _check_links(robot, chosen, tool)
+    tool = tool or default_tool(robot, chosen)
     places = _places(robot, chosen, tool)
     solids = {name: solid_of(robot, name, tool) for name in chosen}
     found = []
@@ -461,7 +465,7 @@ def _end(tool: str) -> SceneBody:
     return SceneBody(name, (), joint, tool, one, one, joint.axis, MASSLESS)
 
 
-def check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
+def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
     """Raise InputError unless the links that become solids, and the tool's, are there."""
     for name in (*chosen, *([] if tool is None else [tool])):
         if name not in robot.links:

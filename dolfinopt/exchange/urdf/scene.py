@@ -16,6 +16,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.robot import GROUND, Robot, RobotJoint, SceneBody, roll_pitch_yaw_of
+from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_table
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
@@ -238,7 +239,22 @@ class RobotScene:
             f"filter_radius = {_number(_up(RADIUS * side))}  # m",
         ]
 
-    def record(self, folder: Path) -> dict[str, Any]:
+    def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
+        """Return all files of a folder, the scene last: where it is, the others are.
+
+        Args:
+            folder: of the scene.
+            t, rows: (n,) s, (n, joints) of all joints that move.
+        """
+        new: dict[Path, str | bytes] = {
+            folder / self.mesh_name(one): one.mesh.data for one in self.bodies if one.mesh
+        }
+        joints = [self.joints[joint.name] for joint in self.robot.movable]
+        new[folder / TRAJECTORY] = _trajectory_text(joints, t, rows)
+        new[folder / RECORD] = json.dumps(self._record(folder), indent=2) + "\n"
+        return new | {folder / f"{self.robot.file.stem}.toml": self.text()}
+
+    def _record(self, folder: Path) -> dict[str, Any]:
         """Return what `export --urdf` needs: the file, and every solid's link and frame."""
         return {
             "urdf": _path_from(self.robot.file, folder),
@@ -265,12 +281,13 @@ class Origin:
     frames: Mapping[str, np.ndarray]
 
 
-def read_origin(record: Path) -> Origin:
-    """Read the record beside a scene.
+def read_origin(table: Path) -> Origin:
+    """Read the record beside a scene's table.
 
     Raises:
         InputError: it is not there, or no record.
     """
+    record = table.with_name(RECORD)
     try:
         data = json.loads(record.read_text(encoding="utf-8"))
         solids = data["solids"]
@@ -368,9 +385,26 @@ def _one_line(text: str) -> str:
 # -- A robot's trajectory: columns for all its joints, checked against its limits ----------------
 
 LIMIT_ROUNDING = 1e-6  # of a limit, which files round
+SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
-def columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]:
+def read_trajectory(robot: Robot, file: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return instants (n,), s, and all joints (n, joints) of a table, and what there is to say.
+
+    Raises:
+        InputError: the robot cannot follow it.
+    """
+    names = _columns_of(robot, file, column_names(file))
+    table = read_table(file, names)
+    assert table.t is not None
+    rows, held = _complete(robot, names, table.rows)
+    _check_positions(robot, file, table.lines, rows)
+    curve = curve_in_time(Table(file, table.lines, table.t, rows))
+    rates = curve(np.linspace(0.0, curve.end, SAMPLES))[1]
+    return table.t, rows, [*held, *_too_fast(robot, file, rates)]
+
+
+def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of a table's columns that are joints with a coordinate of their own.
 
     Raises:
@@ -393,7 +427,7 @@ def columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]
     return found
 
 
-def complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Return values (n, joints) of all joints that move, and a sentence on those not in the table.
 
     A joint that is not in the table stands at zero, or at the limit nearest to it; one that
@@ -414,7 +448,7 @@ def complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.n
     return np.column_stack([given[joint.name] for joint in robot.movable]), said
 
 
-def check_positions(robot: Robot, file: str, lines: Sequence[int], rows: np.ndarray) -> None:
+def _check_positions(robot: Robot, file: str, lines: Sequence[int], rows: np.ndarray) -> None:
     """Raise InputError for the first value beyond a joint's limits.
 
     Args:
@@ -436,7 +470,7 @@ def check_positions(robot: Robot, file: str, lines: Sequence[int], rows: np.ndar
             )
 
 
-def too_fast(robot: Robot, file: str, rates: np.ndarray) -> list[str]:
+def _too_fast(robot: Robot, file: str, rates: np.ndarray) -> list[str]:
     """Return a sentence for every joint whose rate (n, joints) exceeds its limit."""
     found = []
     for joint, values in zip(robot.movable, np.abs(rates).T, strict=True):
@@ -449,7 +483,7 @@ def too_fast(robot: Robot, file: str, rates: np.ndarray) -> list[str]:
     return found
 
 
-def trajectory_text(names: Sequence[str], t: np.ndarray, rows: np.ndarray) -> str:
+def _trajectory_text(names: Sequence[str], t: np.ndarray, rows: np.ndarray) -> str:
     """Return a table, t in s and a column for each joint, as CSV."""
     lines = [",".join(["t", *names])]
     lines += [",".join(repr(float(x)) for x in (at, *row)) for at, row in zip(t, rows)]

@@ -1,4 +1,4 @@
-"""Where a spatial machine's end-effector is, how far off the rigid machine's, and derivatives."""
+"""Where the bodies of a machine in space are, paths of its end-effector, joints that follow."""
 
 from __future__ import annotations
 
@@ -12,118 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.multibody.inverse_dynamics import Link, outward_pass
-from dolfinopt.multibody.kinematics import Interface
-from dolfinopt.multibody.mechanism import GROUND, Site
-from dolfinopt.multibody.motion import RigidMotion, along_curve, curve_of_table, curve_through
+from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
 from dolfinopt.multibody.spatial.mechanism import (
     Pose,
     RigidChain,
     SpatialMechanism,
-    cross,
     end_chain,
     roll_pitch_yaw,
-    times,
-    transposed_times,
 )
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
 from dolfinopt.scene.load import Scene
-
-
-class _Chain:
-    """Places and rotations along the bodies that carry the end-effector, n instants.
-
-    Attributes:
-        bodies: their indices.
-        rotations: (n, 3, 3) of every body's frame against the world's.
-        interfaces: of every body the one on which the next body or the end-effector sits.
-        levers: (n, 3) from these interfaces to the end-effector, the body's components.
-        joints: of every body.
-        at_joints: (n, 3) from every joint's frame to the end-effector, its components.
-        end: (n, 3) the end-effector, m.
-    """
-
-    def __init__(self, mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray) -> None:
-        count = len(motion.q)
-        self.bodies = mechanism.chain
-        outer = [mechanism.joints[i].interface for i in self.bodies[1:]]
-        self.rotations, self.interfaces, self.joints = [], [], []  # type: ignore[var-annotated]
-        links = _at_rest(mechanism, motion.q, q)
-        rotation, place = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))
-        origins = []
-        for i, number in zip(self.bodies, [*outer, mechanism.end_interface], strict=True):
-            joint, interface = links[i].joint, Interface(links[i].body, number)
-            place = place + times(rotation, _vectors(joint.r, count))
-            rotation = rotation @ _matrices(joint.R, count)
-            self.joints.append(joint)
-            self.rotations.append(rotation)
-            self.interfaces.append(interface)
-            origins.append(place)
-            place = place + times(rotation, _vectors(interface.place, count))
-            if links[i].body.is_flexible:
-                rotation = rotation @ _matrices(interface.turning.R, count)
-        self.end = place
-        self.at_joints = [
-            transposed_times(R, place - x) for R, x in zip(self.rotations, origins, strict=True)
-        ]
-        self.levers = [
-            x - _vectors(interface.place, count)
-            for x, interface in zip(self.at_joints, self.interfaces, strict=True)
-        ]
-
-
-def end_effector(mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the end-effector's position (n, 3), m, of the flexible machine."""
-    return _Chain(mechanism, motion, q).end
-
-
-def deviation(mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the flexible minus the equivalent rigid end-effector (n, 3), m."""
-    rigid = end_effector(mechanism, motion, np.zeros_like(q))
-    return end_effector(mechanism, motion, q) - rigid
-
-
-def end_effector_gradient(
-    mechanism: SpatialMechanism, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
-    """Return the gradient of sum_n weights_n . end_effector_n.
-
-    It is what a force of these weights on the end-effector does on every coordinate.
-
-    Args:
-        mechanism, motion, q: as for `end_effector`, n instants.
-        weights: (n, 3).
-
-    Returns:
-        By q (n, N), by the joints (n, joints), and by every body's outboard modes (b, q) and
-        their geometric stiffness (b, q, q), under the names of the shape integrals.
-    """
-    chain = _Chain(mechanism, motion, q)
-    by_q, by_joints = np.zeros_like(q), np.zeros_like(motion.q)
-    by_bodies: list[dict[str, np.ndarray]] = [
-        {"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies
-    ]
-    for at, i in enumerate(chain.bodies):
-        force = transposed_times(chain.rotations[at], weights)
-        joint, lever = chain.joints[at], chain.at_joints[at]
-        if joint.joint.coordinate is not None:
-            load = (force.T, cross(lever, force).T)
-            by_joints[:, joint.joint.coordinate] = joint.drive(load)
-        if not mechanism.bodies[i].num_modes:
-            continue
-        interface, part = chain.interfaces[at], mechanism.slices[i]
-        pull, e = interface.pushes((force.T, cross(chain.levers[at], force).T)), q[:, part]
-        by_q[:, part] = np.einsum("pn,pkn->nk", pull, interface.body.V[interface.places])
-        own = slice(6 * interface.number, 6 * interface.number + 6)
-        by_bodies[i]["outboard"][own] = pull @ e
-        if mechanism.bodies[i].is_stiffened:
-            by_bodies[i]["K0_outboard"] = np.zeros_like(mechanism.bodies[i].K0_outboard)
-            by_bodies[i]["K0_outboard"][own] = -0.5 * (pull[:, None] * e.T) @ e
-    return by_q, by_joints, by_bodies
-
-
-# -- where every body of a machine in space is: frames and outboard interfaces, n instants -------
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,50 +70,25 @@ def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -
         q_r: (n, joints) rigid coordinates; rad or m.
         q_e: (n, N) elastic coordinates.
     """
-    tree, links = mechanism.tree, _at_rest(mechanism, q_r, q_e)
-    count, bodies = len(q_r), len(mechanism.bodies)
-    origin, outboard, held = np.zeros((3, count, bodies, 3))
-    rotation = np.zeros((count, bodies, 3, 3))
-    place: dict[Site, np.ndarray] = {}  # of interfaces
-    turned: dict[Site, np.ndarray] = {}
-    for i in tree.order:
-        link, joint = links[i], mechanism.joints[i]
-        R = np.broadcast_to(np.eye(3), (count, 3, 3))
-        if joint.parent != GROUND:
-            site = joint.parent, joint.interface
-            held[:, i], R = place[site], turned[site]
-        origin[:, i] = held[:, i] + times(R, _vectors(link.joint.r, count))
-        rotation[:, i] = R @ _matrices(link.joint.R, count)
-        for s in range(len(link.body.constants.points)):
-            interface = Interface(link.body, s)
-            away = _vectors(interface.place, count)
-            place[i, s] = origin[:, i] + times(rotation[:, i], away)
-            turned[i, s] = rotation[:, i]
-            if link.body.is_flexible:
-                turned[i, s] = rotation[:, i] @ _matrices(interface.turning.R, count)
-        outboard[:, i] = place[i, 0]
-    axes = np.stack(
-        [rotation[:, i] @ joint.axis for i, joint in enumerate(mechanism.joints)], axis=1
+    posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
+    origin, rotation, outboard, axes, held = [], [], [], [], []
+    for i, joint in enumerate(joints):
+        _, place, R = posed.body(i)
+        R = np.broadcast_to(R if R.ndim == 3 else R[..., None], (3, 3, len(q_r)))
+        origin.append(place.T)
+        rotation.append(R.transpose(2, 0, 1))
+        outboard.append(posed.interface(i, 0)[0].T)
+        axes.append(rotation[-1] @ joint.axis)
+        held.append(posed.interface(joint.parent, joint.interface)[0].T)
+    return Frames(
+        origin=np.stack(origin, axis=1),
+        rotation=np.stack(rotation, axis=1),
+        outboard=np.stack(outboard, axis=1),
+        parents=tuple(joint.parent for joint in joints),
+        axes=np.stack(axes, axis=1),
+        held=np.stack(held, axis=1),
+        end=posed.interface(*mechanism.way[-1])[0].T,
     )
-    parents = tuple(joint.parent for joint in mechanism.joints)
-    end = place[mechanism.end, mechanism.end_interface]
-    return Frames(origin, rotation, outboard, parents, axes, held, end)
-
-
-def _vectors(x: np.ndarray, count: int) -> np.ndarray:
-    """Return vectors (n, 3) of (3, n), or of one (3, 1)."""
-    return np.broadcast_to(x.T, (count, 3))
-
-
-def _matrices(R: np.ndarray, count: int) -> np.ndarray:
-    """Return rotations (n, 3, 3) of (3, 3, n), or of one (3, 3)."""
-    return np.broadcast_to(R if R.ndim == 2 else R.transpose(2, 0, 1), (count, 3, 3))
-
-
-def _at_rest(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> list[Link]:
-    """Return all bodies in given poses."""
-    rigid, elastic = np.zeros_like(q_r), np.zeros_like(q_e)
-    return outward_pass(mechanism.tree, RigidMotion(q_r, rigid, rigid), (q_e, elastic, elastic))
 
 
 # -- path of an end-effector in space: its points, orientation, and joints that a table

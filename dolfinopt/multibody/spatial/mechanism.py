@@ -47,7 +47,7 @@ class SpatialMechanism(ElasticBodies):
     carried_further: Mapping[Site, ShapeIntegrals] = field(default_factory=dict)
 
     @cached_property
-    def tree(self) -> Tree:
+    def tree(self) -> Tree:  # type: ignore[override]
         """Itself as inverse dynamics goes along it."""
         loads = {site: Constants(one) for site, one in self.every_load.items()}
         constants = tuple(map(Constants, self.bodies))
@@ -60,12 +60,31 @@ class SpatialMechanism(ElasticBodies):
         return first | dict(self.carried_further)
 
     @cached_property
-    def chain(self) -> tuple[int, ...]:
-        """The bodies from the ground to the end-effector's."""
-        found = [self.end]
-        while self.joints[found[0]].parent != GROUND:
-            found.insert(0, self.joints[found[0]].parent)
+    def way(self) -> tuple[Site, ...]:  # type: ignore[override]
+        """From the ground to the end-effector: every body and the interface that leads on."""
+        found = [(self.end, self.end_interface)]
+        while (joint := self.joints[found[0][0]]).parent != GROUND:
+            found.insert(0, (joint.parent, joint.interface))
         return tuple(found)
+
+    @property
+    def softness(self) -> float:
+        """Largest static deflection of an interface by a unit force, m/N."""
+        found = [0.0]
+        for body in self.bodies:
+            if body.num_modes:
+                for B in body.outboard.reshape(-1, 6, body.num_modes)[:, :3]:
+                    soft = B @ np.linalg.solve(body.K, B.T)
+                    found.append(float(np.linalg.eigvalsh(0.5 * (soft + soft.T))[-1]))
+        return max(found)
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Deflection of the end by unit rigid coordinates (joints,), m; at most."""
+        reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in self.bodies)
+        reach += sum(float(np.linalg.norm(one.origin)) for one in self.joints)
+        slides = [self.joints[i].kind == "prismatic" for i in self.tree.movable]
+        return np.where(slides, 1.0, reach)
 
     @property
     def num_rigid(self) -> int:
@@ -120,13 +139,6 @@ def rigid_spatial_body(
     )
 
 
-def inertia_about_centre(body: ShapeIntegrals) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre (3,), m, and inertia tensor (3, 3) about it, kg m2, of the undeformed body."""
-    centre = body.w[:, 0] / body.mass if body.mass else np.zeros(3)
-    second = body.W[:, 0, 0].reshape(3, 3) - body.mass * np.outer(centre, centre)
-    return centre, np.trace(second) * ONE - second
-
-
 def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
     """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = inertia
@@ -156,11 +168,6 @@ def skew(v: np.ndarray) -> np.ndarray:
 def times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return A v (n, 3) of matrices (n, 3, 3), or one (3, 3), and vectors (n, 3)."""
     return v @ A.T if A.ndim == 2 else np.einsum("nij,nj->ni", A, v)
-
-
-def transposed_times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return A' v (n, 3)."""
-    return v @ A if A.ndim == 2 else np.einsum("nji,nj->ni", A, v)
 
 
 def exponential(theta: np.ndarray) -> np.ndarray:

@@ -1,17 +1,20 @@
-"""What a diagram is made of: rows that are measured, and curves of them."""
+"""Diagrams: rows that are measured, panels of curves, and their part of bench.md."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 
-from dolfinopt.plots.style import looks, new_figure
-from dolfinopt.scene.load import Scene
+from dolfinopt.bench.measure import Plan
+from dolfinopt.disk import write_text
+from dolfinopt.plots.style import looks, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,19 +24,6 @@ Rows: TypeAlias = Iterator[Row]
 # A step's name, and what measures its rows.
 Steps: TypeAlias = Iterator[tuple[str, Callable[[], Iterable[Row]]]]
 Frame: TypeAlias = pd.DataFrame
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What is measured on: a scene; a quick plan has coarse settings and a single repeat."""
-
-    scene: Scene
-    quick: bool
-
-    @property
-    def repeats(self) -> int:
-        """How often a short computation is timed; the fastest counts."""
-        return 1 if self.quick else 5
 
 
 @dataclass(frozen=True)
@@ -99,6 +89,36 @@ class Diagram:
         return Frame(rows, columns=self.columns.split(" | "))
 
 
+def write(diagram: Diagram, frame: Frame, folder: Path) -> str:
+    """Write <name>.csv and <name>.png; return the diagram's part of the summary."""
+    text = frame.to_csv(index=False, float_format="%.10g", lineterminator="\n")
+    write_text(folder / f"{diagram.name}.csv", text)
+    save(draw(diagram, frame), folder / f"{diagram.name}.png")
+    notes = [note for panel in diagram.panels for note in panel.notes(frame)]
+    notes += [
+        f"Left out, not installed (pip install 'dolfinopt[bench]'): {package}."
+        for package in diagram.uses
+        if not version(package)
+    ]
+    head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)", diagram.note]
+    listed = "\n".join(f"- {note}" for note in notes)
+    return "\n\n".join(filter(None, [*head, listed, markdown(frame)]))
+
+
+def markdown(frame: Frame) -> str:
+    """Return a table, four digits a number, nothing for nan."""
+    cells = frame.astype(object).where(frame.notna(), None)
+    return str(cells.to_markdown(index=False, floatfmt=".4g"))
+
+
+def version(package: str) -> str:
+    """Return a package's version, "" where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
 # -- curves ----------------------------------------------------------------------------------
 
 
@@ -122,20 +142,13 @@ def fastest(found: dict[str, Frame], goal: float) -> tuple[str, float] | None:
 
     Interpolated along curves from coarse to fine, log over log.
     """
-    best: tuple[str, float] | None = None
+    there = []
     for name, points in found.items():
-        x, error = points.to_numpy(dtype=float).T
-        error = np.minimum.accumulate(error)
-        k = int(np.searchsorted(-error, -goal))
-        if k == len(x):
-            continue
-        at = float(x[k])
-        if k > 0 and error[k] < error[k - 1]:
-            share = np.log(error[k - 1] / goal) / np.log(error[k - 1] / error[k])
-            at = float(x[k - 1] * (x[k] / x[k - 1]) ** share)
-        if best is None or at < best[1]:
-            best = name, at
-    return best
+        x, y = np.log(points.to_numpy(dtype=float)).T
+        y = np.minimum.accumulate(y)
+        if y[-1] <= math.log(goal):
+            there.append((name, float(np.exp(np.interp(-math.log(goal), -y, x)))))
+    return min(there, key=lambda one: one[1], default=None)
 
 
 def draw(diagram: Diagram, frame: Frame) -> Figure:
