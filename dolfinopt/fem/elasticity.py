@@ -462,5 +462,7 @@ def _times(matrix: PETSc.Mat, vector: np.ndarray) -> np.ndarray:
     x, y = matrix.createVecs()
     x.array = vector
     matrix.mult(x, y)
-    product: np.ndarray = y.array_r
+    product: np.ndarray = y.array_r.copy()
+    for one in (x, y):
+        one.destroy()
     return product
