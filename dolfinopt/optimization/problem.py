@@ -291,7 +291,7 @@ def problem_of(
     minimum member their gradient is that of the dilated one, scaled to the nominal volume:
     f = V_dilated / V* - 1 with V* = V_dilated / V_nominal times the limit, chosen anew in every
     step and held in the gradient. Other limits are kept by all three; where they bind the nominal
-    one alone, by the eroded one with the limits of `limits_at`.
+    one alone, by that, and by the eroded one with the limits of `limits_at`.
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
 
     Args:
@@ -315,7 +315,9 @@ def problem_of(
     if robust and known and scene.design.controls_widths:
         ratio = (1.0 + f[-1][own]) / (1.0 + f[1][own])
         dfdx = ratio[:, None] * designs[1].constraints[own]
-    bound = [0] if robust and scene.design.limits_on == "nominal" else range(len(designs))
+    bound: Sequence[int] = range(len(designs))
+    if robust and scene.design.limits_on == "nominal":
+        bound = [0, len(designs) - 1]
     f0, df0dx = _objective(scene, designs)
     variants = [limits_of(scene, one.evaluation) for one in designs]
     limits = variants[-1] if scene.design.limits_on == "nominal" else worst_limits(variants)
