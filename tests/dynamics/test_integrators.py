@@ -24,7 +24,6 @@ from dolfinopt.dynamics.collocation import (
     even_steps,
     residual_at,
     stages_of,
-    step_ends,
 )
 from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
 from dolfinopt.dynamics.newton import NewtonMatrix, factorise, simplified_newton_matrix
@@ -127,35 +126,17 @@ def distance(problem: ElasticSystem, one: Solution, other: Solution, count: int 
 # -- coefficients ----------------------------------------------------------------------------
 
 
-def test_radau_coefficients() -> None:
-    """Of one, two and three stages: Hairer & Wanner (1996), tables IV.5.5 and IV.5.6."""
-    root = np.sqrt(6.0)
-    tables = {
-        1: ([1.0], [[1.0]]),
-        2: ([1 / 3, 1.0], [[5 / 12, -1 / 12], [3 / 4, 1 / 4]]),
-        3: (
-            [(4 - root) / 10, (4 + root) / 10, 1.0],
-            [
-                [(88 - 7 * root) / 360, (296 - 169 * root) / 1800, (-2 + 3 * root) / 225],
-                [(296 + 169 * root) / 1800, (88 + 7 * root) / 360, (-2 - 3 * root) / 225],
-                [(16 - root) / 36, (16 + root) / 36, 1 / 9],
-            ],
-        ),
-    }
-    for stages, (c, A) in tables.items():
-        method = radau.radau_iia(stages)
-        assert_close(method.c, c, 1e-14)
-        assert_close(method.A, A, 1e-14)
-        assert_close(method.A2, np.array(A) @ np.array(A), 1e-14)
-
-
-@pytest.mark.parametrize("stages", [2, 3, 4, 5])
-def test_radau_integrates_polynomials(stages: int) -> None:
-    """The last row is of order 2 s - 1: it integrates t^k exactly for k <= 2 s - 2."""
+@pytest.mark.parametrize("stages", [1, 2, 3, 4, 5])
+def test_radau_coefficients(stages: int) -> None:
+    """c_s = 1, B(2 s - 1) and C(s), which nothing else fulfils (Hairer & Wanner 1996, IV.5)."""
     method = radau.radau_iia(stages)
+    c, A = method.c, method.A
+    assert c[-1] == pytest.approx(1.0, abs=1e-14) and len(c) == stages
     for k in range(2 * stages - 1):
-        assert_close(method.A[-1] @ method.c**k, 1.0 / (k + 1), 1e-13)
-    assert abs(method.A[-1] @ method.c ** (2 * stages - 1) - 0.5 / stages) > 1e-6
+        assert_close(A[-1] @ c**k, 1.0 / (k + 1), 1e-13)
+    for k in range(stages):
+        assert_close(A @ c**k, c ** (k + 1) / (k + 1), 1e-13)
+    assert_close(method.A2, A @ A, 1e-14)
 
 
 @pytest.mark.parametrize("rho_inf", [0.0, 0.5, 0.8, 1.0])
@@ -270,8 +251,8 @@ def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
     [
         *(("smooth", *one) for one in ((1, (200, 800)), (2, (40, 160)), (3, (40, 160)))),
         ("smooth", 4, (20, 40)),
-        *(("trapezoidal", *one) for one in ((2, (40, 160)), (3, (40, 160)), (4, (40, 80)))),
-        *(("s-curve", *one) for one in ((2, (40, 160)), (3, (40, 160)), (4, (40, 80)))),
+        *(("trapezoidal", *one) for one in ((2, (40, 160)), (4, (40, 80)))),
+        ("s-curve", 3, (40, 160)),
     ],
 )
 def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None:
@@ -313,9 +294,6 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
             rate,
         )
         assert order == pytest.approx(2.0, abs=0.1)
-
-
-# -- energy ----------------------------------------------------------------------------------
 
 
 # -- error control ---------------------------------------------------------------------------
@@ -406,15 +384,6 @@ def test_agrees_with_scipy() -> None:
         q = solve(integrator, problem, tolerance).sample(t)
         # SciPy's own error is 2e-6 here, measured against rtol = 1e-7.
         assert relative_error(problem.mechanism, q - expected, expected) <= tolerance
-
-
-@pytest.mark.parametrize("arms", [1, 3])
-def test_integrators_agree_on_other_chains(arms: int) -> None:
-    """One arm and three."""
-    size = (0.2, 1.0, -0.8, 0.5)[: 1 + arms]
-    problem, _ = two_arms(lambda t: reach(t, size), arms=arms, damping=2e-3)
-    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 3e-3)
-    assert distance(problem, other, one) <= 3e-3 + 1e-5
 
 
 # -- robustness ------------------------------------------------------------------------------
@@ -709,12 +678,6 @@ def some_stages(problem: ElasticSystem, count: int = 5) -> Stages:
     return stages_of(modes_of(problem), radau.radau_iia(3), edges)
 
 
-def some_factors(stages: Stages, slow: np.ndarray) -> NewtonMatrix:
-    """Return Newton's matrix at a state of rest that is not an equilibrium."""
-    rest = np.zeros((len(stages.h), 3, stages.preconditioner.system.num_coordinates))
-    return factorise(stages, rest, rest, rest, slow)
-
-
 def slow_up_to(monkeypatch: pytest.MonkeyPatch, limits: tuple[float, ...]) -> None:
     """Treat coordinates densely up to these angles, tried in turn."""
     monkeypatch.setattr(factors, "LIMITS", limits)
@@ -766,17 +729,6 @@ def test_modes_are_a_change_of_coordinates() -> None:
     assert_close(modes.gradient_from_modes(found), rows, 1e-12)
 
 
-def test_frequencies_of_the_modes() -> None:
-    """One arm on its own: det(K - w^2 M) = 0, M with the payload by the work it does."""
-    arm = beam()
-    chain = Chain((arm,), 0.7, 0.02, (0.0, 0.0), 0.0)
-    modes = modes_of(ElasticSystem(chain.mechanism(), lambda t: reach(t, (0.2, 1.0)), ENDS))
-    payload = np.array([0.7, 0.7, 0.02])  # kg, kg, kg m2
-    M = arm.body().M + arm.outboard.T @ (payload[:, None] * arm.outboard)
-    squares = np.linalg.eigvals(np.linalg.solve(M, arm.K))
-    assert_close(np.sort(modes.frequencies[0]), np.sort(np.sqrt(squares.real)), 1e-12)
-
-
 def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
     """A step takes the rows' linear part away, and reports the change of q it makes."""
     problem, _ = two_arms()
@@ -797,43 +749,6 @@ def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
     assert_close(at_stages(stages, state, a + step)[0], at[0] + shift, 1e-12)
 
 
-def test_fast_coordinates_alone_are_oscillators() -> None:
-    """A chain of one arm, fast but for one: their rows' diagonal, step by step."""
-    arm = fine_beam(4, 2)
-    chain = Chain((arm,), 1.0, 0.0, (0.0, 0.0), 0.0)
-
-    def still(t: np.ndarray) -> RigidMotion:
-        rest = np.zeros((len(t), 2))
-        return RigidMotion(rest, rest, rest)
-
-    stages = some_stages(ElasticSystem(chain.mechanism(), still, ENDS))
-    rows = np.random.default_rng(5).normal(size=(5, 3, 6))
-    slow = np.array([5])
-    rows[:, :, slow] = 0.0  # and so they stay: nothing couples slow rows to fast columns
-    fast, _ = some_factors(stages, slow).solve(rows, np.zeros((2, 6)))
-    full, _ = some_factors(stages, np.arange(6)).solve(rows, np.zeros((2, 6)))
-    # At rest the arm's vibrations are not coupled: the diagonal is the whole matrix.
-    assert_close(fast, full, 1e-9)
-
-
-@pytest.mark.parametrize("slow", [[0, 3, 4, 9, 15], list(range(16))])
-def test_transposed_matrix(slow: list[int]) -> None:
-    """by_a . step + by_y . states = multipliers . rows for any rows and slopes."""
-    stages = some_stages(fine_arms())
-    rng = np.random.default_rng(6)
-    matrix = some_factors(stages, np.array(slow))
-    rows, by_a = rng.normal(size=(2, 5, 3, 16))
-    by_y, after = rng.normal(size=(5, 2, 16)), rng.normal(size=(2, 16))
-    zero = np.zeros((2, 16))
-    step, _ = matrix.solve(rows, zero)
-    q, qd = step_ends(stages, (zero[0], zero[1]), step)
-    states = np.stack([q, qd], axis=1)
-    expected = np.sum(by_a * step) + np.sum(by_y * states[:-1]) + np.sum(after * states[-1])
-    multipliers = matrix.solve_transposed(by_a, by_y, after)
-    # The terms cancel over stiffnesses that lie eight decades apart.
-    assert np.sum(multipliers * rows) == pytest.approx(expected, rel=1e-9)
-
-
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
 def test_fast_coordinates_change_nothing(
@@ -851,9 +766,9 @@ def test_fast_coordinates_change_nothing(
     assert found.iterations <= expected.iterations + 10
 
 
-@pytest.mark.parametrize("bending", [10.0, 100.0, 1000.0])
+@pytest.mark.parametrize("bending", [10.0, 1000.0])
 @pytest.mark.parametrize("stages", [3, 4])
-@pytest.mark.parametrize("steps", [8, 12, 20])
+@pytest.mark.parametrize("steps", [8, 20])
 def test_estimate_of_vibrations_that_are_not_resolved(
     bending: float, stages: int, steps: int
 ) -> None:
@@ -983,35 +898,6 @@ def test_start_of_other_stages_or_size_is_used_or_ignored() -> None:
     start = radau.integrate(single, 1e-5, 3, Profile())
     other = radau.integrate(problem, 1e-5, 3, Profile(), start)
     assert distance(problem, other, cold) <= 2e-5
-
-
-def test_generalized_alpha_counts_its_iterations() -> None:
-    """At least one a step and grid; the coarser grids count too."""
-    problem, _ = two_arms()
-    profile = Profile()
-    solution = generalized_alpha.integrate(problem, 1e-2, 0.8, profile)
-    assert profile.counts.newton_iterations == solution.iterations > len(solution.a)
-
-
-@BOTH
-def test_sample_is_one_motion(integrator: str) -> None:
-    """Continuous over the steps, with derivatives that are derivatives, and its own ends."""
-    problem, _ = two_arms()
-    solution = solve(integrator, problem, 1e-3)
-    assert_close(solution.sample(solution.time_grid[:-1]), solution.q, 1e-12)
-    assert_close(solution.sample(solution.time_grid[:-1], 1), solution.qd, 1e-12)
-    assert not solution.sample(np.zeros(1)).any()
-
-    h = np.diff(solution.time_grid)
-    inside = solution.time_grid[:-1] + 0.4 * h
-    step = 0.1 * h.min()  # three of them stay in the step: differences are exact up to degree 6
-    for order in (1, 2):
-        expected = solution.sample(inside, order)
-
-        def integral(t: float, below: int = order - 1) -> np.ndarray:
-            return solution.sample(inside + t, below)
-
-        assert_close(derivative(integral, step), expected, 1e-9)  # rounding over step
 
 
 def test_sample_of_known_polynomials() -> None:

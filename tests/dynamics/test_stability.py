@@ -19,7 +19,7 @@ from runs import overrides as options
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics import newton, radau
+from dolfinopt.dynamics import radau
 from dolfinopt.dynamics import radau as march
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
@@ -321,33 +321,6 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
         np.testing.assert_allclose(gram, np.eye(modes), atol=1e-10)
 
 
-def test_ordinary_modes_cost_what_they_did() -> None:
-    """Of a warm start one sweep of count + 4 solves, and three of the constraint modes."""
-    arm = one_arm(cells=(60, 6))
-    arm.reduce(arm.uniform(0.5))
-    before = arm.profile.counts.solves
-    arm.reduce(arm.uniform(0.5) + 0.01 * np.sin(30.0 * arm.mesh.centroid[:, 0]))
-    assert arm.profile.counts.solves - before <= 3 + 10
-    assert arm.profile.counts.eigenproblems == 2
-
-
-@pytest.mark.parametrize("method", ["craig-bampton", "modal", "krylov"])
-@pytest.mark.parametrize("field", [checkerboard, gap, solid])
-def test_a_hundred_coordinates(method: str, field: Field) -> None:
-    """Of checkerboards, too: orthonormal, and the tip as compliant as without reduction."""
-    arm = one_arm(f"reduction.method={method}", "reduction.coordinates=100", cells=(40, 4))
-    body = arm.reduce(field(0, *arm.mesh.centroid.T))
-    normal = slice(3, None) if method == "craig-bampton" else slice(None)
-    np.testing.assert_allclose(
-        body.M[normal, normal], np.eye(len(body.M[normal, normal])), atol=1e-10
-    )
-    if method != "modal":  # statically exact
-        tip = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
-        exact = np.linalg.inv(arm.elastic.constraint_modes().stiffness)
-        scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
-        np.testing.assert_allclose(tip / scale, exact / scale, atol=1e-6)
-
-
 # -- motions ---------------------------------------------------------------------------------
 
 
@@ -490,18 +463,6 @@ def test_undamped_energy_does_not_drift() -> None:
     assert energies[0] > 1e-6 * largest
 
 
-@pytest.mark.slow
-def test_tolerances() -> None:
-    """From 1e-2 to 1e-9, against a solution of 1e-11."""
-    overrides = ["simulation.stages=5", "motion.horizon=2.0", "simulation.sample=0.01"]
-    best = moved(*overrides, "simulation.tolerance=1e-11", field=wave)
-    for tolerance in (1e-2, 1e-4, 1e-6, 1e-9):
-        solution = radau.integrate(
-            best.problem, tolerance, 3 if tolerance > 1e-7 else 5, do.Profile()
-        )
-        assert distance(best, solution) < tolerance
-
-
 # -- what broke Newton -----------------------------------------------------------------------
 
 
@@ -535,24 +496,6 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
     for stages in (3, 4, 5):
         rough = radau.integrate(trajectory.problem, 1e-2, stages, do.Profile())
         assert distance(trajectory, rough) < 1e-2
-
-
-def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Deflections of 28 %: with Newton's method refused for more than 20 steps, the same motion."""
-    trajectory = moved("material.young_modulus=1.5e9", "motion.horizon=1.9")
-    assert len(trajectory.solution.time_grid) > 21
-    method, refused = newton.newton, []
-
-    def stubborn(stages, state, a, *others, **options):
-        if len(stages.h) > 20:
-            refused.append(len(stages.h))
-            return newton.Iterate(a, np.zeros(1, dtype=bool), np.zeros(1), np.ones(1, dtype=int))
-        return method(stages, state, a, *others, **options)
-
-    monkeypatch.setattr(march, "newton", stubborn)
-    again = radau.integrate(trajectory.problem, 1e-4, 5, do.Profile())
-    assert refused
-    assert distance(trajectory, again) < 2e-4
 
 
 # -- units -----------------------------------------------------------------------------------

@@ -12,18 +12,14 @@ import scipy.integrate
 import scipy.linalg
 from mpi4py import MPI
 from remainders import substructure
-from runs import TWO_ARM
 from scipy.optimize import brentq
 
-import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody.shape_integrals import first_frequency, shape_integrals
+from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.reduction import (
-    METHODS,
     Basis,
-    Method,
     Options,
     balanced,
     basis_errors,
@@ -277,20 +273,6 @@ def test_a_warm_start_finds_the_same_modes_with_less_work(shared_arm, method, q)
     size = np.abs(cold.V).max(axis=(0, 1), initial=1e-30)
     assert np.abs((warm.V - cold.V) / size).max(initial=0.0) < 1e-9
     assert np.diag(warm.stiffness) == pytest.approx(np.diag(cold.stiffness), rel=1e-11)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("method", sorted(REDUCTORS))
-def test_the_start_decides_nothing(shared_arm, method):
-    """From any one mode, or with signs reversed, the search ends with the same basis."""
-    arm = with_densities(shared_arm, hollow(shared_arm.mesh.centroid))
-    q = 9
-    cold = REDUCTORS[method](arm, Options(q))
-    size = np.abs(cold.V).max(axis=(0, 1), initial=1e-30)
-    last = cold.start.shape[1] - 1
-    for start in (-cold.start, cold.start[:, :1], cold.start[:, last:], cold.start[:, :0]):
-        again = REDUCTORS[method](arm, Options(q), start)
-        assert np.abs((again.V - cold.V) / size).max(initial=0.0) < 1e-8
 
 
 def test_a_mode_of_another_symmetry_becomes_the_lowest():
@@ -582,78 +564,6 @@ def test_adjoint_of_modes_is_no_answer_where_a_product_is_no_number(iterative):
 # -- in motion ------------------------------------------------------------------------------------
 
 MOTION = ["arms.cells=[30,4]", "motion.duration=0.9", "motion.horizon=1.0"]
-
-
-def simulated(*overrides):
-    """Return scene, arms, evaluation and gradient of the demo's graded arms."""
-    scene = do.load_scene(TWO_ARM, [*MOTION, *overrides])
-    partition, profile = do.partition_arms(COMM, scene.cell_counts), do.Profile()
-    arms = do.build_arms(scene, partition, profile)
-    x = {k: 0.3 + 0.7 * graded(arm.mesh.centroid) for k, arm in arms.items()}
-    evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
-    slopes = do.gradient(scene, partition, arms, trajectory, profile)
-    return scene, partition, arms, x, evaluation, slopes
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_simulations_agree_between_methods():
-    """Compliance and largest deviation against 16 Craig-Bampton coordinates; frozen gradients."""
-    linear = "simulation.stiffening=false"  # bases alone
-    best = ["simulation.tolerance=1e-6", "reduction.coordinates=16", linear]
-    *_, reference, slopes = simulated(*best)
-    # Measured: 1e-7, 2e-8, 4e-5, 8e-2; gradients, where single cells count, 1e-3, 2e-3, 2e-2, 0.3.
-    limits = {
-        "craig-bampton": (1e-6, 1e-2),
-        "krylov": (1e-6, 1e-2),
-        "balanced": (5e-4, 0.1),
-        "modal": (0.2, 0.8),
-    }
-    for method, (limit, slope_limit) in limits.items():
-        *_, found, ours = simulated(best[0], linear, f"reduction.method={method}")
-        for name in ("compliance", "max_deviation"):
-            error = abs(getattr(found, name) / getattr(reference, name) - 1.0)
-            assert error < limit, (method, name)
-            assert error > 0.01 or method != "modal"
-        for k, slope in slopes.items():
-            assert np.abs(ours[k] - slope).max() < slope_limit * np.abs(slope).max(), method
-
-
-@pytest.mark.slow
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize("integrator", ["radau", "generalized-alpha"])
-def test_full_matrices_move_as_diagonal_ones(integrator, monkeypatch):
-    """Nothing behind the reduction takes K_r or M_r for diagonal, or coordinates for modes."""
-    # Coordinates of another length, so that errors are not measured alike, and dense matrices.
-    turn = np.random.default_rng(3).standard_normal((4, 4)) + 2.0 * np.eye(4)
-
-    def mixed(arm, options, start=None):
-        basis = krylov(arm, options, start)
-        return Basis(
-            basis.V @ turn,
-            basis.MV @ turn,
-            turn.T @ basis.stiffness @ turn,
-            basis.outboard @ turn,
-            basis.start,
-        )
-
-    short = [
-        "motion.duration=0.9",
-        "motion.horizon=0.9",
-        "objective.load_cases=5",
-        f"simulation.integrator={integrator}",
-    ]
-    short += ["reduction.method=krylov", "simulation.tolerance=1e-3"]
-    _, _, arms, _, plain, slopes = simulated(*short)
-    first = {k: first_frequency(arm.current.body) for k, arm in arms.items()}
-    monkeypatch.setitem(METHODS, "krylov", Method(mixed, None))
-    _, _, arms, _, found, ours = simulated(*short)
-    for k, arm in arms.items():
-        assert first_frequency(arm.current.body) == pytest.approx(first[k], rel=1e-9)
-    # Steps differ, as the first guess of a step does; both are right to the tolerance.
-    assert found.compliance == pytest.approx(plain.compliance, rel=2e-3)
-    assert found.max_deviation == pytest.approx(plain.max_deviation, rel=2e-3)
-    for k, slope in slopes.items():
-        assert np.abs(ours[k] - slope).max() < 4e-3 * np.abs(slope).max()
 
 
 # -- ranks ----------------------------------------------------------------------------------------
